@@ -1,0 +1,55 @@
+//! The result of one batch: what is stored, listed and answered.
+
+use serde::{Deserialize, Serialize};
+
+use crate::damage::QuantityAssessment;
+use crate::quantity::{Digest, Timestamp};
+
+/// How far a stored batch has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BatchState {
+    /// On disk, not assessed yet: it waits for its turn or for a trained baseline.
+    Received,
+    /// Assessed; see its newest assessment for the undamaged state it was compared with.
+    Assessed,
+    /// The assessment failed; the reason is stored and the batch kept.
+    Failed,
+}
+
+impl BatchState {
+    /// The name used in tables and answers.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Received => "received",
+            Self::Assessed => "assessed",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// What one batch says of the structure: a pure function of data, trained baseline, undamaged state and seed.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Assessment {
+    /// Digest of the trained baseline that gave it.
+    pub model_digest: Digest,
+    /// Digest of the structure it was trained for.
+    pub structure_digest: Digest,
+    /// Version of the undamaged state compared with; `None` when there was none or the batch is part of it.
+    pub undamaged_version: Option<u32>,
+    /// Seed of the draws.
+    pub seed: u64,
+    /// Posterior samples drawn for each measurement.
+    pub draws_per_measurement: usize,
+    /// Measurements with all modes, which the estimate rests on.
+    pub measurements_used: usize,
+    /// Measurements left out because a mode is missing.
+    pub measurements_left_out: usize,
+    /// For each mode, 100·(mean measured − simulated)/mean measured, simulated at the mean of all posterior samples: what
+    /// the simulation cannot reproduce, in per cent.
+    pub misfit_percent: Vec<f64>,
+    /// When it was computed.
+    pub assessed_at: Timestamp,
+    /// One entry for each monitored quantity.
+    pub quantities: Vec<QuantityAssessment>,
+}

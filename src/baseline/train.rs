@@ -1,0 +1,238 @@
+//! From a structure to a trained baseline.
+
+use candle_core::{DType, Tensor};
+use nalgebra::DMatrix;
+
+use super::manifest::{
+    Manifest, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening, FORMAT,
+};
+use super::{to_real_line, Baseline, InferenceError};
+use crate::flow::train::{EpochReport, Pairs, Stopped, TrainSettings};
+use crate::flow::{checkpoint, weights, FlowSettings};
+use crate::parameter::ParameterSpace;
+use crate::quantity::Digest;
+use crate::simulator::{Simulator, TrainingSet};
+use crate::stats;
+
+/// Pairs that choose the best epoch.
+const VALIDATION_SAMPLES: usize = 1_000;
+/// Pairs the manifest's figures are measured on.
+const HELD_OUT_SAMPLES: usize = 2_000;
+/// Draws for each held-out pair.
+const HELD_OUT_DRAWS: usize = 10;
+/// Draws of the self-test.
+const SELF_TEST_DRAWS: usize = 4;
+/// Fewest training samples: below, the covariance of the frequencies itself is uncertain.
+pub const MINIMUM_SAMPLES: usize = 100;
+
+/// Why no baseline came of a training.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Too few samples asked for.
+    #[error("{0} training samples are too few: at least {MINIMUM_SAMPLES} are needed")]
+    TooFewSamples(usize),
+    /// A setting that must be positive is not.
+    #[error("{name} is {value}: it must be positive")]
+    Setting {
+        /// Name of the setting.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+    },
+    /// The simulation failed somewhere in the prior.
+    #[error("the simulation failed: {0}")]
+    Simulation(#[from] crate::simulator::Error),
+    /// Frequencies that do not vary, or not independently.
+    #[error("over the prior, a frequency does not vary or two vary as one: there is nothing to learn from them")]
+    Degenerate,
+    /// The flow was not trained.
+    #[error(transparent)]
+    Flow(#[from] crate::flow::train::Error),
+    /// The weights could not be written.
+    #[error(transparent)]
+    Checkpoint(#[from] checkpoint::Error),
+    /// The trained flow does not infer.
+    #[error(transparent)]
+    Inference(#[from] InferenceError),
+    /// The new baseline does not pass its own checks: a bug.
+    #[error("the new baseline is refused: {0}")]
+    Refused(#[from] Box<super::LoadError>),
+    /// Tensors of the wrong shape: a bug.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// A trained baseline and its two files.
+pub struct Trained {
+    /// Ready for use, loaded back from the files below.
+    pub baseline: Baseline,
+    /// The manifest file.
+    pub manifest_json: Vec<u8>,
+    /// The weight file (safetensors).
+    pub weights: Vec<u8>,
+}
+
+/// Simulates `samples` pairs from the prior of `simulator`, trains a flow on them and measures what it reached.
+///
+/// The same simulator, settings and seed give the same bytes, whatever the number of threads.
+///
+/// # Errors
+/// [`Error`] for settings out of range, a simulation that fails in the prior, or a training that diverges at once.
+pub fn train(
+    simulator: &Simulator,
+    samples: usize,
+    flow_settings: &FlowSettings,
+    settings: &TrainSettings,
+    on_epoch: impl FnMut(EpochReport),
+) -> Result<Trained, Error> {
+    check(samples, flow_settings, settings)?;
+    let space = simulator.space();
+    let draw = |count: usize, purpose: &str| simulator.training_set(count, purpose_seed(settings.seed, purpose));
+    let training = draw(samples, "training set")?;
+    let validation = draw(VALIDATION_SAMPLES, "validation set")?;
+    let whitening = Whitening::fit(&rows(&training.frequencies_hz)).ok_or(Error::Degenerate)?;
+
+    let mut permutations = stats::stream(settings.seed, "permutations");
+    let architecture = flow_settings.architecture(space.len(), simulator.modes(), 1, &mut permutations);
+    let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
+    let training_pairs = pairs(&training, space, &whitening)?;
+    let validation_pairs = pairs(&validation, space, &whitening)?;
+    let outcome =
+        crate::flow::train::train(&flow, &weights, &training_pairs, &validation_pairs, settings, on_epoch)?;
+
+    let weight_bytes = checkpoint::to_bytes(&weights)?;
+    let mut manifest = Manifest {
+        format: FORMAT,
+        program_version: env!("CARGO_PKG_VERSION").to_owned(),
+        structure: simulator.id().clone(),
+        structure_digest: simulator.digest().clone(),
+        weights_sha256: Digest::of_file(&weight_bytes),
+        architecture,
+        whitening: whitening.clone(),
+        training: TrainingRecord {
+            samples,
+            validation_samples: VALIDATION_SAMPLES,
+            settings: settings.clone(),
+            best_epoch: outcome.best_epoch,
+            stopped: outcome.stopped,
+        },
+        validation: ValidationRecord {
+            samples: 0,
+            negative_log_likelihood: 0.0,
+            negative_log_likelihood_error: 0.0,
+            parameters: Vec::new(),
+            inverse_error: 0.0,
+        },
+        self_test: SelfTest { frequencies_hz: Vec::new(), seed: settings.seed, expected: Vec::new() },
+    };
+    // The trained flow measures itself: what goes into the manifest is what a loaded baseline gives.
+    let draft = Baseline {
+        flow,
+        whitening,
+        simulator: simulator.clone(),
+        digest: manifest.weights_sha256.clone(),
+        manifest: manifest.clone(),
+    };
+    let held_out = draw(HELD_OUT_SAMPLES, "held-out set")?;
+    manifest.validation = validate(&draft, &held_out, settings.seed)?;
+    manifest.self_test.frequencies_hz = held_out.frequencies_hz.row(0).iter().copied().collect();
+    let frequencies = std::slice::from_ref(&manifest.self_test.frequencies_hz);
+    let test_draws = draft.infer(frequencies, SELF_TEST_DRAWS, manifest.self_test.seed)?;
+    manifest.self_test.expected = rows(test_draws.theta());
+
+    let mut manifest_json = serde_json::to_vec_pretty(&manifest).map_err(|e| Box::new(super::LoadError::from(e)))?;
+    manifest_json.push(b'\n');
+    let baseline = Baseline::load(&manifest_json, &weight_bytes, simulator).map_err(Box::new)?;
+    Ok(Trained { baseline, manifest_json, weights: weight_bytes })
+}
+
+/// True when the training ended before its last epoch because the loss was not finite.
+pub fn diverged(manifest: &Manifest) -> bool {
+    matches!(manifest.training.stopped, Stopped::Diverged { .. })
+}
+
+fn check(samples: usize, flow: &FlowSettings, settings: &TrainSettings) -> Result<(), Error> {
+    if samples < MINIMUM_SAMPLES {
+        return Err(Error::TooFewSamples(samples));
+    }
+    let positive = [
+        ("epochs", settings.epochs as f64),
+        ("batch", settings.batch as f64),
+        ("learning_rate", settings.learning_rate),
+        ("units", flow.units as f64),
+        ("width", flow.width as f64),
+        ("context_channels", flow.context_channels as f64),
+        ("context_features", flow.context_features as f64),
+        ("clamp_tenths", f64::from(flow.clamp_tenths)),
+    ];
+    match positive.into_iter().find(|(_, value)| !(*value > 0.0 && value.is_finite())) {
+        Some((name, value)) => Err(Error::Setting { name, value }),
+        None => Ok(()),
+    }
+}
+
+/// A seed for each of the three sets, so that they never share a draw.
+fn purpose_seed(seed: u64, purpose: &str) -> u64 {
+    use rand::RngCore as _;
+    stats::stream(seed, purpose).next_u64()
+}
+
+fn pairs(set: &TrainingSet, space: &ParameterSpace, whitening: &Whitening) -> Result<Pairs, candle_core::Error> {
+    Ok(Pairs {
+        x: to_real_line(&set.theta, space)?.to_dtype(DType::F32)?,
+        y: whitening.apply(&rows(&set.frequencies_hz))?.to_dtype(DType::F32)?,
+    })
+}
+
+/// Measures a baseline on pairs it has not seen: likelihood, R² (paper Fig. 8), inverse error.
+///
+/// # Errors
+/// [`InferenceError`] when a draw is not finite.
+pub fn validate(baseline: &Baseline, held_out: &TrainingSet, seed: u64) -> Result<ValidationRecord, InferenceError> {
+    let frequencies = rows(&held_out.frequencies_hz);
+    let count = frequencies.len();
+    let losses: Vec<f64> =
+        baseline.log_density_unit_box(&held_out.theta, &frequencies)?.iter().map(|log_q| -log_q).collect();
+    let samples = baseline.infer(&frequencies, HELD_OUT_DRAWS, seed)?;
+    let means = samples.means();
+    let validation = |(column, parameter): (usize, &crate::parameter::Parameter)| {
+        let truth: Vec<f64> = held_out.theta.column(column).iter().copied().collect();
+        let mean: Vec<f64> = means.column(column).iter().copied().collect();
+        let single: Vec<f64> = samples.column(column).into_iter().step_by(HELD_OUT_DRAWS).collect();
+        let all = samples.column(column);
+        let errors: Vec<f64> = all.iter().enumerate().map(|(i, x)| (x - truth[i / HELD_OUT_DRAWS]).abs()).collect();
+        ParameterValidation {
+            name: parameter.name.clone(),
+            r_squared_mean: stats::r_squared(&truth, &mean),
+            r_squared_single: stats::r_squared(&truth, &single),
+            error_quantile_999: stats::quantile(&errors, 0.999),
+        }
+    };
+    Ok(ValidationRecord {
+        samples: count,
+        negative_log_likelihood: stats::mean(&losses),
+        negative_log_likelihood_error: stats::sample_std(&losses).unwrap_or(f64::NAN) / (count as f64).sqrt(),
+        parameters: baseline.space().iter().enumerate().map(validation).collect(),
+        inverse_error: inverse_error(baseline, &held_out.theta, &frequencies)?,
+    })
+}
+
+/// Largest |u − u'| after x → z → x', u the position in the prior box.
+fn inverse_error(
+    baseline: &Baseline,
+    theta: &DMatrix<f64>,
+    frequencies: &[Vec<f64>],
+) -> Result<f64, InferenceError> {
+    let x = to_real_line(theta, baseline.space())?.to_dtype(DType::F32)?;
+    let context = baseline.flow.summarise(&baseline.condition(frequencies)?)?;
+    let (z, _) = baseline.flow.forward(&x, &context)?;
+    let back = baseline.flow.inverse(&z, &context)?;
+    let unit = |t: &Tensor| t.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();
+    let pairs = unit(&x)?.into_iter().zip(unit(&back)?);
+    Ok(pairs.map(|(a, b)| (super::logistic(a) - super::logistic(b)).abs()).fold(0.0, f64::max))
+}
+
+/// Rows of a matrix.
+fn rows(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
+    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
+}

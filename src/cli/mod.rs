@@ -1,0 +1,158 @@
+//! The door for people: one function a command.
+
+mod assess;
+mod demo;
+mod serve;
+mod simulate;
+mod train;
+
+use std::future::Future;
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::config::{Config, Flags, HttpFlags, DEFAULT_FILE};
+use crate::telemetry;
+
+/// Watches structures through their natural frequencies.
+#[derive(Debug, Parser)]
+#[command(name = "modalwatch", version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run the service.
+    Serve(ServeArgs),
+    /// Start the service, post the paper's case 1 to it and print what it answers.
+    Demo(demo::DemoArgs),
+    /// Train the baseline of a structure.
+    Train(train::TrainArgs),
+    /// Simulate measurements of a structure as CSV.
+    Simulate(simulate::SimulateArgs),
+    /// Assess measurements without a service.
+    Assess(assess::AssessArgs),
+    /// Look at the configuration.
+    Config {
+        #[command(subcommand)]
+        what: ConfigCommand,
+    },
+    /// Ask a running service whether it is ready; exit status 0 when it is.
+    Healthcheck {
+        /// Where it listens.
+        #[arg(long, default_value = "http://127.0.0.1:8080")]
+        url: String,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+enum ConfigCommand {
+    /// Print the configuration in force, as a file; --default prints the commented defaults.
+    Print {
+        /// The commented defaults.
+        #[arg(long)]
+        default: bool,
+        #[command(flatten)]
+        config: ServeArgs,
+    },
+}
+
+/// Where the service listens and keeps its data; each has a default.
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    /// Address and port; port 0 takes a free one [default: 127.0.0.1:8080]
+    #[arg(long)]
+    listen: Option<String>,
+    /// Folder of the database [default: modalwatch-data]
+    #[arg(long)]
+    data_dir: Option<PathBuf>,
+    /// Folder of your own structures and trained baselines; the shipped ones are inside the program
+    #[arg(long)]
+    models: Option<PathBuf>,
+    /// Configuration file (TOML)
+    #[arg(long)]
+    config: Option<PathBuf>,
+}
+
+impl ServeArgs {
+    fn read(&self) -> Result<Config, crate::config::Error> {
+        let flags = Flags {
+            data_dir: self.data_dir.clone(),
+            models_dir: self.models.clone(),
+            http: HttpFlags { listen: self.listen.clone() },
+        };
+        Config::read(self.config.as_deref(), &flags)
+    }
+}
+
+/// Runs the command of the arguments.
+///
+/// # Errors
+/// Whatever stopped the command, with its chain of causes.
+pub fn run() -> anyhow::Result<()> {
+    match Cli::parse().command {
+        Command::Serve(args) => {
+            let config = args.read()?;
+            telemetry::start(&config.log).map_err(anyhow::Error::msg)?;
+            block_on(serve::serve(config))
+        }
+        Command::Demo(args) => block_on(demo::demo(args)),
+        Command::Train(args) => train::train(&args),
+        Command::Simulate(args) => simulate::simulate(&args),
+        Command::Assess(args) => assess::assess(&args),
+        Command::Config { what: ConfigCommand::Print { default: true, .. } } => {
+            print!("{DEFAULT_FILE}");
+            Ok(())
+        }
+        Command::Config { what: ConfigCommand::Print { config, .. } } => {
+            print!("{}", toml::to_string(&config.read()?)?);
+            Ok(())
+        }
+        Command::Healthcheck { url } => block_on(healthcheck(&url)),
+    }
+}
+
+fn block_on(future: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(future)
+}
+
+async fn healthcheck(url: &str) -> anyhow::Result<()> {
+    let response = reqwest::get(format!("{url}/readyz")).await?;
+    let (status, text) = (response.status(), response.text().await?);
+    println!("{text}");
+    anyhow::ensure!(status.is_success(), "not ready: {status}");
+    Ok(())
+}
+
+/// Turns the settings a person gives as `name=a,b` into name and numbers.
+fn named_numbers(text: &str, count: usize, shape: &str) -> Result<(String, Vec<f64>), String> {
+    let wrong = || format!("{text:?} should read {shape}");
+    let (name, numbers) = text.split_once('=').ok_or_else(wrong)?;
+    let numbers = numbers.split(',').map(|n| n.trim().parse().map_err(|_| wrong())).collect::<Result<Vec<f64>, _>>()?;
+    if numbers.len() != count {
+        return Err(wrong());
+    }
+    Ok((name.trim().to_owned(), numbers))
+}
+
+/// Writes a file beside its place and moves it there, so that nobody ever reads half of it.
+fn write_whole(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
+    use anyhow::Context as _;
+    use std::io::Write as _;
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(std::path::Path::new("."));
+    let place = || format!("cannot write {}", path.display());
+    std::fs::create_dir_all(folder).with_context(place)?;
+    let mut file = tempfile::NamedTempFile::new_in(folder).with_context(place)?;
+    file.write_all(bytes).with_context(place)?;
+    file.as_file().sync_all().with_context(place)?;
+    // A temporary file is readable by its owner only; a result should be as readable as any other.
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt as _;
+        file.as_file().set_permissions(std::fs::Permissions::from_mode(0o644)).with_context(place)?;
+    }
+    file.persist(path).with_context(place)?;
+    Ok(())
+}

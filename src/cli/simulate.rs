@@ -1,0 +1,78 @@
+//! `modalwatch simulate`: measurements of a structure and a population, as CSV that the service takes.
+
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::Args;
+
+use super::{named_numbers, write_whole};
+use crate::baseline::library::find_structure;
+use crate::measurement::{csv, ModalMeasurement};
+use crate::quantity::{Hertz, OutOfRange, Timestamp};
+use crate::simulator::population::Population;
+
+/// Simulate measurements of a structure.
+#[derive(Debug, Args)]
+pub struct SimulateArgs {
+    /// Structure file (TOML or JSON), or the id of a shipped structure
+    #[arg(long)]
+    structure: String,
+    /// Population of one parameter, as name=mean,std in its unit; once for each parameter
+    #[arg(long = "parameter", required = true, value_parser = |t: &str| named_numbers(t, 2, "name=mean,std"))]
+    parameters: Vec<(String, Vec<f64>)>,
+    /// Number of measurements
+    #[arg(long, default_value_t = 50)]
+    measurements: usize,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Time of the first measurement
+    #[arg(long, default_value = "2026-01-01T00:00:00Z")]
+    start: String,
+    /// Seconds between measurements
+    #[arg(long, default_value_t = 600)]
+    interval_s: u32,
+    /// File to write; standard output without it
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+/// Draws the population and writes the CSV.
+///
+/// # Errors
+/// A structure or population that is refused, a file that cannot be written.
+pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
+    let simulator = find_structure(&args.structure)?;
+    anyhow::ensure!(args.measurements > 0, "--measurements is 0: at least 1 is needed");
+    let moments: Vec<(String, f64, f64)> = args.parameters.iter().map(|(name, n)| (name.clone(), n[0], n[1])).collect();
+    let population = Population::new(simulator.space(), &moments)?;
+    let drawn = population.draw(&simulator, args.measurements, args.seed)?;
+    let start = Timestamp::parse(&args.start).context("--start")?;
+    let rows: Vec<Vec<f64>> =
+        drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
+    let measurements = at_intervals(&rows, start, args.interval_s)?;
+    let text = csv::write(&measurements);
+    match &args.out {
+        Some(path) => write_whole(path, text.as_bytes())?,
+        None => print!("{text}"),
+    }
+    Ok(())
+}
+
+/// Complete measurements at equal intervals.
+///
+/// # Errors
+/// [`OutOfRange`] for a frequency or time that is none.
+pub fn at_intervals(rows: &[Vec<f64>], start: Timestamp, interval_s: u32) -> Result<Vec<ModalMeasurement>, OutOfRange> {
+    let measurement = |(index, row): (usize, &Vec<f64>)| {
+        let micros = start.micros() + index as i64 * i64::from(interval_s) * 1_000_000;
+        Ok(ModalMeasurement {
+            measured_at: Timestamp::from_micros(micros)?,
+            frequencies_hz: row.iter().map(|f| Hertz::new(*f).map(Some)).collect::<Result<_, _>>()?,
+            std_hz: None,
+            covariates: std::collections::BTreeMap::new(),
+            settings: std::collections::BTreeMap::new(),
+        })
+    };
+    rows.iter().enumerate().map(measurement).collect()
+}

@@ -1,0 +1,101 @@
+//! `modalwatch train`: structure in, baseline out.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::write_whole;
+use crate::baseline::library::find_structure;
+use crate::baseline::manifest::ValidationRecord;
+use crate::baseline::train::{diverged, train as train_baseline};
+use crate::flow::train::TrainSettings;
+use crate::flow::FlowSettings;
+
+/// Train the baseline of a structure.
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Structure file (TOML or JSON), or the id of a shipped structure
+    #[arg(long)]
+    structure: String,
+    /// Folder for structure.toml, baseline.safetensors and baseline.json [default: models/<structure>]
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Simulated training samples
+    #[arg(long, default_value_t = 10_000)]
+    samples: usize,
+    /// Passes over the training samples
+    #[arg(long, default_value_t = TrainSettings::default().epochs)]
+    epochs: usize,
+    /// Seed of everything random; the same seed gives the same files
+    #[arg(long, default_value_t = TrainSettings::default().seed)]
+    seed: u64,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Trains, writes the files and prints what was reached.
+///
+/// # Errors
+/// A structure file that is refused, a training that gives no flow, a folder that cannot be written.
+pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
+    let simulator = find_structure(&args.structure)?;
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("models").join(simulator.id().as_str()));
+    // A folder that cannot be written should not be found out after minutes of training.
+    std::fs::create_dir_all(&out).with_context(|| format!("cannot make the folder {}", out.display()))?;
+
+    let settings = TrainSettings { epochs: args.epochs, seed: args.seed, ..TrainSettings::default() };
+    let bar = ProgressBar::new(args.epochs as u64);
+    let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
+    bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
+    let started = Instant::now();
+    let trained = train_baseline(&simulator, args.samples, &FlowSettings::default(), &settings, |epoch| {
+        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
+        bar.set_position(epoch.epoch as u64);
+    })?;
+    bar.finish_and_clear();
+    let seconds = started.elapsed().as_secs_f64();
+
+    write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
+    write_whole(&out.join("baseline.json"), &trained.manifest_json)?;
+    // A folder that holds its own structure is found by `serve --models`; one that is there already is left alone.
+    let has_structure = ["structure.toml", "structure.json"].iter().any(|name| out.join(name).exists());
+    if !has_structure {
+        write_whole(&out.join("structure.json"), simulator.definition().canonical_json().as_bytes())?;
+    }
+
+    let manifest = trained.baseline.manifest();
+    if args.json {
+        let report = serde_json::json!({
+            "structure": manifest.structure, "model_digest": trained.baseline.digest(), "out": out,
+            "seconds": seconds, "training": manifest.training, "validation": manifest.validation,
+        });
+        println!("{}", serde_json::to_string_pretty(&report)?);
+        return Ok(());
+    }
+    println!("Trained {} in {seconds:.1} s: {}", simulator.id(), out.join("baseline.safetensors").display());
+    println!("model digest {}", trained.baseline.digest());
+    print_validation(&manifest.validation);
+    if diverged(manifest) {
+        println!("The loss was not finite at the end: the weights of epoch {} were kept.", manifest.training.best_epoch);
+    }
+    Ok(())
+}
+
+fn print_validation(validation: &ValidationRecord) {
+    println!(
+        "held-out negative log-likelihood in the unit box {:.2} ± {:.2} nats over {} pairs, inverse error {:.1e}",
+        validation.negative_log_likelihood,
+        validation.negative_log_likelihood_error,
+        validation.samples,
+        validation.inverse_error
+    );
+    println!("{:>16} {:>10} {:>10} {:>24}", "parameter", "R² mean", "R² single", "99.9 % of errors below");
+    for p in &validation.parameters {
+        let (mean, single, quantile) = (p.r_squared_mean, p.r_squared_single, p.error_quantile_999);
+        println!("{:>16} {mean:>10.6} {single:>10.6} {quantile:>24.4}", p.name);
+    }
+}

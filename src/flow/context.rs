@@ -1,0 +1,81 @@
+//! The conditional network: a 1-D convolutional network over the observation vector.
+
+use candle_core::{Result, Tensor, D};
+use candle_nn::{linear, Linear, Module as _, VarBuilder};
+
+use super::Architecture;
+
+/// Reach of a convolution: each mode sees itself and its two neighbours.
+const KERNEL: usize = 3;
+
+/// Two 1-D convolutions along the modes and a dense layer; the observation itself is passed beside the features.
+///
+/// ```text
+///  h = silu(conv₂(silu(conv₁(y)))),    S(y) = [ silu(W·flatten(h) + b), flatten(y) ]
+/// ```
+///
+/// Source: Wang et al. (2025), §3.2.2 and §5.2 (a 1-D CNN as conditional network). The shortcut of y is not in the
+/// paper: without it the narrow posteriors of noise-free data would have to pass through the features.
+pub struct ContextNetwork {
+    first: Convolution,
+    second: Convolution,
+    features: Linear,
+    width: usize,
+}
+
+impl ContextNetwork {
+    /// A network for observations `[n, channels, modes]`.
+    ///
+    /// # Errors
+    /// A candle error when a weight is missing or of another shape.
+    pub fn new(architecture: &Architecture, vb: &VarBuilder<'_>) -> Result<Self> {
+        let (modes, channels) = (architecture.modes, architecture.context_channels);
+        Ok(Self {
+            first: Convolution::new(architecture.channels, channels, &vb.pp("conv1"))?,
+            second: Convolution::new(channels, channels, &vb.pp("conv2"))?,
+            features: linear(modes * channels, architecture.context_features, vb.pp("features"))?,
+            width: architecture.context_features + modes * architecture.channels,
+        })
+    }
+
+    /// Number of entries of S(y).
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// `y`: `[n, channels, modes]`; returns S(y) `[n, width]`.
+    ///
+    /// # Errors
+    /// A candle error when the shape of `y` is another.
+    pub fn forward(&self, y: &Tensor) -> Result<Tensor> {
+        let by_mode = y.transpose(1, 2)?.contiguous()?;
+        let hidden = self.first.forward(&by_mode)?.silu()?;
+        let hidden = self.second.forward(&hidden)?.silu()?;
+        let features = self.features.forward(&hidden.flatten_from(1)?)?.silu()?;
+        Tensor::cat(&[features, y.flatten_from(1)?.contiguous()?], 1)
+    }
+}
+
+/// 1-D convolution with zero padding, as one matrix product over the unfolded input.
+///
+/// candle's own `conv1d` copies to another layout and back for each call; for a handful of modes the unfolding below
+/// is faster forward and backward and gives the same numbers.
+struct Convolution {
+    weights: Linear,
+}
+
+impl Convolution {
+    fn new(inputs: usize, outputs: usize, vb: &VarBuilder<'_>) -> Result<Self> {
+        Ok(Self { weights: linear(KERNEL * inputs, outputs, vb.clone())? })
+    }
+
+    /// `[n, modes, inputs]` to `[n, modes, outputs]`.
+    fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        let modes = x.dim(1)?;
+        let padded = x.pad_with_zeros(1, KERNEL / 2, KERNEL / 2)?;
+        let windows = (0..KERNEL).map(|k| padded.narrow(1, k, modes)).collect::<Result<Vec<_>>>()?;
+        let unfolded = Tensor::cat(&windows, D::Minus1)?;
+        let (rows, _, columns) = unfolded.dims3()?;
+        self.weights.forward(&unfolded.reshape((rows * modes, columns))?)?.reshape((rows, modes, ()))
+    }
+}

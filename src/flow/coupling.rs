@@ -1,0 +1,121 @@
+//! Conditional affine coupling: one half is scaled and shifted by functions of the other half and of the context.
+
+use candle_core::{Result, Tensor, D};
+use candle_nn::{linear, Init, Linear, Module as _, VarBuilder};
+
+use super::Architecture;
+
+/// Conditional affine coupling unit (cACL): two affine couplings, so that both halves of x are transformed.
+///
+/// ```text
+///  z₂ = x₂ ⊙ exp s₁(x₁, c) + t₁(x₁, c)
+///  z₁ = x₁ ⊙ exp s₂(z₂, c) + t₂(z₂, c)
+///  log|det ∂z/∂x| = Σ s₁ + Σ s₂
+/// ```
+///
+/// With one parameter the first half is empty and only the second is transformed.
+///
+/// Source: Wang et al. (2025), Eq. 11 and 12. The soft clamp of the log-scales is not in the paper.
+pub struct CouplingUnit {
+    first: usize,
+    second: usize,
+    on_second: Subnet,
+    on_first: Option<Subnet>,
+}
+
+impl CouplingUnit {
+    /// A unit for `architecture.parameters` columns and `context` context features.
+    ///
+    /// # Errors
+    /// A candle error when a weight is missing or of another shape.
+    pub fn new(architecture: &Architecture, context: usize, vb: &VarBuilder<'_>) -> Result<Self> {
+        let first = architecture.parameters / 2;
+        let second = architecture.parameters - first;
+        let subnet = |passive: usize, active: usize, name: &str| {
+            let clamp = f64::from(architecture.clamp_tenths) / 10.0;
+            Subnet::new(passive + context, architecture.width, active, clamp, &vb.pp(name))
+        };
+        let on_second = subnet(first, second, "on_second")?;
+        let on_first = if first > 0 { Some(subnet(second, first, "on_first")?) } else { None };
+        Ok(Self { first, second, on_second, on_first })
+    }
+
+    /// x to z. `x`: `[n, d]`, `context`: `[n, context]`. Returns z `[n, d]` and log|det ∂z/∂x| `[n]`.
+    ///
+    /// # Errors
+    /// A candle error when shapes do not fit.
+    pub fn forward(&self, x: &Tensor, context: &Tensor) -> Result<(Tensor, Tensor)> {
+        let Some(on_first) = &self.on_first else {
+            let (s, t) = self.on_second.scale_and_shift(context)?;
+            return Ok((((x * s.exp()?)? + t)?, s.sum(D::Minus1)?));
+        };
+        let (x1, x2) = self.halves(x)?;
+        let (s1, t1) = self.on_second.scale_and_shift(&Tensor::cat(&[&x1, context], 1)?)?;
+        let z2 = ((x2 * s1.exp()?)? + t1)?;
+        let (s2, t2) = on_first.scale_and_shift(&Tensor::cat(&[&z2, context], 1)?)?;
+        let z1 = ((x1 * s2.exp()?)? + t2)?;
+        let log_det = (s1.sum(D::Minus1)? + s2.sum(D::Minus1)?)?;
+        Ok((Tensor::cat(&[&z1, &z2], 1)?, log_det))
+    }
+
+    /// z to x, the inverse of [`Self::forward`].
+    ///
+    /// # Errors
+    /// A candle error when shapes do not fit.
+    pub fn inverse(&self, z: &Tensor, context: &Tensor) -> Result<Tensor> {
+        let Some(on_first) = &self.on_first else {
+            let (s, t) = self.on_second.scale_and_shift(context)?;
+            return (z - t)? * s.neg()?.exp()?;
+        };
+        let (z1, z2) = self.halves(z)?;
+        let (s2, t2) = on_first.scale_and_shift(&Tensor::cat(&[&z2, context], 1)?)?;
+        let x1 = ((z1 - t2)? * s2.neg()?.exp()?)?;
+        let (s1, t1) = self.on_second.scale_and_shift(&Tensor::cat(&[&x1, context], 1)?)?;
+        let x2 = ((z2 - t1)? * s1.neg()?.exp()?)?;
+        Tensor::cat(&[&x1, &x2], 1)
+    }
+
+    fn halves(&self, x: &Tensor) -> Result<(Tensor, Tensor)> {
+        Ok((x.narrow(1, 0, self.first)?, x.narrow(1, self.first, self.second)?))
+    }
+}
+
+/// Three-layer network that gives log-scale and shift of one half.
+///
+/// ```text
+///  (s̃, t) = W₃ silu(W₂ silu(W₁ u + b₁) + b₂) + b₃,    s = α·tanh(s̃/α)
+/// ```
+///
+/// The clamp α bounds each scale to exp(±α), so that early training cannot overflow and far-off conditions cannot
+/// throw samples to infinity. W₃ and b₃ begin at 0: an untrained unit is the identity.
+struct Subnet {
+    input: Linear,
+    hidden: Linear,
+    output: Linear,
+    active: usize,
+    clamp: f64,
+}
+
+impl Subnet {
+    fn new(inputs: usize, width: usize, active: usize, clamp: f64, vb: &VarBuilder<'_>) -> Result<Self> {
+        let zero = Init::Const(0.0);
+        let last = vb.pp("output");
+        let weight = last.get_with_hints((2 * active, width), "weight", zero)?;
+        let bias = last.get_with_hints(2 * active, "bias", zero)?;
+        Ok(Self {
+            input: linear(inputs, width, vb.pp("input"))?,
+            hidden: linear(width, width, vb.pp("hidden"))?,
+            output: Linear::new(weight, Some(bias)),
+            active,
+            clamp,
+        })
+    }
+
+    fn scale_and_shift(&self, input: &Tensor) -> Result<(Tensor, Tensor)> {
+        let hidden = self.hidden.forward(&self.input.forward(input)?.silu()?)?.silu()?;
+        let output = self.output.forward(&hidden)?;
+        let raw_scale = output.narrow(1, 0, self.active)?;
+        let scale = ((raw_scale / self.clamp)?.tanh()? * self.clamp)?;
+        Ok((scale, output.narrow(1, self.active, self.active)?))
+    }
+}

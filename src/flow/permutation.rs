@@ -1,0 +1,56 @@
+//! Fixed permutations between the units, so that each unit splits the parameters differently.
+
+use candle_core::{Device, Result, Tensor, D};
+use rand::seq::SliceRandom as _;
+
+use crate::stats::Stream;
+
+/// A random order of `0..count`.
+pub fn random_order(count: usize, stream: &mut Stream) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..count as u32).collect();
+    order.shuffle(stream);
+    order
+}
+
+/// A fixed reordering of columns; its log-determinant is 0.
+pub struct Permutation {
+    order: Tensor,
+    inverse_order: Tensor,
+}
+
+impl Permutation {
+    /// From the order of source columns, a permutation of `0..order.len()`.
+    ///
+    /// # Errors
+    /// A candle error when `order` is no permutation.
+    pub fn new(order: &[u32], device: &Device) -> Result<Self> {
+        let mut inverse = vec![u32::MAX; order.len()];
+        for (to, &from) in order.iter().enumerate() {
+            *inverse.get_mut(from as usize).ok_or_else(|| candle_core::Error::Msg(no_permutation(order)))? = to as u32;
+        }
+        if inverse.contains(&u32::MAX) {
+            return Err(candle_core::Error::Msg(no_permutation(order)));
+        }
+        Ok(Self { order: Tensor::new(order, device)?, inverse_order: Tensor::new(inverse, device)? })
+    }
+
+    /// Column j of the result is column `order[j]` of `x`: `[n, d]`.
+    ///
+    /// # Errors
+    /// A candle error when the number of columns is another.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        x.index_select(&self.order, D::Minus1)
+    }
+
+    /// Undoes [`Self::forward`].
+    ///
+    /// # Errors
+    /// A candle error when the number of columns is another.
+    pub fn inverse(&self, x: &Tensor) -> Result<Tensor> {
+        x.index_select(&self.inverse_order, D::Minus1)
+    }
+}
+
+fn no_permutation(order: &[u32]) -> String {
+    format!("{order:?} is no permutation of 0..{}", order.len())
+}

@@ -1,0 +1,201 @@
+//! Reading requests: id, body, JSON, path and query, with our own errors for each way they can be wrong.
+
+use std::future::Future;
+use std::time::{Duration, Instant};
+
+use axum::body::{Body, Bytes};
+use axum::extract::rejection::{PathRejection, QueryRejection};
+use axum::extract::{FromRequestParts, MatchedPath, Request};
+use axum::http::{header, HeaderMap, HeaderName, HeaderValue, StatusCode};
+use axum::middleware::Next;
+use axum::response::Response;
+use serde::de::DeserializeOwned;
+use serde_path_to_error::Segment;
+use tracing::{info, Instrument as _};
+
+use super::error::ApiError;
+use crate::measurement::check::Problem;
+
+/// Header that carries the request's id both ways.
+pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+tokio::task_local! {
+    static CURRENT_ID: String;
+}
+
+/// Id of the request this task answers.
+pub fn current_id() -> Option<String> {
+    CURRENT_ID.try_with(String::clone).ok()
+}
+
+/// Gives each request an id (the client's, if it is short and printable), a log line, and its place in the metrics.
+pub async fn with_id_and_log(request: Request, next: Next) -> Response {
+    let given = request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok());
+    let usable = |id: &&str| !id.is_empty() && id.len() <= 64 && id.bytes().all(|b| b.is_ascii_graphic());
+    let id = given.filter(usable).map_or_else(|| uuid::Uuid::now_v7().to_string(), str::to_owned);
+    let method = request.method().clone();
+    // The route's pattern, not the path: a label for each id in the path would grow without bound.
+    let route = request.extensions().get::<MatchedPath>().map_or("unmatched", MatchedPath::as_str).to_owned();
+    let span = tracing::info_span!("request", request.id = %id, method = %method, route = %route);
+    let started = Instant::now();
+    let mut response = CURRENT_ID.scope(id.clone(), next.run(request)).instrument(span.clone()).await;
+
+    let (status, seconds) = (response.status().as_u16(), started.elapsed().as_secs_f64());
+    let labels = [("method", method.to_string()), ("route", route.clone()), ("status", status.to_string())];
+    metrics::counter!("modalwatch_http_requests_total", &labels).increment(1);
+    metrics::histogram!("modalwatch_http_request_seconds", "route" => route.clone()).record(seconds);
+    let duration_ms = seconds * 1e3;
+    span.in_scope(|| info!(status, duration_ms, "Answered {method} {route} with {status}"));
+    if let Ok(value) = HeaderValue::from_str(&id) {
+        response.headers_mut().insert(REQUEST_ID, value);
+    }
+    response
+}
+
+/// What a body may be.
+#[derive(Debug, Clone, Copy)]
+pub struct BodyLimits {
+    /// Most bytes.
+    pub bytes: usize,
+    /// Longest time from the end of the header to the end of the body.
+    pub time: Duration,
+}
+
+/// The whole body.
+///
+/// # Errors
+/// 413 when it is larger than the limit, 408 when it is slower, 400 when the connection breaks.
+pub async fn read_body(body: Body, headers: &HeaderMap, limits: BodyLimits) -> Result<Bytes, ApiError> {
+    let too_large = || {
+        let detail = format!("the body is larger than {} bytes: split the batch", limits.bytes);
+        ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", detail)
+    };
+    let announced = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<usize>().ok());
+    if announced.is_some_and(|bytes| bytes > limits.bytes) {
+        return Err(too_large());
+    }
+    let read = tokio::time::timeout(limits.time, axum::body::to_bytes(body, limits.bytes));
+    let Ok(result) = read.await else {
+        let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
+        return Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail));
+    };
+    result.map_err(|error| {
+        let source = std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
+        if source.contains("length limit") {
+            too_large()
+        } else {
+            ApiError::new(StatusCode::BAD_REQUEST, "body_unreadable", "the body broke off")
+        }
+    })
+}
+
+/// Media type of the body, without parameters, in lower case.
+pub fn media_type(headers: &HeaderMap) -> Option<String> {
+    let value = headers.get(header::CONTENT_TYPE)?.to_str().ok()?;
+    Some(value.split(';').next()?.trim().to_ascii_lowercase())
+}
+
+/// 415 with the types that would be right.
+pub fn unsupported_media_type(found: Option<&str>, allowed: &str) -> ApiError {
+    let found = found.map_or("no Content-Type".to_owned(), |t| format!("Content-Type {}", crate::quantity::shown(t)));
+    ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", format!("{found}: send {allowed}"))
+}
+
+/// A JSON body.
+///
+/// # Errors
+/// 400 when it is no JSON, with line and column; 422 when it is JSON of another shape, or has a number that JSON or f64
+/// cannot hold, with a pointer to it.
+pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
+    let mut deserializer = serde_json::Deserializer::from_slice(bytes);
+    let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {
+        let pointer = pointer(error.path());
+        json_error(bytes, pointer, error.inner())
+    })?;
+    deserializer.end().map_err(|error| json_error(bytes, String::new(), &error))?;
+    Ok(value)
+}
+
+fn json_error(bytes: &[u8], pointer: String, error: &serde_json::Error) -> ApiError {
+    let not_a_number = not_a_number_at(bytes, error.line(), error.column());
+    let message = match not_a_number {
+        Some(word) => format!("{word} is no JSON number: send null for a mode that was not identified"),
+        None => error.to_string(),
+    };
+    // serde_json counts a number beyond f64 as a syntax error; for the client it is a wrong value.
+    let wrong_value = error.is_data() || not_a_number.is_some() || message.starts_with("number out of range");
+    if wrong_value {
+        let pointer = if pointer.is_empty() { "/".to_owned() } else { pointer };
+        return ApiError::invalid_field(pointer, message);
+    }
+    ApiError::new(StatusCode::BAD_REQUEST, "malformed_json", format!("the body is no JSON: {message}"))
+}
+
+/// `NaN` or `Infinity` at the place where the parser stopped.
+fn not_a_number_at(bytes: &[u8], line: usize, column: usize) -> Option<&'static str> {
+    let line = bytes.split(|b| *b == b'\n').nth(line.checked_sub(1)?)?;
+    // The parser stops at or just behind the first character it cannot use.
+    let around = &line[column.saturating_sub(2).min(line.len())..];
+    let around = &around[..around.len().min(12)];
+    ["-Infinity", "Infinity", "NaN"].into_iter().find(|word| {
+        around.windows(word.len()).take(3).any(|window| window == word.as_bytes())
+    })
+}
+
+fn pointer(path: &serde_path_to_error::Path) -> String {
+    let segment = |segment: &Segment| match segment {
+        Segment::Seq { index } => format!("/{index}"),
+        Segment::Map { key } => format!("/{}", key.replace('~', "~0").replace('/', "~1")),
+        Segment::Enum { variant } => format!("/{variant}"),
+        Segment::Unknown => String::new(),
+    };
+    path.iter().map(segment).collect()
+}
+
+/// Path parameters, with our own errors.
+pub struct ApiPath<T>(pub T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for ApiPath<T> {
+    type Rejection = ApiError;
+
+    fn from_request_parts(
+        parts: &mut axum::http::request::Parts,
+        state: &S,
+    ) -> impl Future<Output = Result<Self, ApiError>> + Send {
+        let read = axum::extract::Path::<T>::from_request_parts(parts, state);
+        async {
+            let invalid = |e: PathRejection| ApiError::invalid_field("path", e.body_text());
+            read.await.map(|path| Self(path.0)).map_err(invalid)
+        }
+    }
+}
+
+/// Query parameters, with our own errors.
+pub struct ApiQuery<T>(pub T);
+
+impl<T: DeserializeOwned + Send, S: Send + Sync> FromRequestParts<S> for ApiQuery<T> {
+    type Rejection = ApiError;
+
+    fn from_request_parts(
+        parts: &mut axum::http::request::Parts,
+        state: &S,
+    ) -> impl Future<Output = Result<Self, ApiError>> + Send {
+        let read = axum::extract::Query::<T>::from_request_parts(parts, state);
+        async {
+            let invalid = |e: QueryRejection| ApiError::invalid_field("query", e.body_text());
+            read.await.map(|query| Self(query.0)).map_err(invalid)
+        }
+    }
+}
+
+/// A structure id from the path.
+///
+/// # Errors
+/// 422 for anything that is no id.
+pub fn structure_id(text: &str) -> Result<crate::quantity::StructureId, ApiError> {
+    let invalid = |e: crate::quantity::OutOfRange| {
+        let problem = Problem { pointer: "path".to_owned(), message: e.to_string() };
+        ApiError::invalid("invalid_id", e.to_string(), vec![problem])
+    };
+    crate::quantity::StructureId::parse(text).map_err(invalid)
+}

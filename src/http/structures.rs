@@ -1,0 +1,147 @@
+//! `/v1/structures`: define and read.
+
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::{header, HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::error::ApiError;
+use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath};
+use super::Shared;
+use crate::measurement::check::Problem;
+use crate::monitor::Watched;
+use crate::quantity::{StructureId, Timestamp};
+use crate::simulator::definition::{DefinitionError, StructureDefinition};
+use crate::store::PutStructure;
+
+/// A structure with the state of its trained baseline.
+#[derive(Debug, Serialize)]
+struct StructureBody {
+    id: StructureId,
+    digest: String,
+    definition: Value,
+    nominal_frequencies_hz: Vec<f64>,
+    model: Option<ModelBody>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model_missing: Option<String>,
+    undamaged: Option<super::answer::Undamaged>,
+}
+
+/// The trained baseline in use.
+#[derive(Debug, Serialize)]
+struct ModelBody {
+    digest: String,
+    program_version: String,
+    training_samples: usize,
+    validation: crate::baseline::manifest::ValidationRecord,
+}
+
+/// One line of the list.
+#[derive(Debug, Serialize)]
+struct ListedStructure {
+    id: StructureId,
+    digest: String,
+    created_at: Timestamp,
+    batches: u64,
+    last_measured_at: Option<Timestamp>,
+    model_digest: Option<String>,
+}
+
+/// `GET /v1/structures`.
+///
+/// # Errors
+/// 500.
+pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
+    let mut items = Vec::new();
+    for summary in shared.monitor.store().structures().await? {
+        let watched = shared.monitor.structure(&summary.id)?;
+        items.push(ListedStructure {
+            model_digest: watched.baseline.as_ref().ok().map(|b| b.digest().to_string()),
+            id: summary.id,
+            digest: summary.digest.to_string(),
+            created_at: summary.created_at,
+            batches: summary.batches,
+            last_measured_at: summary.last_measured_at,
+        });
+    }
+    Ok(Json(serde_json::json!({ "items": items })).into_response())
+}
+
+/// `GET /v1/structures/{id}`.
+///
+/// # Errors
+/// 404, 422.
+pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
+    let id = structure_id(&id)?;
+    let watched = shared.monitor.structure(&id)?;
+    let undamaged = shared.monitor.store().undamaged(&id).await?;
+    Ok(Json(body(&id, &watched, undamaged.map(|u| super::answer::Undamaged::new(&id, u)))).into_response())
+}
+
+/// `PUT /v1/structures/{id}`: a structure as JSON or TOML; 201 when it is new, 200 when it was there already.
+///
+/// # Errors
+/// 400 and 422 with the place in the file; 409 when it has batches under another definition.
+pub async fn put(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    let id = structure_id(&id)?;
+    let bytes = read_body(body, &headers, shared.limits).await?;
+    let definition = match media_type(&headers).as_deref() {
+        Some("application/json") => parse_definition_json(&bytes)?,
+        Some("application/toml") => StructureDefinition::parse_toml(utf8(&bytes)?).map_err(refused)?,
+        other => return Err(unsupported_media_type(other, "application/json or application/toml")),
+    };
+    if definition.id != id.as_str() {
+        let message = format!("the id in the body is {}, in the path {id}", crate::quantity::shown(&definition.id));
+        return Err(ApiError::invalid_field("/id", message));
+    }
+    let outcome = shared.monitor.put_structure(definition).await?;
+    let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
+    let watched = shared.monitor.structure(&id)?;
+    let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
+    Ok((status, location, Json(self::body(&id, &watched, None))).into_response())
+}
+
+/// Malformed JSON is told apart from JSON that is no structure.
+fn parse_definition_json(bytes: &[u8]) -> Result<StructureDefinition, ApiError> {
+    parse_json::<Value>(bytes)?;
+    StructureDefinition::parse_json(utf8(bytes)?).map_err(refused)
+}
+
+fn utf8(bytes: &[u8]) -> Result<&str, ApiError> {
+    std::str::from_utf8(bytes).map_err(|e| ApiError::new(StatusCode::BAD_REQUEST, "not_utf8", e.to_string()))
+}
+
+fn refused(error: DefinitionError) -> ApiError {
+    let problem = |p: &crate::simulator::definition::DefinitionProblem| Problem {
+        pointer: p.line.map_or_else(|| p.pointer.clone(), |line| format!("line {line}, {}", p.pointer)),
+        message: p.message.clone(),
+    };
+    ApiError::invalid("invalid_structure", error.to_string(), error.problems.iter().map(problem).collect())
+}
+
+fn body(id: &StructureId, watched: &Watched, undamaged: Option<super::answer::Undamaged>) -> StructureBody {
+    let model = watched.baseline.as_ref().ok().map(|baseline| ModelBody {
+        digest: baseline.digest().to_string(),
+        program_version: baseline.manifest().program_version.clone(),
+        training_samples: baseline.manifest().training.samples,
+        validation: baseline.manifest().validation.clone(),
+    });
+    let definition = serde_json::from_str(&watched.simulator.definition().canonical_json());
+    StructureBody {
+        id: id.clone(),
+        digest: watched.simulator.digest().to_string(),
+        definition: definition.expect("canonical JSON is JSON"),
+        nominal_frequencies_hz: watched.simulator.nominal_frequencies_hz(),
+        model,
+        model_missing: watched.baseline.as_ref().err().cloned(),
+        undamaged,
+    }
+}

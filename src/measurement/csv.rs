@@ -1,0 +1,270 @@
+//! Measurements as a table.
+//!
+//! Columns: `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, declared covariates by name, `set_<parameter>`; an empty
+//! cell is a missing value. Separator `,`, `;` or tab, found from the header; with `;` or tab a decimal comma is read.
+
+use std::collections::BTreeMap;
+
+use super::check::{Place, Problem, RawMeasurement};
+use super::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
+use crate::quantity::{shown, Hertz, Timestamp};
+
+/// What to do about times.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Times {
+    /// The column `measured_at` must be there.
+    Required,
+    /// Without it, row i (from 0) gets 1970-01-01T00:00:00Z plus i seconds: for files that never meet a clock.
+    RowNumber,
+}
+
+/// How a table is read.
+#[derive(Debug, Clone)]
+pub struct CsvOptions {
+    /// What to do about times.
+    pub times: Times,
+    /// Columns that are not read.
+    pub ignore: Vec<String>,
+}
+
+/// What a column holds.
+#[derive(Debug, Clone, PartialEq)]
+enum Column {
+    Ignored,
+    Time,
+    Frequency(usize),
+    Std(usize),
+    Covariate(String, CovariateKind),
+    Setting(String),
+}
+
+/// Reads a table of a structure with `modes` modes.
+///
+/// # Errors
+/// The mistakes of the header, or those of the first row that has any, with line and column.
+pub fn read(
+    bytes: &[u8],
+    modes: usize,
+    covariates: &[Covariate],
+    options: &CsvOptions,
+) -> Result<Vec<RawMeasurement>, Vec<Problem>> {
+    let text = std::str::from_utf8(bytes).map_err(|e| {
+        let line = bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
+        vec![Problem::new(format!("line {line}"), "not UTF-8: save the table as UTF-8")]
+    })?;
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    let separator = separator(text);
+    let mut reader = csv::ReaderBuilder::new()
+        .delimiter(separator)
+        .has_headers(false)
+        .flexible(true)
+        .trim(csv::Trim::All)
+        .from_reader(text.as_bytes());
+    let mut records = reader.records();
+    let mut next = || match records.next() {
+        None => Ok(None),
+        Some(Ok(record)) => Ok(Some(record)),
+        Some(Err(error)) => {
+            let line = error.position().map_or(1, csv::Position::line);
+            Err(vec![Problem::new(format!("line {line}"), error.to_string())])
+        }
+    };
+    let Some(header) = next()? else {
+        return Err(vec![Problem::new("line 1", "the table is empty: its first line names the columns")]);
+    };
+    let columns = columns(&header, modes, covariates, options)?;
+    let mut measurements = Vec::new();
+    while let Some(record) = next()? {
+        let line = record.position().map_or(1, csv::Position::line);
+        if record.iter().all(str::is_empty) {
+            continue;
+        }
+        measurements.push(row(&record, line, &columns, modes, separator != b',', measurements.len(), options.times)?);
+    }
+    Ok(measurements)
+}
+
+/// The separator that is most frequent in the header.
+fn separator(text: &str) -> u8 {
+    let header = text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default();
+    let count = |c: u8| header.bytes().filter(|b| *b == c).count();
+    [b',', b';', b'\t'].into_iter().rev().max_by_key(|c| count(*c)).unwrap_or(b',')
+}
+
+fn columns(
+    header: &csv::StringRecord,
+    modes: usize,
+    covariates: &[Covariate],
+    options: &CsvOptions,
+) -> Result<Vec<Column>, Vec<Problem>> {
+    let line = header.position().map_or(1, csv::Position::line);
+    let mut problems = Vec::new();
+    let mut add = |message: String| problems.push(Problem::new(format!("line {line}"), message));
+    let mut columns: Vec<Column> = Vec::new();
+    for name in header {
+        let column = column(name, covariates, options);
+        match &column {
+            None => {
+                let known = covariates.iter().map(|c| format!(", {}", c.name)).collect::<String>();
+                add(format!(
+                    "unknown column {}: known are measured_at, f1_hz to f{modes}_hz, std_f1_hz to std_f{modes}_hz, \
+                     set_<parameter>{known}; a covariate must be declared in the structure, other columns ignored",
+                    shown(name)
+                ));
+            }
+            Some(Column::Frequency(mode) | Column::Std(mode)) if *mode >= modes => {
+                add(format!("column {}: the structure has {modes} modes", shown(name)));
+            }
+            Some(other) if *other != Column::Ignored && columns.contains(other) => {
+                add(format!("column {} is there twice", shown(name)));
+            }
+            Some(_) => {}
+        }
+        columns.push(column.unwrap_or(Column::Ignored));
+    }
+    let missing: Vec<String> = (0..modes)
+        .filter(|mode| !columns.contains(&Column::Frequency(*mode)))
+        .map(|mode| format!("f{}_hz", mode + 1))
+        .collect();
+    if !missing.is_empty() {
+        add(format!("missing column {}: the structure has {modes} modes", missing.join(", ")));
+    }
+    if options.times == Times::Required && !columns.contains(&Column::Time) {
+        add("missing column measured_at: RFC 3339 with an offset, such as 2026-03-01T12:00:00Z".to_owned());
+    }
+    if problems.is_empty() {
+        Ok(columns)
+    } else {
+        Err(problems)
+    }
+}
+
+fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<Column> {
+    let lower = name.to_ascii_lowercase();
+    let mode = |text: &str| {
+        let number: usize = text.strip_prefix('f')?.strip_suffix("_hz")?.parse().ok()?;
+        number.checked_sub(1)
+    };
+    if options.ignore.iter().any(|ignored| ignored.eq_ignore_ascii_case(name)) {
+        return Some(Column::Ignored);
+    }
+    if lower == "measured_at" {
+        return Some(Column::Time);
+    }
+    if let Some(covariate) = covariates.iter().find(|c| c.name.eq_ignore_ascii_case(name)) {
+        return Some(Column::Covariate(covariate.name.clone(), covariate.kind));
+    }
+    if let Some(mode) = mode(&lower) {
+        return Some(Column::Frequency(mode));
+    }
+    if let Some(mode) = lower.strip_prefix("std_").and_then(mode) {
+        return Some(Column::Std(mode));
+    }
+    // Names of parameters keep their case.
+    lower.starts_with("set_").then(|| Column::Setting(name["set_".len()..].to_owned()))
+}
+
+fn row(
+    record: &csv::StringRecord,
+    line: u64,
+    columns: &[Column],
+    modes: usize,
+    decimal_comma: bool,
+    index: usize,
+    times: Times,
+) -> Result<RawMeasurement, Vec<Problem>> {
+    if record.len() != columns.len() {
+        let message = format!("{} cells, the header has {}", record.len(), columns.len());
+        return Err(vec![Problem::new(format!("line {line}"), message)]);
+    }
+    let mut raw = RawMeasurement {
+        place: Place::Csv { line },
+        measured_at: None,
+        frequencies_hz: vec![None; modes],
+        std_hz: columns.iter().any(|c| matches!(c, Column::Std(_))).then(|| vec![None; modes]),
+        covariates: BTreeMap::new(),
+        settings: BTreeMap::new(),
+    };
+    for (column, cell) in columns.iter().zip(record).filter(|(_, cell)| !cell.is_empty()) {
+        let number = |name: String| {
+            number(cell, decimal_comma).map_err(|message| vec![Problem::new(format!("line {line}, column {name}"), message)])
+        };
+        match column {
+            Column::Ignored => {}
+            Column::Time => raw.measured_at = Some(cell.to_owned()),
+            Column::Frequency(mode) => raw.frequencies_hz[*mode] = Some(number(format!("f{}_hz", mode + 1))?),
+            Column::Std(mode) => {
+                let value = number(format!("std_f{}_hz", mode + 1))?;
+                raw.std_hz.get_or_insert_with(|| vec![None; modes])[*mode] = Some(value);
+            }
+            Column::Covariate(name, CovariateKind::Number) => {
+                raw.covariates.insert(name.clone(), CovariateValue::Number(number(name.clone())?));
+            }
+            Column::Covariate(name, CovariateKind::Category) => {
+                raw.covariates.insert(name.clone(), CovariateValue::Category(cell.to_owned()));
+            }
+            Column::Setting(name) => {
+                raw.settings.insert(name.clone(), number(format!("set_{name}"))?);
+            }
+        }
+    }
+    // A row without any standard deviation says nothing about them.
+    raw.std_hz = raw.std_hz.filter(|stds| stds.iter().any(Option::is_some));
+    if times == Times::RowNumber && !columns.contains(&Column::Time) {
+        let time = Timestamp::from_micros(index as i64 * 1_000_000).expect("a table has fewer rows than years have seconds");
+        raw.measured_at = Some(time.to_string());
+    }
+    Ok(raw)
+}
+
+fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {
+    let text = if decimal_comma { cell.replace(',', ".") } else { cell.to_owned() };
+    match text.parse::<f64>() {
+        Ok(value) if value.is_finite() => Ok(value),
+        Ok(_) => Err(format!("{} is not finite: leave the cell empty for a missing mode", shown(cell))),
+        Err(_) if !decimal_comma && cell.contains(',') => {
+            Err(format!("{} is no number: a decimal comma needs ';' or tab as separator", shown(cell)))
+        }
+        Err(_) => Err(format!("{} is no number", shown(cell))),
+    }
+}
+
+/// Measurements as a table that [`read`] gives back.
+///
+/// # Panics
+/// Never: measurements that exist have equal numbers of modes, and memory can be written.
+pub fn write(measurements: &[ModalMeasurement]) -> String {
+    let modes = measurements.iter().map(|m| m.frequencies_hz.len()).max().unwrap_or_default();
+    let with_std = measurements.iter().any(|m| m.std_hz.is_some());
+    let names = |pick: fn(&ModalMeasurement) -> Vec<String>| {
+        measurements.iter().flat_map(pick).collect::<std::collections::BTreeSet<_>>()
+    };
+    let covariates = names(|m| m.covariates.keys().cloned().collect());
+    let settings = names(|m| m.settings.keys().cloned().collect());
+
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    let mut put = |row: Vec<String>| writer.write_record(row).expect("rows have equal lengths, memory can be written");
+    let mut header = vec!["measured_at".to_owned()];
+    header.extend((1..=modes).map(|mode| format!("f{mode}_hz")));
+    header.extend((1..=if with_std { modes } else { 0 }).map(|mode| format!("std_f{mode}_hz")));
+    header.extend(covariates.iter().cloned());
+    header.extend(settings.iter().map(|name| format!("set_{name}")));
+    put(header);
+    let cell = |value: Option<f64>| value.map_or_else(String::new, |v| v.to_string());
+    for m in measurements {
+        let mut row = vec![m.measured_at.to_string()];
+        row.extend(m.frequencies_hz.iter().map(|f| cell(f.map(Hertz::get))));
+        if with_std {
+            row.extend((0..modes).map(|mode| cell(m.std_hz.as_ref().and_then(|stds| stds[mode]))));
+        }
+        row.extend(covariates.iter().map(|name| match m.covariates.get(name) {
+            Some(CovariateValue::Number(number)) => number.to_string(),
+            Some(CovariateValue::Category(text)) => text.clone(),
+            None => String::new(),
+        }));
+        row.extend(settings.iter().map(|name| cell(m.settings.get(name).copied())));
+        put(row);
+    }
+    let bytes = writer.into_inner().expect("memory can be written");
+    String::from_utf8(bytes).expect("all cells are text")
+}

@@ -1,0 +1,469 @@
+//! What happens to a batch: store it, assess it, store the result; declare undamaged states; resume after a restart.
+
+pub mod assess;
+pub mod compute;
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, RwLock};
+
+use serde::{Deserialize, Serialize};
+use tracing::{error, info, warn};
+
+use crate::assessment::{Assessment, BatchState};
+use crate::baseline::library::{Library, Refusal};
+use crate::baseline::{assessment_seed, Baseline};
+use crate::damage::{self, QuantitySamples, UndamagedState};
+use crate::measurement::check::Expectation;
+use crate::measurement::MeasurementBatch;
+use crate::quantity::{StructureId, Timestamp};
+use crate::simulator::definition::{DefinitionError, StructureDefinition};
+use crate::simulator::Simulator;
+use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store};
+use assess::Draws;
+use compute::{Compute, ComputeSettings, QueueFull};
+
+/// How batches are taken and assessed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MonitorSettings {
+    /// Posterior samples drawn for each measurement (paper §5.2: 10).
+    pub draws_per_measurement: usize,
+    /// Most measurements of one batch.
+    pub max_measurements: usize,
+    /// The queue in front of the processor.
+    pub compute: ComputeSettings,
+}
+
+impl Default for MonitorSettings {
+    fn default() -> Self {
+        Self { draws_per_measurement: 10, max_measurements: 5_000, compute: ComputeSettings::default() }
+    }
+}
+
+/// Why the monitor could not do what it was asked.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No such structure.
+    #[error("there is no structure {0}")]
+    UnknownStructure(StructureId),
+    /// No such batch of that structure.
+    #[error("structure {structure} has no batch {batch}")]
+    UnknownBatch {
+        /// The structure.
+        structure: StructureId,
+        /// The batch asked for.
+        batch: String,
+    },
+    /// The structure has no trained baseline in use.
+    #[error("structure {structure} has no trained baseline in use: {reason}")]
+    NoModel {
+        /// The structure.
+        structure: StructureId,
+        /// Why, and the next step.
+        reason: String,
+    },
+    /// The queue is full; nothing was stored.
+    #[error(transparent)]
+    QueueFull(#[from] QueueFull),
+    /// The key was used for other content.
+    #[error("the idempotency key was used for batch {batch} with other content")]
+    KeyConflict {
+        /// The batch stored under that key.
+        batch: String,
+    },
+    /// A measurement of this source and time is stored already, with other content around it.
+    #[error("measurement {ordinal} at {measured_at} of this source is already in batch {batch}, which has other content")]
+    MeasurementConflict {
+        /// Index in the batch that was posted.
+        ordinal: usize,
+        /// Its time.
+        measured_at: Timestamp,
+        /// The batch that has it.
+        batch: String,
+    },
+    /// Another definition of a structure that has batches.
+    #[error("structure {0} has batches that were measured under another definition; use another id for the new one")]
+    StructureInUse(StructureId),
+    /// The same batch named twice.
+    #[error("batch {0} is named twice")]
+    RepeatedBatch(String),
+    /// The batches make no undamaged state.
+    #[error(transparent)]
+    Undamaged(#[from] damage::Error),
+    /// An inference failed.
+    #[error("batch {batch} could not be used: {source}")]
+    Assess {
+        /// The batch.
+        batch: String,
+        /// The cause.
+        source: assess::Error,
+    },
+    /// A stored definition is not readable any more: the database was written by another version.
+    #[error("the stored definition of a structure is refused: {0}")]
+    StoredDefinition(#[from] DefinitionError),
+    /// The database failed.
+    #[error(transparent)]
+    Store(#[from] store::Error),
+    /// A computation or an owned task panicked: a bug.
+    #[error("a task panicked")]
+    Panicked,
+}
+
+/// A structure in use: its simulator, and its trained baseline or the reason why there is none.
+pub struct Watched {
+    /// The structure.
+    pub simulator: Simulator,
+    /// The trained baseline in use, or why there is none.
+    pub baseline: Result<Arc<Baseline>, String>,
+}
+
+/// A batch with all that is known of it.
+pub struct BatchView {
+    /// The batch as stored.
+    pub record: BatchRecord,
+    /// Its current assessment.
+    pub assessment: Option<Assessment>,
+    /// Why there is no assessment, or no comparison with an undamaged state; and what to do next.
+    pub next_step: Option<String>,
+}
+
+/// A batch taken in.
+pub struct Ingested {
+    /// The batch.
+    pub view: BatchView,
+    /// True when it had been posted before.
+    pub replayed: bool,
+}
+
+/// The office: a cheap handle on store, baselines and queue.
+#[derive(Clone)]
+pub struct Monitor {
+    store: Store,
+    library: Arc<Library>,
+    watched: Arc<RwLock<BTreeMap<StructureId, Arc<Watched>>>>,
+    compute: Compute,
+    settings: MonitorSettings,
+}
+
+impl Monitor {
+    /// Puts the structures of the library into the store, where they are not yet, and takes up those stored.
+    ///
+    /// # Errors
+    /// [`Error::Store`]; [`Error::StoredDefinition`] for a database of another version.
+    pub async fn open(store: Store, library: Library, settings: MonitorSettings) -> Result<Self, Error> {
+        for refusal in library.refusals() {
+            error!(file = %refusal.file, "Refused {}: {}", refusal.file, refusal.reason);
+        }
+        let monitor = Self {
+            store,
+            library: Arc::new(library),
+            watched: Arc::default(),
+            compute: Compute::new(settings.compute),
+            settings,
+        };
+        for (id, entry) in monitor.library.iter() {
+            let json = entry.simulator.definition().canonical_json();
+            let outcome = monitor.store.put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            if outcome == PutStructure::Refused {
+                warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches and the library's differs");
+            }
+        }
+        for summary in monitor.store.structures().await? {
+            if let Some(record) = monitor.store.structure(&summary.id).await? {
+                let simulator = Simulator::new(StructureDefinition::parse_json(&record.definition_json)?)?;
+                monitor.watch(simulator);
+            }
+        }
+        Ok(monitor)
+    }
+
+    /// The store, for what is only read.
+    pub fn store(&self) -> &Store {
+        &self.store
+    }
+
+    /// How batches are taken.
+    pub fn settings(&self) -> &MonitorSettings {
+        &self.settings
+    }
+
+    /// Files of the library that were refused.
+    pub fn refusals(&self) -> &[Refusal] {
+        self.library.refusals()
+    }
+
+    /// Structures with a trained baseline in use.
+    pub fn baselines_in_use(&self) -> usize {
+        self.lock_read().values().filter(|watched| watched.baseline.is_ok()).count()
+    }
+
+    /// Places left in the queue.
+    pub fn free_places(&self) -> usize {
+        self.compute.free()
+    }
+
+    /// A structure in use.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`].
+    pub fn structure(&self, id: &StructureId) -> Result<Arc<Watched>, Error> {
+        self.lock_read().get(id).cloned().ok_or_else(|| Error::UnknownStructure(id.clone()))
+    }
+
+    /// Defines a structure.
+    ///
+    /// # Errors
+    /// [`Error::StructureInUse`] when it has batches under another definition.
+    pub async fn put_structure(&self, definition: StructureDefinition) -> Result<PutStructure, Error> {
+        let simulator = Simulator::new(definition)?;
+        let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
+        let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
+        match outcome {
+            PutStructure::Refused => return Err(Error::StructureInUse(id)),
+            PutStructure::Created | PutStructure::Replaced => self.watch(simulator),
+            PutStructure::Unchanged => {}
+        }
+        Ok(outcome)
+    }
+
+    /// What a batch of this structure must look like.
+    pub fn expectation<'a>(&self, watched: &'a Watched) -> Expectation<'a> {
+        Expectation {
+            modes: watched.simulator.modes(),
+            frequency_limits_hz: watched.simulator.frequency_limits_hz(),
+            covariates: watched.simulator.covariates(),
+            space: watched.simulator.space(),
+            now: Timestamp::now(),
+            max_measurements: self.settings.max_measurements,
+        }
+    }
+
+    /// Stores a batch, assesses it and stores the result.
+    ///
+    /// It runs in a task of its own: a client that goes away does not stop it half-way.
+    ///
+    /// # Errors
+    /// [`Error::QueueFull`] with nothing stored; the conflicts of [`InsertBatch`]; [`Error::Store`].
+    pub async fn ingest(&self, batch: MeasurementBatch) -> Result<Ingested, Error> {
+        let place = self.compute.reserve()?;
+        let monitor = self.clone();
+        let task = tokio::spawn(async move { monitor.ingest_here(batch, place).await });
+        task.await.map_err(|_| Error::Panicked)?
+    }
+
+    async fn ingest_here(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {
+        let structure = batch.structure.clone();
+        let watched = self.structure(&structure)?;
+        let id = uuid::Uuid::now_v7().to_string();
+        let (id, replayed) = match self.store.insert_batch(&batch, &id, Timestamp::now()).await? {
+            InsertBatch::Inserted => (id, false),
+            InsertBatch::Replayed(id) => (id, true),
+            InsertBatch::KeyConflict { batch_id } => return Err(Error::KeyConflict { batch: batch_id }),
+            InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
+                return Err(Error::MeasurementConflict { ordinal, measured_at, batch: batch_id });
+            }
+        };
+        let record = self.stored(&structure, &id).await?;
+        if record.state == BatchState::Received && watched.baseline.is_ok() {
+            self.assess_stored(&watched, record, place).await?;
+        }
+        Ok(Ingested { view: self.batch(&structure, &id).await?, replayed })
+    }
+
+    /// One batch with its current assessment.
+    ///
+    /// # Errors
+    /// [`Error::UnknownBatch`], [`Error::UnknownStructure`].
+    pub async fn batch(&self, structure: &StructureId, batch_id: &str) -> Result<BatchView, Error> {
+        let watched = self.structure(structure)?;
+        let record = self.stored(structure, batch_id).await?;
+        let assessment = self.store.assessment(structure, batch_id).await?;
+        let next_step = match (&assessment, &watched.baseline) {
+            (None, Err(reason)) => Some(reason.clone()),
+            (Some(a), _) if a.undamaged_version.is_none() => Some(self.why_not_compared(structure, batch_id).await?),
+            _ => None,
+        };
+        Ok(BatchView { record, assessment, next_step })
+    }
+
+    async fn why_not_compared(&self, structure: &StructureId, batch_id: &str) -> Result<String, Error> {
+        Ok(match self.store.undamaged(structure).await? {
+            Some(undamaged) if undamaged.batches.iter().any(|id| id == batch_id) => {
+                format!("part of the undamaged state, version {}: not compared with itself", undamaged.state.version)
+            }
+            Some(_) => "not compared with the undamaged state yet".to_owned(),
+            None => format!(
+                "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/baseline \
+                 {{\"batches\": [\"{batch_id}\"]}}"
+            ),
+        })
+    }
+
+    /// Takes batches as the undamaged state. Other batches that were never compared are assessed against it afterwards.
+    ///
+    /// # Errors
+    /// [`Error::NoModel`], [`Error::UnknownBatch`], [`Error::Assess`] for a batch without a complete measurement,
+    /// [`Error::Undamaged`] for too few measurements.
+    pub async fn declare_undamaged(
+        &self,
+        structure: &StructureId,
+        batch_ids: Vec<String>,
+        threshold_probability: f64,
+    ) -> Result<store::UndamagedRecord, Error> {
+        let watched = self.structure(structure)?;
+        let baseline = baseline_of(structure, &watched)?;
+        let mut records = Vec::new();
+        for (index, id) in batch_ids.iter().enumerate() {
+            if batch_ids[..index].contains(id) {
+                return Err(Error::RepeatedBatch(id.clone()));
+            }
+            records.push(self.stored(structure, id).await?);
+        }
+        let per_measurement = self.settings.draws_per_measurement;
+        let model_digest = baseline.digest().clone();
+        let compute = self.compute.reserve()?.run(move || pool(&baseline, &records, per_measurement));
+        let samples = compute.await.map_err(|_| Error::Panicked)??;
+        let state = UndamagedState::from_samples(0, &samples, threshold_probability)?;
+
+        let store = self.store.clone();
+        let version =
+            store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
+        info!(structure.id = %structure, version, "Undamaged state {version} of {structure} from {} batches", batch_ids.len());
+        self.resume_later(structure.clone());
+        let stored = self.store.undamaged(structure).await?;
+        Ok(stored.expect("it was stored a moment ago and is never deleted"))
+    }
+
+    /// Assesses what an earlier run left unassessed, in the background.
+    pub fn resume(&self) {
+        let structures: Vec<StructureId> = self.lock_read().keys().cloned().collect();
+        for structure in structures {
+            self.resume_later(structure);
+        }
+    }
+
+    fn resume_later(&self, structure: StructureId) {
+        let monitor = self.clone();
+        tokio::spawn(async move {
+            if let Err(error) = monitor.resume_structure(&structure).await {
+                error!(structure.id = %structure, %error, "Could not go on with unassessed batches of {structure}: {error}");
+            }
+        });
+    }
+
+    async fn resume_structure(&self, structure: &StructureId) -> Result<(), Error> {
+        let watched = self.structure(structure)?;
+        if watched.baseline.is_err() {
+            return Ok(());
+        }
+        loop {
+            let pending = self.store.pending(structure, 100).await?;
+            if pending.is_empty() {
+                return Ok(());
+            }
+            for batch_id in pending {
+                let place = self.compute.wait().await;
+                let record = self.stored(structure, &batch_id).await?;
+                self.assess_stored(&watched, record, place).await?;
+            }
+        }
+    }
+
+    /// Assesses a stored batch and stores the result, or the reason why there is none.
+    async fn assess_stored(&self, watched: &Watched, record: BatchRecord, place: compute::Place) -> Result<(), Error> {
+        let structure = record.batch.structure.clone();
+        let baseline = baseline_of(&structure, watched)?;
+        let undamaged = self.store.undamaged(&structure).await?;
+        // An undamaged state holds for the baseline whose samples it was taken from, and not for its own batches.
+        let undamaged = undamaged
+            .filter(|u| u.model_digest == *baseline.digest() && !u.batches.contains(&record.batch_id))
+            .map(|u| u.state);
+        let draws = draws(&baseline, &record, self.settings.draws_per_measurement);
+        let batch_id = record.batch_id.clone();
+        let started = std::time::Instant::now();
+        let work = move || assess::assess(&baseline, &record.batch.measurements, undamaged.as_ref(), draws);
+        let reason = match place.run(work).await {
+            Ok(Ok(assessment)) => {
+                let seconds = started.elapsed().as_secs_f64();
+                metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
+                report(&structure, &batch_id, &assessment, seconds);
+                return Ok(self.store.insert_assessment(&structure, &batch_id, &assessment).await?);
+            }
+            Ok(Err(error)) => error.to_string(),
+            Err(panicked) => panicked.to_string(),
+        };
+        metrics::counter!("modalwatch_assessments_failed_total").increment(1);
+        warn!(structure.id = %structure, batch.id = %batch_id, "Could not assess batch {batch_id} of {structure}: {reason}");
+        Ok(self.store.mark_failed(&structure, &batch_id, &reason).await?)
+    }
+
+    async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
+        let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: crate::quantity::shown(batch_id) };
+        self.store.batch(structure, batch_id).await?.ok_or_else(unknown)
+    }
+
+    fn watch(&self, simulator: Simulator) {
+        let id = simulator.id().clone();
+        let baseline = self.find_baseline(&simulator);
+        let watched = Arc::new(Watched { simulator, baseline });
+        self.watched.write().expect("no holder of this lock panics").insert(id, watched);
+    }
+
+    fn find_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
+        let id = simulator.id();
+        let train = format!("train one with `modalwatch train` into a folder of --models and start the service again");
+        let Some(entry) = self.library.get(id) else {
+            return Err(format!("no trained baseline: {train}"));
+        };
+        if entry.simulator.digest() != simulator.digest() {
+            return Err(format!("the trained baseline is for another definition of {id}: {train}"));
+        }
+        let refused = || self.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
+        entry.baseline.clone().ok_or_else(|| match refused() {
+            Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
+            None => format!("no trained baseline: {train}"),
+        })
+    }
+
+    fn lock_read(&self) -> std::sync::RwLockReadGuard<'_, BTreeMap<StructureId, Arc<Watched>>> {
+        self.watched.read().expect("no holder of this lock panics")
+    }
+}
+
+fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baseline>, Error> {
+    let missing = |reason: &String| Error::NoModel { structure: structure.clone(), reason: reason.clone() };
+    watched.baseline.as_ref().map(Arc::clone).map_err(missing)
+}
+
+fn draws(baseline: &Baseline, record: &BatchRecord, per_measurement: usize) -> Draws {
+    Draws { per_measurement, seed: assessment_seed(&record.content_digest, baseline.digest()) }
+}
+
+/// Samples of several batches as one pool for each quantity.
+fn pool(baseline: &Baseline, records: &[BatchRecord], per_measurement: usize) -> Result<Vec<QuantitySamples>, Error> {
+    let mut pooled: Vec<QuantitySamples> = Vec::new();
+    for record in records {
+        let failed = |source| Error::Assess { batch: record.batch_id.clone(), source };
+        let draws = draws(baseline, record, per_measurement);
+        let samples = assess::draw(baseline, &record.batch.measurements, draws).map_err(failed)?;
+        let quantities = assess::monitored_quantities(baseline, &samples.posterior);
+        if pooled.is_empty() {
+            pooled = quantities;
+        } else {
+            pooled.iter_mut().zip(quantities).for_each(|(all, more)| all.pool.extend(more.pool));
+        }
+    }
+    Ok(pooled)
+}
+
+fn report(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
+    metrics::counter!("modalwatch_assessments_total").increment(1);
+    let exceeding = assessment.quantities.iter().filter(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
+    let exceeding: Vec<&str> = exceeding.map(|q| q.name.as_str()).collect();
+    let duration_ms = seconds * 1e3;
+    let measurements = assessment.measurements_used;
+    info!(
+        structure.id = %structure, batch.id = %batch_id, model.digest = %assessment.model_digest, duration_ms,
+        exceeding = ?exceeding, "Assessed {measurements} measurements of {structure}"
+    );
+}

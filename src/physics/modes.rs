@@ -1,0 +1,166 @@
+//! Natural frequencies, mode shapes, and their derivatives.
+
+use std::f64::consts::PI;
+
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+
+use super::assembly::{mass_diagonal, stiffness_matrix};
+use super::{Error, Node, Structure};
+
+/// Below this share of the largest eigenvalue, the smallest is rounding: the structure is a mechanism.
+const SINGULAR: f64 = 1e-12;
+
+/// Relative gap below which two eigenvalues count as one: rounding moves them by some 1e-13.
+const REPEATED: f64 = 1e-8;
+
+/// All modes of a structure; `count` of them were asked for.
+#[derive(Debug, Clone)]
+pub struct Modes {
+    /// Natural frequencies asked for, Hz, ascending.
+    pub frequencies_hz: Vec<f64>,
+    /// All eigenvalues λ = (2πf)², rad²/s², ascending.
+    eigenvalues: Vec<f64>,
+    /// All mode shapes by columns, mass-normalised: φᵀMφ = 1, kg^-½.
+    all_shapes: DMatrix<f64>,
+}
+
+impl Modes {
+    /// Shapes of the modes asked for, `[n, count]`, mass-normalised, kg^-½; the sign of each is arbitrary.
+    pub fn shapes(&self) -> DMatrix<f64> {
+        self.all_shapes.columns(0, self.frequencies_hz.len()).into_owned()
+    }
+}
+
+/// ∂f/∂k and ∂f/∂m of each mode.
+#[derive(Debug, Clone)]
+pub struct FrequencySensitivity {
+    /// Hz per N/m, `[modes, springs]`.
+    pub by_spring: DMatrix<f64>,
+    /// Hz per kg, `[modes, masses]`.
+    pub by_mass: DMatrix<f64>,
+}
+
+/// The lowest `count` natural frequencies, Hz, ascending.
+///
+/// ```text
+///  K φ = λ M φ,    f = √λ / 2π
+/// ```
+///
+/// # Errors
+/// [`Error::TooFewModes`], [`Error::NearMechanism`].
+pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec<f64>, Error> {
+    let mut eigenvalues: Vec<f64> = scaled_stiffness(structure).0.symmetric_eigenvalues().iter().copied().collect();
+    // nalgebra gives them unsorted.
+    eigenvalues.sort_by(f64::total_cmp);
+    frequencies(&eigenvalues, count)
+}
+
+/// The lowest `count` modes with their shapes.
+///
+/// # Errors
+/// [`Error::TooFewModes`], [`Error::NearMechanism`].
+pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
+    let (scaled, inverse_root_mass) = scaled_stiffness(structure);
+    let SymmetricEigen { eigenvalues, eigenvectors } = scaled.symmetric_eigen();
+    let mut order: Vec<usize> = (0..eigenvalues.len()).collect();
+    order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
+    let sorted: Vec<f64> = order.iter().map(|i| eigenvalues[*i]).collect();
+    let n = order.len();
+    let all_shapes =
+        DMatrix::from_fn(n, n, |row, column| inverse_root_mass[row] * eigenvectors[(row, order[column])]);
+    Ok(Modes { frequencies_hz: frequencies(&sorted, count)?, eigenvalues: sorted, all_shapes })
+}
+
+/// Derivatives of the frequencies with respect to every spring and every mass.
+///
+/// ```text
+///  ∂λ_i/∂k = (φ_ai − φ_bi)²   (φ_ai² for a spring to the ground),    ∂λ_i/∂m_a = −λ_i φ_ai²
+///  ∂f_i = ∂λ_i / (8π² f_i)
+/// ```
+///
+/// Repeated eigenvalues: the shapes of a cluster are not unique, and the formula above would depend on the choice. For
+/// each single parameter the derivatives are then the eigenvalues of the r × r matrix Φᵀ(∂K − λ∂M)Φ over the cluster,
+/// here in ascending order: the right-hand derivatives of the frequencies in their ascending order (the left-hand ones
+/// are the same in descending order). In several parameters at once, sorted frequencies have no gradient there.
+///
+/// Source: Nelson (1976) for single, Ojalvo (1988) for repeated eigenvalues.
+pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencySensitivity {
+    let count = modes.frequencies_hz.len();
+    let shapes = &modes.all_shapes;
+    let clusters = clusters(&modes.eigenvalues);
+    let derivative = |columns: usize, form: &dyn Fn(usize, usize, usize, f64) -> f64| {
+        let mut result = DMatrix::zeros(count, columns);
+        for &(start, end) in clusters.iter().filter(|(start, _)| *start < count) {
+            let size = end - start;
+            let eigenvalue = modes.eigenvalues[start..end].iter().sum::<f64>() / size as f64;
+            for column in 0..columns {
+                let projected = DMatrix::from_fn(size, size, |i, j| form(column, start + i, start + j, eigenvalue));
+                let mut slopes: Vec<f64> = if size == 1 {
+                    vec![projected[(0, 0)]]
+                } else {
+                    projected.symmetric_eigenvalues().iter().copied().collect()
+                };
+                slopes.sort_by(f64::total_cmp);
+                for mode in start..end.min(count) {
+                    result[(mode, column)] = slopes[mode - start] / (8.0 * PI * PI * modes.frequencies_hz[mode]);
+                }
+            }
+        }
+        result
+    };
+    let elongation = |spring: usize, mode: usize| {
+        let displacement = |node| match node {
+            Node::Ground => 0.0,
+            Node::Mass(mass) => shapes[(mass, mode)],
+        };
+        let spring = &structure.springs()[spring];
+        displacement(spring.from) - displacement(spring.to)
+    };
+    FrequencySensitivity {
+        by_spring: derivative(structure.springs().len(), &|spring, i, j, _| {
+            elongation(spring, i) * elongation(spring, j)
+        }),
+        by_mass: derivative(structure.masses().len(), &|mass, i, j, eigenvalue| {
+            -eigenvalue * shapes[(mass, i)] * shapes[(mass, j)]
+        }),
+    }
+}
+
+/// M^-½ K M^-½, whose eigenvalues are those of K φ = λ M φ, and the diagonal of M^-½.
+fn scaled_stiffness(structure: &Structure) -> (DMatrix<f64>, DVector<f64>) {
+    let mut scaled = stiffness_matrix(structure);
+    let inverse_root = mass_diagonal(structure).map(|kg| 1.0 / kg.sqrt());
+    for row in 0..scaled.nrows() {
+        for column in 0..scaled.ncols() {
+            scaled[(row, column)] *= inverse_root[row] * inverse_root[column];
+        }
+    }
+    (scaled, inverse_root)
+}
+
+fn frequencies(sorted_eigenvalues: &[f64], count: usize) -> Result<Vec<f64>, Error> {
+    let available = sorted_eigenvalues.len();
+    if count > available {
+        return Err(Error::TooFewModes { asked: count, available });
+    }
+    let (smallest, largest) = (sorted_eigenvalues[0], sorted_eigenvalues[available - 1]);
+    // Not `<=`: NaN must fail too.
+    let positive = smallest > SINGULAR * largest && largest.is_finite();
+    if !positive {
+        return Err(Error::NearMechanism { smallest, largest });
+    }
+    Ok(sorted_eigenvalues[..count].iter().map(|lambda| lambda.sqrt() / (2.0 * PI)).collect())
+}
+
+/// Runs of eigenvalues that count as one, as half-open ranges.
+fn clusters(sorted: &[f64]) -> Vec<(usize, usize)> {
+    let mut clusters = Vec::new();
+    let mut start = 0;
+    for end in 1..=sorted.len() {
+        if end == sorted.len() || sorted[end] - sorted[end - 1] > REPEATED * sorted[end] {
+            clusters.push((start, end));
+            start = end;
+        }
+    }
+    clusters
+}

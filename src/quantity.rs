@@ -1,0 +1,236 @@
+//! Values that cross a border (HTTP, SQL, a file) and are valid once they exist.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
+
+/// A value outside the range of its quantity.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{value} {unit} is no {quantity}: it must be {must}")]
+pub struct OutOfRange {
+    /// What the value was meant to be.
+    pub quantity: &'static str,
+    /// Unit of `value`; empty for text and pure numbers.
+    pub unit: &'static str,
+    /// The value as it came.
+    pub value: String,
+    /// What would be right.
+    pub must: &'static str,
+}
+
+/// A natural frequency: finite and above 0 Hz.
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
+#[serde(transparent)]
+pub struct Hertz(f64);
+
+impl Hertz {
+    /// Checks a value in Hz.
+    ///
+    /// # Errors
+    /// [`OutOfRange`] unless `value` is finite and positive.
+    pub fn new(value: f64) -> Result<Self, OutOfRange> {
+        let valid = value.is_finite() && value > 0.0;
+        valid.then_some(Self(value)).ok_or_else(|| OutOfRange {
+            quantity: "natural frequency",
+            unit: "Hz",
+            value: value.to_string(),
+            must: "finite and above 0",
+        })
+    }
+
+    /// The value in Hz.
+    pub const fn get(self) -> f64 {
+        self.0
+    }
+}
+
+/// A probability: in [0, 1].
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
+#[serde(transparent)]
+pub struct Probability(f64);
+
+impl Probability {
+    /// Checks a probability.
+    ///
+    /// # Errors
+    /// [`OutOfRange`] unless `value` lies in [0, 1].
+    pub fn new(value: f64) -> Result<Self, OutOfRange> {
+        let valid = (0.0..=1.0).contains(&value);
+        valid.then_some(Self(value)).ok_or_else(|| OutOfRange {
+            quantity: "probability",
+            unit: "",
+            value: value.to_string(),
+            must: "between 0 and 1",
+        })
+    }
+
+    /// The value.
+    pub const fn get(self) -> f64 {
+        self.0
+    }
+}
+
+/// A point in time, whole microseconds since 1970-01-01T00:00:00Z; written as RFC 3339 in UTC.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Timestamp(jiff::Timestamp);
+
+impl Timestamp {
+    /// Reads RFC 3339 with an offset; anything finer than a microsecond is cut off.
+    ///
+    /// # Errors
+    /// [`OutOfRange`] when the text is no such time or has no offset.
+    pub fn parse(text: &str) -> Result<Self, OutOfRange> {
+        let time: jiff::Timestamp = text.trim().parse().map_err(|_| OutOfRange {
+            quantity: "time",
+            unit: "",
+            value: shown(text),
+            must: "RFC 3339 with an offset, such as 2026-03-01T12:00:00Z",
+        })?;
+        Self::from_micros(time.as_microsecond())
+    }
+
+    /// From microseconds since 1970-01-01T00:00:00Z.
+    ///
+    /// # Errors
+    /// [`OutOfRange`] beyond the years ±9999.
+    pub fn from_micros(micros: i64) -> Result<Self, OutOfRange> {
+        let time = jiff::Timestamp::from_microsecond(micros);
+        time.map(Self).map_err(|_| OutOfRange {
+            quantity: "time",
+            unit: "µs",
+            value: micros.to_string(),
+            must: "between the years -9999 and 9999",
+        })
+    }
+
+    /// The system clock now.
+    pub fn now() -> Self {
+        Self::from_micros(jiff::Timestamp::now().as_microsecond()).expect("the clock is within the calendar")
+    }
+
+    /// Microseconds since 1970-01-01T00:00:00Z.
+    pub fn micros(self) -> i64 {
+        self.0.as_microsecond()
+    }
+}
+
+impl fmt::Display for Timestamp {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+impl Serialize for Timestamp {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// Name of a structure: 1 to 64 of `a–z 0–9 - _ .`, beginning with a letter or digit.
+///
+/// It becomes a path segment and a folder name, so nothing else is let in.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct StructureId(String);
+
+impl StructureId {
+    /// Checks an id.
+    ///
+    /// # Errors
+    /// [`OutOfRange`] when it is empty, longer than 64 or has other characters.
+    pub fn parse(text: &str) -> Result<Self, OutOfRange> {
+        let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_.".contains(c);
+        let starts_well = text.chars().next().is_some_and(|c| c.is_ascii_alphanumeric());
+        let valid = starts_well && text.len() <= 64 && text.chars().all(allowed);
+        valid.then(|| Self(text.to_owned())).ok_or_else(|| OutOfRange {
+            quantity: "structure id",
+            unit: "",
+            value: shown(text),
+            must: "1 to 64 of a-z, 0-9, '-', '_', '.', beginning with a letter or digit",
+        })
+    }
+
+    /// The id as text.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for StructureId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl TryFrom<String> for StructureId {
+    type Error = OutOfRange;
+
+    fn try_from(text: String) -> Result<Self, OutOfRange> {
+        Self::parse(&text)
+    }
+}
+
+impl From<StructureId> for String {
+    fn from(id: StructureId) -> Self {
+        id.0
+    }
+}
+
+/// SHA-256 of some content, written as 64 hexadecimal digits.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Digest(String);
+
+impl Digest {
+    /// Digest of several byte strings; each is preceded by its length, so that no two lists collide.
+    pub fn of(parts: &[&[u8]]) -> Self {
+        let mut hasher = Sha256::new();
+        for part in parts {
+            hasher.update((part.len() as u64).to_le_bytes());
+            hasher.update(part);
+        }
+        Self::from_hasher(hasher)
+    }
+
+    /// Digest of a file's bytes, as `sha256sum` prints it.
+    pub fn of_file(bytes: &[u8]) -> Self {
+        let mut hasher = Sha256::new();
+        hasher.update(bytes);
+        Self::from_hasher(hasher)
+    }
+
+    /// A digest read back from where it was stored; compared with, never computed on.
+    pub fn from_stored(text: String) -> Self {
+        Self(text)
+    }
+
+    /// The hexadecimal digits.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    fn from_hasher(hasher: Sha256) -> Self {
+        use std::fmt::Write as _;
+        let mut text = String::with_capacity(64);
+        for byte in hasher.finalize() {
+            write!(text, "{byte:02x}").expect("writing to a string cannot fail");
+        }
+        Self(text)
+    }
+}
+
+impl fmt::Display for Digest {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Foreign text made safe for a message: at most 80 characters, control characters escaped.
+pub fn shown(text: &str) -> String {
+    let mut short: String = text.chars().take(80).flat_map(char::escape_debug).collect();
+    if text.chars().nth(80).is_some() {
+        short.push('…');
+    }
+    format!("\"{short}\"")
+}

@@ -1,0 +1,339 @@
+//! The structure file: one TOML file or one JSON body, read strictly, every mistake named with its place.
+//!
+//! `models/three-dof/structure.toml` is an example; README lists the keys.
+
+use std::fmt;
+use std::ops::Range;
+
+use serde::de::{self, DeserializeOwned, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
+
+use super::check;
+use crate::measurement::CovariateKind;
+use crate::parameter::DamageDirection;
+use crate::quantity::Digest;
+
+/// A structure as a file describes it; `simulator::Simulator` is the checked form.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StructureDefinition {
+    /// Name of the structure, see [`crate::quantity::StructureId`].
+    pub id: String,
+    /// For people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub description: Option<String>,
+    /// Number of modes measured, from the lowest.
+    pub modes: usize,
+    /// Standard deviation of one measured frequency.
+    #[serde(default)]
+    pub measurement_noise: MeasurementNoise,
+    /// Masses.
+    #[serde(rename = "mass", default)]
+    pub masses: Vec<MassDefinition>,
+    /// Springs.
+    #[serde(rename = "spring", default)]
+    pub springs: Vec<SpringDefinition>,
+    /// Unknown parameters.
+    #[serde(rename = "parameter", default)]
+    pub parameters: Vec<ParameterDefinition>,
+    /// What is measured beside the frequencies.
+    #[serde(rename = "covariate", default, skip_serializing_if = "Vec::is_empty")]
+    pub covariates: Vec<CovariateDefinition>,
+}
+
+/// Standard deviation of one measured frequency.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MeasurementNoise {
+    /// As a share of the frequency.
+    Relative(f64),
+    /// In Hz, the same for each mode.
+    Hz(f64),
+}
+
+impl Default for MeasurementNoise {
+    fn default() -> Self {
+        Self::Relative(0.0)
+    }
+}
+
+impl MeasurementNoise {
+    /// Standard deviation of a frequency, Hz.
+    pub fn std_hz(self, frequency_hz: f64) -> f64 {
+        match self {
+            Self::Relative(share) => share * frequency_hz,
+            Self::Hz(std_hz) => std_hz,
+        }
+    }
+}
+
+/// A mass.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MassDefinition {
+    /// Unique name; `ground` is taken.
+    pub name: String,
+    /// Mass, kg.
+    pub kg: f64,
+}
+
+/// A spring between two masses, or a mass and the ground.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SpringDefinition {
+    /// Unique name.
+    pub name: String,
+    /// `ground` or the name of a mass.
+    pub from: String,
+    /// `ground` or the name of a mass.
+    pub to: String,
+    /// Nominal stiffness, N/m; may be left out where a parameter sets it, whose middle then counts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub n_per_m: Option<f64>,
+}
+
+/// An unknown parameter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ParameterDefinition {
+    /// Unique name.
+    pub name: String,
+    /// Unit, for people; N/m where it sets springs plainly.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit: Option<String>,
+    /// What is known before measuring.
+    pub prior: Prior,
+    /// The springs it sets: one table or a list of them.
+    #[serde(deserialize_with = "one_or_many")]
+    pub sets: Vec<Sets>,
+    /// Which change is damage.
+    #[serde(default)]
+    pub damage: DamageDirection,
+}
+
+/// What is known of a parameter before measuring.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Prior {
+    /// Equally probable between the two values.
+    Uniform([f64; 2]),
+}
+
+/// A spring that a parameter sets.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sets {
+    /// Name of the spring.
+    pub spring: String,
+    /// How; without a law the parameter is the stiffness itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub law: Option<Law>,
+}
+
+/// Stiffness as a function of a parameter.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Law {
+    /// k = a·exp(b·p) + c.
+    Exponential(Exponential),
+}
+
+/// Constants of k = a·exp(b·p) + c (paper Eq. 25).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Exponential {
+    /// N/m.
+    pub a: f64,
+    /// One over the parameter's unit.
+    pub b: f64,
+    /// N/m.
+    pub c: f64,
+}
+
+impl Law {
+    /// Stiffness at a parameter value, N/m.
+    pub fn value(&self, p: f64) -> f64 {
+        let Self::Exponential(e) = self;
+        e.a * (e.b * p).exp() + e.c
+    }
+
+    /// Its derivative, N/m per unit of the parameter.
+    pub fn slope(&self, p: f64) -> f64 {
+        let Self::Exponential(e) = self;
+        e.a * e.b * (e.b * p).exp()
+    }
+}
+
+/// Something measured beside the frequencies.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CovariateDefinition {
+    /// Unique name with its unit, such as `temperature_c`.
+    pub name: String,
+    /// Kind of its values.
+    #[serde(default)]
+    pub kind: CovariateKind,
+}
+
+/// One mistake in a structure file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DefinitionProblem {
+    /// JSON pointer, such as `/spring/3/from`; empty for the whole file.
+    pub pointer: String,
+    /// Line of a text file, from 1.
+    pub line: Option<usize>,
+    /// What is wrong and what would be right.
+    pub message: String,
+}
+
+impl DefinitionProblem {
+    pub(super) fn new(pointer: impl Into<String>, message: impl Into<String>) -> Self {
+        Self { pointer: pointer.into(), line: None, message: message.into() }
+    }
+}
+
+impl fmt::Display for DefinitionProblem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(line) = self.line {
+            write!(f, "line {line}, ")?;
+        }
+        if !self.pointer.is_empty() {
+            write!(f, "{}: ", self.pointer)?;
+        }
+        f.write_str(&self.message)
+    }
+}
+
+/// All mistakes found in a structure file; never empty.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub struct DefinitionError {
+    /// The mistakes, in the order of the file's sections.
+    pub problems: Vec<DefinitionProblem>,
+}
+
+impl fmt::Display for DefinitionError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, problem) in self.problems.iter().enumerate() {
+            write!(f, "{}{problem}", if index > 0 { "; " } else { "" })?;
+        }
+        Ok(())
+    }
+}
+
+impl StructureDefinition {
+    /// Reads and checks a TOML file.
+    ///
+    /// # Errors
+    /// [`DefinitionError`] with line and pointer of each mistake.
+    pub fn parse_toml(text: &str) -> Result<Self, DefinitionError> {
+        let syntax = |error: &toml::de::Error, pointer: String| {
+            let line = error.span().map(|span| line_at(text, span.start));
+            DefinitionError { problems: vec![DefinitionProblem { pointer, line, message: one_line(error.message()) }] }
+        };
+        let document = toml::Deserializer::parse(text).map_err(|e| syntax(&e, String::new()))?;
+        let definition: Self =
+            serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), pointer(e.path())))?;
+        definition.check().map_err(|mut error| {
+            for problem in &mut error.problems {
+                problem.line = toml_line(text, &problem.pointer);
+            }
+            error
+        })
+    }
+
+    /// Reads and checks JSON.
+    ///
+    /// # Errors
+    /// [`DefinitionError`] with the pointer of each mistake.
+    pub fn parse_json(text: &str) -> Result<Self, DefinitionError> {
+        let definition: Self = from_json(text)?;
+        definition.check()
+    }
+
+    /// The definition as JSON with its keys in a fixed order: equal definitions give equal text.
+    pub fn canonical_json(&self) -> String {
+        serde_json::to_string(self).expect("a definition is plain data")
+    }
+
+    /// Digest of [`Self::canonical_json`]: the version of the structure.
+    pub fn digest(&self) -> Digest {
+        Digest::of(&[self.canonical_json().as_bytes()])
+    }
+
+    fn check(self) -> Result<Self, DefinitionError> {
+        check::check(&self).map(|_| self).map_err(|problems| DefinitionError { problems })
+    }
+}
+
+fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, DefinitionError> {
+    let mut deserializer = serde_json::Deserializer::from_str(text);
+    let failed = |pointer: String, error: &serde_json::Error| DefinitionError {
+        problems: vec![DefinitionProblem { pointer, line: Some(error.line()), message: error.to_string() }],
+    };
+    let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(pointer(e.path()), e.inner()))?;
+    deserializer.end().map_err(|e| failed(String::new(), &e))?;
+    Ok(value)
+}
+
+fn pointer(path: &serde_path_to_error::Path) -> String {
+    use serde_path_to_error::Segment;
+    let segment = |segment: &Segment| match segment {
+        Segment::Seq { index } => format!("/{index}"),
+        Segment::Map { key } => format!("/{key}"),
+        Segment::Enum { variant } => format!("/{variant}"),
+        Segment::Unknown => String::new(),
+    };
+    path.iter().map(segment).collect()
+}
+
+fn one_line(message: &str) -> String {
+    message.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn line_at(text: &str, offset: usize) -> usize {
+    text.as_bytes()[..offset.min(text.len())].iter().filter(|b| **b == b'\n').count() + 1
+}
+
+/// Line of a pointer in a TOML text, or of the nearest thing above it that is there.
+fn toml_line(text: &str, pointer: &str) -> Option<usize> {
+    use toml::de::{DeTable, DeValue};
+    let document = DeTable::parse(text).ok()?;
+    let mut value = DeValue::Table(document.get_ref().clone());
+    let mut span: Range<usize> = document.span();
+    for segment in pointer.split('/').skip(1) {
+        let next = match &value {
+            DeValue::Table(table) => {
+                table.iter().find(|(key, _)| key.get_ref() == segment).map(|(key, value)| (key.span(), value.clone()))
+            }
+            DeValue::Array(items) => {
+                segment.parse::<usize>().ok().and_then(|i| items.get(i)).map(|item| (item.span(), item.clone()))
+            }
+            _ => None,
+        };
+        let Some((next_span, next_value)) = next else { break };
+        span = next_span;
+        value = next_value.into_inner();
+    }
+    Some(line_at(text, span.start))
+}
+
+/// One table or a list of tables, without losing the messages of either.
+fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Sets>, D::Error> {
+    struct OneOrMany;
+    impl<'de> Visitor<'de> for OneOrMany {
+        type Value = Vec<Sets>;
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("{ spring = \"…\" } or a list of such tables")
+        }
+
+        fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Vec<Sets>, A::Error> {
+            Sets::deserialize(de::value::MapAccessDeserializer::new(map)).map(|one| vec![one])
+        }
+
+        fn visit_seq<A: SeqAccess<'de>>(self, seq: A) -> Result<Vec<Sets>, A::Error> {
+            Vec::deserialize(de::value::SeqAccessDeserializer::new(seq))
+        }
+    }
+    deserializer.deserialize_any(OneOrMany)
+}

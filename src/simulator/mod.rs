@@ -1,0 +1,260 @@
+//! The bench: parameters in, natural frequencies out.
+
+mod check;
+pub mod definition;
+pub mod population;
+
+use std::sync::Arc;
+
+use nalgebra::DMatrix;
+use rand::Rng as _;
+use rand_distr::StandardNormal;
+use rayon::prelude::*;
+
+use crate::measurement::Covariate;
+use crate::parameter::ParameterSpace;
+use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_hz, Structure};
+use crate::quantity::{Digest, StructureId};
+use crate::stats;
+use definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
+
+/// How far outside its simulated range a frequency may lie before it is taken for a mistake of unit or place.
+const FREQUENCY_MARGIN: f64 = 100.0;
+
+/// Tries to draw a noisy frequency that is positive before giving up.
+const NOISE_TRIES: usize = 100;
+
+/// A parameter that sets a spring.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Binding {
+    /// Column of the parameter.
+    pub parameter: usize,
+    /// Index of the spring.
+    pub spring: usize,
+    /// How; plainly without a law.
+    pub law: Option<Law>,
+}
+
+impl Binding {
+    /// Stiffness at a parameter value, N/m.
+    pub fn stiffness(&self, p: f64) -> f64 {
+        self.law.map_or(p, |law| law.value(p))
+    }
+
+    /// Its derivative, N/m per unit of the parameter.
+    pub fn slope(&self, p: f64) -> f64 {
+        self.law.map_or(1.0, |law| law.slope(p))
+    }
+}
+
+/// Why a simulation failed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// No natural frequencies at these parameters.
+    #[error("at {parameters:?}: {source}")]
+    Physics {
+        /// The parameters, in the order of the space.
+        parameters: Vec<f64>,
+        /// The cause.
+        source: physics::Error,
+    },
+    /// Noise so large that frequencies are negative.
+    #[error("a frequency of {frequency_hz} Hz with noise of {std_hz} Hz is not positive in {NOISE_TRIES} draws")]
+    Noise {
+        /// Frequency without noise, Hz.
+        frequency_hz: f64,
+        /// Standard deviation of the noise, Hz.
+        std_hz: f64,
+    },
+}
+
+/// A structure whose parameters can be set; a cheap handle.
+#[derive(Debug, Clone)]
+pub struct Simulator {
+    parts: Arc<Parts>,
+}
+
+#[derive(Debug)]
+struct Parts {
+    definition: StructureDefinition,
+    digest: Digest,
+    checked: check::Checked,
+}
+
+/// Simulated pairs of parameters and frequencies.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainingSet {
+    /// `[n, d]`, uniform in the prior box, in parameter units.
+    pub theta: DMatrix<f64>,
+    /// `[n, m]`, Hz, with the structure's measurement noise.
+    pub frequencies_hz: DMatrix<f64>,
+    /// Seed of the draws.
+    pub seed: u64,
+}
+
+/// The stiffness of a spring that a parameter sets through a law.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DerivedStiffness {
+    /// `spring:` and the spring's name.
+    pub name: String,
+    /// Column of the parameter.
+    pub parameter: usize,
+    /// The law.
+    pub law: Law,
+}
+
+impl DerivedStiffness {
+    /// Stiffness at a parameter value, N/m.
+    pub fn value(&self, p: f64) -> f64 {
+        self.law.value(p)
+    }
+}
+
+impl Simulator {
+    /// The simulator of a definition.
+    ///
+    /// # Errors
+    /// [`DefinitionError`] with every mistake and its place.
+    pub fn new(definition: StructureDefinition) -> Result<Self, DefinitionError> {
+        let checked = check::check(&definition).map_err(|problems| DefinitionError { problems })?;
+        let digest = definition.digest();
+        Ok(Self { parts: Arc::new(Parts { definition, digest, checked }) })
+    }
+
+    /// Id of the structure.
+    pub fn id(&self) -> &StructureId {
+        &self.parts.checked.id
+    }
+
+    /// The definition it was made of.
+    pub fn definition(&self) -> &StructureDefinition {
+        &self.parts.definition
+    }
+
+    /// Digest of the definition.
+    pub fn digest(&self) -> &Digest {
+        &self.parts.digest
+    }
+
+    /// The structure at its nominal stiffnesses.
+    pub fn structure(&self) -> &Structure {
+        &self.parts.checked.structure
+    }
+
+    /// The parameters.
+    pub fn space(&self) -> &ParameterSpace {
+        &self.parts.checked.space
+    }
+
+    /// Number of modes measured m.
+    pub fn modes(&self) -> usize {
+        self.parts.definition.modes
+    }
+
+    /// Declared covariates.
+    pub fn covariates(&self) -> &[Covariate] {
+        &self.parts.checked.covariates
+    }
+
+    /// Standard deviation of one measured frequency.
+    pub fn noise(&self) -> MeasurementNoise {
+        self.parts.definition.measurement_noise
+    }
+
+    /// Natural frequencies, Hz, ascending, at parameters `theta` (`[d]`, parameter units), without noise.
+    ///
+    /// # Errors
+    /// [`physics::Error`] for parameters that give a negative stiffness or a mechanism.
+    pub fn frequencies_hz(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
+        natural_frequencies_hz(&self.structure_at(theta)?, self.modes())
+    }
+
+    /// Derivatives of the frequencies at `theta`, Hz per parameter unit, `[m, d]`.
+    ///
+    /// ```text
+    ///  ∂f_i/∂p = Σ over springs that p sets:  ∂f_i/∂k · dk/dp
+    /// ```
+    ///
+    /// Where eigenvalues repeat, see [`frequency_sensitivity`]: sums over several springs are then not derivatives.
+    ///
+    /// # Errors
+    /// As [`Self::frequencies_hz`].
+    pub fn jacobian(&self, theta: &[f64]) -> Result<DMatrix<f64>, physics::Error> {
+        let structure = self.structure_at(theta)?;
+        let modes = modes(&structure, self.modes())?;
+        let sensitivity = frequency_sensitivity(&structure, &modes);
+        let mut jacobian = DMatrix::zeros(self.modes(), self.space().len());
+        for binding in &self.parts.checked.bindings {
+            let slope = binding.slope(theta[binding.parameter]);
+            for mode in 0..self.modes() {
+                jacobian[(mode, binding.parameter)] += sensitivity.by_spring[(mode, binding.spring)] * slope;
+            }
+        }
+        Ok(jacobian)
+    }
+
+    /// Natural frequencies at the nominal stiffnesses, Hz.
+    pub fn nominal_frequencies_hz(&self) -> Vec<f64> {
+        natural_frequencies_hz(self.structure(), self.modes()).unwrap_or_default()
+    }
+
+    /// Smallest and largest frequency that a measurement can have without being a mistake of unit or place, Hz.
+    ///
+    /// The nominal range, widened a hundredfold on both sides: rad/s for Hz still passes (and is judged later, with the
+    /// posterior), minutes for seconds or MHz for Hz do not.
+    pub fn frequency_limits_hz(&self) -> (f64, f64) {
+        let nominal = self.nominal_frequencies_hz();
+        let first = nominal.first().copied().unwrap_or(f64::MIN_POSITIVE);
+        let last = nominal.last().copied().unwrap_or(f64::MAX);
+        (first / FREQUENCY_MARGIN, last * FREQUENCY_MARGIN)
+    }
+
+    /// The springs set through a law, whose stiffness is monitored beside the parameter.
+    pub fn derived_stiffnesses(&self) -> Vec<DerivedStiffness> {
+        let derived = |binding: &Binding| {
+            let name = format!("spring:{}", self.structure().springs()[binding.spring].name);
+            Some(DerivedStiffness { name, parameter: binding.parameter, law: binding.law? })
+        };
+        self.parts.checked.bindings.iter().filter_map(derived).collect()
+    }
+
+    /// `samples` pairs from the prior; the same seed gives the same bits on any number of threads.
+    ///
+    /// # Errors
+    /// [`Error`]; a checked definition has no mechanism in its prior, so only noise out of proportion can fail.
+    pub fn training_set(&self, samples: usize, seed: u64) -> Result<TrainingSet, Error> {
+        let space = self.space();
+        let mut stream = stats::stream(seed, "prior");
+        // Row by row, so that a longer set begins with the shorter one.
+        let rows: Vec<Vec<f64>> = (0..samples)
+            .map(|_| space.iter().map(|p| p.from_unit(stream.random::<f64>())).collect())
+            .collect();
+        let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
+        Ok(TrainingSet { frequencies_hz: self.measure(&rows, seed)?, theta, seed })
+    }
+
+    /// Frequencies of each row of parameters with measurement noise, `[n, m]`, Hz.
+    fn measure(&self, rows: &[Vec<f64>], seed: u64) -> Result<DMatrix<f64>, Error> {
+        let simulate = |theta: &Vec<f64>| {
+            self.frequencies_hz(theta).map_err(|source| Error::Physics { parameters: theta.clone(), source })
+        };
+        let exact = rows.par_iter().map(simulate).collect::<Result<Vec<_>, _>>()?;
+        let mut stream = stats::stream(seed, "measurement noise");
+        let mut noisy = DMatrix::zeros(rows.len(), self.modes());
+        for (row, frequencies) in exact.iter().enumerate() {
+            for (mode, &frequency_hz) in frequencies.iter().enumerate() {
+                let std_hz = self.noise().std_hz(frequency_hz);
+                let mut draw = || frequency_hz + std_hz * stream.sample::<f64, _>(StandardNormal);
+                let value = (0..NOISE_TRIES).map(|_| draw()).find(|f| *f > 0.0);
+                noisy[(row, mode)] = value.ok_or(Error::Noise { frequency_hz, std_hz })?;
+            }
+        }
+        Ok(noisy)
+    }
+
+    fn structure_at(&self, theta: &[f64]) -> Result<Structure, physics::Error> {
+        let changes: Vec<(usize, f64)> =
+            self.parts.checked.bindings.iter().map(|b| (b.spring, b.stiffness(theta[b.parameter]))).collect();
+        self.structure().with_stiffness(&changes)
+    }
+}

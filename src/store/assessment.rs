@@ -1,0 +1,237 @@
+//! Assessments: written beside each other, one for each pair of trained baseline and undamaged state.
+
+use std::collections::BTreeMap;
+
+use sqlx::FromRow;
+
+use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
+use crate::assessment::Assessment;
+use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
+use crate::quantity::{Digest, StructureId};
+
+#[derive(FromRow)]
+struct AssessmentRow {
+    batch_id: String,
+    model_digest: String,
+    undamaged_version: u32,
+    structure_digest: String,
+    seed: i64,
+    draws_per_measurement: i64,
+    measurements_used: i64,
+    measurements_left_out: i64,
+    misfit_percent: Vec<u8>,
+    assessed_at_us: i64,
+}
+
+#[derive(FromRow)]
+struct QuantityRow {
+    batch_id: String,
+    model_digest: String,
+    undamaged_version: u32,
+    quantity: String,
+    unit: String,
+    kind: String,
+    mean: f64,
+    std: Option<f64>,
+    variance_within: f64,
+    variance_between: Option<f64>,
+    edge_mass: f64,
+    threshold: Option<f64>,
+    probability_of_damage: Option<f64>,
+    exceeds: Option<bool>,
+    relative_change: Option<f64>,
+}
+
+/// Orders the assessments of a batch; the current one comes first.
+pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
+
+impl Store {
+    /// Stores an assessment and marks its batch as assessed; storing it again changes nothing.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn insert_assessment(
+        &self,
+        structure: &StructureId,
+        batch_id: &str,
+        assessment: &Assessment,
+    ) -> Result<(), Error> {
+        let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
+        self.write(move |connection| {
+            Box::pin(async move {
+                let version = a.undamaged_version.unwrap_or(0);
+                for table in ["quantity_assessment", "assessment"] {
+                    let delete = format!(
+                        "delete from {table}
+                         where structure_id = ? and batch_id = ? and model_digest = ? and undamaged_version = ?"
+                    );
+                    sqlx::query(sqlx::AssertSqlSafe(delete))
+                        .bind(&structure)
+                        .bind(&id)
+                        .bind(a.model_digest.as_str())
+                        .bind(version)
+                        .execute(&mut *connection)
+                        .await?;
+                }
+                sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
+                    .bind(&structure)
+                    .bind(&id)
+                    .bind(a.model_digest.as_str())
+                    .bind(version)
+                    .bind(a.structure_digest.as_str())
+                    .bind(a.seed.cast_signed())
+                    .bind(a.draws_per_measurement as i64)
+                    .bind(a.measurements_used as i64)
+                    .bind(a.measurements_left_out as i64)
+                    .bind(to_blob(a.misfit_percent.iter().copied()))
+                    .bind(a.assessed_at.micros())
+                    .execute(&mut *connection)
+                    .await?;
+                for (position, q) in a.quantities.iter().enumerate() {
+                    let damage = q.damage.as_ref();
+                    sqlx::query(
+                        "insert into quantity_assessment
+                         values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                    )
+                    .bind(&structure)
+                    .bind(&id)
+                    .bind(a.model_digest.as_str())
+                    .bind(version)
+                    .bind(&q.name)
+                    .bind(position as i64)
+                    .bind(&q.unit)
+                    .bind(kind_name(q.kind))
+                    .bind(q.hyperparameters.mean)
+                    .bind(q.hyperparameters.std)
+                    .bind(q.hyperparameters.within)
+                    .bind(q.hyperparameters.between)
+                    .bind(q.edge_mass)
+                    .bind(damage.map(|d| d.threshold))
+                    .bind(damage.map(|d| d.probability_of_damage))
+                    .bind(damage.map(|d| d.exceeds))
+                    .bind(damage.map(|d| d.relative_change))
+                    .execute(&mut *connection)
+                    .await?;
+                }
+                sqlx::query(
+                    "update measurement_batch set state = 'assessed', failure = null
+                     where structure_id = ? and batch_id = ?",
+                )
+                .bind(&structure)
+                .bind(&id)
+                .execute(&mut *connection)
+                .await?;
+                Ok(())
+            })
+        })
+        .await
+    }
+
+    /// The current assessment of a batch: the newest.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn assessment(&self, structure: &StructureId, batch_id: &str) -> Result<Option<Assessment>, Error> {
+        let mut found = self.current_assessments(structure, &[batch_id.to_owned()], None).await?;
+        Ok(found.remove(batch_id))
+    }
+
+    /// The current assessments of some batches, by batch; with one quantity each, if one is asked for.
+    pub(super) async fn current_assessments(
+        &self,
+        structure: &StructureId,
+        batch_ids: &[String],
+        quantity: Option<&str>,
+    ) -> Result<BTreeMap<String, Assessment>, Error> {
+        let ids = serde_json::to_string(batch_ids).map_err(|e| bad_row("batch")(&e))?;
+        let select = format!(
+            "select batch_id, model_digest, undamaged_version, structure_digest, seed, draws_per_measurement,
+                    measurements_used, measurements_left_out, misfit_percent, assessed_at_us
+             from assessment where structure_id = ? and batch_id in (select value from json_each(?))
+             order by batch_id, {CURRENT_FIRST}"
+        );
+        let rows: Vec<AssessmentRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(&ids)
+            .fetch_all(&self.reader)
+            .await?;
+        let quantities: Vec<QuantityRow> = sqlx::query_as(
+            "select batch_id, model_digest, undamaged_version, quantity, unit, kind, mean, std, variance_within,
+                    variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change
+             from quantity_assessment
+             where structure_id = ? and batch_id in (select value from json_each(?))
+               and (?3 is null or quantity = ?3)
+             order by batch_id, position",
+        )
+        .bind(structure.as_str())
+        .bind(&ids)
+        .bind(quantity)
+        .fetch_all(&self.reader)
+        .await?;
+        let mut current = BTreeMap::new();
+        for row in rows {
+            // The first of a batch is the current one.
+            if !current.contains_key(&row.batch_id) {
+                let key = (row.model_digest.clone(), row.undamaged_version);
+                current.insert(row.batch_id.clone(), (key, assessment(row)?));
+            }
+        }
+        for row in quantities {
+            if let Some((key, assessment)) = current.get_mut(&row.batch_id) {
+                if *key == (row.model_digest.clone(), row.undamaged_version) {
+                    assessment.quantities.push(quantity_assessment(row)?);
+                }
+            }
+        }
+        Ok(current.into_iter().map(|(id, (_, assessment))| (id, assessment)).collect())
+    }
+}
+
+fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
+    Ok(Assessment {
+        model_digest: Digest::from_stored(row.model_digest),
+        structure_digest: Digest::from_stored(row.structure_digest),
+        undamaged_version: Some(row.undamaged_version).filter(|version| *version > 0),
+        seed: row.seed.cast_unsigned(),
+        draws_per_measurement: row.draws_per_measurement as usize,
+        measurements_used: row.measurements_used as usize,
+        measurements_left_out: row.measurements_left_out as usize,
+        misfit_percent: from_blob("assessment", &row.misfit_percent)?,
+        assessed_at: timestamp("assessment", row.assessed_at_us)?,
+        quantities: Vec::new(),
+    })
+}
+
+fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
+    let damage = match (row.threshold, row.probability_of_damage, row.exceeds, row.relative_change) {
+        (Some(threshold), Some(probability_of_damage), Some(exceeds), Some(relative_change)) => {
+            Some(Damage { threshold, probability_of_damage, exceeds, relative_change })
+        }
+        _ => None,
+    };
+    Ok(QuantityAssessment {
+        kind: kind_of(&row.kind)?,
+        name: row.quantity,
+        unit: row.unit,
+        hyperparameters: Hyperparameters {
+            mean: row.mean,
+            std: row.std,
+            within: row.variance_within,
+            between: row.variance_between,
+        },
+        edge_mass: row.edge_mass,
+        damage,
+    })
+}
+
+fn kind_name(kind: QuantityKind) -> &'static str {
+    match kind {
+        QuantityKind::Parameter => "parameter",
+        QuantityKind::SpringStiffness => "spring_stiffness",
+    }
+}
+
+fn kind_of(name: &str) -> Result<QuantityKind, Error> {
+    let kinds = [QuantityKind::Parameter, QuantityKind::SpringStiffness];
+    kinds.into_iter().find(|kind| kind_name(*kind) == name).ok_or_else(|| bad_row("quantity")(&name))
+}

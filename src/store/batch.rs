@@ -1,0 +1,288 @@
+//! Batches and their measurements.
+
+use sqlx::sqlite::SqliteConnection;
+use sqlx::FromRow;
+
+use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
+use crate::assessment::BatchState;
+use crate::measurement::{MeasurementBatch, ModalMeasurement};
+use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
+
+/// What became of a batch.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum InsertBatch {
+    /// It is stored.
+    Inserted,
+    /// It had been stored before under this id.
+    Replayed(String),
+    /// Its key belongs to a batch of other content; nothing was stored.
+    KeyConflict {
+        /// That batch.
+        batch_id: String,
+    },
+    /// One of its measurements is in a batch of other content; nothing was stored.
+    MeasurementConflict {
+        /// Index of the measurement.
+        ordinal: usize,
+        /// Its time.
+        measured_at: Timestamp,
+        /// The batch that has it.
+        batch_id: String,
+    },
+}
+
+/// A stored batch.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BatchRecord {
+    /// Its id.
+    pub batch_id: String,
+    /// What was measured.
+    pub batch: MeasurementBatch,
+    /// Digest of what was measured.
+    pub content_digest: Digest,
+    /// When it arrived.
+    pub received_at: Timestamp,
+    /// How far it has come.
+    pub state: BatchState,
+    /// Why its assessment failed.
+    pub failure: Option<String>,
+}
+
+#[derive(FromRow)]
+struct BatchRow {
+    source: String,
+    idempotency_key: Option<String>,
+    content_digest: String,
+    received_at_us: i64,
+    state: String,
+    failure: Option<String>,
+}
+
+#[derive(FromRow)]
+struct MeasurementRow {
+    measured_at_us: i64,
+    frequency_hz: Vec<u8>,
+    std_hz: Option<Vec<u8>>,
+    covariates: String,
+    settings: String,
+}
+
+impl Store {
+    /// Stores a batch, whole or not at all, unless it is there already.
+    ///
+    /// A known key decides; without one, the measurements do, which are known by source and time.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::Sqlite`].
+    pub async fn insert_batch(
+        &self,
+        batch: &MeasurementBatch,
+        batch_id: &str,
+        received_at: Timestamp,
+    ) -> Result<InsertBatch, Error> {
+        let (batch, id) = (batch.clone(), batch_id.to_owned());
+        self.write(move |connection| {
+            Box::pin(async move {
+                let digest = batch.content_digest();
+                if let Some(known) = find_stored(connection, &batch, &digest).await? {
+                    return Ok(known);
+                }
+                insert(connection, &batch, &digest, &id, received_at).await?;
+                Ok(InsertBatch::Inserted)
+            })
+        })
+        .await
+    }
+
+    /// One batch with its measurements.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn batch(&self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
+        let row: Option<BatchRow> = sqlx::query_as(
+            "select source, idempotency_key, content_digest, received_at_us, state, failure
+             from measurement_batch where structure_id = ? and batch_id = ?",
+        )
+        .bind(structure.as_str())
+        .bind(batch_id)
+        .fetch_optional(&self.reader)
+        .await?;
+        let Some(row) = row else { return Ok(None) };
+        let measurements: Vec<MeasurementRow> = sqlx::query_as(
+            "select measured_at_us, frequency_hz, std_hz, covariates, settings
+             from measurement where structure_id = ? and batch_id = ? order by ordinal",
+        )
+        .bind(structure.as_str())
+        .bind(batch_id)
+        .fetch_all(&self.reader)
+        .await?;
+        Ok(Some(BatchRecord {
+            batch_id: batch_id.to_owned(),
+            batch: MeasurementBatch {
+                structure: structure.clone(),
+                source: row.source,
+                idempotency_key: row.idempotency_key,
+                measurements: measurements.into_iter().map(measurement).collect::<Result<_, _>>()?,
+            },
+            content_digest: Digest::from_stored(row.content_digest),
+            received_at: timestamp("batch", row.received_at_us)?,
+            state: batch_state(&row.state)?,
+            failure: row.failure,
+        }))
+    }
+
+    /// Batches of a structure that wait for their assessment, oldest first.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn pending(&self, structure: &StructureId, limit: usize) -> Result<Vec<String>, Error> {
+        let rows: Vec<(String,)> = sqlx::query_as(
+            "select batch_id from measurement_batch where structure_id = ? and state = 'received'
+             order by received_at_us, batch_id limit ?",
+        )
+        .bind(structure.as_str())
+        .bind(limit as i64)
+        .fetch_all(&self.reader)
+        .await?;
+        Ok(rows.into_iter().map(|(id,)| id).collect())
+    }
+
+    /// Marks a batch whose assessment failed.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn mark_failed(&self, structure: &StructureId, batch_id: &str, reason: &str) -> Result<(), Error> {
+        let (structure, id, reason) = (structure.to_string(), batch_id.to_owned(), reason.to_owned());
+        self.write(move |connection| {
+            Box::pin(async move {
+                sqlx::query(
+                    "update measurement_batch set state = 'failed', failure = ? where structure_id = ? and batch_id = ?",
+                )
+                .bind(reason)
+                .bind(structure)
+                .bind(id)
+                .execute(&mut *connection)
+                .await?;
+                Ok(())
+            })
+        })
+        .await
+    }
+}
+
+async fn find_stored(
+    connection: &mut SqliteConnection,
+    batch: &MeasurementBatch,
+    digest: &Digest,
+) -> Result<Option<InsertBatch>, Error> {
+    let structure = batch.structure.as_str();
+    let (exists,): (bool,) = sqlx::query_as("select exists (select 1 from structure where structure_id = ?)")
+        .bind(structure)
+        .fetch_one(&mut *connection)
+        .await?;
+    if !exists {
+        return Err(Error::UnknownStructure(structure.to_owned()));
+    }
+    if let Some(key) = &batch.idempotency_key {
+        let known: Option<(String, String)> = sqlx::query_as(
+            "select batch_id, content_digest from measurement_batch where structure_id = ? and idempotency_key = ?",
+        )
+        .bind(structure)
+        .bind(key)
+        .fetch_optional(&mut *connection)
+        .await?;
+        if let Some((batch_id, content)) = known {
+            let same = content == digest.as_str();
+            return Ok(Some(if same { InsertBatch::Replayed(batch_id) } else { InsertBatch::KeyConflict { batch_id } }));
+        }
+    }
+    for (ordinal, measurement) in batch.measurements.iter().enumerate() {
+        let holder: Option<(String, String)> = sqlx::query_as(
+            "select b.batch_id, b.content_digest from measurement m
+             join measurement_batch b using (structure_id, batch_id)
+             where m.structure_id = ? and m.source = ? and m.measured_at_us = ?",
+        )
+        .bind(structure)
+        .bind(&batch.source)
+        .bind(measurement.measured_at.micros())
+        .fetch_optional(&mut *connection)
+        .await?;
+        if let Some((batch_id, content)) = holder {
+            // Equal digests mean equal measurements: if one of them is in that batch, all are.
+            let measured_at = measurement.measured_at;
+            return Ok(Some(if content == digest.as_str() {
+                InsertBatch::Replayed(batch_id)
+            } else {
+                InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id }
+            }));
+        }
+    }
+    Ok(None)
+}
+
+async fn insert(
+    connection: &mut SqliteConnection,
+    batch: &MeasurementBatch,
+    digest: &Digest,
+    batch_id: &str,
+    received_at: Timestamp,
+) -> Result<(), Error> {
+    let (from, to) = batch.time_span();
+    sqlx::query(
+        "insert into measurement_batch (structure_id, batch_id, source, idempotency_key, content_digest, received_at_us,
+             measured_from_us, measured_to_us, measurement_count, state)
+         values (?, ?, ?, ?, ?, ?, ?, ?, ?, 'received')",
+    )
+    .bind(batch.structure.as_str())
+    .bind(batch_id)
+    .bind(&batch.source)
+    .bind(&batch.idempotency_key)
+    .bind(digest.as_str())
+    .bind(received_at.micros())
+    .bind(from.micros())
+    .bind(to.micros())
+    .bind(batch.measurements.len() as i64)
+    .execute(&mut *connection)
+    .await?;
+    let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("measurement")(&e));
+    for (ordinal, m) in batch.measurements.iter().enumerate() {
+        let frequencies = m.frequencies_hz.iter().map(|f| f.map_or(f64::NAN, Hertz::get));
+        let std = m.std_hz.as_ref().map(|stds| to_blob(stds.iter().map(|s| s.unwrap_or(f64::NAN))));
+        sqlx::query("insert into measurement values (?, ?, ?, ?, ?, ?, ?, ?, ?)")
+            .bind(batch.structure.as_str())
+            .bind(batch_id)
+            .bind(ordinal as i64)
+            .bind(&batch.source)
+            .bind(m.measured_at.micros())
+            .bind(to_blob(frequencies))
+            .bind(std)
+            .bind(json(serde_json::to_string(&m.covariates))?)
+            .bind(json(serde_json::to_string(&m.settings))?)
+            .execute(&mut *connection)
+            .await?;
+    }
+    Ok(())
+}
+
+fn measurement(row: MeasurementRow) -> Result<ModalMeasurement, Error> {
+    let what = "measurement";
+    let frequency = |value: f64| match value {
+        missing if missing.is_nan() => Ok(None),
+        value => Hertz::new(value).map(Some).map_err(|e| bad_row(what)(&e)),
+    };
+    let frequencies = from_blob(what, &row.frequency_hz)?;
+    let std = row.std_hz.map(|blob| from_blob(what, &blob)).transpose()?;
+    Ok(ModalMeasurement {
+        measured_at: timestamp(what, row.measured_at_us)?,
+        frequencies_hz: frequencies.into_iter().map(frequency).collect::<Result<_, _>>()?,
+        std_hz: std.map(|values| values.into_iter().map(|s| Some(s).filter(|s| !s.is_nan())).collect()),
+        covariates: serde_json::from_str(&row.covariates).map_err(|e| bad_row(what)(&e))?,
+        settings: serde_json::from_str(&row.settings).map_err(|e| bad_row(what)(&e))?,
+    })
+}
+
+/// The state of its name.
+pub(super) fn batch_state(name: &str) -> Result<BatchState, Error> {
+    let states = [BatchState::Received, BatchState::Assessed, BatchState::Failed];
+    states.into_iter().find(|s| s.as_str() == name).ok_or_else(|| bad_row("batch")(&name))
+}

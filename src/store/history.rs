@@ -1,0 +1,194 @@
+//! Pages of history and of exceedances, by keyset: a page costs the same at the end as at the beginning.
+
+use sqlx::FromRow;
+
+use super::batch::batch_state;
+use super::{timestamp, Error, Store};
+use crate::assessment::{Assessment, BatchState};
+use crate::quantity::{Digest, StructureId, Timestamp};
+
+/// Which part of the history.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct HistoryQuery {
+    /// Batches that begin at or after this time.
+    pub from: Option<Timestamp>,
+    /// Batches that begin before this time.
+    pub to: Option<Timestamp>,
+    /// Only this quantity.
+    pub parameter: Option<String>,
+    /// Most items.
+    pub limit: usize,
+    /// Behind this place: time of the first measurement and id of the last item of the page before.
+    pub after: Option<(Timestamp, String)>,
+    /// For exceedances, of which a batch can have several: the quantity of the last item of the page before.
+    pub after_quantity: Option<String>,
+}
+
+/// A batch of the history.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HistoryEntry {
+    /// Its id.
+    pub batch_id: String,
+    /// Where it came from.
+    pub source: String,
+    /// Time of its first measurement.
+    pub measured_from: Timestamp,
+    /// Time of its last measurement.
+    pub measured_to: Timestamp,
+    /// When it arrived.
+    pub received_at: Timestamp,
+    /// Its measurements.
+    pub measurement_count: usize,
+    /// How far it has come.
+    pub state: BatchState,
+    /// Why its assessment failed.
+    pub failure: Option<String>,
+    /// Its current assessment.
+    pub assessment: Option<Assessment>,
+}
+
+/// A probability of damage above the undamaged threshold, in the current assessment of a batch.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Exceedance {
+    /// The batch.
+    pub batch_id: String,
+    /// Time of its first measurement.
+    pub measured_from: Timestamp,
+    /// Time of its last measurement.
+    pub measured_to: Timestamp,
+    /// The quantity.
+    pub quantity: String,
+    /// Its unit.
+    pub unit: String,
+    /// Its probability of damage.
+    pub probability_of_damage: f64,
+    /// The probability that was exceeded.
+    pub threshold_probability: f64,
+    /// δ, in the unit.
+    pub threshold: f64,
+    /// (μ − μ_ud)/μ_ud.
+    pub relative_change: f64,
+    /// The undamaged state compared with.
+    pub undamaged_version: u32,
+    /// The trained baseline.
+    pub model_digest: Digest,
+}
+
+#[derive(FromRow)]
+struct EntryRow {
+    batch_id: String,
+    source: String,
+    measured_from_us: i64,
+    measured_to_us: i64,
+    received_at_us: i64,
+    measurement_count: i64,
+    state: String,
+    failure: Option<String>,
+}
+
+#[derive(FromRow)]
+struct ExceedanceRow {
+    batch_id: String,
+    measured_from_us: i64,
+    measured_to_us: i64,
+    quantity: String,
+    unit: String,
+    probability_of_damage: f64,
+    threshold_probability: f64,
+    threshold: f64,
+    relative_change: f64,
+    undamaged_version: u32,
+    model_digest: String,
+}
+
+impl Store {
+    /// A page of batches with their current assessments, by (first measurement, id), oldest first.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn history(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
+        let (after_time, after_id) = query.after.clone().unzip();
+        let rows: Vec<EntryRow> = sqlx::query_as(
+            "select batch_id, source, measured_from_us, measured_to_us, received_at_us, measurement_count, state, failure
+             from measurement_batch
+             where structure_id = ?1 and measured_from_us >= ?2 and measured_from_us < ?3
+               and (measured_from_us, batch_id) > (?4, ?5)
+             order by measured_from_us, batch_id limit ?6",
+        )
+        .bind(structure.as_str())
+        .bind(query.from.map_or(i64::MIN, Timestamp::micros))
+        .bind(query.to.map_or(i64::MAX, Timestamp::micros))
+        .bind(after_time.map_or(i64::MIN, Timestamp::micros))
+        .bind(after_id.unwrap_or_default())
+        .bind(query.limit as i64)
+        .fetch_all(&self.reader)
+        .await?;
+        let ids: Vec<String> = rows.iter().map(|row| row.batch_id.clone()).collect();
+        let mut assessments = self.current_assessments(structure, &ids, query.parameter.as_deref()).await?;
+        let entry = |row: EntryRow| {
+            Ok(HistoryEntry {
+                assessment: assessments.remove(&row.batch_id),
+                batch_id: row.batch_id,
+                source: row.source,
+                measured_from: timestamp("batch", row.measured_from_us)?,
+                measured_to: timestamp("batch", row.measured_to_us)?,
+                received_at: timestamp("batch", row.received_at_us)?,
+                measurement_count: row.measurement_count as usize,
+                state: batch_state(&row.state)?,
+                failure: row.failure,
+            })
+        };
+        rows.into_iter().map(entry).collect()
+    }
+
+    /// A page of exceedances in current assessments, by (first measurement, id, quantity), newest first.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn exceedances(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
+        let (before_time, before_id) = query.after.clone().unzip();
+        let select = format!(
+            "select b.batch_id, b.measured_from_us, b.measured_to_us, q.quantity, q.unit, q.probability_of_damage,
+                    u.threshold_probability, q.threshold, q.relative_change, q.undamaged_version, q.model_digest
+             from measurement_batch b
+             join quantity_assessment q using (structure_id, batch_id)
+             join undamaged_state u on u.structure_id = q.structure_id and u.version = q.undamaged_version
+             where b.structure_id = ?1 and b.measured_from_us >= ?2 and b.measured_from_us < ?3 and q.exceeds = 1
+               and (?4 is null or (b.measured_from_us, b.batch_id, q.quantity) < (?4, ?5, ?6))
+               and (?7 is null or q.quantity = ?7)
+               and (q.model_digest, q.undamaged_version) = (
+                   select model_digest, undamaged_version from assessment a
+                   where a.structure_id = b.structure_id and a.batch_id = b.batch_id
+                   order by {} limit 1)
+             order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit ?8",
+            super::assessment::CURRENT_FIRST
+        );
+        let rows: Vec<ExceedanceRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(query.from.map_or(i64::MIN, Timestamp::micros))
+            .bind(query.to.map_or(i64::MAX, Timestamp::micros))
+            .bind(before_time.map(Timestamp::micros))
+            .bind(before_id.unwrap_or_default())
+            .bind(query.after_quantity.clone().unwrap_or_default())
+            .bind(query.parameter.clone())
+            .bind(query.limit as i64)
+            .fetch_all(&self.reader)
+            .await?;
+        let exceedance = |row: ExceedanceRow| {
+            Ok(Exceedance {
+                batch_id: row.batch_id,
+                measured_from: timestamp("batch", row.measured_from_us)?,
+                measured_to: timestamp("batch", row.measured_to_us)?,
+                quantity: row.quantity,
+                unit: row.unit,
+                probability_of_damage: row.probability_of_damage,
+                threshold_probability: row.threshold_probability,
+                threshold: row.threshold,
+                relative_change: row.relative_change,
+                undamaged_version: row.undamaged_version,
+                model_digest: Digest::from_stored(row.model_digest),
+            })
+        };
+        rows.into_iter().map(exceedance).collect()
+    }
+}
