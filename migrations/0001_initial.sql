@@ -56,6 +56,7 @@ create table assessment (
     draws_per_measurement integer not null check (draws_per_measurement > 0),
     measurements_used     integer not null check (measurements_used > 0),
     measurements_left_out integer not null check (measurements_left_out >= 0),
+    measurements_outside  integer not null check (measurements_outside >= 0),
     misfit_percent        blob    not null,  -- f64 for each mode, %
     assessed_at_us        integer not null,
     primary key (structure_id, batch_id, model_digest, undamaged_version),

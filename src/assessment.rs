@@ -45,6 +45,8 @@ pub struct Assessment {
     pub measurements_used: usize,
     /// Measurements left out because a mode is missing.
     pub measurements_left_out: usize,
+    /// Of those used, measurements that no point of the prior box gives; they count as the nearest point of the box.
+    pub measurements_outside: usize,
     /// For each mode, 100·(mean measured − simulated)/mean measured, simulated at the mean of all posterior samples: what
     /// the simulation cannot reproduce, in per cent.
     pub misfit_percent: Vec<f64>,

@@ -34,9 +34,10 @@ impl Hyperparameters {
     pub fn from_pool(pool: &[f64], draws: usize) -> Self {
         let measurements = pool.len() / draws;
         let means: Vec<f64> = pool.chunks(draws).map(stats::mean).collect();
-        let spread = pool.chunks(draws).zip(&means).map(|(samples, mean)| {
-            samples.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / draws as f64
-        });
+        let spread = pool
+            .chunks(draws)
+            .zip(&means)
+            .map(|(samples, mean)| samples.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / draws as f64);
         let within = spread.sum::<f64>() / measurements as f64;
         let between = stats::sample_std(&means).map(|std| std.powi(2));
         let bessel = measurements as f64 / (measurements as f64 - 1.0);

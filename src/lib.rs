@@ -1,4 +1,62 @@
-//! modalwatch
+//! **modalwatch** watches structures through their natural frequencies.
+//!
+//! A batch of measured frequencies goes in; out come the stiffnesses the structure has now, with their spread, and for
+//! each the probability that it has fallen below what the undamaged structure showed. Between them stands a conditional
+//! invertible neural network, trained once on simulations of the structure.
+//!
+//! # The house
+//!
+//! Numbers with units enter at the bottom, JSON leaves at the top. Each room uses only rooms below it;
+//! `tests/architecture.rs` holds them to it.
+//!
+//! ```text
+//!  cli · http                            the doors      words for people and programs
+//!  config · telemetry                    what the doors are set to, and what they log
+//!  monitor                               the office     what happens to a batch
+//!  store                                 the archive    the only room that speaks SQL
+//!  assessment                            the result of one batch
+//!  damage                                judgement on posterior samples
+//!  baseline                              a trained flow, its record, and where it is found
+//!  posterior                             samples of the parameters, whoever drew them
+//!  simulator                             the bench      parameters in, natural frequencies out
+//!  physics | flow                        two workshops  structures without networks | networks without structures
+//!  parameter · measurement               what is unknown · what arrives
+//!  quantity · stats                      the foundation
+//! ```
+//!
+//! # Reading order
+//!
+//! [`quantity`], [`parameter`], [`measurement`], then [`physics`] and [`simulator`], then [`flow`] and [`baseline`], then
+//! [`damage`], [`monitor`], [`store`], [`http`].
+//!
+//! # Words
+//!
+//! | word | here |
+//! |---|---|
+//! | parameter | an unknown of the structure, mostly a stiffness; θ is a vector of them |
+//! | batch | measurements of one structure taken in one state |
+//! | hyperparameters | mean and standard deviation of a parameter over a batch |
+//! | baseline | a trained flow with its manifest: `models/<structure>/baseline.safetensors` and `.json` |
+//! | model digest | SHA-256 of the manifest; names the baseline in every result |
+//! | undamaged state | the batches later ones are compared with; made by `POST …/baseline` |
+//! | threshold δ | μ_ud − 1.645 σ_ud: below it a value counts as damaged |
+//! | probability of damage | share of a batch's samples below δ |
+//! | exceedance | a probability of damage above that of the undamaged state, 5 % |
+//! | outside | a measurement that no parameters of the prior give |
+//!
+//! # References
+//!
+//! - T. Wang et al. (2025), Stochastic model updating and damage detection with a conditional invertible neural network,
+//!   Mechanical Systems and Signal Processing 232, 112743. The method.
+//! - L. Dinh, J. Sohl-Dickstein, S. Bengio (2017), Density estimation using Real NVP, ICLR. Affine couplings.
+//! - L. Ardizzone et al. (2019), Guided image generation with conditional invertible neural networks,
+//!   arXiv:1907.02392. Conditions on couplings.
+//! - R. B. Nelson (1976), Simplified calculation of eigenvector derivatives, AIAA Journal 14, 1201–1205,
+//!   doi:10.2514/3.7211; I. U. Ojalvo (1988), Efficient computation of modal sensitivities for systems with repeated
+//!   frequencies, AIAA Journal 26, 361–366, doi:10.2514/3.9897. Derivatives of eigenvalues.
+//! - R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
+//!   doi:10.1080/00031305.1996.10473566.
+
 pub mod assessment;
 pub mod baseline;
 pub mod cli;

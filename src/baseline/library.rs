@@ -151,8 +151,7 @@ pub enum StructureFileError {
 pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError> {
     let bytes = std::fs::read(path).map_err(|source| StructureFileError::Read { path: path.to_owned(), source })?;
     let name = path.to_string_lossy();
-    read_definition(&name, &bytes)
-        .map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
+    read_definition(&name, &bytes).map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
 }
 
 /// A shipped or stored structure for the command line: a file, or the id of a shipped structure.

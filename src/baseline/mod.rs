@@ -2,6 +2,7 @@
 
 pub mod library;
 pub mod manifest;
+pub mod reach;
 pub mod train;
 
 use candle_core::{DType, Device, Tensor};
@@ -64,7 +65,9 @@ pub enum LoadError {
     #[error(transparent)]
     Weights(#[from] checkpoint::Error),
     /// The self-test gave other draws than when it was trained.
-    #[error("the self-test differs by {difference:.2e} of the prior's width (at most {SELF_TEST_TOLERANCE:.0e} is allowed)")]
+    #[error(
+        "the self-test differs by {difference:.2e} of the prior's width (at most {SELF_TEST_TOLERANCE:.0e} is allowed)"
+    )]
     SelfTest {
         /// Largest difference, as a share of the prior's width.
         difference: f64,
@@ -160,7 +163,12 @@ impl Baseline {
     ///
     /// # Errors
     /// [`InferenceError`] for another number of modes or a draw that is not finite.
-    pub fn infer(&self, frequencies_hz: &[Vec<f64>], draws: usize, seed: u64) -> Result<PosteriorSamples, InferenceError> {
+    pub fn infer(
+        &self,
+        frequencies_hz: &[Vec<f64>],
+        draws: usize,
+        seed: u64,
+    ) -> Result<PosteriorSamples, InferenceError> {
         let y = self.condition(frequencies_hz)?;
         let x = self.flow.sample(&y, draws, &mut stats::stream(seed, "latent"))?;
         let real = x.to_dtype(DType::F64)?.to_vec2::<f64>()?;

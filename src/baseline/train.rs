@@ -3,9 +3,7 @@
 use candle_core::{DType, Tensor};
 use nalgebra::DMatrix;
 
-use super::manifest::{
-    Manifest, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening, FORMAT,
-};
+use super::manifest::{Manifest, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening, FORMAT};
 use super::{to_real_line, Baseline, InferenceError};
 use crate::flow::train::{EpochReport, Pairs, Stopped, TrainSettings};
 use crate::flow::{checkpoint, weights, FlowSettings};
@@ -97,8 +95,7 @@ pub fn train(
     let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
     let training_pairs = pairs(&training, space, &whitening)?;
     let validation_pairs = pairs(&validation, space, &whitening)?;
-    let outcome =
-        crate::flow::train::train(&flow, &weights, &training_pairs, &validation_pairs, settings, on_epoch)?;
+    let outcome = crate::flow::train::train(&flow, &weights, &training_pairs, &validation_pairs, settings, on_epoch)?;
 
     let weight_bytes = checkpoint::to_bytes(&weights)?;
     let mut manifest = Manifest {
@@ -218,11 +215,7 @@ pub fn validate(baseline: &Baseline, held_out: &TrainingSet, seed: u64) -> Resul
 }
 
 /// Largest |u − u'| after x → z → x', u the position in the prior box.
-fn inverse_error(
-    baseline: &Baseline,
-    theta: &DMatrix<f64>,
-    frequencies: &[Vec<f64>],
-) -> Result<f64, InferenceError> {
+fn inverse_error(baseline: &Baseline, theta: &DMatrix<f64>, frequencies: &[Vec<f64>]) -> Result<f64, InferenceError> {
     let x = to_real_line(theta, baseline.space())?.to_dtype(DType::F32)?;
     let context = baseline.flow.summarise(&baseline.condition(frequencies)?)?;
     let (z, _) = baseline.flow.forward(&x, &context)?;

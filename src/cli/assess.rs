@@ -80,7 +80,10 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
         println!("{}", serde_json::to_string_pretty(&report)?);
         return Ok(());
     }
-    println!("{} measurements, {} left out", assessment.measurements_used, assessment.measurements_left_out);
+    println!(
+        "{} measurements used ({} of them outside the prior), {} left out for a missing mode",
+        assessment.measurements_used, assessment.measurements_outside, assessment.measurements_left_out
+    );
     let misfit: Vec<String> = assessment.misfit_percent.iter().map(|m| format!("{m:+.3}")).collect();
     println!("simulation misses the mean frequencies by {} %", misfit.join(", "));
     println!("{:>16} {:>12} {:>12} {:>12} {:>8} {:>8}", "parameter", "mean", "std", "threshold", "PoD", "exceeds");

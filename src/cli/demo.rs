@@ -95,7 +95,8 @@ struct ParameterReport {
 /// A service that does not start, or an answer that is not a success.
 pub async fn demo(args: DemoArgs) -> anyhow::Result<()> {
     // The table is what people came for; the log speaks up only when something is wrong.
-    telemetry::start(&LogSettings { level: "warn".to_owned(), ..LogSettings::default() }).map_err(anyhow::Error::msg)?;
+    telemetry::start(&LogSettings { level: "warn".to_owned(), ..LogSettings::default() })
+        .map_err(anyhow::Error::msg)?;
     let temporary = tempfile::tempdir().context("cannot make a temporary folder")?;
     let data_dir = args.data_dir.clone().unwrap_or_else(|| temporary.path().to_owned());
     let listen = match &args.listen {
@@ -170,8 +171,7 @@ struct Drawn {
 }
 
 fn draw(simulator: &Simulator, scenario: &Scenario, seed: u64, index: usize) -> anyhow::Result<Drawn> {
-    let moments: Vec<(String, f64, f64)> =
-        (0..3).map(|k| (format!("k{}", k + 1), scenario.mean[k], STD[k])).collect();
+    let moments: Vec<(String, f64, f64)> = (0..3).map(|k| (format!("k{}", k + 1), scenario.mean[k], STD[k])).collect();
     let population = Population::new(simulator.space(), &moments)?;
     // Each scenario has its own draws; the digest keeps neighbouring seeds apart.
     let drawn = population.draw(simulator, MEASUREMENTS, seed_of(seed, index))?;
@@ -233,7 +233,17 @@ fn print_table(report: &Report) {
     println!("{:22}{group}", "");
     println!(
         "{:<12} {:>5}    {:>8} {:>10} {:>10}   {:>8} {:>10} {:>8}   {:>8} {:>9} {:>7} {:>9}  exceeds",
-        "scenario", "", "target", "realised", "updated", "target", "realised", "updated", "target", "realised", "paper",
+        "scenario",
+        "",
+        "target",
+        "realised",
+        "updated",
+        "target",
+        "realised",
+        "updated",
+        "target",
+        "realised",
+        "paper",
         "updated"
     );
     let percent = |p: Option<f64>| p.map_or("-".to_owned(), |p| format!("{:.1}", 100.0 * p));
@@ -258,6 +268,8 @@ fn print_table(report: &Report) {
             );
         }
     }
-    println!("\nA healthy batch of {MEASUREMENTS} has a PoD near 5 % and exceeds 5 % about every second time: an exceedance");
+    println!(
+        "\nA healthy batch of {MEASUREMENTS} has a PoD near 5 % and exceeds 5 % about every second time: an exceedance"
+    );
     println!("is not yet an alarm. Set \"updated\" beside \"realised\": {MEASUREMENTS} draws scatter about their population.");
 }

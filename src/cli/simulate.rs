@@ -48,8 +48,7 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let population = Population::new(simulator.space(), &moments)?;
     let drawn = population.draw(&simulator, args.measurements, args.seed)?;
     let start = Timestamp::parse(&args.start).context("--start")?;
-    let rows: Vec<Vec<f64>> =
-        drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
+    let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
     let measurements = at_intervals(&rows, start, args.interval_s)?;
     let text = csv::write(&measurements);
     match &args.out {

@@ -80,7 +80,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     println!("model digest {}", trained.baseline.digest());
     print_validation(&manifest.validation);
     if diverged(manifest) {
-        println!("The loss was not finite at the end: the weights of epoch {} were kept.", manifest.training.best_epoch);
+        println!(
+            "The loss was not finite at the end: the weights of epoch {} were kept.",
+            manifest.training.best_epoch
+        );
     }
     Ok(())
 }

@@ -69,6 +69,7 @@ pub struct AssessmentBody {
     draws_per_measurement: usize,
     measurements_used: usize,
     measurements_left_out: usize,
+    measurements_outside: usize,
     misfit_percent: Vec<f64>,
     assessed_at: Timestamp,
     exceeds: bool,
@@ -103,6 +104,7 @@ impl From<Assessment> for AssessmentBody {
             draws_per_measurement: a.draws_per_measurement,
             measurements_used: a.measurements_used,
             measurements_left_out: a.measurements_left_out,
+            measurements_outside: a.measurements_outside,
             misfit_percent: a.misfit_percent,
             assessed_at: a.assessed_at,
             exceeds,
@@ -164,8 +166,22 @@ impl From<HistoryEntry> for HistoryItem {
 
 /// Columns of the history as CSV: one row for each batch and quantity, or one with empty places without an assessment.
 pub const HISTORY_COLUMNS: [&str; 16] = [
-    "batch", "source", "measured_from", "measured_to", "measurement_count", "state", "parameter", "unit", "mean", "std",
-    "edge_mass", "threshold", "probability_of_damage", "exceeds", "relative_change", "model_digest",
+    "batch",
+    "source",
+    "measured_from",
+    "measured_to",
+    "measurement_count",
+    "state",
+    "parameter",
+    "unit",
+    "mean",
+    "std",
+    "edge_mass",
+    "threshold",
+    "probability_of_damage",
+    "exceeds",
+    "relative_change",
+    "model_digest",
 ];
 
 impl HistoryItem {

@@ -130,8 +130,7 @@ fn parse_batch(
     };
     let source = source.or(query.source).unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
     check_source(&source).map_err(|problem| ApiError::invalid_input(vec![problem]))?;
-    let measurements =
-        check_measurements(raw, &monitor.expectation(watched)).map_err(ApiError::invalid_input)?;
+    let measurements = check_measurements(raw, &monitor.expectation(watched)).map_err(ApiError::invalid_input)?;
     Ok(MeasurementBatch { structure, source, idempotency_key, measurements })
 }
 

@@ -58,7 +58,11 @@ impl ApiError {
     /// 500: logged once, here, with its cause; the client learns nothing internal.
     pub fn internal(cause: &dyn std::fmt::Display) -> Self {
         error!(cause = %cause, "Answering 500: {cause}");
-        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "internal error; the log has the cause under this request id")
+        Self::new(
+            StatusCode::INTERNAL_SERVER_ERROR,
+            "internal",
+            "internal error; the log has the cause under this request id",
+        )
     }
 
     /// The same error with another header.
@@ -100,9 +104,12 @@ impl From<crate::store::Error> for ApiError {
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
-        let problem = ProblemDetails::from_status_code(self.status)
-            .with_detail(self.detail)
-            .with_extensions(Extensions { code: self.code, errors: self.errors, request_id: super::request::current_id() });
+        let problem =
+            ProblemDetails::from_status_code(self.status).with_detail(self.detail).with_extensions(Extensions {
+                code: self.code,
+                errors: self.errors,
+                request_id: super::request::current_id(),
+            });
         let mut response = problem.into_response();
         if let Some((name, value)) = self.header {
             response.headers_mut().insert(name, value);

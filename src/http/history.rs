@@ -9,9 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::answer::{HistoryItem, Undamaged, HISTORY_COLUMNS};
 use super::error::ApiError;
-use super::request::{
-    media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery,
-};
+use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery};
 use super::Shared;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::HistoryQuery;
@@ -97,9 +95,7 @@ pub async fn history(
     let page = page(&query)?;
     let limit = page.limit;
     let entries = shared.monitor.store().history(&id, &page).await?;
-    let next = (entries.len() == limit)
-        .then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id)))
-        .flatten();
+    let next = (entries.len() == limit).then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id))).flatten();
     let items: Vec<HistoryItem> = entries.into_iter().map(HistoryItem::from).collect();
     let mut response = if csv {
         ([(header::CONTENT_TYPE, "text/csv; charset=utf-8")], to_csv(&items)).into_response()
@@ -207,9 +203,7 @@ fn parse_cursor(text: &str) -> Result<(Timestamp, String, Option<String>), ApiEr
     let mut parts = text.splitn(3, '~');
     let time = parts.next().and_then(|t| t.parse().ok()).and_then(|t| Timestamp::from_micros(t).ok());
     match (time, parts.next()) {
-        (Some(time), Some(batch)) if batch.len() <= 64 => {
-            Ok((time, batch.to_owned(), parts.next().map(str::to_owned)))
-        }
+        (Some(time), Some(batch)) if batch.len() <= 64 => Ok((time, batch.to_owned(), parts.next().map(str::to_owned))),
         _ => {
             let message = format!("{} was not given out by this service", crate::quantity::shown(text));
             Err(ApiError::invalid_field("query/cursor", message))

@@ -66,8 +66,7 @@ pub struct Shared {
 
 /// All routes of the service.
 pub fn router(monitor: Monitor, metrics: PrometheusHandle, settings: &HttpSettings) -> Router {
-    let limits =
-        BodyLimits { bytes: settings.max_body_bytes, time: Duration::from_secs(settings.body_timeout_s) };
+    let limits = BodyLimits { bytes: settings.max_body_bytes, time: Duration::from_secs(settings.body_timeout_s) };
     let shared = Shared { monitor, metrics: Arc::new(metrics), limits };
     Router::new()
         .route("/v1/structures", get(structures::list))

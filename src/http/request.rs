@@ -137,9 +137,9 @@ fn not_a_number_at(bytes: &[u8], line: usize, column: usize) -> Option<&'static 
     // The parser stops at or just behind the first character it cannot use.
     let around = &line[column.saturating_sub(2).min(line.len())..];
     let around = &around[..around.len().min(12)];
-    ["-Infinity", "Infinity", "NaN"].into_iter().find(|word| {
-        around.windows(word.len()).take(3).any(|window| window == word.as_bytes())
-    })
+    ["-Infinity", "Infinity", "NaN"]
+        .into_iter()
+        .find(|word| around.windows(word.len()).take(3).any(|window| window == word.as_bytes()))
 }
 
 fn pointer(path: &serde_path_to_error::Path) -> String {

@@ -231,8 +231,9 @@ fn check_frequencies(
             None
         });
         if let Some(outside) = hertz.map(Hertz::get).filter(|f| !(lowest..=highest).contains(f)) {
-            let message =
-                format!("{outside} Hz is far from anything this structure has ({lowest:.3e} to {highest:.3e} Hz): is it in Hz?");
+            let message = format!(
+                "{outside} Hz is far from anything this structure has ({lowest:.3e} to {highest:.3e} Hz): is it in Hz?"
+            );
             problems.add(pointer(), message);
         }
         frequencies.push(hertz);

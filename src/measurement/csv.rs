@@ -187,7 +187,8 @@ fn row(
     };
     for (column, cell) in columns.iter().zip(record).filter(|(_, cell)| !cell.is_empty()) {
         let number = |name: String| {
-            number(cell, decimal_comma).map_err(|message| vec![Problem::new(format!("line {line}, column {name}"), message)])
+            number(cell, decimal_comma)
+                .map_err(|message| vec![Problem::new(format!("line {line}, column {name}"), message)])
         };
         match column {
             Column::Ignored => {}
@@ -211,7 +212,8 @@ fn row(
     // A row without any standard deviation says nothing about them.
     raw.std_hz = raw.std_hz.filter(|stds| stds.iter().any(Option::is_some));
     if times == Times::RowNumber && !columns.contains(&Column::Time) {
-        let time = Timestamp::from_micros(index as i64 * 1_000_000).expect("a table has fewer rows than years have seconds");
+        let time =
+            Timestamp::from_micros(index as i64 * 1_000_000).expect("a table has fewer rows than years have seconds");
         raw.measured_at = Some(time.to_string());
     }
     Ok(raw)

@@ -1,6 +1,9 @@
 //! From the measurements of a batch to its assessment: pure, so that service and command line agree to the bit.
 
+use rayon::prelude::*;
+
 use crate::assessment::Assessment;
+use crate::baseline::reach::{reach, Reach};
 use crate::baseline::{Baseline, InferenceError};
 use crate::damage::{self, QuantityKind, QuantitySamples, UndamagedState};
 use crate::measurement::ModalMeasurement;
@@ -44,6 +47,8 @@ pub struct BatchSamples {
     pub frequencies_hz: Vec<Vec<f64>>,
     /// Measurements left out because a mode is missing.
     pub left_out: usize,
+    /// Measurements that no point of the prior box gives; they are drawn from as their nearest point.
+    pub outside: usize,
 }
 
 /// Draws from the posterior of each complete measurement.
@@ -55,8 +60,37 @@ pub fn draw(baseline: &Baseline, measurements: &[ModalMeasurement], draws: Draws
     if frequencies_hz.is_empty() {
         return Err(Error::NoCompleteMeasurement { measurements: measurements.len() });
     }
+    let left_out = measurements.len() - frequencies_hz.len();
     let posterior = baseline.infer(&frequencies_hz, draws.per_measurement, draws.seed)?;
-    Ok(BatchSamples { posterior, left_out: measurements.len() - frequencies_hz.len(), frequencies_hz })
+    let nearest = nearest_points(baseline, &posterior, &frequencies_hz)?;
+    let outside = nearest.iter().flatten().count();
+    if outside == 0 {
+        return Ok(BatchSamples { posterior, frequencies_hz, left_out, outside });
+    }
+    let given = |(nearest, measured): (Option<Vec<f64>>, &Vec<f64>)| nearest.unwrap_or_else(|| measured.clone());
+    let condition: Vec<Vec<f64>> = nearest.into_iter().zip(&frequencies_hz).map(given).collect();
+    let posterior = baseline.infer(&condition, draws.per_measurement, draws.seed)?;
+    Ok(BatchSamples { posterior, frequencies_hz, left_out, outside })
+}
+
+/// For each measurement that the simulation cannot give inside the prior box, the frequencies that come nearest.
+///
+/// A flow has seen nothing beyond the box: asked about it, it answers at random, in all parameters. The nearest point
+/// keeps the parameters that do fit and puts the others at the edge.
+fn nearest_points(
+    baseline: &Baseline,
+    posterior: &PosteriorSamples,
+    frequencies_hz: &[Vec<f64>],
+) -> Result<Vec<Option<Vec<f64>>>, crate::physics::Error> {
+    let means = posterior.means();
+    let look = |(row, measured): (usize, &Vec<f64>)| {
+        let start: Vec<f64> = means.row(row).iter().copied().collect();
+        Ok(match reach(baseline.simulator(), measured, &start)? {
+            Reach::Inside => None,
+            Reach::Outside { nearest_hz, .. } => Some(nearest_hz),
+        })
+    };
+    frequencies_hz.par_iter().enumerate().map(look).collect()
 }
 
 /// Samples of everything that is monitored: each parameter, and the stiffness of each spring set through a law.
@@ -106,6 +140,7 @@ pub fn assess(
         draws_per_measurement: draws.per_measurement,
         measurements_used: samples.frequencies_hz.len(),
         measurements_left_out: samples.left_out,
+        measurements_outside: samples.outside,
         misfit_percent: misfit_percent(baseline, &samples)?,
         assessed_at: Timestamp::now(),
         quantities: damage::assess(&monitored_quantities(baseline, &samples.posterior), undamaged),

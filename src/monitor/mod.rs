@@ -72,7 +72,9 @@ pub enum Error {
         batch: String,
     },
     /// A measurement of this source and time is stored already, with other content around it.
-    #[error("measurement {ordinal} at {measured_at} of this source is already in batch {batch}, which has other content")]
+    #[error(
+        "measurement {ordinal} at {measured_at} of this source is already in batch {batch}, which has other content"
+    )]
     MeasurementConflict {
         /// Index in the batch that was posted.
         ordinal: usize,
@@ -326,8 +328,7 @@ impl Monitor {
         let state = UndamagedState::from_samples(0, &samples, threshold_probability)?;
 
         let store = self.store.clone();
-        let version =
-            store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
+        let version = store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
         info!(structure.id = %structure, version, "Undamaged state {version} of {structure} from {} batches", batch_ids.len());
         self.resume_later(structure.clone());
         let stored = self.store.undamaged(structure).await?;

@@ -89,7 +89,9 @@ pub enum Error {
         masses: usize,
     },
     /// A mass that no chain of springs ties to the ground.
-    #[error("mass \"{mass}\" is not tied to the ground by springs of positive stiffness: the structure is a mechanism")]
+    #[error(
+        "mass \"{mass}\" is not tied to the ground by springs of positive stiffness: the structure is a mechanism"
+    )]
     Mechanism {
         /// Name of a floating mass.
         mass: String,

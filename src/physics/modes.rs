@@ -66,8 +66,7 @@ pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
     order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
     let sorted: Vec<f64> = order.iter().map(|i| eigenvalues[*i]).collect();
     let n = order.len();
-    let all_shapes =
-        DMatrix::from_fn(n, n, |row, column| inverse_root_mass[row] * eigenvectors[(row, order[column])]);
+    let all_shapes = DMatrix::from_fn(n, n, |row, column| inverse_root_mass[row] * eigenvectors[(row, order[column])]);
     Ok(Modes { frequencies_hz: frequencies(&sorted, count)?, eigenvalues: sorted, all_shapes })
 }
 

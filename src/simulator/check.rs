@@ -29,7 +29,8 @@ type Problems = Vec<DefinitionProblem>;
 /// Checks a definition; all mistakes of a stage are reported together, a later stage needs the earlier ones.
 pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problems> {
     let mut problems = Problems::new();
-    let id = StructureId::parse(&definition.id).map_err(|e| problems.push(DefinitionProblem::new("/id", e.to_string())));
+    let id =
+        StructureId::parse(&definition.id).map_err(|e| problems.push(DefinitionProblem::new("/id", e.to_string())));
     check_head(definition, &mut problems);
     let masses = check_masses(definition, &mut problems);
     let ends = check_springs(definition, &masses, &mut problems);
@@ -44,9 +45,9 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
         return Err(problems);
     }
     let masses = definition.masses.iter().map(|m| Mass { name: m.name.clone(), kg: m.kg }).collect();
-    let structure = Structure::new(masses, springs).map_err(|e| vec![DefinitionProblem::new("/spring", e.to_string())])?;
-    let covariates =
-        definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
+    let structure =
+        Structure::new(masses, springs).map_err(|e| vec![DefinitionProblem::new("/spring", e.to_string())])?;
+    let covariates = definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
     Ok(Checked { id, structure, space, bindings, covariates })
 }
 
@@ -64,7 +65,8 @@ fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
         MeasurementNoise::Hz(std_hz) => ("hz", std_hz),
     };
     if !(noise.is_finite() && noise >= 0.0) || (key == "relative" && noise >= 0.5) {
-        let message = format!("{noise} is no standard deviation: it must be finite, not negative, and relative below 0.5");
+        let message =
+            format!("{noise} is no standard deviation: it must be finite, not negative, and relative below 0.5");
         problems.push(DefinitionProblem::new(format!("/measurement_noise/{key}"), message));
     }
     if definition.parameters.is_empty() {
@@ -118,7 +120,11 @@ fn check_springs(
             _ if name == "ground" => Node::Ground,
             Some(mass) => Node::Mass(*mass),
             None => {
-                let message = format!("spring {} goes to {}, which is no mass and not \"ground\"", shown(&spring.name), shown(name));
+                let message = format!(
+                    "spring {} goes to {}, which is no mass and not \"ground\"",
+                    shown(&spring.name),
+                    shown(name)
+                );
                 problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
                 Node::Ground
             }
@@ -226,12 +232,7 @@ fn springs(
 }
 
 /// No value of the prior may give a negative stiffness or cut a mass off from the ground.
-fn check_priors(
-    definition: &StructureDefinition,
-    springs: &[Spring],
-    bindings: &[Binding],
-    problems: &mut Problems,
-) {
+fn check_priors(definition: &StructureDefinition, springs: &[Spring], bindings: &[Binding], problems: &mut Problems) {
     let mut weakest: Vec<Spring> = springs.to_vec();
     for binding in bindings {
         let Prior::Uniform([lower, upper]) = definition.parameters[binding.parameter].prior;
@@ -252,7 +253,9 @@ fn check_priors(
     let masses = definition.masses.len();
     if let Some(mass) = floating_mass(masses, springs.iter().filter(|s| s.n_per_m > 0.0)) {
         let name = shown(&definition.masses[mass].name);
-        let message = format!("mass {name} is not tied to the ground by springs of positive stiffness: the structure is a mechanism");
+        let message = format!(
+            "mass {name} is not tied to the ground by springs of positive stiffness: the structure is a mechanism"
+        );
         problems.push(DefinitionProblem::new("/spring", message));
     } else if let Some(mass) = floating_mass(masses, weakest.iter().filter(|s| s.n_per_m > 0.0)) {
         let name = shown(&definition.masses[mass].name);

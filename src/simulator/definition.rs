@@ -270,7 +270,8 @@ fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, DefinitionError> {
     let failed = |pointer: String, error: &serde_json::Error| DefinitionError {
         problems: vec![DefinitionProblem { pointer, line: Some(error.line()), message: error.to_string() }],
     };
-    let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(pointer(e.path()), e.inner()))?;
+    let value =
+        serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(pointer(e.path()), e.inner()))?;
     deserializer.end().map_err(|e| failed(String::new(), &e))?;
     Ok(value)
 }

@@ -226,9 +226,8 @@ impl Simulator {
         let space = self.space();
         let mut stream = stats::stream(seed, "prior");
         // Row by row, so that a longer set begins with the shorter one.
-        let rows: Vec<Vec<f64>> = (0..samples)
-            .map(|_| space.iter().map(|p| p.from_unit(stream.random::<f64>())).collect())
-            .collect();
+        let rows: Vec<Vec<f64>> =
+            (0..samples).map(|_| space.iter().map(|p| p.from_unit(stream.random::<f64>())).collect()).collect();
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
         Ok(TrainingSet { frequencies_hz: self.measure(&rows, seed)?, theta, seed })
     }

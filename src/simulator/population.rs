@@ -72,9 +72,10 @@ impl Population {
                 return Err(Error::Repeated(name.clone()));
             }
         }
-        let complete = given.iter().zip(space.iter()).map(|(moments, parameter)| {
-            moments.ok_or_else(|| Error::Missing(parameter.name.clone()))
-        });
+        let complete = given
+            .iter()
+            .zip(space.iter())
+            .map(|(moments, parameter)| moments.ok_or_else(|| Error::Missing(parameter.name.clone())));
         let (mean, std) = complete.collect::<Result<Vec<_>, _>>()?.into_iter().unzip();
         Ok(Self { mean, std })
     }

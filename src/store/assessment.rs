@@ -19,6 +19,7 @@ struct AssessmentRow {
     draws_per_measurement: i64,
     measurements_used: i64,
     measurements_left_out: i64,
+    measurements_outside: i64,
     misfit_percent: Vec<u8>,
     assessed_at_us: i64,
 }
@@ -73,7 +74,7 @@ impl Store {
                         .execute(&mut *connection)
                         .await?;
                 }
-                sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
+                sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
                     .bind(&structure)
                     .bind(&id)
                     .bind(a.model_digest.as_str())
@@ -83,6 +84,7 @@ impl Store {
                     .bind(a.draws_per_measurement as i64)
                     .bind(a.measurements_used as i64)
                     .bind(a.measurements_left_out as i64)
+                    .bind(a.measurements_outside as i64)
                     .bind(to_blob(a.misfit_percent.iter().copied()))
                     .bind(a.assessed_at.micros())
                     .execute(&mut *connection)
@@ -146,7 +148,7 @@ impl Store {
         let ids = serde_json::to_string(batch_ids).map_err(|e| bad_row("batch")(&e))?;
         let select = format!(
             "select batch_id, model_digest, undamaged_version, structure_digest, seed, draws_per_measurement,
-                    measurements_used, measurements_left_out, misfit_percent, assessed_at_us
+                    measurements_used, measurements_left_out, measurements_outside, misfit_percent, assessed_at_us
              from assessment where structure_id = ? and batch_id in (select value from json_each(?))
              order by batch_id, {CURRENT_FIRST}"
         );
@@ -196,6 +198,7 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
         draws_per_measurement: row.draws_per_measurement as usize,
         measurements_used: row.measurements_used as usize,
         measurements_left_out: row.measurements_left_out as usize,
+        measurements_outside: row.measurements_outside as usize,
         misfit_percent: from_blob("assessment", &row.misfit_percent)?,
         assessed_at: timestamp("assessment", row.assessed_at_us)?,
         quantities: Vec::new(),

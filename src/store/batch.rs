@@ -193,7 +193,11 @@ async fn find_stored(
         .await?;
         if let Some((batch_id, content)) = known {
             let same = content == digest.as_str();
-            return Ok(Some(if same { InsertBatch::Replayed(batch_id) } else { InsertBatch::KeyConflict { batch_id } }));
+            return Ok(Some(if same {
+                InsertBatch::Replayed(batch_id)
+            } else {
+                InsertBatch::KeyConflict { batch_id }
+            }));
         }
     }
     for (ordinal, measurement) in batch.measurements.iter().enumerate() {

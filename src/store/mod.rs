@@ -147,7 +147,8 @@ impl Store {
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
             .busy_timeout(BUSY_TIMEOUT);
-        let writer_options = options.clone().create_if_missing(true).pragma("application_id", APPLICATION_ID.to_string());
+        let writer_options =
+            options.clone().create_if_missing(true).pragma("application_id", APPLICATION_ID.to_string());
         // The connection lives as long as the store; a pool of one is the queue of writers.
         let writer = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
         let writer = writer.connect_with(writer_options).await.map_err(|e| not_a_database(e, &path))?;

@@ -87,13 +87,15 @@ impl Store {
                 if in_use {
                     return Ok(PutStructure::Refused);
                 }
-                sqlx::query("update structure set definition = ?, digest = ?, updated_at_us = ? where structure_id = ?")
-                    .bind(&json)
-                    .bind(&digest)
-                    .bind(now)
-                    .bind(&id)
-                    .execute(&mut *connection)
-                    .await?;
+                sqlx::query(
+                    "update structure set definition = ?, digest = ?, updated_at_us = ? where structure_id = ?",
+                )
+                .bind(&json)
+                .bind(&digest)
+                .bind(now)
+                .bind(&id)
+                .execute(&mut *connection)
+                .await?;
                 Ok(PutStructure::Replaced)
             })
         })
