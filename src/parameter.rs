@@ -78,7 +78,7 @@ impl ParameterSpace {
         self.parameters.iter()
     }
 
-    /// The parameters in column order.
+    /// The parameters in column order, by index.
     pub fn as_slice(&self) -> &[Parameter] {
         &self.parameters
     }
@@ -86,5 +86,14 @@ impl ParameterSpace {
     /// Column of a named parameter.
     pub fn position(&self, name: &str) -> Option<usize> {
         self.parameters.iter().position(|p| p.name == name)
+    }
+}
+
+impl<'a> IntoIterator for &'a ParameterSpace {
+    type Item = &'a Parameter;
+    type IntoIter = std::slice::Iter<'a, Parameter>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
     }
 }

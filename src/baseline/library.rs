@@ -102,7 +102,7 @@ impl Library {
         };
         let id = simulator.id().clone();
         let mut baseline = None;
-        for (file, weights) in files.iter().filter(|(name, _)| name.ends_with(".safetensors")) {
+        for (file, weights) in files.iter().filter(|(name, _)| has_extension(name, "safetensors")) {
             let manifest_name = file.replace(".safetensors", ".json");
             let path = format!("{origin}/{file}");
             let Some(manifest) = files.get(&manifest_name) else {
@@ -177,6 +177,10 @@ fn read_definition(name: &str, bytes: &[u8]) -> Result<Simulator, DefinitionErro
     Simulator::new(definition)
 }
 
+fn has_extension(name: &str, extension: &str) -> bool {
+    Path::new(name).extension().is_some_and(|found| found == extension)
+}
+
 fn is_definition(name: &str) -> bool {
     name == "structure.toml" || name == "structure.json"
 }
@@ -202,7 +206,7 @@ fn read_folders(path: &Path) -> std::io::Result<BTreeMap<String, Folder>> {
         for file in std::fs::read_dir(entry.path())? {
             let file = file?;
             let name = file.file_name().to_string_lossy().into_owned();
-            let ours = is_definition(&name) || name.ends_with(".safetensors") || name.ends_with(".json");
+            let ours = is_definition(&name) || has_extension(&name, "safetensors") || has_extension(&name, "json");
             if ours && file.file_type()?.is_file() {
                 files.insert(name, std::fs::read(file.path())?);
             }

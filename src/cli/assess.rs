@@ -50,19 +50,16 @@ pub struct AssessArgs {
 /// Any file that is refused, with line and column.
 pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
-    let baseline = match &args.model {
-        Some(weights) => {
-            let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
-            let manifest = weights.with_extension("json");
-            Baseline::load(&read(&manifest)?, &read(weights)?, &simulator)
-                .with_context(|| format!("{} is refused", weights.display()))?
-                .into()
-        }
-        None => {
-            let library = Library::open(None)?;
-            let entry = library.get(simulator.id()).and_then(|e| e.baseline.clone());
-            entry.with_context(|| format!("no baseline of {} is shipped: give --model", simulator.id()))?
-        }
+    let baseline = if let Some(weights) = &args.model {
+        let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
+        let manifest = weights.with_extension("json");
+        Baseline::load(&read(&manifest)?, &read(weights)?, &simulator)
+            .with_context(|| format!("{} is refused", weights.display()))?
+            .into()
+    } else {
+        let library = Library::open(None)?;
+        let entry = library.get(simulator.id()).and_then(|e| e.baseline.clone());
+        entry.with_context(|| format!("no baseline of {} is shipped: give --model", simulator.id()))?
     };
     let undamaged_batch = read_batch(args, &args.baseline, &baseline)?;
     let batch = read_batch(args, &args.data, &baseline)?;

@@ -1,6 +1,6 @@
 //! The one place where errors meet status codes. Bodies are `application/problem+json` (RFC 9457).
 
-use axum::http::{header, HeaderName, HeaderValue, StatusCode};
+use axum::http::{header, StatusCode};
 use axum::response::{IntoResponse, Response};
 use problem_details::ProblemDetails;
 use serde::Serialize;
@@ -19,7 +19,7 @@ pub struct ApiError {
     code: &'static str,
     detail: String,
     errors: Vec<Problem>,
-    header: Option<(HeaderName, HeaderValue)>,
+    retry_after_s: Option<u32>,
 }
 
 /// Members beyond RFC 9457.
@@ -35,7 +35,7 @@ struct Extensions {
 impl ApiError {
     /// An error with a stable code and a sentence for people.
     pub fn new(status: StatusCode, code: &'static str, detail: impl Into<String>) -> Self {
-        Self { status, code, detail: detail.into(), errors: Vec::new(), header: None }
+        Self { status, code, detail: detail.into(), errors: Vec::new(), retry_after_s: None }
     }
 
     /// 422: it was read, but is not what this API takes.
@@ -64,12 +64,6 @@ impl ApiError {
             "internal error; the log has the cause under this request id",
         )
     }
-
-    /// The same error with another header.
-    fn with_header(mut self, name: HeaderName, value: HeaderValue) -> Self {
-        self.header = Some((name, value));
-        self
-    }
 }
 
 impl From<monitor::Error> for ApiError {
@@ -89,8 +83,10 @@ impl From<monitor::Error> for ApiError {
             E::RepeatedBatch(_) | E::Undamaged(_) | E::Assess { .. } => {
                 Self::invalid("unusable_baseline", detail, Vec::new())
             }
-            E::QueueFull(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "queue_full", detail)
-                .with_header(header::RETRY_AFTER, RETRY_AFTER_SECONDS.into()),
+            E::QueueFull(_) => Self {
+                retry_after_s: Some(RETRY_AFTER_SECONDS),
+                ..Self::new(StatusCode::SERVICE_UNAVAILABLE, "queue_full", detail)
+            },
             E::Store(_) | E::StoredDefinition(_) | E::Panicked => Self::internal(&detail),
         }
     }
@@ -111,8 +107,8 @@ impl IntoResponse for ApiError {
                 request_id: super::request::current_id(),
             });
         let mut response = problem.into_response();
-        if let Some((name, value)) = self.header {
-            response.headers_mut().insert(name, value);
+        if let Some(seconds) = self.retry_after_s {
+            response.headers_mut().insert(header::RETRY_AFTER, seconds.into());
         }
         response
     }

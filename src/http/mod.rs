@@ -97,6 +97,7 @@ async fn method_not_allowed() -> ApiError {
     ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", "this path does not take this method")
 }
 
+#[expect(clippy::needless_pass_by_value, reason = "the shape that CatchPanicLayer takes")]
 fn panicked(panic: Box<dyn std::any::Any + Send + 'static>) -> Response {
     let cause = panic.downcast_ref::<&str>().map(ToString::to_string);
     let cause = cause.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "a panic".to_owned());

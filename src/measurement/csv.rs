@@ -49,7 +49,7 @@ pub fn read(
     options: &CsvOptions,
 ) -> Result<Vec<RawMeasurement>, Vec<Problem>> {
     let text = std::str::from_utf8(bytes).map_err(|e| {
-        let line = bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count() + 1;
+        let line = bytes[..e.valid_up_to()].split(|b| *b == b'\n').count();
         vec![Problem::new(format!("line {line}"), "not UTF-8: save the table as UTF-8")]
     })?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
@@ -105,7 +105,8 @@ fn columns(
         let column = column(name, covariates, options);
         match &column {
             None => {
-                let known = covariates.iter().map(|c| format!(", {}", c.name)).collect::<String>();
+                let known: Vec<&str> = covariates.iter().map(|c| c.name.as_str()).collect();
+                let known = if known.is_empty() { String::new() } else { format!(", {}", known.join(", ")) };
                 add(format!(
                     "unknown column {}: known are measured_at, f1_hz to f{modes}_hz, std_f1_hz to std_f{modes}_hz, \
                      set_<parameter>{known}; a covariate must be declared in the structure, other columns ignored",

@@ -412,7 +412,7 @@ impl Monitor {
 
     fn find_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
         let id = simulator.id();
-        let train = format!("train one with `modalwatch train` into a folder of --models and start the service again");
+        let train = "train one with `modalwatch train` into a folder of --models and start the service again";
         let Some(entry) = self.library.get(id) else {
             return Err(format!("no trained baseline: {train}"));
         };

@@ -268,7 +268,7 @@ async fn refuse_foreign(path: &Path) -> Result<(), Error> {
 }
 
 fn not_a_database(error: sqlx::Error, path: &Path) -> Error {
-    let code = error.as_database_error().and_then(|e| e.code()).map(std::borrow::Cow::into_owned);
+    let code = error.as_database_error().and_then(sqlx::error::DatabaseError::code).map(std::borrow::Cow::into_owned);
     match code.as_deref() {
         Some("26") => Error::NotADatabase(path.to_owned()),
         Some("11") => Error::Corrupt { path: path.to_owned(), detail: error.to_string() },

@@ -1,0 +1,80 @@
+//! Each room of the house uses only rooms below it: the table of `lib.rs`, held against every `crate::` in `src`.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+const FOUNDATION: [&str; 4] = ["quantity", "stats", "parameter", "measurement"];
+
+/// Module and the modules it may use besides itself.
+fn may_use(module: &str) -> Vec<&'static str> {
+    let (own, foundation): (&[&str], bool) = match module {
+        "quantity" | "stats" => (&[], false),
+        "parameter" => (&["quantity", "stats"], false),
+        "measurement" => (&["quantity", "stats", "parameter"], false),
+        "physics" => (&["quantity", "stats"], false),
+        "flow" => (&["stats"], false),
+        "simulator" => (&["physics"], true),
+        "posterior" => (&[], true),
+        // `physics` for the error of a simulation only.
+        "baseline" => (&["flow", "simulator", "posterior", "physics"], true),
+        "damage" => (&["posterior"], true),
+        "assessment" => (&["damage"], true),
+        "store" => (&["assessment", "damage"], true),
+        "telemetry" => (&[], false),
+        "monitor" => (&["assessment", "baseline", "damage", "physics", "posterior", "simulator", "store"], true),
+        "http" => (&["assessment", "baseline", "damage", "monitor", "simulator", "store"], true),
+        "config" => (&["http", "monitor", "telemetry"], false),
+        "cli" => {
+            let rooms =
+                &["baseline", "config", "damage", "flow", "http", "monitor", "simulator", "store", "telemetry"];
+            (rooms, true)
+        }
+        "lib" | "main" => (&[], false),
+        unknown => panic!("module {unknown} has no row in this table: give it one"),
+    };
+    own.iter().copied().chain(FOUNDATION.into_iter().filter(|_| foundation)).collect()
+}
+
+fn sources(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let nested = entries.flat_map(|path| if path.is_dir() { sources(&path) } else { vec![path] });
+    nested.filter(|path| path.extension().is_some_and(|e| e == "rs")).collect()
+}
+
+/// First segment of a path below `src`: the module.
+fn module_of(path: &Path, root: &Path) -> String {
+    let first = path.strip_prefix(root).unwrap().components().next().unwrap();
+    first.as_os_str().to_str().unwrap().trim_end_matches(".rs").to_owned()
+}
+
+#[test]
+fn each_module_uses_only_modules_below_it() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut seen = BTreeSet::new();
+    for path in sources(&root) {
+        let module = module_of(&path, &root);
+        let allowed = may_use(&module);
+        for (number, line) in fs::read_to_string(&path).unwrap().lines().enumerate() {
+            for used in line.split("crate::").skip(1) {
+                let used = used.split(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap();
+                let fine = used == module || allowed.contains(&used);
+                assert!(fine, "{}:{}: {module} uses {used}", path.display(), number + 1);
+            }
+        }
+        seen.insert(module);
+    }
+    assert!(seen.len() > 15, "only {} modules were found", seen.len());
+}
+
+#[test]
+fn only_the_store_speaks_sql_and_only_the_doors_speak_http() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    for path in sources(&root) {
+        let (module, text) = (module_of(&path, &root), fs::read_to_string(&path).unwrap());
+        assert!(module == "store" || !text.contains("sqlx::"), "{} uses sqlx", path.display());
+        assert!(module == "http" || !text.contains("axum::"), "{} uses axum", path.display());
+        let tensors = ["flow", "baseline"].contains(&module.as_str());
+        assert!(tensors || !text.contains("candle_core::"), "{} uses tensors", path.display());
+    }
+}
