@@ -26,8 +26,7 @@ fn may_use(module: &str) -> Vec<&'static str> {
         "http" => (&["assessment", "baseline", "damage", "monitor", "simulator", "store"], true),
         "config" => (&["http", "monitor", "telemetry"], false),
         "cli" => {
-            let rooms =
-                &["baseline", "config", "damage", "flow", "http", "monitor", "simulator", "store", "telemetry"];
+            let rooms = &["baseline", "config", "damage", "flow", "http", "monitor", "simulator", "store", "telemetry"];
             (rooms, true)
         }
         "lib" | "main" => (&[], false),

@@ -9,6 +9,7 @@ use axum::extract::{FromRequestParts, MatchedPath, Request};
 use axum::http::{header, HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::Next;
 use axum::response::Response;
+use http_body_util::BodyExt as _;
 use serde::de::DeserializeOwned;
 use serde_path_to_error::Segment;
 use tracing::{info, Instrument as _};
@@ -61,32 +62,41 @@ pub struct BodyLimits {
     pub time: Duration,
 }
 
+/// How many times the limit is read and thrown away before the connection is cut: a client that is still sending does
+/// not see the answer, only a broken connection.
+const DRAINED_LIMITS: usize = 8;
+
 /// The whole body.
 ///
 /// # Errors
 /// 413 when it is larger than the limit, 408 when it is slower, 400 when the connection breaks.
-pub async fn read_body(body: Body, headers: &HeaderMap, limits: BodyLimits) -> Result<Bytes, ApiError> {
-    let too_large = || {
-        let detail = format!("the body is larger than {} bytes: split the batch", limits.bytes);
-        ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", detail)
-    };
-    let announced = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()?.parse::<usize>().ok());
-    if announced.is_some_and(|bytes| bytes > limits.bytes) {
-        return Err(too_large());
-    }
-    let read = tokio::time::timeout(limits.time, axum::body::to_bytes(body, limits.bytes));
-    let Ok(result) = read.await else {
-        let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
-        return Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail));
-    };
-    result.map_err(|error| {
-        let source = std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default();
-        if source.contains("length limit") {
-            too_large()
-        } else {
-            ApiError::new(StatusCode::BAD_REQUEST, "body_unreadable", "the body broke off")
+pub async fn read_body(body: Body, limits: BodyLimits) -> Result<Bytes, ApiError> {
+    match tokio::time::timeout(limits.time, collect(body, limits.bytes)).await {
+        Ok(result) => result,
+        Err(_) => {
+            let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
+            Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail))
         }
-    })
+    }
+}
+
+async fn collect(mut body: Body, limit: usize) -> Result<Bytes, ApiError> {
+    let (mut collected, mut total) = (Vec::new(), 0);
+    while let Some(frame) = body.frame().await {
+        let broken = |_| ApiError::new(StatusCode::BAD_REQUEST, "body_unreadable", "the body broke off");
+        let Ok(data) = frame.map_err(broken)?.into_data() else { continue };
+        total += data.len();
+        if total <= limit {
+            collected.extend_from_slice(&data);
+        } else if total > DRAINED_LIMITS * limit {
+            break;
+        }
+    }
+    if total > limit {
+        let detail = format!("the body is larger than {limit} bytes: split the batch");
+        return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", detail));
+    }
+    Ok(collected.into())
 }
 
 /// Media type of the body, without parameters, in lower case.
@@ -107,6 +117,10 @@ pub fn unsupported_media_type(found: Option<&str>, allowed: &str) -> ApiError {
 /// 400 when it is no JSON, with line and column; 422 when it is JSON of another shape, or has a number that JSON or f64
 /// cannot hold, with a pointer to it.
 pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
+    // serde would also read an object's fields from a list, by position.
+    if !begins_as_object(bytes) && serde_json::from_slice::<serde::de::IgnoredAny>(bytes).is_ok() {
+        return Err(ApiError::invalid_field("/", "the body must be a JSON object"));
+    }
     let mut deserializer = serde_json::Deserializer::from_slice(bytes);
     let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {
         let pointer = pointer(error.path());
@@ -122,13 +136,22 @@ fn json_error(bytes: &[u8], pointer: String, error: &serde_json::Error) -> ApiEr
         Some(word) => format!("{word} is no JSON number: send null for a mode that was not identified"),
         None => error.to_string(),
     };
+    let malformed =
+        || ApiError::new(StatusCode::BAD_REQUEST, "malformed_json", format!("the body is no JSON: {message}"));
+    if !begins_as_object(bytes) {
+        return malformed();
+    }
     // serde_json counts a number beyond f64 as a syntax error; for the client it is a wrong value.
     let wrong_value = error.is_data() || not_a_number.is_some() || message.starts_with("number out of range");
     if wrong_value {
         let pointer = if pointer.is_empty() { "/".to_owned() } else { pointer };
         return ApiError::invalid_field(pointer, message);
     }
-    ApiError::new(StatusCode::BAD_REQUEST, "malformed_json", format!("the body is no JSON: {message}"))
+    malformed()
+}
+
+fn begins_as_object(bytes: &[u8]) -> bool {
+    bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'{')
 }
 
 /// `NaN` or `Infinity` at the place where the parser stopped.

@@ -78,7 +78,13 @@ fn each_mistake_is_named_with_its_line_and_place() {
         ("uniform = [5.0, 15.0]", "uniform = [-5.0, 15.0]", 20, "/parameter/0/prior/uniform", "stiffness of -5"),
         ("uniform = [5.0, 15.0]", "uniform = [0.0, 15.0]", 20, "/parameter/0/prior/uniform", "allows a mechanism"),
         ("uniform = [5.0, 15.0]", "normal = [5.0, 15.0]", 20, "/parameter/0/prior", "unknown variant"),
-        ("sets = { spring = \"k2\" }", "sets = { spring = \"k9\" }", 21, "/parameter/0/sets/spring", "no spring \"k9\""),
+        (
+            "sets = { spring = \"k2\" }",
+            "sets = { spring = \"k9\" }",
+            21,
+            "/parameter/0/sets/spring",
+            "no spring \"k9\"",
+        ),
         ("sets = { spring = \"k2\" }", "sets = []", 21, "/parameter/0/sets", "sets nothing"),
         (
             "sets = { spring = \"k2\" }",
@@ -167,9 +173,11 @@ fn simulated_noise_has_the_stated_size() {
     let quiet = RIG.replace("relative = 0.005", "relative = 0.0");
     let noisy = Simulator::new(StructureDefinition::parse_toml(RIG).unwrap()).unwrap();
     let quiet = Simulator::new(StructureDefinition::parse_toml(&quiet).unwrap()).unwrap();
-    let ratios = noisy.training_set(4_000, 1).unwrap().frequencies_hz.component_div(
-        &quiet.training_set(4_000, 1).unwrap().frequencies_hz,
-    );
+    let ratios = noisy
+        .training_set(4_000, 1)
+        .unwrap()
+        .frequencies_hz
+        .component_div(&quiet.training_set(4_000, 1).unwrap().frequencies_hz);
     let deviations: Vec<f64> = ratios.iter().map(|r| r - 1.0).collect();
     let std = modalwatch::stats::sample_std(&deviations).unwrap();
     // 12,000 draws: the standard error of a standard deviation is σ/√(2n) = 0.65 %; four of them.

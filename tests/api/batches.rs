@@ -1,0 +1,233 @@
+//! Post, read, post again: the path of a batch.
+
+use serde_json::{json, Value};
+
+use crate::helpers::{created, measurements, problem, spawn, time};
+
+const BATCHES: &str = "/v1/structures/three-dof/batches";
+
+#[tokio::test]
+async fn from_the_first_batch_to_the_probability_of_damage() {
+    let (service, _folder) = spawn();
+    let healthy = measurements([4.0, 5.0, 6.0], 20, 0);
+    let first = service.post_batch("three-dof", &healthy).await;
+    assert_eq!(first["state"], "assessed", "{first}");
+    assert!(first["next_step"].as_str().unwrap().contains("POST /v1/structures/three-dof/baseline"), "{first}");
+    let k1 = &first["assessment"]["parameters"][0];
+    assert!((k1["mean"].as_f64().unwrap() - 4.0).abs() < 0.05, "{k1}");
+    assert_eq!(k1["probability_of_damage"], Value::Null);
+
+    let baseline = json!({ "batches": [first["batch"]] });
+    let undamaged = created(service.post("/v1/structures/three-dof/baseline", &baseline).await).await;
+    assert_eq!(undamaged["version"], 1);
+    assert_eq!(undamaged["measurement_count"], 20);
+    let delta = undamaged["parameters"][1]["threshold"].as_f64().unwrap();
+    let (mean, std) = (&undamaged["parameters"][1]["mean"], &undamaged["parameters"][1]["std"]);
+    assert!((delta - (mean.as_f64().unwrap() - 1.645 * std.as_f64().unwrap())).abs() < 1e-4, "{undamaged}");
+
+    // Ten per cent off k2 alone.
+    let damaged = service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 100_000)).await;
+    let parameters = damaged["assessment"]["parameters"].as_array().unwrap();
+    assert_eq!(parameters[1]["probability_of_damage"], 1.0, "{damaged}");
+    assert_eq!(parameters[1]["exceeds"], true);
+    assert!((parameters[1]["relative_change"].as_f64().unwrap() + 0.1).abs() < 0.01, "{damaged}");
+    for other in [0, 2] {
+        let pod = parameters[other]["probability_of_damage"].as_f64().unwrap();
+        assert!(pod < 0.2, "only k2 lost stiffness: {damaged}");
+    }
+    assert_eq!(damaged["assessment"]["exceeds"], true);
+
+    let alarms = service.read("/v1/structures/three-dof/alarms?parameter=k2").await;
+    assert_eq!(alarms["items"].as_array().unwrap().len(), 1, "{alarms}");
+    assert_eq!(alarms["items"][0]["batch"], damaged["batch"]);
+
+    let path = format!("{BATCHES}/{}", damaged["batch"].as_str().unwrap());
+    let read = service.read(&path).await;
+    assert_eq!(read["assessment"], damaged["assessment"]);
+    assert_eq!(read["measurements"].as_array().unwrap().len(), 20);
+    assert_eq!(read["measurements"][0]["frequencies_hz"].as_array().unwrap().len(), 3);
+}
+
+#[tokio::test]
+async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards() {
+    let (service, _folder) = spawn();
+    let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
+    let damaged = service.post_batch("three-dof", &measurements([4.0, 4.0, 6.0], 20, 100_000)).await;
+    assert_eq!(damaged["assessment"]["undamaged_version"], Value::Null);
+    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    let path = |batch: &Value| format!("{BATCHES}/{}", batch["batch"].as_str().unwrap());
+    let mut compared = Value::Null;
+    for _ in 0..100 {
+        compared = service.read(&path(&damaged)).await;
+        if compared["assessment"]["undamaged_version"] == 1 {
+            break;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+    assert_eq!(compared["assessment"]["parameters"][1]["probability_of_damage"], 1.0, "{compared}");
+    let own = service.read(&path(&healthy)).await;
+    assert_eq!(own["assessment"]["undamaged_version"], Value::Null, "{own}");
+    assert!(own["next_step"].as_str().unwrap().contains("not compared with itself"), "{own}");
+}
+
+#[tokio::test]
+async fn the_same_batch_sent_twice_is_stored_once_and_answered_the_same() {
+    let (service, _folder) = spawn();
+    let body = json!({ "source": "logger-1", "measurements": measurements([4.0, 5.0, 6.0], 5, 0) });
+    let post = |key: Option<&'static str>, body: Value| {
+        let mut request = service.request(reqwest::Method::POST, BATCHES).json(&body);
+        if let Some(key) = key {
+            request = request.header("idempotency-key", key);
+        }
+        async { request.send().await.unwrap() }
+    };
+    let first = post(Some("a-1"), body.clone()).await;
+    assert!(first.headers().get("idempotency-replayed").is_none());
+    let first = created(first).await;
+    // With the same key, without a key, and with another key: it is the same batch.
+    for key in [Some("a-1"), None, Some("a-2")] {
+        let again = post(key, body.clone()).await;
+        assert_eq!(again.headers()["idempotency-replayed"], "true", "{key:?}");
+        assert_eq!(created(again).await, first, "{key:?}");
+    }
+    let history = service.read("/v1/structures/three-dof/history").await;
+    assert_eq!(history["items"].as_array().unwrap().len(), 1);
+
+    let mut other = body.clone();
+    other["measurements"] = json!(measurements([4.1, 5.0, 6.0], 5, 50_000));
+    problem(post(Some("a-1"), other).await, 422, "idempotency_key_reused").await;
+
+    let mut overlapping = body.clone();
+    overlapping["measurements"] = json!(measurements([4.0, 5.0, 6.0], 6, 0));
+    let refused = problem(post(None, overlapping.clone()).await, 422, "measurement_exists").await;
+    assert_eq!(refused["errors"][0]["pointer"], "/measurements/0", "{refused}");
+    // Nothing of it was stored: from another source it is new, and whole.
+    overlapping["source"] = json!("logger-2");
+    assert_eq!(created(post(None, overlapping).await).await["measurement_count"], 6);
+}
+
+#[tokio::test]
+async fn two_clients_that_post_the_same_batch_at_once_store_it_once() {
+    let (service, _folder) = spawn();
+    let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 10, 0) });
+    let post = || tokio::spawn(service.request(reqwest::Method::POST, BATCHES).json(&body).send());
+    let posts: Vec<_> = (0..8).map(|_| post()).collect();
+    let mut ids = Vec::new();
+    for answer in posts {
+        ids.push(created(answer.await.unwrap().unwrap()).await["batch"].clone());
+    }
+    assert!(ids.iter().all(|id| *id == ids[0]), "{ids:?}");
+    assert_eq!(service.read("/v1/structures/three-dof/history").await["items"].as_array().unwrap().len(), 1);
+}
+
+#[tokio::test]
+async fn csv_in_every_dialect_is_the_same_batch_as_json() {
+    let (service, _folder) = spawn();
+    let rows = measurements([4.0, 5.0, 6.0], 3, 0);
+    let first =
+        created(service.post(&format!("{BATCHES}?source=x"), &json!({ "measurements": rows, "source": "x" })).await)
+            .await;
+    let table = |separator: &str, comma: bool, end: &str| {
+        let mut text = ["measured_at", "f1_hz", "f2_hz", "f3_hz"].join(separator) + end;
+        for row in &rows {
+            let f = row["frequencies_hz"].as_array().unwrap().iter().map(|f| f.to_string());
+            let f = f.map(|f| if comma { f.replace('.', ",") } else { f }).collect::<Vec<_>>().join(separator);
+            text += &format!("{}{separator}{f}{end}", row["measured_at"].as_str().unwrap());
+        }
+        text
+    };
+    let dialects = [
+        ("plain", table(",", false, "\n")),
+        ("CRLF", table(",", false, "\r\n")),
+        ("BOM", format!("\u{feff}{}", table(",", false, "\n"))),
+        ("semicolon", table(";", false, "\n")),
+        ("decimal comma", table(";", true, "\r\n")),
+        ("tab", table("\t", false, "\n")),
+        ("no last newline", table(",", false, "\n").trim_end().to_owned()),
+        ("upper case and blanks", table(",", false, " \n").replace("f1_hz", " F1_Hz ")),
+        ("blank lines", table(",", false, "\n\n")),
+    ];
+    for (name, text) in dialects {
+        let again = service.post_text(&format!("{BATCHES}?source=x"), "text/csv; charset=utf-8", text).await;
+        assert_eq!(again.headers().get("idempotency-replayed").map(|v| v.as_bytes()), Some(&b"true"[..]), "{name}");
+        assert_eq!(created(again).await["batch"], first["batch"], "{name}");
+    }
+}
+
+#[tokio::test]
+async fn a_measurement_with_a_missing_mode_is_kept_and_left_out_of_the_estimate() {
+    let (service, _folder) = spawn();
+    let mut rows = measurements([4.0, 5.0, 6.0], 4, 0);
+    rows[1]["frequencies_hz"][2] = Value::Null;
+    let answer = service.post_batch("three-dof", &rows).await;
+    assert_eq!(answer["measurement_count"], 4);
+    assert_eq!(answer["assessment"]["measurements_used"], 3, "{answer}");
+    assert_eq!(answer["assessment"]["measurements_left_out"], 1, "{answer}");
+
+    let mut all = measurements([4.0, 5.0, 6.0], 2, 50_000);
+    all.iter_mut().for_each(|row| row["frequencies_hz"][0] = Value::Null);
+    let answer = service.post_batch("three-dof", &all).await;
+    assert_eq!(answer["state"], "failed", "{answer}");
+    assert!(answer["failure"].as_str().unwrap().contains("lack a mode"), "{answer}");
+}
+
+#[tokio::test]
+async fn one_measurement_has_a_mean_and_no_spread() {
+    let (service, _folder) = spawn();
+    let answer = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 1, 0)).await;
+    assert!(answer["assessment"]["parameters"][0]["mean"].is_f64(), "{answer}");
+    assert_eq!(answer["assessment"]["parameters"][0]["std"], Value::Null);
+    let refused = service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [answer["batch"]] })).await;
+    let refused = problem(refused, 422, "unusable_baseline").await;
+    assert!(refused["detail"].as_str().unwrap().contains("at least 2"), "{refused}");
+}
+
+#[tokio::test]
+async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_baseline() {
+    let (service, _folder) = spawn();
+    let definition = json!({
+        "id": "tower-1", "modes": 1,
+        "mass": [{ "name": "m", "kg": 100.0 }],
+        "spring": [{ "name": "k", "from": "ground", "to": "m" }],
+        "parameter": [{ "name": "k", "prior": { "uniform": [1000.0, 9000.0] }, "sets": { "spring": "k" } }],
+        "covariate": [{ "name": "temperature_c" }, { "name": "operator", "kind": "category" }],
+    });
+    let put = |body: Value| service.request(reqwest::Method::PUT, "/v1/structures/tower-1").json(&body).send();
+    assert_eq!(put(definition.clone()).await.unwrap().status(), 201);
+    assert_eq!(put(definition.clone()).await.unwrap().status(), 200);
+
+    let measurement = json!({
+        "measured_at": time(0), "frequencies_hz": [1.1], "std_hz": [0.01],
+        "covariates": { "temperature_c": -3.5, "operator": "B" }, "settings": { "k": 5000.0 },
+    });
+    let answer = service.post_batch("tower-1", &[measurement.clone()]).await;
+    assert_eq!(answer["state"], "received", "{answer}");
+    assert!(answer["next_step"].as_str().unwrap().contains("modalwatch train"), "{answer}");
+    let path = format!("/v1/structures/tower-1/batches/{}", answer["batch"].as_str().unwrap());
+    assert_eq!(service.read(&path).await["measurements"][0], measurement);
+
+    let baseline = service.post("/v1/structures/tower-1/baseline", &json!({ "batches": [answer["batch"]] })).await;
+    problem(baseline, 409, "no_model").await;
+    let mut heavier = definition.clone();
+    heavier["mass"][0]["kg"] = json!(101.0);
+    problem(put(heavier).await.unwrap(), 409, "structure_in_use").await;
+
+    let list = service.read("/v1/structures").await;
+    let ids: Vec<&str> = list["items"].as_array().unwrap().iter().map(|s| s["id"].as_str().unwrap()).collect();
+    assert_eq!(ids, ["rig", "ruler-frame-4dof", "three-dof", "tower-1"]);
+    assert_eq!(list["items"][3]["batches"], 1);
+}
+
+#[tokio::test]
+async fn toml_defines_a_structure_too() {
+    let (service, _folder) = spawn();
+    let text = include_str!("../../models/three-dof/structure.toml").replace("id = \"three-dof\"", "id = \"copy\"");
+    let put = service.request(reqwest::Method::PUT, "/v1/structures/copy");
+    let answer = put.header("content-type", "application/toml").body(text).send().await.unwrap();
+    assert_eq!(answer.status(), 201);
+    let nominal = service.read("/v1/structures/copy").await["nominal_frequencies_hz"].clone();
+    let expected = crate::helpers::three_dof_hz([4.0, 5.0, 6.0]);
+    for (mode, f) in expected.iter().enumerate() {
+        assert!((nominal[mode].as_f64().unwrap() - f).abs() < 1e-9, "{nominal} {expected:?}");
+    }
+}

@@ -1,0 +1,214 @@
+//! A running service, a client for it, and measurements to post.
+
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use reqwest::{Client, Method, RequestBuilder, Response};
+use serde_json::{json, Value};
+use tempfile::TempDir;
+
+/// A service of its own, ended when dropped.
+pub struct Service {
+    child: Child,
+    url: String,
+    stdout: Option<BufReader<ChildStdout>>,
+    pub client: Client,
+}
+
+/// Command line of a service in `data_dir`, on a free port.
+pub fn command(data_dir: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    command.args(["serve", "--listen", "127.0.0.1:0", "--data-dir"]).arg(data_dir);
+    command.env("MODALWATCH__LOG__LEVEL", "warn");
+    command
+}
+
+impl Service {
+    /// Starts a service in `data_dir`; panics with what it printed when it does not start.
+    pub fn start(data_dir: &Path) -> Self {
+        Self::spawn(&mut command(data_dir))
+    }
+
+    /// Starts a service from a prepared command.
+    pub fn spawn(command: &mut Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
+        let mut line = String::new();
+        stdout.read_line(&mut line).unwrap();
+        let Some((_, url)) = line.trim().split_once("listens on ") else {
+            let mut text = String::new();
+            child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
+            panic!("the service did not start: {line}{text}");
+        };
+        // Its log must be read, or the pipe fills and the service waits for it.
+        let mut stderr = child.stderr.take().unwrap();
+        std::thread::spawn(move || std::io::copy(&mut stderr, &mut std::io::sink()));
+        Self { url: url.to_owned(), child, stdout: Some(stdout), client: Client::new() }
+    }
+
+    /// Address without scheme.
+    pub fn address(&self) -> &str {
+        self.url.trim_start_matches("http://")
+    }
+
+    /// Id of the process.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
+        self.client.request(method, format!("{}{path}", self.url))
+    }
+
+    pub fn get(&self, path: &str) -> RequestBuilder {
+        self.request(Method::GET, path)
+    }
+
+    /// Posts JSON.
+    pub async fn post(&self, path: &str, body: &Value) -> Response {
+        self.request(Method::POST, path).json(body).send().await.unwrap()
+    }
+
+    /// Posts text of any content type.
+    pub async fn post_text(&self, path: &str, content_type: &str, body: impl Into<reqwest::Body>) -> Response {
+        self.request(Method::POST, path).header("content-type", content_type).body(body).send().await.unwrap()
+    }
+
+    /// Reads JSON that must be there.
+    pub async fn read(&self, path: &str) -> Value {
+        let response = self.get(path).send().await.unwrap();
+        assert!(response.status().is_success(), "GET {path}: {}", response.text().await.unwrap());
+        response.json().await.unwrap()
+    }
+
+    /// Posts a batch that must be taken; returns the answer.
+    pub async fn post_batch(&self, structure: &str, measurements: &[Value]) -> Value {
+        let body = json!({ "measurements": measurements });
+        created(self.post(&format!("/v1/structures/{structure}/batches"), &body).await).await
+    }
+
+    /// `kill -9`, as a power loss would.
+    pub fn kill(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
+    /// Sends a signal by name and waits for the end; returns the exit status.
+    pub fn stop(&mut self, signal: &str) -> std::process::ExitStatus {
+        self.signal(signal);
+        self.wait(Duration::from_secs(40))
+    }
+
+    pub fn signal(&self, signal: &str) {
+        let status = Command::new("kill").args([&format!("-{signal}"), &self.pid().to_string()]).status().unwrap();
+        assert!(status.success());
+    }
+
+    pub fn wait(&mut self, limit: Duration) -> std::process::ExitStatus {
+        let started = Instant::now();
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status;
+            }
+            assert!(started.elapsed() < limit, "the service did not stop within {limit:?}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        drop(self.stdout.take());
+    }
+}
+
+/// A service in a folder of its own.
+pub fn spawn() -> (Service, TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    (Service::start(folder.path()), folder)
+}
+
+/// The body of a 201.
+pub async fn created(response: Response) -> Value {
+    let status = response.status();
+    let body: Value = response.json().await.unwrap();
+    assert_eq!(status, 201, "{body}");
+    body
+}
+
+/// The body of a problem, after a check of its form.
+pub async fn problem(response: Response, status: u16, code: &str) -> Value {
+    let found = response.status().as_u16();
+    let content_type = response.headers().get("content-type").map(|v| v.to_str().unwrap().to_owned());
+    let id = response.headers().get("x-request-id").map(|v| v.to_str().unwrap().to_owned());
+    let text = response.text().await.unwrap();
+    let body: Value = serde_json::from_str(&text).unwrap_or_else(|_| panic!("{found} is no problem+json: {text}"));
+    assert_eq!(found, status, "{body}");
+    assert_eq!(body["code"], code, "{body}");
+    assert_eq!(body["status"], status, "{body}");
+    assert_eq!(content_type.as_deref(), Some("application/problem+json"), "{body}");
+    assert!(body["title"].is_string() && body["detail"].is_string(), "{body}");
+    assert_eq!(body["request_id"].as_str(), id.as_deref(), "{body}");
+    body
+}
+
+/// Frequencies of `three-dof` by its characteristic polynomial: the tests' own physics, Hz, ascending.
+///
+/// det(K − λM) = 0 is a cubic in λ with three positive roots, found by bisection between its turning points.
+pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {
+    let (m, c) = ([0.7, 0.5, 0.3], 5.0);
+    let determinant = |lambda: f64| {
+        let d = [0, 1, 2].map(|i: usize| k[i] + 2.0 * c - lambda * m[i]);
+        d[0] * d[1] * d[2] - 2.0 * c * c * c - c * c * (d[0] + d[1] + d[2])
+    };
+    // Leading coefficient −m₁m₂m₃; its derivative is a quadratic whose roots separate those of the cubic.
+    let steps = 200_000;
+    let highest = 200.0;
+    let at = |i: usize| highest * i as f64 / steps as f64;
+    let mut roots = Vec::new();
+    for i in 0..steps {
+        let (mut low, mut high) = (at(i), at(i + 1));
+        if determinant(low) * determinant(high) <= 0.0 {
+            for _ in 0..60 {
+                let middle = f64::midpoint(low, high);
+                if determinant(low) * determinant(middle) <= 0.0 {
+                    high = middle
+                } else {
+                    low = middle
+                }
+            }
+            roots.push(low.sqrt() / std::f64::consts::TAU);
+        }
+    }
+    roots.try_into().unwrap()
+}
+
+/// `count` measurements of `three-dof` ten minutes apart from `start_s` (seconds after 2026-01-01), with stiffnesses
+/// spread evenly by ±2 % about `k`.
+pub fn measurements(k: [f64; 3], count: usize, start_s: usize) -> Vec<Value> {
+    let one = |i: usize| {
+        let wave = |phase: usize| 1.0 + 0.02 * ((i * 7 + phase * 3) as f64).sin();
+        let f = three_dof_hz([k[0] * wave(0), k[1] * wave(1), k[2] * wave(2)]);
+        json!({ "measured_at": time(start_s + 600 * i), "frequencies_hz": f })
+    };
+    (0..count).map(one).collect()
+}
+
+/// RFC 3339 of seconds after 2026-01-01T00:00:00Z.
+pub fn time(seconds: usize) -> String {
+    let (day, rest) = (seconds / 86_400, seconds % 86_400);
+    let (month, day) = [31, 28, 31, 30, 31, 30, 31, 31]
+        .iter()
+        .enumerate()
+        .try_fold(day, |left, (month, days)| if left < *days { Err((month + 1, left + 1)) } else { Ok(left - days) })
+        .unwrap_err();
+    format!("2026-{month:02}-{day:02}T{:02}:{:02}:{:02}Z", rest / 3600, rest / 60 % 60, rest % 60)
+}
+
+pub fn repository(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}

@@ -1,0 +1,49 @@
+//! A real structure through HTTP: the four-storey ruler frame of two laboratories.
+
+use serde_json::{json, Value};
+
+use crate::helpers::{created, repository, spawn, time};
+
+const BATCHES: &str = "/v1/structures/ruler-frame-4dof/batches";
+
+/// Rows of one laboratory, or `None` where the data are not on this machine.
+fn rows(lab: &str) -> Option<Vec<Value>> {
+    let path = repository("../shared/data/ruler-frame-4dof/ruler_frame_frequencies.csv");
+    let text = std::fs::read_to_string(path).ok()?;
+    let mut lines = text.lines();
+    let header: Vec<&str> = lines.next()?.split(',').collect();
+    let column = |name: &str| header.iter().position(|h| *h == name).unwrap();
+    let modes: Vec<usize> = (1..=4).map(|i| column(&format!("f{i}_hz"))).collect();
+    let of_lab = lines.map(|l| l.split(',').collect::<Vec<_>>()).filter(|cells| cells[column("lab")] == lab);
+    // The file has no times: one test a minute, laboratory de a month after br.
+    let start = if lab == "br" { 0 } else { 31 * 86_400 };
+    let row = |(i, cells): (usize, Vec<&str>)| {
+        let f: Vec<Option<f64>> = modes.iter().map(|m| cells[*m].parse().ok()).collect();
+        json!({ "measured_at": time(start + 60 * i), "frequencies_hz": f, "covariates": { "lab": lab } })
+    };
+    Some(of_lab.enumerate().map(row).collect())
+}
+
+#[tokio::test]
+async fn two_laboratories_are_taken_with_their_missing_values() {
+    let (Some(br), Some(de)) = (rows("br"), rows("de")) else {
+        println!("skipped: ../shared/data/ruler-frame-4dof is not on this machine");
+        return;
+    };
+    let (service, _folder) = spawn();
+    let undamaged = service.post_batch("ruler-frame-4dof", &br[..50]).await;
+    let path = "/v1/structures/ruler-frame-4dof/baseline";
+    created(service.post(path, &json!({ "batches": [undamaged["batch"]] })).await).await;
+    let mut left_out = 0;
+    for batch in br[50..].chunks(10).chain(de.chunks(10)) {
+        let answer = created(service.post(BATCHES, &json!({ "measurements": batch })).await).await;
+        assert_eq!(answer["state"], "assessed", "{answer}");
+        left_out += answer["assessment"]["measurements_left_out"].as_u64().unwrap();
+    }
+    assert_eq!(left_out, 4, "de lacks f4 in three rows and f3 in one");
+    let history = service.read("/v1/structures/ruler-frame-4dof/history").await;
+    assert_eq!(history["items"].as_array().unwrap().len(), 16);
+    let csv = service.get("/v1/structures/ruler-frame-4dof/history?format=csv").send().await.unwrap();
+    println!("{}", csv.text().await.unwrap());
+    println!("{}", service.read("/v1/structures/ruler-frame-4dof/history?limit=1").await["items"][0]["assessment"]);
+}
