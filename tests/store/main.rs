@@ -1,0 +1,196 @@
+//! The archive: whole or not at all, whoever goes away in the middle.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use modalwatch::assessment::{Assessment, BatchState};
+use modalwatch::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
+use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
+use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
+use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
+
+fn bridge() -> StructureId {
+    StructureId::parse("bridge").unwrap()
+}
+
+fn at(seconds: i64) -> Timestamp {
+    Timestamp::from_micros(1_700_000_000_000_000 + seconds * 1_000_000).unwrap()
+}
+
+fn batch(source: &str, start: i64, count: i64) -> MeasurementBatch {
+    let measurement = |i: i64| ModalMeasurement {
+        measured_at: at(start + i),
+        frequencies_hz: vec![Some(Hertz::new(1.0 + 0.01 * i as f64).unwrap()), None],
+        std_hz: Some(vec![Some(0.01), None]),
+        covariates: BTreeMap::new(),
+        settings: BTreeMap::from([("k".to_owned(), 4.0)]),
+    };
+    MeasurementBatch {
+        structure: bridge(),
+        source: source.to_owned(),
+        idempotency_key: None,
+        measurements: (0..count).map(measurement).collect(),
+    }
+}
+
+async fn open() -> (Store, tempfile::TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::open(folder.path()).await.unwrap();
+    let digest = Digest::of(&[b"v1"]);
+    assert_eq!(store.put_structure(&bridge(), "{}", &digest, at(0)).await.unwrap(), PutStructure::Created);
+    (store, folder)
+}
+
+fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestamp) -> Assessment {
+    let damage = Damage { threshold: 3.5, probability_of_damage: 0.4, exceeds: true, relative_change: -0.1 };
+    let quantity = |name: &str| QuantityAssessment {
+        name: name.to_owned(),
+        unit: "N/m".to_owned(),
+        kind: QuantityKind::Parameter,
+        hyperparameters: Hyperparameters { mean: 3.6, std: Some(0.3), within: 0.01, between: Some(0.08) },
+        edge_mass: 0.02,
+        damage: undamaged_version.map(|_| damage.clone()),
+    };
+    Assessment {
+        model_digest: Digest::of(&[model.as_bytes()]),
+        structure_digest: Digest::of(&[b"v1"]),
+        undamaged_version,
+        seed: u64::MAX - 1,
+        draws_per_measurement: 10,
+        measurements_used: 3,
+        measurements_left_out: 1,
+        measurements_outside: 2,
+        misfit_percent: vec![0.1, -0.2],
+        assessed_at,
+        quantities: vec![quantity("k2"), quantity("k1")],
+    }
+}
+
+#[tokio::test]
+async fn a_batch_comes_back_as_it_was_given() {
+    let (store, _folder) = open().await;
+    let given = batch("logger", 0, 4);
+    assert_eq!(store.insert_batch(&given, "b1", at(99)).await.unwrap(), InsertBatch::Inserted);
+    let stored = store.batch(&bridge(), "b1").await.unwrap().unwrap();
+    assert_eq!((stored.batch, stored.received_at, stored.state), (given.clone(), at(99), BatchState::Received));
+    assert_eq!(stored.content_digest, given.content_digest());
+    assert!(store.batch(&bridge(), "b2").await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn an_assessment_comes_back_as_it_was_given_and_the_newest_is_current() {
+    let (store, _folder) = open().await;
+    store.insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
+    let (old, new) = (assessment("m1", None, at(1)), assessment("m2", None, at(2)));
+    for given in [&old, &new, &old, &old] {
+        store.insert_assessment(&bridge(), "b1", given).await.unwrap();
+    }
+    assert_eq!(store.assessment(&bridge(), "b1").await.unwrap().unwrap(), new);
+    assert_eq!(store.batch(&bridge(), "b1").await.unwrap().unwrap().state, BatchState::Assessed);
+}
+
+#[tokio::test]
+async fn pages_walk_batches_of_equal_time_once() {
+    let (store, _folder) = open().await;
+    for i in 0..23 {
+        store.insert_batch(&batch(&format!("s{i}"), i / 5, 1), &format!("b{i:02}"), at(i)).await.unwrap();
+    }
+    let (mut walked, mut after) = (Vec::new(), None);
+    loop {
+        let query = HistoryQuery { limit: 4, after: after.clone(), ..HistoryQuery::default() };
+        let page = store.history(&bridge(), &query).await.unwrap();
+        let Some(last) = page.last() else { break };
+        after = Some((last.measured_from, last.batch_id.clone()));
+        walked.extend(page.iter().map(|e| (e.measured_from, e.batch_id.clone())));
+    }
+    assert_eq!(walked.len(), 23);
+    assert!(walked.is_sorted());
+}
+
+#[tokio::test]
+async fn a_writer_who_goes_away_leaves_whole_batches_and_a_usable_store() {
+    let (store, _folder) = open().await;
+    for i in 0..60 {
+        let given = batch(&format!("s{i}"), 0, 40);
+        let id = format!("b{i}");
+        // Dropped at once, or after some microseconds in the middle of the transaction.
+        let _ = tokio::time::timeout(Duration::from_micros(i * 20), store.insert_batch(&given, &id, at(0))).await;
+    }
+    // One more write waits for those still under way and shows that the connection is not left in a transaction.
+    assert_eq!(store.insert_batch(&batch("last", 0, 40), "last", at(0)).await.unwrap(), InsertBatch::Inserted);
+    let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
+    let stored = store.history(&bridge(), &query).await.unwrap();
+    assert!(stored.len() > 1);
+    for entry in stored {
+        let record = store.batch(&bridge(), &entry.batch_id).await.unwrap().unwrap();
+        assert_eq!(record.batch.measurements.len(), 40, "{} is not whole", entry.batch_id);
+    }
+}
+
+#[tokio::test]
+async fn a_refused_batch_leaves_nothing_behind() {
+    let (store, _folder) = open().await;
+    store.insert_batch(&batch("logger", 10, 5), "b1", at(0)).await.unwrap();
+    let overlapping = store.insert_batch(&batch("logger", 7, 5), "b2", at(1)).await.unwrap();
+    let expected = InsertBatch::MeasurementConflict { ordinal: 3, measured_at: at(10), batch_id: "b1".to_owned() };
+    assert_eq!(overlapping, expected);
+    assert!(store.batch(&bridge(), "b2").await.unwrap().is_none());
+    // The three that did not collide are free.
+    assert_eq!(store.insert_batch(&batch("logger", 7, 3), "b3", at(2)).await.unwrap(), InsertBatch::Inserted);
+}
+
+#[tokio::test]
+async fn a_new_undamaged_state_sends_back_only_what_was_never_compared() {
+    let (store, _folder) = open().await;
+    let model = Digest::of(&[b"m"]);
+    for (i, version) in [(0, None), (1, None), (2, Some(1))] {
+        let id = format!("b{i}");
+        store.insert_batch(&batch(&format!("s{i}"), i, 2), &id, at(i)).await.unwrap();
+        if version.is_some() {
+            let state = undamaged();
+            assert_eq!(store.insert_undamaged(&bridge(), &state, &model, &["b0".into()], at(5)).await.unwrap(), 1);
+        }
+        store.insert_assessment(&bridge(), &id, &assessment("m", version, at(i))).await.unwrap();
+    }
+    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b1"]);
+    store.insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8))).await.unwrap();
+    assert_eq!(store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".into()], at(9)).await.unwrap(), 2);
+    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b0"], "b0 was never compared; b2 was");
+    let newest = store.undamaged(&bridge()).await.unwrap().unwrap();
+    assert_eq!((newest.state.version, newest.batches), (2, vec!["b1".to_owned()]));
+    let unknown = store.insert_undamaged(&bridge(), &undamaged(), &model, &["nothing".into()], at(9)).await;
+    assert!(unknown.unwrap_err().to_string().contains("no batch nothing"));
+    assert_eq!(store.undamaged(&bridge()).await.unwrap().unwrap().state.version, 2);
+}
+
+fn undamaged() -> modalwatch::damage::UndamagedState {
+    modalwatch::damage::UndamagedState {
+        version: 0,
+        threshold_probability: 0.05,
+        measurements: 2,
+        quantities: vec![modalwatch::damage::UndamagedQuantity {
+            name: "k1".to_owned(),
+            mean: 4.0,
+            std: 0.3,
+            threshold: Some(3.5),
+        }],
+    }
+}
+
+#[tokio::test]
+async fn each_connection_keeps_what_it_acknowledges() {
+    use sqlx::Connection as _;
+    let (store, folder) = open().await;
+    store.insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
+    store.close().await;
+    let ids: BTreeSet<String> = {
+        let options = sqlx::sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));
+        let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+        let (mode,): (String,) = sqlx::query_as("pragma journal_mode").fetch_one(&mut connection).await.unwrap();
+        assert_eq!(mode, "wal");
+        let rows: Vec<(String,)> =
+            sqlx::query_as("select batch_id from measurement_batch").fetch_all(&mut connection).await.unwrap();
+        rows.into_iter().map(|(id,)| id).collect()
+    };
+    assert_eq!(ids, BTreeSet::from(["b1".to_owned()]));
+}
