@@ -55,3 +55,24 @@ pub struct Assessment {
     /// One entry for each monitored quantity.
     pub quantities: Vec<QuantityAssessment>,
 }
+
+/// Share of samples at a prior edge above which the prior is called too narrow.
+const MUCH_EDGE_MASS: f64 = 0.05;
+
+impl Assessment {
+    /// What a reader must know before believing the figures, in sentences; empty when there is nothing.
+    pub fn warnings(&self) -> Vec<String> {
+        let (outside, used) = (self.measurements_outside, self.measurements_used);
+        let outside = (outside > 0).then(|| {
+            format!(
+                "{outside} of {used} measurements cannot come from this simulation with any parameters of the prior; they \
+                 count as the nearest point. Check units and modes, then whether the simulation fits, before believing a \
+                 probability of damage"
+            )
+        });
+        let at_edge = self.quantities.iter().filter(|q| q.edge_mass > MUCH_EDGE_MASS).map(|q| {
+            format!("{:.0} % of the samples of {} lie at an edge of its prior: widen it", 100.0 * q.edge_mass, q.name)
+        });
+        outside.into_iter().chain(at_edge).collect()
+    }
+}

@@ -81,6 +81,9 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
         "{} measurements used ({} of them outside the prior), {} left out for a missing mode",
         assessment.measurements_used, assessment.measurements_outside, assessment.measurements_left_out
     );
+    for warning in assessment.warnings() {
+        println!("warning: {warning}");
+    }
     let misfit: Vec<String> = assessment.misfit_percent.iter().map(|m| format!("{m:+.3}")).collect();
     println!("simulation misses the mean frequencies by {} %", misfit.join(", "));
     println!("{:>16} {:>12} {:>12} {:>12} {:>8} {:>8}", "parameter", "mean", "std", "threshold", "PoD", "exceeds");

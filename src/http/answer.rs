@@ -73,6 +73,8 @@ pub struct AssessmentBody {
     misfit_percent: Vec<f64>,
     assessed_at: Timestamp,
     exceeds: bool,
+    /// What a reader must know before believing the figures.
+    warnings: Vec<String>,
     parameters: Vec<ParameterBody>,
 }
 
@@ -95,6 +97,7 @@ pub struct ParameterBody {
 
 impl From<Assessment> for AssessmentBody {
     fn from(a: Assessment) -> Self {
+        let warnings = a.warnings();
         let exceeds = a.quantities.iter().any(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
         Self {
             model_digest: a.model_digest.to_string(),
@@ -108,6 +111,7 @@ impl From<Assessment> for AssessmentBody {
             misfit_percent: a.misfit_percent,
             assessed_at: a.assessed_at,
             exceeds,
+            warnings,
             parameters: a.quantities.into_iter().map(ParameterBody::from).collect(),
         }
     }

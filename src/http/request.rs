@@ -71,13 +71,10 @@ const DRAINED_LIMITS: usize = 8;
 /// # Errors
 /// 413 when it is larger than the limit, 408 when it is slower, 400 when the connection breaks.
 pub async fn read_body(body: Body, limits: BodyLimits) -> Result<Bytes, ApiError> {
-    match tokio::time::timeout(limits.time, collect(body, limits.bytes)).await {
-        Ok(result) => result,
-        Err(_) => {
-            let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
-            Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail))
-        }
-    }
+    tokio::time::timeout(limits.time, collect(body, limits.bytes)).await.unwrap_or_else(|_| {
+        let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
+        Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail))
+    })
 }
 
 async fn collect(mut body: Body, limit: usize) -> Result<Bytes, ApiError> {

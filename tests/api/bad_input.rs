@@ -134,7 +134,9 @@ async fn values_that_cannot_be_are_a_422_with_a_pointer() {
 async fn several_mistakes_are_reported_together_and_not_without_end() {
     let (service, _folder) = spawn();
     let mut rows = measurements([4.0, 5.0, 6.0], 40, 0);
-    rows.iter_mut().for_each(|row| row["frequencies_hz"][1] = json!(-1.0));
+    for row in &mut rows {
+        row["frequencies_hz"][1] = json!(-1.0);
+    }
     let answer = problem(service.post(BATCHES, &json!({ "measurements": rows })).await, 422, "invalid").await;
     let errors = answer["errors"].as_array().unwrap();
     assert_eq!(errors.len(), 21, "{answer}");
@@ -152,13 +154,13 @@ async fn a_batch_that_is_too_long_or_a_body_that_is_too_large_is_refused() {
     let huge = vec![b' '; 5 << 20];
     problem(service.post_text(BATCHES, "application/json", huge.clone()).await, 413, "body_too_large").await;
     // Without a length, which is found out while reading.
-    let chunks = futures_stream(huge);
+    let chunks = without_length(&huge);
     problem(service.post_text(BATCHES, "application/json", chunks).await, 413, "body_too_large").await;
     nothing_is_stored(&service).await;
 }
 
 /// A body without a known length.
-fn futures_stream(bytes: Vec<u8>) -> reqwest::Body {
+fn without_length(bytes: &[u8]) -> reqwest::Body {
     struct Chunks(std::collections::VecDeque<Vec<u8>>);
     impl http_body::Body for Chunks {
         type Data = bytes::Bytes;
@@ -282,6 +284,9 @@ async fn a_structure_with_mistakes_is_refused_with_its_place() {
     problem(service.get("/v1/structures/x").send().await.unwrap(), 404, "unknown_structure").await;
 }
 
+/// What a test does to the files of a baseline's folder.
+type Change<'a> = Box<dyn Fn(&std::path::Path) + 'a>;
+
 /// A models folder whose one baseline was changed by `change`.
 fn models_with(change: impl Fn(&std::path::Path)) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
@@ -310,7 +315,6 @@ async fn a_baseline_file_that_is_damaged_is_named_and_the_others_serve() {
         manifest["weights_sha256"] = json!(digest.as_str());
         std::fs::write(path, serde_json::to_vec(&manifest).unwrap()).unwrap();
     };
-    type Change<'a> = Box<dyn Fn(&std::path::Path) + 'a>;
     let cases: Vec<(&str, Change, &str)> = vec![
         ("bit flip", Box::new(|f| rewrite(weights(f), &|b| b[5_000] ^= 1)), "SHA-256"),
         (

@@ -176,9 +176,9 @@ pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {
             for _ in 0..60 {
                 let middle = f64::midpoint(low, high);
                 if determinant(low) * determinant(middle) <= 0.0 {
-                    high = middle
+                    high = middle;
                 } else {
-                    low = middle
+                    low = middle;
                 }
             }
             roots.push(low.sqrt() / std::f64::consts::TAU);

@@ -1,5 +1,7 @@
 //! The real program on a free port with its own SQLite file.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
 mod bad_input;
 mod batches;
 mod helpers;

@@ -111,7 +111,7 @@ async fn sigterm_under_load_answers_what_was_taken_and_exits_with_0() {
         .map(|i| {
             let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 20, i * 20_000) });
             let post = client.post(&url).json(&body).send();
-            tokio::spawn(async move { post.await.ok().filter(|r| r.status() == 201).is_some() })
+            tokio::spawn(async move { post.await.is_ok_and(|r| r.status() == 201) })
         })
         .collect();
     tokio::time::sleep(Duration::from_millis(30)).await;

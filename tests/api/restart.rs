@@ -63,7 +63,7 @@ async fn every_201_is_in_the_history_exactly_once_whenever_the_service_is_killed
     }
     let once: BTreeSet<String> = stored.iter().cloned().collect();
     assert_eq!(once.len(), stored.len(), "a batch is in the history twice");
-    let acknowledged = acknowledged.lock().unwrap();
+    let acknowledged = std::mem::take(&mut *acknowledged.lock().unwrap());
     assert!(acknowledged.len() > 50, "only {} posts were acknowledged: the test shows little", acknowledged.len());
     let lost: Vec<&String> = acknowledged.difference(&once).collect();
     assert!(lost.is_empty(), "{} of {} acknowledged batches are lost", lost.len(), acknowledged.len());

@@ -1,5 +1,7 @@
 //! The flow as mathematics: inverse of forward, log-determinant, a posterior with a closed form, files and back.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
 use candle_core::{DType, Device, Tensor};
 use modalwatch::flow::train::{train, Pairs, TrainSettings};
 use modalwatch::flow::weights::{untrained_flow, Weights};

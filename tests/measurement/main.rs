@@ -1,5 +1,7 @@
 //! Tables of measurements: whatever comes, no panic; what is written is read back.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
 use std::collections::BTreeMap;
 
 use modalwatch::measurement::check::{check_measurements, Expectation};

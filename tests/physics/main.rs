@@ -1,5 +1,7 @@
 //! Structures against closed forms, derivatives against finite differences, structure files against their mistakes.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
 mod definition;
 
 use std::f64::consts::PI;

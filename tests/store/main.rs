@@ -1,5 +1,7 @@
 //! The archive: whole or not at all, whoever goes away in the middle.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
