@@ -8,7 +8,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::write_whole;
-use crate::baseline::library::find_structure;
+use crate::baseline::library::{find_structure, read_structure_file};
 use crate::baseline::manifest::ValidationRecord;
 use crate::baseline::train::{diverged, train as train_baseline};
 use crate::flow::train::TrainSettings;
@@ -47,6 +47,19 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // A folder that cannot be written should not be found out after minutes of training.
     std::fs::create_dir_all(&out).with_context(|| format!("cannot make the folder {}", out.display()))?;
 
+    let own_file =
+        ["structure.toml", "structure.json"].map(|name| out.join(name)).into_iter().find(|path| path.exists());
+    if let Some(path) = &own_file {
+        // A baseline beside another structure's file would be refused when it is loaded.
+        let beside = read_structure_file(path)?;
+        anyhow::ensure!(
+            beside.digest() == simulator.digest(),
+            "{} describes another structure than {}: choose another --out",
+            path.display(),
+            args.structure
+        );
+    }
+
     let settings = TrainSettings { epochs: args.epochs, seed: args.seed, ..TrainSettings::default() };
     let bar = ProgressBar::new(args.epochs as u64);
     let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
@@ -61,9 +74,8 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
     write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
     write_whole(&out.join("baseline.json"), &trained.manifest_json)?;
-    // A folder that holds its own structure is found by `serve --models`; one that is there already is left alone.
-    let has_structure = ["structure.toml", "structure.json"].iter().any(|name| out.join(name).exists());
-    if !has_structure {
+    // A folder that holds its own structure is found by `serve --models`.
+    if own_file.is_none() {
         write_whole(&out.join("structure.json"), simulator.definition().canonical_json().as_bytes())?;
     }
 

@@ -134,7 +134,6 @@ pub fn train(
             sum += value;
         }
         let validation_loss = scalar(&mean_loss(flow, &validation.x, &validation.y)?)?;
-        on_epoch(EpochReport { epoch, loss: sum / steps_per_epoch as f64, validation_loss });
         if !validation_loss.is_finite() {
             stopped = Stopped::Diverged { epoch };
             break;
@@ -143,6 +142,7 @@ pub fn train(
             let copies = weights.iter().map(|(name, var)| Ok((name.as_str(), var.as_tensor().copy()?)));
             best = Some((epoch, validation_loss, copies.collect::<Result<_, candle_core::Error>>()?));
         }
+        on_epoch(EpochReport { epoch, loss: sum / steps_per_epoch as f64, validation_loss });
     }
     let diverged_at_once = Error::DivergedAtOnce { learning_rate: settings.learning_rate };
     let (best_epoch, best_validation_loss, copies) = best.ok_or(diverged_at_once)?;

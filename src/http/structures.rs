@@ -105,8 +105,9 @@ pub async fn put(
     let outcome = shared.monitor.put_structure(definition).await?;
     let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
     let watched = shared.monitor.structure(&id)?;
+    let undamaged = shared.monitor.store().undamaged(&id).await?.map(|u| super::answer::Undamaged::new(&id, u));
     let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
-    Ok((status, location, Json(self::body(&id, &watched, None))).into_response())
+    Ok((status, location, Json(self::body(&id, &watched, undamaged))).into_response())
 }
 
 /// Malformed JSON is told apart from JSON that is no structure.

@@ -2,25 +2,28 @@
 
 pub mod assess;
 pub mod compute;
+mod undamaged;
+mod watched;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, RwLock};
 
 use serde::{Deserialize, Serialize};
-use tracing::{error, info, warn};
+use tracing::{error, info, warn, Instrument as _};
 
 use crate::assessment::{Assessment, BatchState};
 use crate::baseline::library::{Library, Refusal};
 use crate::baseline::{assessment_seed, Baseline};
-use crate::damage::{self, QuantitySamples, UndamagedState};
+use crate::damage;
 use crate::measurement::check::Expectation;
 use crate::measurement::MeasurementBatch;
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::simulator::Simulator;
 use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store};
 use assess::Draws;
 use compute::{Compute, ComputeSettings, QueueFull};
+pub use watched::Watched;
 
 /// How batches are taken and assessed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -111,14 +114,6 @@ pub enum Error {
     Panicked,
 }
 
-/// A structure in use: its simulator, and its trained baseline or the reason why there is none.
-pub struct Watched {
-    /// The structure.
-    pub simulator: Simulator,
-    /// The trained baseline in use, or why there is none.
-    pub baseline: Result<Arc<Baseline>, String>,
-}
-
 /// A batch with all that is known of it.
 pub struct BatchView {
     /// The batch as stored.
@@ -194,38 +189,9 @@ impl Monitor {
         self.library.refusals()
     }
 
-    /// Structures with a trained baseline in use.
-    pub fn baselines_in_use(&self) -> usize {
-        self.lock_read().values().filter(|watched| watched.baseline.is_ok()).count()
-    }
-
     /// Places left in the queue.
     pub fn free_places(&self) -> usize {
         self.compute.free()
-    }
-
-    /// A structure in use.
-    ///
-    /// # Errors
-    /// [`Error::UnknownStructure`].
-    pub fn structure(&self, id: &StructureId) -> Result<Arc<Watched>, Error> {
-        self.lock_read().get(id).cloned().ok_or_else(|| Error::UnknownStructure(id.clone()))
-    }
-
-    /// Defines a structure.
-    ///
-    /// # Errors
-    /// [`Error::StructureInUse`] when it has batches under another definition.
-    pub async fn put_structure(&self, definition: StructureDefinition) -> Result<PutStructure, Error> {
-        let simulator = Simulator::new(definition)?;
-        let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
-        let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
-        match outcome {
-            PutStructure::Refused => return Err(Error::StructureInUse(id)),
-            PutStructure::Created | PutStructure::Replaced => self.watch(simulator),
-            PutStructure::Unchanged => {}
-        }
-        Ok(outcome)
     }
 
     /// What a batch of this structure must look like.
@@ -249,7 +215,7 @@ impl Monitor {
     pub async fn ingest(&self, batch: MeasurementBatch) -> Result<Ingested, Error> {
         let place = self.compute.reserve()?;
         let monitor = self.clone();
-        let task = tokio::spawn(async move { monitor.ingest_here(batch, place).await });
+        let task = tokio::spawn(async move { monitor.ingest_here(batch, place).await }.in_current_span());
         task.await.map_err(|_| Error::Panicked)?
     }
 
@@ -280,59 +246,38 @@ impl Monitor {
         let watched = self.structure(structure)?;
         let record = self.stored(structure, batch_id).await?;
         let assessment = self.store.assessment(structure, batch_id).await?;
+        let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
         let next_step = match (&assessment, &watched.baseline) {
             (None, Err(reason)) => Some(reason.clone()),
-            (Some(a), _) if a.undamaged_version.is_none() => Some(self.why_not_compared(structure, batch_id).await?),
+            (Some(a), _) if a.undamaged_version.is_none() => {
+                Some(self.why_not_compared(structure, batch_id, in_use).await?)
+            }
             _ => None,
         };
         Ok(BatchView { record, assessment, next_step })
     }
 
-    async fn why_not_compared(&self, structure: &StructureId, batch_id: &str) -> Result<String, Error> {
+    async fn why_not_compared(
+        &self,
+        structure: &StructureId,
+        batch_id: &str,
+        model_digest: Option<&Digest>,
+    ) -> Result<String, Error> {
         Ok(match self.store.undamaged(structure).await? {
             Some(undamaged) if undamaged.batches.iter().any(|id| id == batch_id) => {
                 format!("part of the undamaged state, version {}: not compared with itself", undamaged.state.version)
             }
+            Some(undamaged) if model_digest.is_some_and(|digest| *digest != undamaged.model_digest) => format!(
+                "the undamaged state, version {}, was taken with another trained baseline: name undamaged batches again \
+                 by POST /v1/structures/{structure}/baseline",
+                undamaged.state.version
+            ),
             Some(_) => "not compared with the undamaged state yet".to_owned(),
             None => format!(
                 "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/baseline \
                  {{\"batches\": [\"{batch_id}\"]}}"
             ),
         })
-    }
-
-    /// Takes batches as the undamaged state. Other batches that were never compared are assessed against it afterwards.
-    ///
-    /// # Errors
-    /// [`Error::NoModel`], [`Error::UnknownBatch`], [`Error::Assess`] for a batch without a complete measurement,
-    /// [`Error::Undamaged`] for too few measurements.
-    pub async fn declare_undamaged(
-        &self,
-        structure: &StructureId,
-        batch_ids: Vec<String>,
-        threshold_probability: f64,
-    ) -> Result<store::UndamagedRecord, Error> {
-        let watched = self.structure(structure)?;
-        let baseline = baseline_of(structure, &watched)?;
-        let mut records = Vec::new();
-        for (index, id) in batch_ids.iter().enumerate() {
-            if batch_ids[..index].contains(id) {
-                return Err(Error::RepeatedBatch(id.clone()));
-            }
-            records.push(self.stored(structure, id).await?);
-        }
-        let per_measurement = self.settings.draws_per_measurement;
-        let model_digest = baseline.digest().clone();
-        let compute = self.compute.reserve()?.run(move || pool(&baseline, &records, per_measurement));
-        let samples = compute.await.map_err(|_| Error::Panicked)??;
-        let state = UndamagedState::from_samples(0, &samples, threshold_probability)?;
-
-        let store = self.store.clone();
-        let version = store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
-        info!(structure.id = %structure, version, "Undamaged state {version} of {structure} from {} batches", batch_ids.len());
-        self.resume_later(structure.clone());
-        let stored = self.store.undamaged(structure).await?;
-        Ok(stored.expect("it was stored a moment ago and is never deleted"))
     }
 
     /// Assesses what an earlier run left unassessed, in the background.
@@ -402,33 +347,6 @@ impl Monitor {
         let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: crate::quantity::shown(batch_id) };
         self.store.batch(structure, batch_id).await?.ok_or_else(unknown)
     }
-
-    fn watch(&self, simulator: Simulator) {
-        let id = simulator.id().clone();
-        let baseline = self.find_baseline(&simulator);
-        let watched = Arc::new(Watched { simulator, baseline });
-        self.watched.write().expect("no holder of this lock panics").insert(id, watched);
-    }
-
-    fn find_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
-        let id = simulator.id();
-        let train = "train one with `modalwatch train` into a folder of --models and start the service again";
-        let Some(entry) = self.library.get(id) else {
-            return Err(format!("no trained baseline: {train}"));
-        };
-        if entry.simulator.digest() != simulator.digest() {
-            return Err(format!("the trained baseline is for another definition of {id}: {train}"));
-        }
-        let refused = || self.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
-        entry.baseline.clone().ok_or_else(|| match refused() {
-            Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
-            None => format!("no trained baseline: {train}"),
-        })
-    }
-
-    fn lock_read(&self) -> std::sync::RwLockReadGuard<'_, BTreeMap<StructureId, Arc<Watched>>> {
-        self.watched.read().expect("no holder of this lock panics")
-    }
 }
 
 fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baseline>, Error> {
@@ -438,23 +356,6 @@ fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baselin
 
 fn draws(baseline: &Baseline, record: &BatchRecord, per_measurement: usize) -> Draws {
     Draws { per_measurement, seed: assessment_seed(&record.content_digest, baseline.digest()) }
-}
-
-/// Samples of several batches as one pool for each quantity.
-fn pool(baseline: &Baseline, records: &[BatchRecord], per_measurement: usize) -> Result<Vec<QuantitySamples>, Error> {
-    let mut pooled: Vec<QuantitySamples> = Vec::new();
-    for record in records {
-        let failed = |source| Error::Assess { batch: record.batch_id.clone(), source };
-        let draws = draws(baseline, record, per_measurement);
-        let samples = assess::draw(baseline, &record.batch.measurements, draws).map_err(failed)?;
-        let quantities = assess::monitored_quantities(baseline, &samples.posterior);
-        if pooled.is_empty() {
-            pooled = quantities;
-        } else {
-            pooled.iter_mut().zip(quantities).for_each(|(all, more)| all.pool.extend(more.pool));
-        }
-    }
-    Ok(pooled)
 }
 
 fn report(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {

@@ -8,10 +8,10 @@ use super::definition::{
 use super::Binding;
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::{floating_mass, Mass, Node, Spring, Structure};
+use crate::physics::{floating_mass, natural_frequencies_hz, Mass, Node, Spring, Structure};
 use crate::quantity::{shown, StructureId};
 
-/// Most degrees of freedom: a dense eigenproblem of this size takes half a second.
+/// Most degrees of freedom: a dense eigenproblem of this size takes some three seconds.
 const MOST_MASSES: usize = 2_000;
 
 /// The checked parts of a structure.
@@ -19,6 +19,7 @@ const MOST_MASSES: usize = 2_000;
 pub(super) struct Checked {
     pub id: StructureId,
     pub structure: Structure,
+    pub nominal_frequencies_hz: Vec<f64>,
     pub space: ParameterSpace,
     pub bindings: Vec<Binding>,
     pub covariates: Vec<Covariate>,
@@ -47,8 +48,11 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
     let masses = definition.masses.iter().map(|m| Mass { name: m.name.clone(), kg: m.kg }).collect();
     let structure =
         Structure::new(masses, springs).map_err(|e| vec![DefinitionProblem::new("/spring", e.to_string())])?;
+    // Tied to the ground is not enough: values far apart can drown the lowest frequency in rounding.
+    let nominal_frequencies_hz = natural_frequencies_hz(&structure, definition.modes)
+        .map_err(|e| vec![DefinitionProblem::new("/spring", format!("at the nominal stiffnesses: {e}"))])?;
     let covariates = definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
-    Ok(Checked { id, structure, space, bindings, covariates })
+    Ok(Checked { id, structure, nominal_frequencies_hz, space, bindings, covariates })
 }
 
 fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
@@ -171,11 +175,10 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/sets"), message));
         }
         for (place, sets) in parameter.sets.iter().enumerate() {
-            // One table in the file, or a list of them: both have a key `spring` that the line finder meets or stops above.
-            let pointer = if parameter.sets.len() == 1 {
-                format!("/parameter/{index}/sets/spring")
-            } else {
-                format!("/parameter/{index}/sets/{place}/spring")
+            // A single one may stand in the file as a table or as a list; a list of several has an index.
+            let pointer = match parameter.sets.len() {
+                1 => format!("/parameter/{index}/sets"),
+                _ => format!("/parameter/{index}/sets/{place}/spring"),
             };
             let Some(spring) = definition.springs.iter().position(|s| s.name == sets.spring) else {
                 let message = format!("there is no spring {}", shown(&sets.spring));
@@ -241,8 +244,9 @@ fn check_priors(definition: &StructureDefinition, springs: &[Spring], bindings: 
         let least = at_lower.min(at_upper);
         let pointer = format!("/parameter/{}/prior/uniform", binding.parameter);
         let name = shown(&springs[binding.spring].name);
-        if !(least >= 0.0 && at_lower.max(at_upper).is_finite()) {
-            let message = format!("the prior [{lower}, {upper}] lets spring {name} have a stiffness of {least} N/m: it must be finite and not negative");
+        // Each end by itself: `min` and `max` pass over NaN, which 0·exp(large) gives.
+        if !(least >= 0.0 && at_lower.is_finite() && at_upper.is_finite()) {
+            let message = format!("the prior [{lower}, {upper}] lets spring {name} have a stiffness of {at_lower} to {at_upper} N/m: it must be finite and not negative");
             problems.push(DefinitionProblem::new(pointer, message));
         }
         weakest[binding.spring].n_per_m = least;

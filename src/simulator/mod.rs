@@ -195,7 +195,7 @@ impl Simulator {
 
     /// Natural frequencies at the nominal stiffnesses, Hz.
     pub fn nominal_frequencies_hz(&self) -> Vec<f64> {
-        natural_frequencies_hz(self.structure(), self.modes()).unwrap_or_default()
+        self.parts.checked.nominal_frequencies_hz.clone()
     }
 
     /// Smallest and largest frequency that a measurement can have without being a mistake of unit or place, Hz.
@@ -221,7 +221,8 @@ impl Simulator {
     /// `samples` pairs from the prior; the same seed gives the same bits on any number of threads.
     ///
     /// # Errors
-    /// [`Error`]; a checked definition has no mechanism in its prior, so only noise out of proportion can fail.
+    /// [`Error`]; a checked definition has no mechanism in its prior, so only noise out of proportion can fail, or
+    /// stiffnesses of a prior that differ by twelve orders of magnitude.
     pub fn training_set(&self, samples: usize, seed: u64) -> Result<TrainingSet, Error> {
         let space = self.space();
         let mut stream = stats::stream(seed, "prior");

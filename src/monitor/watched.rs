@@ -1,0 +1,77 @@
+//! The structures in use, each with its trained baseline or the reason why there is none.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, RwLockReadGuard};
+
+use super::{Error, Monitor};
+use crate::baseline::Baseline;
+use crate::quantity::{StructureId, Timestamp};
+use crate::simulator::definition::StructureDefinition;
+use crate::simulator::Simulator;
+use crate::store::PutStructure;
+
+/// A structure in use: its simulator, and its trained baseline or the reason why there is none.
+pub struct Watched {
+    /// The structure.
+    pub simulator: Simulator,
+    /// The trained baseline in use, or why there is none.
+    pub baseline: Result<Arc<Baseline>, String>,
+}
+
+impl Monitor {
+    /// Structures with a trained baseline in use.
+    pub fn baselines_in_use(&self) -> usize {
+        self.lock_read().values().filter(|watched| watched.baseline.is_ok()).count()
+    }
+
+    /// A structure in use.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`].
+    pub fn structure(&self, id: &StructureId) -> Result<Arc<Watched>, Error> {
+        self.lock_read().get(id).cloned().ok_or_else(|| Error::UnknownStructure(id.clone()))
+    }
+
+    /// Defines a structure.
+    ///
+    /// # Errors
+    /// [`Error::StructureInUse`] when it has batches under another definition.
+    pub async fn put_structure(&self, definition: StructureDefinition) -> Result<PutStructure, Error> {
+        let simulator = Simulator::new(definition)?;
+        let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
+        let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
+        match outcome {
+            PutStructure::Refused => return Err(Error::StructureInUse(id)),
+            PutStructure::Created | PutStructure::Replaced => self.watch(simulator),
+            PutStructure::Unchanged => {}
+        }
+        Ok(outcome)
+    }
+
+    pub(super) fn watch(&self, simulator: Simulator) {
+        let id = simulator.id().clone();
+        let baseline = self.find_baseline(&simulator);
+        let watched = Arc::new(Watched { simulator, baseline });
+        self.watched.write().expect("no holder of this lock panics").insert(id, watched);
+    }
+
+    fn find_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
+        let id = simulator.id();
+        let train = "train one with `modalwatch train` into a folder of --models and start the service again";
+        let Some(entry) = self.library.get(id) else {
+            return Err(format!("no trained baseline: {train}"));
+        };
+        if entry.simulator.digest() != simulator.digest() {
+            return Err(format!("the trained baseline is for another definition of {id}: {train}"));
+        }
+        let refused = || self.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
+        entry.baseline.clone().ok_or_else(|| match refused() {
+            Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
+            None => format!("no trained baseline: {train}"),
+        })
+    }
+
+    pub(super) fn lock_read(&self) -> RwLockReadGuard<'_, BTreeMap<StructureId, Arc<Watched>>> {
+        self.watched.read().expect("no holder of this lock panics")
+    }
+}
