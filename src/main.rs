@@ -12,8 +12,17 @@ fn main() -> ExitCode {
     match modalwatch::cli::run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("modalwatch: {error:#}");
+            eprintln!("modalwatch: {}", message(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// The chain of causes, without those whose text the one above them quotes already.
+fn message(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |said, cause| match said.as_str() {
+        "" => cause,
+        said if said.contains(&cause) => said.to_owned(),
+        said => format!("{said}: {cause}"),
+    })
 }

@@ -47,6 +47,10 @@ pub fn start(settings: &LogSettings) -> Result<(), String> {
         LogFormat::Auto => !std::io::stderr().is_terminal(),
     };
     let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    let started = if json { builder.json().flatten_event(true).try_init() } else { builder.compact().try_init() };
+    let started = if json {
+        builder.json().flatten_event(true).with_span_list(false).try_init()
+    } else {
+        builder.compact().try_init()
+    };
     started.map_err(|e| e.to_string())
 }

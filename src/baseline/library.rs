@@ -127,12 +127,14 @@ impl Library {
 #[derive(Debug, thiserror::Error)]
 pub enum StructureFileError {
     /// The file cannot be read.
-    #[error("the structure file {path} cannot be read: {source}")]
+    #[error("{path} cannot be read as a structure file ({source}); the shipped structures are {shipped}")]
     Read {
         /// The file.
         path: PathBuf,
         /// The cause.
         source: std::io::Error,
+        /// What could have been meant instead.
+        shipped: String,
     },
     /// It is no structure.
     #[error("{path}: {source}")]
@@ -149,7 +151,10 @@ pub enum StructureFileError {
 /// # Errors
 /// [`StructureFileError`] with the file's name and the place in it.
 pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError> {
-    let bytes = std::fs::read(path).map_err(|source| StructureFileError::Read { path: path.to_owned(), source })?;
+    let bytes = std::fs::read(path).map_err(|source| {
+        let shipped = shipped_folders().into_keys().collect::<Vec<_>>().join(", ");
+        StructureFileError::Read { path: path.to_owned(), source, shipped }
+    })?;
     let name = path.to_string_lossy();
     read_definition(&name, &bytes).map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
 }
