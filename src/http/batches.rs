@@ -69,7 +69,7 @@ pub async fn create(
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
     let key = idempotency_key(&headers)?;
-    let bytes = read_body(body, shared.limits).await?;
+    let bytes = read_body(body, &headers, shared.limits).await?;
     let kind = media_type(&headers);
     let monitor = shared.monitor.clone();
     // A body of thousands of measurements takes milliseconds to parse: not on an async thread.

@@ -158,7 +158,7 @@ pub async fn declare_baseline(
         Some("application/json") => {}
         other => return Err(unsupported_media_type(other, "application/json")),
     }
-    let body: BaselineBody = parse_json(&read_body(body, shared.limits).await?)?;
+    let body: BaselineBody = parse_json(&read_body(body, &headers, shared.limits).await?)?;
     if body.batches.is_empty() {
         return Err(ApiError::invalid_field("/batches", "name at least one batch"));
     }

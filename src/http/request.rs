@@ -69,8 +69,12 @@ const DRAINED_LIMITS: usize = 8;
 /// The whole body.
 ///
 /// # Errors
-/// 413 when it is larger than the limit, 408 when it is slower, 400 when the connection breaks.
-pub async fn read_body(body: Body, limits: BodyLimits) -> Result<Bytes, ApiError> {
+/// 415 when it is compressed, 413 when it is larger than the limit, 408 when it is slower, 400 when the connection breaks.
+pub async fn read_body(body: Body, headers: &HeaderMap, limits: BodyLimits) -> Result<Bytes, ApiError> {
+    if headers.get(header::CONTENT_ENCODING).is_some_and(|encoding| encoding != "identity") {
+        let detail = "a compressed body is not decoded: send it without Content-Encoding";
+        return Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_encoding", detail));
+    }
     tokio::time::timeout(limits.time, collect(body, limits.bytes)).await.unwrap_or_else(|_| {
         let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
         Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail))

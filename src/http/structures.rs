@@ -92,7 +92,7 @@ pub async fn put(
     body: Body,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let bytes = read_body(body, shared.limits).await?;
+    let bytes = read_body(body, &headers, shared.limits).await?;
     let definition = match media_type(&headers).as_deref() {
         Some("application/json") => parse_definition_json(&bytes)?,
         Some("application/toml") => StructureDefinition::parse_toml(utf8(&bytes)?).map_err(refused)?,

@@ -108,6 +108,8 @@ impl Store {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn history(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
         let (after_time, after_id) = query.after.clone().unzip();
+        // SQLite takes one lower bound for its search in the index: without this it reads all earlier pages again.
+        let from = query.from.max(after_time);
         let rows: Vec<EntryRow> = sqlx::query_as(
             "select batch_id, source, measured_from_us, measured_to_us, received_at_us, measurement_count, state, failure
              from measurement_batch
@@ -116,7 +118,7 @@ impl Store {
              order by measured_from_us, batch_id limit ?6",
         )
         .bind(structure.as_str())
-        .bind(query.from.map_or(i64::MIN, Timestamp::micros))
+        .bind(from.map_or(i64::MIN, Timestamp::micros))
         .bind(query.to.map_or(i64::MAX, Timestamp::micros))
         .bind(after_time.map_or(i64::MIN, Timestamp::micros))
         .bind(after_id.unwrap_or_default())
@@ -147,6 +149,9 @@ impl Store {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn exceedances(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
         let (before_time, before_id) = query.after.clone().unzip();
+        // As in `history`; one microsecond more, because a batch of the same time can still follow.
+        let behind = before_time.map_or(i64::MAX, |time| time.micros() + 1);
+        let to = query.to.map_or(i64::MAX, Timestamp::micros).min(behind);
         let select = format!(
             "select b.batch_id, b.measured_from_us, b.measured_to_us, q.quantity, q.unit, q.probability_of_damage,
                     u.threshold_probability, q.threshold, q.relative_change, q.undamaged_version, q.model_digest
@@ -166,7 +171,7 @@ impl Store {
         let rows: Vec<ExceedanceRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(query.from.map_or(i64::MIN, Timestamp::micros))
-            .bind(query.to.map_or(i64::MAX, Timestamp::micros))
+            .bind(to)
             .bind(before_time.map(Timestamp::micros))
             .bind(before_id.unwrap_or_default())
             .bind(query.after_quantity.clone().unwrap_or_default())

@@ -7,6 +7,8 @@ mod assessment;
 mod batch;
 mod history;
 mod structure;
+#[cfg(test)]
+mod tests;
 mod undamaged;
 
 use std::fs::{File, TryLockError};
@@ -147,12 +149,12 @@ impl Store {
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
             .busy_timeout(BUSY_TIMEOUT);
-        let writer_options =
-            options.clone().create_if_missing(true).pragma("application_id", APPLICATION_ID.to_string());
         // The connection lives as long as the store; a pool of one is the queue of writers.
         let writer = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
-        let writer = writer.connect_with(writer_options).await.map_err(|e| not_a_database(e, &path))?;
-        let (check,): (String,) = sqlx::query_as("pragma quick_check(1)").fetch_one(&writer).await?;
+        let writer = writer.connect_with(options.clone().create_if_missing(true)).await;
+        let writer = writer.map_err(|e| not_a_database(e, &path))?;
+        let check: Result<(String,), _> = sqlx::query_as("pragma quick_check(1)").fetch_one(&writer).await;
+        let (check,) = check.map_err(|e| not_a_database(e, &path))?;
         if check != "ok" {
             return Err(Error::Corrupt { path, detail: check });
         }
@@ -161,6 +163,9 @@ impl Store {
         if numbers.as_slice() < OLDEST_SQLITE.as_slice() {
             return Err(Error::LibraryTooOld(sqlite_version));
         }
+        // Only now: the mark is a write, and a damaged file is left as it is.
+        let mark = format!("pragma application_id = {APPLICATION_ID}");
+        sqlx::query(sqlx::AssertSqlSafe(mark)).execute(&writer).await?;
         MIGRATIONS.run(&writer).await.map_err(|error| match error {
             MigrateError::VersionMissing(found) => Error::SchemaTooNew { path: path.clone(), found, known: newest() },
             other => Error::Migration(other),
@@ -257,10 +262,14 @@ async fn refuse_foreign(path: &Path) -> Result<(), Error> {
     let mut connection = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(path))
         .await
         .map_err(|e| not_a_database(e, path))?;
-    let found: Result<(i64,), _> = sqlx::query_as("pragma application_id").fetch_one(&mut connection).await;
-    let (application_id,) = found.map_err(|e| not_a_database(e, path))?;
+    let found: Result<(i64, bool), _> =
+        sqlx::query_as("select application_id, not exists (select 1 from sqlite_schema) from pragma_application_id")
+            .fetch_one(&mut connection)
+            .await;
+    let (application_id, empty) = found.map_err(|e| not_a_database(e, path))?;
     connection.close().await?;
-    if application_id == APPLICATION_ID {
+    // Unmarked and without a table is what a first start leaves that was killed between making the file and marking it.
+    if application_id == APPLICATION_ID || (application_id == 0 && empty) {
         Ok(())
     } else {
         Err(Error::Foreign { path: path.to_owned(), application_id })

@@ -1,5 +1,6 @@
 //! Undamaged states: versions that never change.
 
+use super::assessment::CURRENT_FIRST;
 use super::{timestamp, Error, Store};
 use crate::damage::{UndamagedQuantity, UndamagedState};
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -20,7 +21,7 @@ pub struct UndamagedRecord {
 impl Store {
     /// Stores an undamaged state under the next version, which is returned.
     ///
-    /// In the same transaction, batches outside it that were never compared with any go back to be assessed.
+    /// In the same transaction, batches outside it whose current assessment compares with none go back to be assessed.
     ///
     /// # Errors
     /// [`Error::UnknownBatch`], [`Error::Sqlite`].
@@ -76,18 +77,20 @@ impl Store {
                         .execute(&mut *connection)
                         .await?;
                 }
-                sqlx::query(
+                // The current one decides: one compared under an earlier baseline says nothing under this one.
+                let requeue = format!(
                     "update measurement_batch set state = 'received'
                      where structure_id = ?1 and state = 'assessed'
                        and batch_id not in (select batch_id from undamaged_batch where structure_id = ?1 and version = ?2)
-                       and not exists (select 1 from assessment a
+                       and 0 = (select undamaged_version from assessment a
                            where a.structure_id = ?1 and a.batch_id = measurement_batch.batch_id
-                             and a.undamaged_version > 0)",
-                )
-                .bind(&structure)
-                .bind(version)
-                .execute(&mut *connection)
-                .await?;
+                           order by {CURRENT_FIRST} limit 1)"
+                );
+                sqlx::query(sqlx::AssertSqlSafe(requeue))
+                    .bind(&structure)
+                    .bind(version)
+                    .execute(&mut *connection)
+                    .await?;
                 Ok(version)
             })
         })

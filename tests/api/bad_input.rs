@@ -183,6 +183,9 @@ async fn other_content_types_are_a_415() {
         let answer = problem(service.post_text(BATCHES, kind, "{}").await, 415, "unsupported_media_type").await;
         assert!(answer["detail"].as_str().unwrap().contains("application/json or text/csv"), "{answer}");
     }
+    let compressed = service.request(reqwest::Method::POST, BATCHES).header("content-encoding", "gzip");
+    let compressed = compressed.header("content-type", "application/json").body("{}").send().await.unwrap();
+    problem(compressed, 415, "unsupported_encoding").await;
     let none = service.request(reqwest::Method::POST, BATCHES).body("{}").send().await.unwrap();
     problem(none, 415, "unsupported_media_type").await;
 }

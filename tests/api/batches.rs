@@ -49,6 +49,20 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
 }
 
 #[tokio::test]
+async fn the_example_of_the_readme_is_taken() {
+    let readme = include_str!("../../README.md");
+    let (_, rest) = readme.split_once(" -d '").unwrap();
+    let (body, _) = rest.split_once("'\n").unwrap();
+    let (service, _folder) = spawn();
+    let answer = created(service.post_text(BATCHES, "application/json", body).await).await;
+    assert_eq!(answer["measurement_count"], 2);
+    let assessment = &answer["assessment"];
+    assert_eq!((&assessment["measurements_outside"], &assessment["warnings"]), (&json!(0), &json!([])), "{answer}");
+    let mean = assessment["parameters"][0]["mean"].as_f64().unwrap();
+    assert!(readme.contains(&format!("\"mean\": {mean:.4}")), "README shows another mean of k1 than {mean}");
+}
+
+#[tokio::test]
 async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;

@@ -1,0 +1,238 @@
+//! What `tests/store` cannot reach through whole batches: files that are refused, and what SQLite searches.
+
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
+use sqlx::Connection as _;
+
+use super::{Error, HistoryQuery, InsertBatch, PutStructure, Store, APPLICATION_ID, DATABASE_FILE};
+use crate::assessment::Assessment;
+use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedState};
+use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
+use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
+
+fn bridge() -> StructureId {
+    StructureId::parse("bridge").unwrap()
+}
+
+fn at(seconds: i64) -> Timestamp {
+    Timestamp::from_micros(1_700_000_000_000_000 + seconds * 1_000_000).unwrap()
+}
+
+fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementBatch {
+    let measurement = |i: i64| ModalMeasurement {
+        measured_at: at(start + i),
+        frequencies_hz: vec![None, Some(Hertz::new(1.5).unwrap())],
+        std_hz: None,
+        covariates: [("operator".to_owned(), CovariateValue::Category("é \"x\"".to_owned()))]
+            .into_iter()
+            .chain([("temperature_c".to_owned(), CovariateValue::Number(0.1 + 0.2))])
+            .collect(),
+        settings: [].into(),
+    };
+    MeasurementBatch {
+        structure: bridge(),
+        source: source.to_owned(),
+        idempotency_key: key.map(str::to_owned),
+        measurements: (0..2).map(measurement).collect(),
+    }
+}
+
+fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestamp) -> Assessment {
+    let damage = Damage { threshold: 3.5, probability_of_damage: 0.4, exceeds: true, relative_change: -0.1 };
+    let quantity = |name: &str| QuantityAssessment {
+        name: name.to_owned(),
+        unit: "N/m".to_owned(),
+        kind: QuantityKind::Parameter,
+        hyperparameters: Hyperparameters { mean: 3.6, std: None, within: 0.01, between: None },
+        edge_mass: 0.0,
+        damage: undamaged_version.map(|_| damage.clone()),
+    };
+    Assessment {
+        model_digest: Digest::of(&[model.as_bytes()]),
+        structure_digest: Digest::of(&[b"v1"]),
+        undamaged_version,
+        seed: u64::MAX,
+        draws_per_measurement: 10,
+        measurements_used: 1,
+        measurements_left_out: 1,
+        measurements_outside: 0,
+        misfit_percent: vec![0.1],
+        assessed_at,
+        quantities: vec![quantity("k2"), quantity("k1")],
+    }
+}
+
+fn undamaged() -> UndamagedState {
+    UndamagedState { version: 0, threshold_probability: 0.05, measurements: 2, quantities: Vec::new() }
+}
+
+async fn open() -> (Store, tempfile::TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::open(folder.path()).await.unwrap();
+    let put = store.put_structure(&bridge(), "{}", &Digest::of(&[b"v1"]), at(0)).await.unwrap();
+    assert_eq!(put, PutStructure::Created);
+    (store, folder)
+}
+
+/// Runs statements on the file of a folder without a store, making it where it is missing.
+async fn by_hand(folder: &Path, statements: &[&'static str]) {
+    let options = SqliteConnectOptions::new().filename(folder.join(DATABASE_FILE)).create_if_missing(true);
+    let mut connection = SqliteConnection::connect_with(&options).await.unwrap();
+    for statement in statements {
+        sqlx::query(*statement).execute(&mut connection).await.unwrap();
+    }
+    connection.close().await.unwrap();
+}
+
+async fn refusal(folder: &Path) -> Error {
+    Store::open(folder).await.err().expect("the folder should be refused")
+}
+
+#[tokio::test]
+async fn what_is_not_our_database_is_refused_and_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join(DATABASE_FILE);
+    std::fs::write(&file, "some text that is longer than a header").unwrap();
+    assert!(matches!(refusal(folder.path()).await, Error::NotADatabase(_)));
+    assert!(std::fs::read_to_string(&file).unwrap().starts_with("some text"));
+    std::fs::remove_file(&file).unwrap();
+    by_hand(folder.path(), &["create table theirs (a)"]).await;
+    assert!(matches!(refusal(folder.path()).await, Error::Foreign { application_id: 0, .. }));
+    by_hand(folder.path(), &["drop table theirs", "pragma application_id = 7"]).await;
+    assert!(matches!(refusal(folder.path()).await, Error::Foreign { application_id: 7, .. }));
+}
+
+#[tokio::test]
+async fn a_first_start_that_was_killed_before_it_marked_its_file_can_be_repeated() {
+    let folder = tempfile::tempdir().unwrap();
+    by_hand(folder.path(), &["pragma journal_mode = wal"]).await;
+    assert!(std::fs::metadata(folder.path().join(DATABASE_FILE)).unwrap().len() > 0);
+    let store = Store::open(folder.path()).await.unwrap();
+    store.is_writable().await.unwrap();
+    let (id,): (i64,) = sqlx::query_as("pragma application_id").fetch_one(&store.reader).await.unwrap();
+    assert_eq!(id, APPLICATION_ID);
+}
+
+#[tokio::test]
+async fn one_folder_has_one_store() {
+    let (store, folder) = open().await;
+    assert!(matches!(refusal(folder.path()).await, Error::Locked(_)));
+    store.close().await;
+    drop(store);
+    assert_eq!(Store::open(folder.path()).await.unwrap().structures().await.unwrap().len(), 1);
+}
+
+#[tokio::test]
+async fn a_read_only_file_or_folder_is_refused_even_to_root() {
+    let (store, folder) = open().await;
+    store.close().await;
+    drop(store);
+    for (path, mode) in [(folder.path().join(DATABASE_FILE), 0o644), (folder.path().to_owned(), 0o755)] {
+        let allow = |bits| std::fs::set_permissions(&path, std::fs::Permissions::from_mode(bits)).unwrap();
+        allow(mode & 0o555);
+        assert!(matches!(refusal(folder.path()).await, Error::ReadOnly(named) if named == path));
+        allow(mode);
+    }
+    Store::open(folder.path()).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_newer_schema_is_refused_with_both_versions() {
+    let (store, folder) = open().await;
+    store.close().await;
+    drop(store);
+    let newer = "insert into _sqlx_migrations select 9999, 'x', installed_on, true, checksum, 0 from _sqlx_migrations";
+    by_hand(folder.path(), &[newer]).await;
+    assert!(matches!(refusal(folder.path()).await, Error::SchemaTooNew { found: 9999, known: 1, .. }));
+}
+
+#[tokio::test]
+async fn a_damaged_or_truncated_file_is_refused_as_corrupt() {
+    let (store, folder) = open().await;
+    for i in 0..40 {
+        store.insert_batch(&batch(&format!("s{i}"), 0, None), &format!("b{i}"), at(0)).await.unwrap();
+    }
+    store.close().await;
+    drop(store);
+    let file = folder.path().join(DATABASE_FILE);
+    let good = std::fs::read(&file).unwrap();
+    for page in 0..good.len() / 4096 {
+        let mut bad = good.clone();
+        let start = (page * 4096).max(100); // behind the file header
+        bad[start..start + 60].fill(0xa5);
+        std::fs::write(&file, &bad).unwrap();
+        let error = refusal(folder.path()).await;
+        assert!(matches!(error, Error::Corrupt { .. }), "page {page}: {error}");
+        assert!(std::fs::read(&file).unwrap() == bad, "page {page}: a damaged file was written to");
+    }
+    std::fs::write(&file, &good[..good.len() / 2]).unwrap();
+    assert!(matches!(refusal(folder.path()).await, Error::Corrupt { .. }));
+}
+
+#[tokio::test]
+async fn a_known_key_decides_and_then_the_measurements() {
+    let (store, _folder) = open().await;
+    let (given, other) = (batch("s", 0, Some("key")), batch("s", 50, Some("key")));
+    let insert = async |batch: &MeasurementBatch| store.insert_batch(batch, "b", at(0)).await.unwrap();
+    assert_eq!(insert(&given).await, InsertBatch::Inserted);
+    assert_eq!(store.batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
+    assert_eq!(insert(&given).await, InsertBatch::Replayed("b".to_owned()));
+    assert_eq!(insert(&batch("s", 0, None)).await, InsertBatch::Replayed("b".to_owned()));
+    assert_eq!(insert(&other).await, InsertBatch::KeyConflict { batch_id: "b".to_owned() });
+    let nowhere = MeasurementBatch { structure: StructureId::parse("nowhere").unwrap(), ..given };
+    assert!(matches!(store.insert_batch(&nowhere, "c", at(0)).await, Err(Error::UnknownStructure(_))));
+}
+
+#[tokio::test]
+async fn a_comparison_under_an_earlier_baseline_does_not_keep_a_batch_from_the_next() {
+    let (store, _folder) = open().await;
+    for id in ["b0", "b1"] {
+        store.insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
+    }
+    let declare = async |model: &str| {
+        let digest = Digest::of(&[model.as_bytes()]);
+        store.insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap()
+    };
+    assert_eq!(declare("old").await, 1);
+    for (id, assessment) in [
+        ("b1", assessment("old", Some(1), at(2))),
+        ("b1", assessment("new", None, at(3))),
+        ("b0", assessment("new", None, at(3))),
+    ] {
+        store.insert_assessment(&bridge(), id, &assessment).await.unwrap();
+    }
+    assert_eq!(declare("new").await, 2);
+    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b1"]);
+}
+
+#[tokio::test]
+async fn pages_of_exceedances_walk_the_current_ones_once_and_newest_first() {
+    let (store, _folder) = open().await;
+    for i in 0..12 {
+        let id = format!("b{i:02}");
+        // Three batches at each time, so that pages end between equals.
+        store.insert_batch(&batch(&format!("s{i}"), i / 3, None), &id, at(0)).await.unwrap();
+        if i == 0 {
+            store.insert_undamaged(&bridge(), &undamaged(), &Digest::of(&[b"m"]), &[id], at(1)).await.unwrap();
+        } else {
+            store.insert_assessment(&bridge(), &id, &assessment("m", Some(1), at(1))).await.unwrap();
+        }
+    }
+    store.insert_assessment(&bridge(), "b07", &assessment("later", None, at(9))).await.unwrap();
+    for limit in 1..6 {
+        let mut query = HistoryQuery { limit, from: Some(at(0)), to: Some(at(3)), ..HistoryQuery::default() };
+        let mut walked = Vec::new();
+        loop {
+            let page = store.exceedances(&bridge(), &query).await.unwrap();
+            let Some(last) = page.last() else { break };
+            query.after = Some((last.measured_from, last.batch_id.clone()));
+            query.after_quantity = Some(last.quantity.clone());
+            walked.extend(page.into_iter().map(|e| (e.measured_from, e.batch_id, e.quantity)));
+        }
+        // b01 to b08 without b07, which is no longer current; two quantities each.
+        assert_eq!(walked.len(), 14, "limit {limit}");
+        assert!(walked.is_sorted_by(|a, b| a > b), "limit {limit}");
+    }
+}
