@@ -78,7 +78,7 @@ impl Place {
     ///
     /// # Errors
     /// [`Panicked`] when `work` panicked.
-    pub async fn run<T: Send + 'static>(self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Panicked> {
+    pub async fn run<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Panicked> {
         let _thread = self.threads.acquire().await.expect("the semaphore is never closed");
         tokio::task::spawn_blocking(work).await.map_err(|_| Panicked)
     }

@@ -14,7 +14,7 @@ use tracing::{error, info, warn, Instrument as _};
 use crate::assessment::{Assessment, BatchState};
 use crate::baseline::library::{Library, Refusal};
 use crate::baseline::{assessment_seed, Baseline};
-use crate::damage;
+use crate::damage::{self, UndamagedState};
 use crate::measurement::check::Expectation;
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -319,28 +319,50 @@ impl Monitor {
     async fn assess_stored(&self, watched: &Watched, record: BatchRecord, place: compute::Place) -> Result<(), Error> {
         let structure = record.batch.structure.clone();
         let baseline = baseline_of(&structure, watched)?;
-        let undamaged = self.store.undamaged(&structure).await?;
-        // An undamaged state holds for the baseline whose samples it was taken from, and not for its own batches.
-        let undamaged = undamaged
-            .filter(|u| u.model_digest == *baseline.digest() && !u.batches.contains(&record.batch_id))
-            .map(|u| u.state);
         let draws = draws(&baseline, &record, self.settings.draws_per_measurement);
-        let batch_id = record.batch_id.clone();
-        let started = std::time::Instant::now();
-        let work = move || assess::assess(&baseline, &record.batch.measurements, undamaged.as_ref(), draws);
-        let reason = match place.run(work).await {
-            Ok(Ok(assessment)) => {
-                let seconds = started.elapsed().as_secs_f64();
-                metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
-                report(&structure, &batch_id, &assessment, seconds);
-                return Ok(self.store.insert_assessment(&structure, &batch_id, &assessment).await?);
-            }
-            Ok(Err(error)) => error.to_string(),
-            Err(panicked) => panicked.to_string(),
-        };
-        metrics::counter!("modalwatch_assessments_failed_total").increment(1);
-        warn!(structure.id = %structure, batch.id = %batch_id, "Could not assess batch {batch_id} of {structure}: {reason}");
-        Ok(self.store.mark_failed(&structure, &batch_id, &reason).await?)
+        let record = Arc::new(record);
+        let mut undamaged = self.comparable(&structure, &record, &baseline).await?;
+        loop {
+            let started = std::time::Instant::now();
+            let version = undamaged.as_ref().map(|state| state.version);
+            let (baseline_here, record_here) = (Arc::clone(&baseline), Arc::clone(&record));
+            let work =
+                move || assess::assess(&baseline_here, &record_here.batch.measurements, undamaged.as_ref(), draws);
+            let reason = match place.run(work).await {
+                Ok(Ok(assessment)) => {
+                    let seconds = started.elapsed().as_secs_f64();
+                    metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
+                    report(&structure, &record.batch_id, &assessment, seconds);
+                    self.store.insert_assessment(&structure, &record.batch_id, &assessment).await?;
+                    // A state declared while this was computed did not find the batch assessed, and so did not send it
+                    // back: it is compared now.
+                    undamaged = self.comparable(&structure, &record, &baseline).await?;
+                    if undamaged.as_ref().map(|state| state.version) == version {
+                        return Ok(());
+                    }
+                    continue;
+                }
+                Ok(Err(error)) => error.to_string(),
+                Err(panicked) => panicked.to_string(),
+            };
+            let id = &record.batch_id;
+            metrics::counter!("modalwatch_assessments_failed_total").increment(1);
+            warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
+            return Ok(self.store.mark_failed(&structure, id, &reason).await?);
+        }
+    }
+
+    /// The undamaged state a batch is compared with: the newest, if it was taken with this baseline and without this batch.
+    async fn comparable(
+        &self,
+        structure: &StructureId,
+        record: &BatchRecord,
+        baseline: &Baseline,
+    ) -> Result<Option<UndamagedState>, Error> {
+        let newest = self.store.undamaged(structure).await?;
+        let fits =
+            |u: &store::UndamagedRecord| u.model_digest == *baseline.digest() && !u.batches.contains(&record.batch_id);
+        Ok(newest.filter(fits).map(|u| u.state))
     }
 
     async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {

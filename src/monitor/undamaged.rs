@@ -9,7 +9,7 @@ use crate::quantity::{StructureId, Timestamp};
 use crate::store::{BatchRecord, UndamagedRecord};
 
 impl Monitor {
-    /// Takes batches as the undamaged state. Other batches that were never compared are assessed against it afterwards.
+    /// Takes batches as the undamaged state. Other batches that are compared with none are assessed against it afterwards.
     ///
     /// It runs in a task of its own, as [`Self::ingest`] does.
     ///
@@ -44,8 +44,9 @@ impl Monitor {
         }
         let per_measurement = self.settings.draws_per_measurement;
         let model_digest = baseline.digest().clone();
-        let compute = self.compute.reserve()?.run(move || pool(&baseline, &records, per_measurement));
-        let samples = compute.await.map_err(|_| Error::Panicked)??;
+        let place = self.compute.reserve()?;
+        let pooled = place.run(move || pool(&baseline, &records, per_measurement)).await;
+        let samples = pooled.map_err(|_| Error::Panicked)??;
         let state = UndamagedState::from_samples(0, &samples, threshold_probability)?;
         let version =
             self.store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;

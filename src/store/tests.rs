@@ -1,4 +1,4 @@
-//! What `tests/store` cannot reach through whole batches: files that are refused, and what SQLite searches.
+//! Files that are refused, and rules that whole batches in `tests/store` do not reach.
 
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;

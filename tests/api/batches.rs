@@ -85,6 +85,32 @@ async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards
 }
 
 #[tokio::test]
+async fn an_undamaged_state_declared_among_posts_misses_none_of_them() {
+    let (service, _folder) = spawn();
+    let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
+    let bodies = (1..40).map(|i| json!({ "measurements": measurements([4.0, 5.0, 6.0], 5, i * 20_000) }));
+    let mut tasks: Vec<_> = bodies
+        .map(|body| service.request(reqwest::Method::POST, BATCHES).json(&body).send())
+        .map(tokio::spawn)
+        .collect();
+    let baseline = json!({ "batches": [healthy["batch"]] });
+    let path = "/v1/structures/three-dof/baseline";
+    tasks.insert(20, tokio::spawn(service.request(reqwest::Method::POST, path).json(&baseline).send()));
+    for task in tasks {
+        created(task.await.unwrap().unwrap()).await;
+    }
+    for _ in 0..100 {
+        let history = service.read("/v1/structures/three-dof/history?limit=100").await;
+        let others = history["items"].as_array().unwrap().iter().filter(|item| item["batch"] != healthy["batch"]);
+        if others.clone().count() == 39 && others.clone().all(|item| item["assessment"]["undamaged_version"] == 1) {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    panic!("some batches were never compared with the undamaged state");
+}
+
+#[tokio::test]
 async fn the_same_batch_sent_twice_is_stored_once_and_answered_the_same() {
     let (service, _folder) = spawn();
     let body = json!({ "source": "logger-1", "measurements": measurements([4.0, 5.0, 6.0], 5, 0) });
