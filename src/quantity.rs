@@ -234,3 +234,15 @@ pub fn shown(text: &str) -> String {
     }
     format!("\"{short}\"")
 }
+
+/// The path of a value as a JSON pointer (RFC 6901), such as `/mass/0/kg`; empty for the whole document.
+pub fn json_pointer(path: &serde_path_to_error::Path) -> String {
+    use serde_path_to_error::Segment;
+    let segment = |segment: &Segment| match segment {
+        Segment::Seq { index } => format!("/{index}"),
+        Segment::Map { key } => format!("/{}", key.replace('~', "~0").replace('/', "~1")),
+        Segment::Enum { variant } => format!("/{variant}"),
+        Segment::Unknown => String::new(),
+    };
+    path.iter().map(segment).collect()
+}

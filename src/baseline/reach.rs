@@ -26,8 +26,6 @@ pub enum Reach {
     Outside {
         /// Frequencies of the nearest point of the prior box, Hz.
         nearest_hz: Vec<f64>,
-        /// Largest relative difference from them, –.
-        distance: f64,
     },
 }
 
@@ -54,9 +52,7 @@ pub fn reach(simulator: &Simulator, frequencies_hz: &[f64], start: &[f64]) -> Re
     if fits(&nearest_hz, EXACT) {
         return Ok(Reach::Inside);
     }
-    let distances = frequencies_hz.iter().zip(&nearest_hz).map(|(f, s)| (f / s - 1.0).abs());
-    let distance = distances.fold(0.0, f64::max);
-    Ok(Reach::Outside { nearest_hz, distance })
+    Ok(Reach::Outside { nearest_hz })
 }
 
 /// Frequencies of the point of the prior box that comes nearest, Hz.

@@ -11,11 +11,11 @@ use axum::middleware::Next;
 use axum::response::Response;
 use http_body_util::BodyExt as _;
 use serde::de::DeserializeOwned;
-use serde_path_to_error::Segment;
 use tracing::{info, Instrument as _};
 
 use super::error::ApiError;
 use crate::measurement::check::Problem;
+use crate::quantity::json_pointer;
 
 /// Header that carries the request's id both ways.
 pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
@@ -124,7 +124,7 @@ pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
     }
     let mut deserializer = serde_json::Deserializer::from_slice(bytes);
     let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {
-        let pointer = pointer(error.path());
+        let pointer = json_pointer(error.path());
         json_error(bytes, pointer, error.inner())
     })?;
     deserializer.end().map_err(|error| json_error(bytes, String::new(), &error))?;
@@ -164,16 +164,6 @@ fn not_a_number_at(bytes: &[u8], line: usize, column: usize) -> Option<&'static 
     ["-Infinity", "Infinity", "NaN"]
         .into_iter()
         .find(|word| around.windows(word.len()).take(3).any(|window| window == word.as_bytes()))
-}
-
-fn pointer(path: &serde_path_to_error::Path) -> String {
-    let segment = |segment: &Segment| match segment {
-        Segment::Seq { index } => format!("/{index}"),
-        Segment::Map { key } => format!("/{}", key.replace('~', "~0").replace('/', "~1")),
-        Segment::Enum { variant } => format!("/{variant}"),
-        Segment::Unknown => String::new(),
-    };
-    path.iter().map(segment).collect()
 }
 
 /// Path parameters, with our own errors.

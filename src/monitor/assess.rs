@@ -87,7 +87,7 @@ fn nearest_points(
         let start: Vec<f64> = means.row(row).iter().copied().collect();
         Ok(match reach(baseline.simulator(), measured, &start)? {
             Reach::Inside => None,
-            Reach::Outside { nearest_hz, .. } => Some(nearest_hz),
+            Reach::Outside { nearest_hz } => Some(nearest_hz),
         })
     };
     frequencies_hz.par_iter().enumerate().map(look).collect()

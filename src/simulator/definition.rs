@@ -11,7 +11,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use super::check;
 use crate::measurement::CovariateKind;
 use crate::parameter::DamageDirection;
-use crate::quantity::Digest;
+use crate::quantity::{json_pointer, Digest};
 
 /// A structure as a file describes it; `simulator::Simulator` is the checked form.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -232,7 +232,7 @@ impl StructureDefinition {
         };
         let document = toml::Deserializer::parse(text).map_err(|e| syntax(&e, String::new()))?;
         let definition: Self =
-            serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), pointer(e.path())))?;
+            serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), json_pointer(e.path())))?;
         definition.check().map_err(|mut error| {
             for problem in &mut error.problems {
                 problem.line = toml_line(text, &problem.pointer);
@@ -271,20 +271,9 @@ fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, DefinitionError> {
         problems: vec![DefinitionProblem { pointer, line: Some(error.line()), message: error.to_string() }],
     };
     let value =
-        serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(pointer(e.path()), e.inner()))?;
+        serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(json_pointer(e.path()), e.inner()))?;
     deserializer.end().map_err(|e| failed(String::new(), &e))?;
     Ok(value)
-}
-
-fn pointer(path: &serde_path_to_error::Path) -> String {
-    use serde_path_to_error::Segment;
-    let segment = |segment: &Segment| match segment {
-        Segment::Seq { index } => format!("/{index}"),
-        Segment::Map { key } => format!("/{key}"),
-        Segment::Enum { variant } => format!("/{variant}"),
-        Segment::Unknown => String::new(),
-    };
-    path.iter().map(segment).collect()
 }
 
 fn one_line(message: &str) -> String {
