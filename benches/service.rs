@@ -81,7 +81,7 @@ fn body(index: u32) -> Value {
     let simulator = find_structure("three-dof").expect("it is shipped");
     let moments = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)].map(|(n, m, s)| (n.to_owned(), m, s));
     let population = Population::new(simulator.space(), &moments).expect("all parameters are named");
-    let drawn = population.draw(&simulator, MEASUREMENTS, u64::from(index)).expect("the population is physical");
+    let drawn = population.draw(&simulator, MEASUREMENTS, 1.0, u64::from(index)).expect("the population is physical");
     let row = |(i, row): (usize, nalgebra::MatrixView1xX<'_, f64, nalgebra::U1, nalgebra::Dyn>)| {
         let second = index as usize * MEASUREMENTS + i;
         let (day, rest) = (second / 86_400, second % 86_400);

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::damage::QuantityAssessment;
 use crate::quantity::{Digest, Timestamp};
+use crate::trust::Trust;
 
 /// How far a stored batch has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -41,38 +42,21 @@ pub struct Assessment {
     pub seed: u64,
     /// Posterior samples drawn for each measurement.
     pub draws_per_measurement: usize,
-    /// Measurements with all modes, which the estimate rests on.
+    /// Measurements that the estimate rests on.
     pub measurements_used: usize,
-    /// Measurements left out because a mode is missing.
+    /// Measurements left out; the findings say which and why.
     pub measurements_left_out: usize,
     /// Of those used, measurements that no point of the prior box gives; they count as the nearest point of the box.
     pub measurements_outside: usize,
+    /// Mean number of effective samples that a measurement contributes to the hyperparameters.
+    pub effective_sample_size: f64,
     /// For each mode, 100·(mean measured − simulated)/mean measured, simulated at the mean of all posterior samples: what
-    /// the simulation cannot reproduce, in per cent.
-    pub misfit_percent: Vec<f64>,
+    /// the simulation cannot reproduce, in per cent; `None` for a mode that no measurement has.
+    pub misfit_percent: Vec<Option<f64>>,
+    /// How far it can be believed.
+    pub trust: Trust,
     /// When it was computed.
     pub assessed_at: Timestamp,
     /// One entry for each monitored quantity.
     pub quantities: Vec<QuantityAssessment>,
-}
-
-/// Share of samples at a prior edge above which the prior is called too narrow.
-const MUCH_EDGE_MASS: f64 = 0.05;
-
-impl Assessment {
-    /// What a reader must know before believing the figures, in sentences; empty when there is nothing.
-    pub fn warnings(&self) -> Vec<String> {
-        let (outside, used) = (self.measurements_outside, self.measurements_used);
-        let outside = (outside > 0).then(|| {
-            format!(
-                "{outside} of {used} measurements cannot come from this simulation with any parameters of the prior; they \
-                 count as the nearest point. Check units and modes, then whether the simulation fits, before believing a \
-                 probability of damage"
-            )
-        });
-        let at_edge = self.quantities.iter().filter(|q| q.edge_mass > MUCH_EDGE_MASS).map(|q| {
-            format!("{:.0} % of the samples of {} lie at an edge of its prior: widen it", 100.0 * q.edge_mass, q.name)
-        });
-        outside.into_iter().chain(at_edge).collect()
-    }
 }

@@ -123,15 +123,22 @@ impl Config {
             ("http.body_timeout_s", self.http.body_timeout_s),
             ("http.max_connections", self.http.max_connections as u64),
             ("monitor.draws_per_measurement", self.monitor.draws_per_measurement as u64),
+            ("monitor.draws_for_population", self.monitor.draws_for_population as u64),
             ("monitor.max_measurements", self.monitor.max_measurements as u64),
             ("monitor.compute.queue", self.monitor.compute.queue as u64),
         ];
         if let Some(&(key, value)) = positive.iter().find(|(_, value)| *value == 0) {
             return Err(Error::Range { key, value: value.to_string(), must: "at least 1" });
         }
-        if self.monitor.draws_per_measurement > 10_000 {
-            let value = self.monitor.draws_per_measurement.to_string();
-            return Err(Error::Range { key: "monitor.draws_per_measurement", value, must: "at most 10000" });
+        let draws = [
+            ("monitor.draws_per_measurement", self.monitor.draws_per_measurement),
+            ("monitor.draws_for_population", self.monitor.draws_for_population),
+        ];
+        if let Some((key, value)) = draws.into_iter().find(|(_, value)| *value > 10_000) {
+            return Err(Error::Range { key, value: value.to_string(), must: "at most 10000" });
+        }
+        if let Some((key, value, must)) = self.monitor.alarm.problem() {
+            return Err(Error::Range { key, value, must });
         }
         Ok(())
     }

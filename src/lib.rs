@@ -57,20 +57,24 @@
 //! - R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
 //!   doi:10.1080/00031305.1996.10473566.
 
+pub mod alarm;
 pub mod assessment;
 pub mod baseline;
 pub mod cli;
 pub mod config;
 pub mod damage;
 pub mod flow;
+pub mod hierarchy;
 pub mod http;
 pub mod measurement;
 pub mod monitor;
 pub mod parameter;
 pub mod physics;
+pub mod plot;
 pub mod posterior;
 pub mod quantity;
 pub mod simulator;
 pub mod stats;
 pub mod store;
 pub mod telemetry;
+pub mod trust;

@@ -44,6 +44,18 @@ impl PosteriorSamples {
         self.theta.column(parameter).iter().copied().collect()
     }
 
+    /// The first `draws` samples of each measurement.
+    ///
+    /// # Panics
+    /// When there are fewer: a bug.
+    #[must_use]
+    pub fn first(&self, draws: usize) -> Self {
+        assert!(draws <= self.draws, "{draws} of {} draws", self.draws);
+        let source = |row: usize| row / draws * self.draws + row % draws;
+        let rows = self.measurements() * draws;
+        Self::new(DMatrix::from_fn(rows, self.theta.ncols(), |row, column| self.theta[(source(row), column)]), draws)
+    }
+
     /// Posterior mean of each measurement, `[n, d]`.
     pub fn means(&self) -> DMatrix<f64> {
         DMatrix::from_fn(self.measurements(), self.theta.ncols(), |measurement, parameter| {

@@ -9,9 +9,10 @@ use std::path::{Path, PathBuf};
 const FOUNDATION: [&str; 4] = ["quantity", "stats", "parameter", "measurement"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
-const TABLE: [(&str, &[&str], bool); 18] = [
+const TABLE: [(&str, &[&str], bool); 22] = [
     ("quantity", &[], false),
     ("stats", &[], false),
+    ("plot", &[], false),
     ("parameter", &["quantity", "stats"], false),
     ("measurement", &["quantity", "stats", "parameter"], false),
     ("physics", &["quantity", "stats"], false),
@@ -20,14 +21,25 @@ const TABLE: [(&str, &[&str], bool); 18] = [
     ("posterior", &[], true),
     // `physics` for the error of a simulation only.
     ("baseline", &["flow", "simulator", "posterior", "physics"], true),
-    ("damage", &["posterior"], true),
-    ("assessment", &["damage"], true),
-    ("store", &["assessment", "damage"], true),
+    ("hierarchy", &["posterior"], true),
+    ("trust", &["baseline", "simulator", "physics"], true),
+    ("damage", &["hierarchy", "posterior"], true),
+    ("alarm", &["damage"], true),
+    ("assessment", &["damage", "trust"], true),
+    ("store", &["alarm", "assessment", "damage", "trust"], true),
     ("telemetry", &[], false),
-    ("monitor", &["assessment", "baseline", "damage", "physics", "posterior", "simulator", "store"], true),
-    ("http", &["assessment", "baseline", "damage", "monitor", "simulator", "store"], true),
+    (
+        "monitor",
+        &["alarm", "assessment", "baseline", "damage", "hierarchy", "physics", "posterior", "simulator", "store", "trust"],
+        true,
+    ),
+    ("http", &["assessment", "baseline", "damage", "monitor", "simulator", "store", "trust"], true),
     ("config", &["http", "monitor", "telemetry"], false),
-    ("cli", &["baseline", "config", "damage", "flow", "http", "monitor", "simulator", "store", "telemetry"], true),
+    (
+        "cli",
+        &["alarm", "baseline", "config", "damage", "flow", "http", "monitor", "plot", "simulator", "store", "telemetry"],
+        true,
+    ),
     ("lib", &[], false),
 ];
 

@@ -2,12 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::calibration::CalibrationRecord;
+use super::identifiability::IdentifiabilityRecord;
 use crate::flow::train::{Stopped, TrainSettings};
 use crate::flow::Architecture;
 use crate::quantity::{Digest, StructureId};
 
 /// Version of the manifest's layout.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 /// Everything about a trained baseline but its weights. It holds no clock time and no machine name: the same command
 /// gives the same bytes.
@@ -28,10 +30,16 @@ pub struct Manifest {
     pub architecture: Architecture,
     /// Standardiser of the observations.
     pub whitening: Whitening,
+    /// What was varied in training beside the parameters.
+    pub conditions: Conditions,
     /// How it was trained.
     pub training: TrainingRecord,
     /// What it reached on pairs it never saw.
     pub validation: ValidationRecord,
+    /// Whether it is as sure as it should be.
+    pub calibration: CalibrationRecord,
+    /// What the modes can tell apart.
+    pub identifiability: IdentifiabilityRecord,
     /// An inference whose result is known.
     pub self_test: SelfTest,
 }
@@ -44,6 +52,27 @@ pub struct Whitening {
     pub mean: Vec<f64>,
     /// Lower triangular factor L of the covariance, by rows.
     pub factor: Vec<Vec<f64>>,
+}
+
+/// What the flow is conditioned on beside the frequencies.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Conditions {
+    /// Lower and upper end of the box it was trained in, one pair a parameter, in parameter units: the prior with a margin.
+    /// Draws beyond the prior are drawn again.
+    pub training_box: Vec<[f64; 2]>,
+    /// Noise of the frequencies; `None` for a structure without noise, whose measurements must be complete and exact.
+    pub noise_range: Option<NoiseRange>,
+}
+
+/// The noise a flow was trained for, as multiples of the structure's own; modes may be missing within it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoiseRange {
+    /// Least noise: less is taken as this much.
+    pub lowest: f64,
+    /// Most noise: a mode with more counts as missing.
+    pub highest: f64,
 }
 
 /// How a baseline was trained.
@@ -96,7 +125,7 @@ pub struct ParameterValidation {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SelfTest {
-    /// One measurement, Hz.
+    /// One complete measurement, Hz.
     pub frequencies_hz: Vec<f64>,
     /// Seed of the draws.
     pub seed: u64,

@@ -1,8 +1,11 @@
 //! A trained baseline: the flow of one structure, with everything needed to use it and to trust it.
 
+pub mod calibration;
+pub mod identifiability;
 pub mod library;
 pub mod manifest;
-pub mod reach;
+pub mod nearest;
+pub mod observation;
 pub mod train;
 
 use candle_core::{DType, Device, Tensor};
@@ -10,16 +13,25 @@ use nalgebra::{DMatrix, DVector};
 use rand::RngCore as _;
 
 use crate::flow::{checkpoint, Flow};
-use crate::parameter::ParameterSpace;
+use crate::measurement::ModalMeasurement;
+use crate::parameter::{Parameter, ParameterSpace};
 use crate::posterior::PosteriorSamples;
-use crate::quantity::Digest;
+use crate::quantity::{Digest, Hertz};
 use crate::simulator::Simulator;
 use crate::stats;
+use identifiability::Group;
 use manifest::{Manifest, SelfTest, Whitening};
+use observation::{Admitted, Encoder, Observation};
 
 /// Largest difference of a self-test draw, as a share of the prior's width: f32 kernels differ between processors by
 /// some 1e-5, a wrong weight by far more.
 const SELF_TEST_TOLERANCE: f64 = 1e-3;
+
+/// Times that draws beyond the prior are drawn again.
+const ROUNDS: usize = 12;
+
+/// Draws that estimate which share of a posterior lies inside the prior.
+const SHARE_DRAWS: usize = 200;
 
 /// Why a stored baseline is refused.
 #[derive(Debug, thiserror::Error)]
@@ -96,6 +108,9 @@ pub enum InferenceError {
         /// Name of the parameter.
         parameter: String,
     },
+    /// The simulation failed inside the prior.
+    #[error("the simulation failed: {0}")]
+    Simulation(String),
     /// A tensor error.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),
@@ -104,8 +119,10 @@ pub enum InferenceError {
 /// A flow with its standardisers, its structure and its record.
 pub struct Baseline {
     flow: Flow,
-    whitening: Whitening,
+    encoder: Encoder,
     simulator: Simulator,
+    /// The box it was trained in, which its real line stands for.
+    training_space: ParameterSpace,
     manifest: Manifest,
     digest: Digest,
 }
@@ -136,8 +153,9 @@ impl Baseline {
         let shapes = [
             ("architecture.parameters", manifest.architecture.parameters, d),
             ("architecture.modes", manifest.architecture.modes, m),
-            ("architecture.channels", manifest.architecture.channels, 1),
+            ("architecture.channels", manifest.architecture.channels, manifest.conditions.channels()),
             ("architecture.permutations", manifest.architecture.permutations.len(), manifest.architecture.units),
+            ("conditions.training_box", manifest.conditions.training_box.len(), d),
             ("whitening.mean", manifest.whitening.mean.len(), m),
             ("whitening.factor", manifest.whitening.factor.len(), m),
             ("self_test.frequencies_hz", manifest.self_test.frequencies_hz.len(), m),
@@ -148,7 +166,8 @@ impl Baseline {
         let flow = checkpoint::from_bytes(weights, &manifest.architecture, DType::F32)?;
         let baseline = Self {
             flow,
-            whitening: manifest.whitening.clone(),
+            encoder: Encoder::new(&manifest.whitening, &manifest.conditions),
+            training_space: training_space(simulator.space(), &manifest.conditions),
             simulator: simulator.clone(),
             digest: Digest::of_file(manifest_bytes),
             manifest,
@@ -159,52 +178,124 @@ impl Baseline {
 
     /// Posterior samples of each measurement, `draws` for each.
     ///
-    /// `frequencies_hz`: complete measurements, m values each, Hz, positive.
-    ///
     /// # Errors
     /// [`InferenceError`] for another number of modes or a draw that is not finite.
     pub fn infer(
         &self,
-        frequencies_hz: &[Vec<f64>],
+        observations: &[Observation],
         draws: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
-        let y = self.condition(frequencies_hz)?;
-        let x = self.flow.sample(&y, draws, &mut stats::stream(seed, "latent"))?;
-        let real = x.to_dtype(DType::F64)?.to_vec2::<f64>()?;
-        let space = self.space();
-        let theta = DMatrix::from_fn(real.len(), space.len(), |row, column| {
-            space.as_slice()[column].from_unit(logistic(real[row][column]))
-        });
-        if let Some(place) = theta.iter().position(|v| !v.is_finite()) {
-            let parameter = space.as_slice()[place / theta.nrows()].name.clone();
-            return Err(InferenceError::NotFinite { row: place % theta.nrows(), parameter });
+        let d = self.space().len();
+        let context = self.flow.summarise(&self.condition(observations)?)?;
+        let mut stream = stats::stream(seed, "latent");
+        let mut theta = DMatrix::from_element(observations.len() * draws, d, f64::NAN);
+        let mut filled = vec![0; observations.len()];
+        // Draws beyond the prior, in the margin of the training box, are drawn again. Where hardly any falls inside, the
+        // measurement lies outside, and the nearest point of the box has to do.
+        for round in 1..=ROUNDS {
+            let pending: Vec<u32> = (0..observations.len() as u32).filter(|&row| filled[row as usize] < draws).collect();
+            if pending.is_empty() {
+                break;
+            }
+            let rows = Tensor::from_slice(&pending, pending.len(), &Device::Cpu)?;
+            let x = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
+            let real = x.to_dtype(DType::F64)?.to_vec2::<f64>()?;
+            for (place, values) in real.iter().enumerate() {
+                let row = pending[place / draws] as usize;
+                if filled[row] == draws {
+                    continue;
+                }
+                let mut draw = Vec::with_capacity(d);
+                for (value, (wide, parameter)) in values.iter().zip(self.training_space.iter().zip(self.space())) {
+                    let value = wide.from_unit(logistic(*value));
+                    if !value.is_finite() {
+                        return Err(InferenceError::NotFinite { row: place, parameter: parameter.name.clone() });
+                    }
+                    let inside = value.clamp(parameter.lower, parameter.upper);
+                    if inside == value || round == ROUNDS {
+                        draw.push(inside);
+                    }
+                }
+                if draw.len() == d {
+                    let target = row * draws + filled[row];
+                    draw.iter().enumerate().for_each(|(column, value)| theta[(target, column)] = *value);
+                    filled[row] += 1;
+                }
+            }
         }
         Ok(PosteriorSamples::new(theta, draws))
     }
 
-    /// Log-density of each row of `theta` given the frequencies of the same row, in the unit box, nats.
+    /// A measurement as this baseline takes it, with the structure's noise where none is given.
+    ///
+    /// Less noise than it was trained for counts as the least it knows: the answer is wider than need be. A mode with more
+    /// counts as missing: the answer is wider too. Neither is extrapolated.
+    pub fn admit(&self, measurement: &ModalMeasurement) -> Admitted {
+        let mut frequencies_hz: Vec<Option<f64>> =
+            measurement.frequencies_hz.iter().map(|f| f.map(Hertz::get)).collect();
+        let mut noise_multiple = vec![1.0; frequencies_hz.len()];
+        let (mut below_range, mut above_range) = (false, false);
+        match &self.manifest.conditions.noise_range {
+            Some(range) => {
+                for (mode, frequency) in frequencies_hz.iter_mut().enumerate() {
+                    let given = measurement.std_hz.as_ref().and_then(|stds| stds[mode]);
+                    let own = frequency.map(|f| self.simulator.noise().std_hz(f));
+                    let multiple = given.zip(own).map_or(1.0, |(given, own)| given / own);
+                    // The ends of the range belong to it, whatever the last digit of a division.
+                    below_range |= frequency.is_some() && multiple < range.lowest * (1.0 - 1e-6);
+                    if frequency.is_some() && multiple > range.highest * (1.0 + 1e-6) {
+                        above_range = true;
+                        *frequency = None;
+                    } else if frequency.is_some() {
+                        noise_multiple[mode] = multiple.clamp(range.lowest, range.highest);
+                    }
+                }
+            }
+            // Trained on exact and complete measurements only.
+            None if frequencies_hz.iter().any(Option::is_none) => frequencies_hz.fill(None),
+            None => noise_multiple.fill(0.0),
+        }
+        let observation = Observation { frequencies_hz, noise_multiple };
+        Admitted { observation: (observation.modes_present() > 0).then_some(observation), below_range, above_range }
+    }
+
+    /// Log-density of each row of `theta` given the observation of the same row, in the unit box, nats.
     ///
     /// ```text
-    ///  log q(u | y) = log q(ℓ | y) − Σ log(u(1 − u)),    ℓ = logit u,    u = (θ − lower)/(upper − lower)
+    ///  log q(u | y) = log q(ℓ | y) − Σ log(v(1 − v)) − Σ log(wide/prior width) − log P(inside the prior | y)
+    ///  ℓ = logit v,    v = (θ − lower)/width of the training box
     /// ```
     ///
-    /// `theta`: `[n, d]` inside the prior box; `frequencies_hz`: n rows of m values.
+    /// The share inside the prior is estimated by drawing.
+    ///
+    /// `theta`: `[n, d]` inside the prior box; `observations`: n.
     ///
     /// # Errors
     /// [`InferenceError`] for another number of modes.
     pub fn log_density_unit_box(
         &self,
         theta: &DMatrix<f64>,
-        frequencies_hz: &[Vec<f64>],
+        observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
-        let x = to_real_line(theta, self.space())?.to_dtype(self.flow.dtype())?;
-        let log_q = self.flow.log_prob(&x, &self.condition(frequencies_hz)?)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
-        let jacobian = |row: usize| -> f64 {
-            let unit = |(column, p): (usize, &crate::parameter::Parameter)| p.to_unit(theta[(row, column)]);
-            self.space().iter().enumerate().map(unit).map(|u| (u * (1.0 - u)).ln()).sum()
+        let context = self.flow.summarise(&self.condition(observations)?)?;
+        let x = to_real_line(theta, &self.training_space)?.to_dtype(self.flow.dtype())?;
+        let log_q = self.flow.log_prob(&x, &context)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
+        let drawn = self.flow.sample(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
+        let drawn = drawn.to_dtype(DType::F64)?.to_vec2::<f64>()?;
+        let one = |(row, log_q): (usize, &f64)| {
+            let stretch: f64 = self.training_space.iter().zip(self.space()).enumerate().map(|(column, (wide, prior))| {
+                let v = wide.to_unit(theta[(row, column)]);
+                (v * (1.0 - v)).ln() + ((wide.upper - wide.lower) / (prior.upper - prior.lower)).ln()
+            }).sum();
+            let inside = |values: &&Vec<f64>| {
+                let pairs = values.iter().zip(self.training_space.iter().zip(self.space()));
+                { pairs }.all(|(x, (wide, prior))| (prior.lower..=prior.upper).contains(&wide.from_unit(logistic(*x))))
+            };
+            let count = drawn[row * SHARE_DRAWS..(row + 1) * SHARE_DRAWS].iter().filter(inside).count();
+            log_q - stretch - (count.max(1) as f64 / SHARE_DRAWS as f64).ln()
         };
-        Ok(log_q.iter().enumerate().map(|(row, log_q)| log_q - jacobian(row)).collect())
+        Ok(log_q.iter().enumerate().map(one).collect())
     }
 
     /// The structure it was trained for.
@@ -222,22 +313,28 @@ impl Baseline {
         &self.manifest
     }
 
+    /// Parameters that cannot be told apart.
+    pub fn groups(&self) -> Vec<Group> {
+        self.manifest.identifiability.resolve(self.space())
+    }
+
     /// SHA-256 of the manifest file, which holds that of the weights: the name of this baseline in every result.
     pub fn digest(&self) -> &Digest {
         &self.digest
     }
 
-    fn condition(&self, frequencies_hz: &[Vec<f64>]) -> Result<Tensor, InferenceError> {
-        let modes = self.simulator.modes();
-        if let Some(row) = frequencies_hz.iter().find(|row| row.len() != modes) {
-            return Err(InferenceError::Modes { found: row.len(), expected: modes });
+    fn condition(&self, observations: &[Observation]) -> Result<Tensor, InferenceError> {
+        let expected = self.simulator.modes();
+        if let Some(o) = observations.iter().find(|o| o.frequencies_hz.len() != expected) {
+            return Err(InferenceError::Modes { found: o.frequencies_hz.len(), expected });
         }
-        Ok(self.whitening.apply(frequencies_hz)?.to_dtype(self.flow.dtype())?)
+        Ok(self.encoder.encode(observations)?.to_dtype(self.flow.dtype())?)
     }
 
     fn self_test(&self) -> Result<(), LoadError> {
         let SelfTest { frequencies_hz, seed, expected } = &self.manifest.self_test;
-        let samples = self.infer(std::slice::from_ref(frequencies_hz), expected.len().max(1), *seed)?;
+        let observation = Observation::complete(frequencies_hz);
+        let samples = self.infer(&[observation], expected.len().max(1), *seed)?;
         let width = |column: usize| self.space().as_slice()[column].upper - self.space().as_slice()[column].lower;
         let mut difference = 0.0_f64;
         for (row, values) in expected.iter().enumerate() {
@@ -268,7 +365,13 @@ fn logistic(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// θ of the prior box to the real line by the logit of its position, f64 `[n, d]`.
+/// The box a flow was trained in.
+fn training_space(prior: &ParameterSpace, conditions: &manifest::Conditions) -> ParameterSpace {
+    let wide = |(p, [lower, upper]): (&Parameter, &[f64; 2])| Parameter { lower: *lower, upper: *upper, ..p.clone() };
+    ParameterSpace::new(prior.iter().zip(&conditions.training_box).map(wide).collect())
+}
+
+/// θ of the box `space` to the real line by the logit of its position, f64 `[n, d]`.
 fn to_real_line(theta: &DMatrix<f64>, space: &ParameterSpace) -> Result<Tensor, candle_core::Error> {
     let (rows, columns) = theta.shape();
     let mut values = Vec::with_capacity(rows * columns);
@@ -303,20 +406,5 @@ impl Whitening {
         let factor = covariance.cholesky()?.l();
         let rows = (0..modes).map(|i| factor.row(i).iter().copied().collect()).collect();
         Some(Self { mean: mean.iter().copied().collect(), factor: rows })
-    }
-
-    /// Whitened log-frequencies `[n, 1, m]`, f64.
-    fn apply(&self, frequencies_hz: &[Vec<f64>]) -> Result<Tensor, candle_core::Error> {
-        let modes = self.mean.len();
-        let mut values = Vec::with_capacity(frequencies_hz.len() * modes);
-        for row in frequencies_hz {
-            let start = values.len();
-            for (i, frequency) in row.iter().enumerate() {
-                // Forward substitution with the lower triangular factor.
-                let known: f64 = (0..i).map(|j| self.factor[i][j] * values[start + j]).sum();
-                values.push((frequency.ln() - self.mean[i] - known) / self.factor[i][i]);
-            }
-        }
-        Tensor::from_vec(values, (frequencies_hz.len(), 1, modes), &Device::Cpu)
     }
 }

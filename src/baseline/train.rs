@@ -3,11 +3,15 @@
 use candle_core::{DType, Tensor};
 use nalgebra::DMatrix;
 
-use super::manifest::{Manifest, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening, FORMAT};
+use super::calibration::{calibrate, CalibrationRecord};
+use super::identifiability::{identifiability, IdentifiabilityRecord};
+use super::manifest::{
+    Conditions, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening, FORMAT,
+};
+use super::observation::{measure, Encoder, Observation};
 use super::{to_real_line, Baseline, InferenceError};
 use crate::flow::train::{EpochReport, Pairs, Stopped, TrainSettings};
 use crate::flow::{checkpoint, weights, FlowSettings};
-use crate::parameter::ParameterSpace;
 use crate::quantity::Digest;
 use crate::simulator::{Simulator, TrainingSet};
 use crate::stats;
@@ -36,6 +40,14 @@ pub enum Error {
         name: &'static str,
         /// Its value.
         value: f64,
+    },
+    /// A noise range that is none.
+    #[error("the noise range {lowest} to {highest} is none: two multiples of the structure's noise, both above 0, ascending, with 1 between them")]
+    NoiseRange {
+        /// Lowest multiple given.
+        lowest: f64,
+        /// Highest multiple given.
+        highest: f64,
     },
     /// The simulation failed somewhere in the prior.
     #[error("the simulation failed: {0}")]
@@ -72,6 +84,9 @@ pub struct Trained {
 
 /// Simulates `samples` pairs from the prior of `simulator`, trains a flow on them and measures what it reached.
 ///
+/// Where the structure has measurement noise, its size, the noise itself and the missing modes are drawn afresh in each
+/// epoch, so that the flow never sees a measurement twice.
+///
 /// The same simulator, settings and seed give the same bytes, whatever the number of threads.
 ///
 /// # Errors
@@ -79,23 +94,41 @@ pub struct Trained {
 pub fn train(
     simulator: &Simulator,
     samples: usize,
+    noise_range: NoiseRange,
     flow_settings: &FlowSettings,
     settings: &TrainSettings,
     on_epoch: impl FnMut(EpochReport),
 ) -> Result<Trained, Error> {
-    check(samples, flow_settings, settings)?;
-    let space = simulator.space();
-    let draw = |count: usize, purpose: &str| simulator.training_set(count, purpose_seed(settings.seed, purpose));
+    check(samples, noise_range, flow_settings, settings)?;
+    let space = simulator.training_space();
+    let noisy = simulator.noise().std_hz(1.0) > 0.0;
+    let training_box = space.iter().map(|p| [p.lower, p.upper]).collect();
+    let conditions = Conditions { training_box, noise_range: noisy.then_some(noise_range) };
+    let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
     let training = draw(samples, "training set")?;
-    let validation = draw(VALIDATION_SAMPLES, "validation set")?;
     let whitening = Whitening::fit(&rows(&training.frequencies_hz)).ok_or(Error::Degenerate)?;
+    let encoder = Encoder::new(&whitening, &conditions);
+    let observed = |set: &TrainingSet, purpose: &str| {
+        let mut stream = stats::stream(settings.seed, purpose);
+        observe(simulator, &conditions, set, &mut stream)
+    };
 
     let mut permutations = stats::stream(settings.seed, "permutations");
-    let architecture = flow_settings.architecture(space.len(), simulator.modes(), 1, &mut permutations);
+    let architecture =
+        flow_settings.architecture(space.len(), simulator.modes(), conditions.channels(), &mut permutations);
     let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
-    let training_pairs = pairs(&training, space, &whitening)?;
-    let validation_pairs = pairs(&validation, space, &whitening)?;
-    let outcome = crate::flow::train::train(&flow, &weights, &training_pairs, &validation_pairs, settings, on_epoch)?;
+    let x = to_real_line(&training.theta, &space)?.to_dtype(DType::F32)?;
+    let epoch_pairs = |epoch: usize| {
+        let observations = observed(&training, &format!("observations of epoch {epoch}"));
+        Ok(Pairs { x: x.clone(), y: encoder.encode(&observations)?.to_dtype(DType::F32)? })
+    };
+    let validation = draw(VALIDATION_SAMPLES, "validation set")?;
+    let validation_pairs = Pairs {
+        x: to_real_line(&validation.theta, &space)?.to_dtype(DType::F32)?,
+        y: encoder.encode(&observed(&validation, "observations of validation"))?.to_dtype(DType::F32)?,
+    };
+    let outcome =
+        crate::flow::train::train(&flow, &weights, samples, epoch_pairs, &validation_pairs, settings, on_epoch)?;
 
     let weight_bytes = checkpoint::to_bytes(&weights)?;
     let mut manifest = Manifest {
@@ -105,7 +138,8 @@ pub fn train(
         structure_digest: simulator.digest().clone(),
         weights_sha256: Digest::of_file(&weight_bytes),
         architecture,
-        whitening: whitening.clone(),
+        whitening,
+        conditions,
         training: TrainingRecord {
             samples,
             validation_samples: VALIDATION_SAMPLES,
@@ -120,21 +154,28 @@ pub fn train(
             parameters: Vec::new(),
             inverse_error: 0.0,
         },
+        calibration: CalibrationRecord { simulations: 0, draws: 0, failures: Vec::new(), cells: Vec::new() },
+        identifiability: IdentifiabilityRecord { parameters: Vec::new(), groups: Vec::new() },
         self_test: SelfTest { frequencies_hz: Vec::new(), seed: settings.seed, expected: Vec::new() },
     };
     // The trained flow measures itself: what goes into the manifest is what a loaded baseline gives.
     let draft = Baseline {
         flow,
-        whitening,
+        encoder,
+        training_space: space,
         simulator: simulator.clone(),
         digest: manifest.weights_sha256.clone(),
         manifest: manifest.clone(),
     };
-    let held_out = draw(HELD_OUT_SAMPLES, "held-out set")?;
-    manifest.validation = validate(&draft, &held_out, settings.seed)?;
+    let held_out = simulator.training_set(HELD_OUT_SAMPLES, purpose_seed(settings.seed, "held-out set"))?;
+    let mut stream = stats::stream(settings.seed, "observations of held-out set");
+    let observations = observe(simulator, &manifest.conditions, &held_out, &mut stream);
+    manifest.validation = validate(&draft, &held_out.theta, &observations, settings.seed)?;
+    (manifest.calibration, _) = calibrate(&draft, purpose_seed(settings.seed, "calibration"))?;
+    manifest.identifiability = identifiability(&draft, purpose_seed(settings.seed, "identifiability"))?;
     manifest.self_test.frequencies_hz = held_out.frequencies_hz.row(0).iter().copied().collect();
-    let frequencies = std::slice::from_ref(&manifest.self_test.frequencies_hz);
-    let test_draws = draft.infer(frequencies, SELF_TEST_DRAWS, manifest.self_test.seed)?;
+    let observation = Observation::complete(&manifest.self_test.frequencies_hz);
+    let test_draws = draft.infer(&[observation], SELF_TEST_DRAWS, manifest.self_test.seed)?;
     manifest.self_test.expected = rows(test_draws.theta());
 
     let mut manifest_json = serde_json::to_vec_pretty(&manifest).map_err(|e| Box::new(super::LoadError::from(e)))?;
@@ -148,7 +189,16 @@ pub fn diverged(manifest: &Manifest) -> bool {
     matches!(manifest.training.stopped, Stopped::Diverged { .. })
 }
 
-fn check(samples: usize, flow: &FlowSettings, settings: &TrainSettings) -> Result<(), Error> {
+fn check(
+    samples: usize,
+    noise_range: NoiseRange,
+    flow: &FlowSettings,
+    settings: &TrainSettings,
+) -> Result<(), Error> {
+    let NoiseRange { lowest, highest } = noise_range;
+    if !(lowest > 0.0 && highest.is_finite() && lowest < highest && (lowest..=highest).contains(&1.0)) {
+        return Err(Error::NoiseRange { lowest, highest });
+    }
     if samples < MINIMUM_SAMPLES {
         return Err(Error::TooFewSamples(samples));
     }
@@ -174,26 +224,37 @@ fn purpose_seed(seed: u64, purpose: &str) -> u64 {
     stats::stream(seed, purpose).next_u64()
 }
 
-fn pairs(set: &TrainingSet, space: &ParameterSpace, whitening: &Whitening) -> Result<Pairs, candle_core::Error> {
-    Ok(Pairs {
-        x: to_real_line(&set.theta, space)?.to_dtype(DType::F32)?,
-        y: whitening.apply(&rows(&set.frequencies_hz))?.to_dtype(DType::F32)?,
-    })
+/// A measurement of each pair, with noise and missing modes drawn as in training.
+pub fn observe(
+    simulator: &Simulator,
+    conditions: &Conditions,
+    set: &TrainingSet,
+    stream: &mut stats::Stream,
+) -> Vec<Observation> {
+    let one = |exact: Vec<f64>| {
+        let multiples = conditions.draw(exact.len(), stream);
+        measure(simulator, &exact, &multiples, stream)
+    };
+    rows(&set.frequencies_hz).into_iter().map(one).collect()
 }
 
 /// Measures a baseline on pairs it has not seen: likelihood, R² (paper Fig. 8), inverse error.
 ///
 /// # Errors
 /// [`InferenceError`] when a draw is not finite.
-pub fn validate(baseline: &Baseline, held_out: &TrainingSet, seed: u64) -> Result<ValidationRecord, InferenceError> {
-    let frequencies = rows(&held_out.frequencies_hz);
-    let count = frequencies.len();
+pub fn validate(
+    baseline: &Baseline,
+    theta: &DMatrix<f64>,
+    observations: &[Observation],
+    seed: u64,
+) -> Result<ValidationRecord, InferenceError> {
+    let count = observations.len();
     let losses: Vec<f64> =
-        baseline.log_density_unit_box(&held_out.theta, &frequencies)?.iter().map(|log_q| -log_q).collect();
-    let samples = baseline.infer(&frequencies, HELD_OUT_DRAWS, seed)?;
+        baseline.log_density_unit_box(theta, observations)?.iter().map(|log_q| -log_q).collect();
+    let samples = baseline.infer(observations, HELD_OUT_DRAWS, seed)?;
     let means = samples.means();
     let validation = |(column, parameter): (usize, &crate::parameter::Parameter)| {
-        let truth: Vec<f64> = held_out.theta.column(column).iter().copied().collect();
+        let truth: Vec<f64> = theta.column(column).iter().copied().collect();
         let mean: Vec<f64> = means.column(column).iter().copied().collect();
         let single: Vec<f64> = samples.column(column).into_iter().step_by(HELD_OUT_DRAWS).collect();
         let all = samples.column(column);
@@ -210,14 +271,14 @@ pub fn validate(baseline: &Baseline, held_out: &TrainingSet, seed: u64) -> Resul
         negative_log_likelihood: stats::mean(&losses),
         negative_log_likelihood_error: stats::sample_std(&losses).unwrap_or(f64::NAN) / (count as f64).sqrt(),
         parameters: baseline.space().iter().enumerate().map(validation).collect(),
-        inverse_error: inverse_error(baseline, &held_out.theta, &frequencies)?,
+        inverse_error: inverse_error(baseline, theta, observations)?,
     })
 }
 
 /// Largest |u − u'| after x → z → x', u the position in the prior box.
-fn inverse_error(baseline: &Baseline, theta: &DMatrix<f64>, frequencies: &[Vec<f64>]) -> Result<f64, InferenceError> {
-    let x = to_real_line(theta, baseline.space())?.to_dtype(DType::F32)?;
-    let context = baseline.flow.summarise(&baseline.condition(frequencies)?)?;
+fn inverse_error(baseline: &Baseline, theta: &DMatrix<f64>, observations: &[Observation]) -> Result<f64, InferenceError> {
+    let x = to_real_line(theta, &baseline.training_space)?.to_dtype(DType::F32)?;
+    let context = baseline.flow.summarise(&baseline.condition(observations)?)?;
     let (z, _) = baseline.flow.forward(&x, &context)?;
     let back = baseline.flow.inverse(&z, &context)?;
     let unit = |t: &Tensor| t.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();

@@ -5,9 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Args;
 
-use crate::baseline::library::find_structure;
-use crate::baseline::{assessment_seed, library::Library, Baseline};
-use crate::damage::UndamagedState;
+use super::calibrate::load;
+use crate::baseline::{assessment_seed, Baseline};
 use crate::measurement::check::{check_measurements, Expectation};
 use crate::measurement::csv::{self, CsvOptions, Times};
 use crate::measurement::MeasurementBatch;
@@ -49,28 +48,21 @@ pub struct AssessArgs {
 /// # Errors
 /// Any file that is refused, with line and column.
 pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
-    let simulator = find_structure(&args.structure)?;
-    let baseline = if let Some(weights) = &args.model {
-        let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
-        let manifest = weights.with_extension("json");
-        Baseline::load(&read(&manifest)?, &read(weights)?, &simulator)
-            .with_context(|| format!("{} is refused", weights.display()))?
-            .into()
-    } else {
-        let library = Library::open(None)?;
-        let entry = library.get(simulator.id()).and_then(|e| e.baseline.clone());
-        entry.with_context(|| format!("no baseline of {} is shipped: give --model", simulator.id()))?
-    };
+    let baseline = load(&args.structure, args.model.as_deref())?;
     let undamaged_batch = read_batch(args, &args.baseline, &baseline)?;
     let batch = read_batch(args, &args.data, &baseline)?;
     let draws = |batch: &MeasurementBatch| Draws {
         per_measurement: MonitorSettings::default().draws_per_measurement,
+        for_population: MonitorSettings::default().draws_for_population,
         seed: assessment_seed(&batch.content_digest(), baseline.digest()),
     };
-    let samples = assess::draw(&baseline, &undamaged_batch.measurements, draws(&undamaged_batch))?;
-    let quantities = assess::monitored_quantities(&baseline, &samples.posterior);
-    let undamaged = UndamagedState::from_samples(1, &quantities, args.threshold_probability)?;
-    let assessment = assess::assess(&baseline, &batch.measurements, Some(&undamaged), draws(&batch))?;
+    let undamaged_draws = draws(&undamaged_batch);
+    let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
+    let mut undamaged = assess::undamaged_state(&baseline, &batches, args.threshold_probability)
+        .with_context(|| format!("{} makes no undamaged state", args.baseline.display()))?;
+    undamaged.version = 1;
+    let context = assess::Context { undamaged: Some(&undamaged), previous: None };
+    let assessment = assess::assess(&baseline, &batch.measurements, context, draws(&batch))?;
 
     if args.json {
         let report = serde_json::json!({ "undamaged": undamaged, "assessment": assessment });
@@ -78,23 +70,40 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     println!(
-        "{} measurements used ({} of them outside the prior), {} left out for a missing mode",
+        "{} measurements used ({} of them beyond the prior), {} left out",
         assessment.measurements_used, assessment.measurements_outside, assessment.measurements_left_out
     );
-    for warning in assessment.warnings() {
-        println!("warning: {warning}");
+    if !assessment.trust.accepted() {
+        println!("NOT TO BE TRUSTED: no probability of damage is given");
     }
-    let misfit: Vec<String> = assessment.misfit_percent.iter().map(|m| format!("{m:+.3}")).collect();
+    for finding in undamaged.doubts.iter().chain(assessment.trust.findings.iter().map(|f| &f.message)) {
+        println!("note: {finding}");
+    }
+    let percent = |misfit: &Option<f64>| misfit.map_or("-".to_owned(), |m| format!("{m:+.3}"));
+    let misfit: Vec<String> = assessment.misfit_percent.iter().map(percent).collect();
     println!("simulation misses the mean frequencies by {} %", misfit.join(", "));
-    println!("{:>16} {:>12} {:>12} {:>12} {:>8} {:>8}", "parameter", "mean", "std", "threshold", "PoD", "exceeds");
+    println!(
+        "{:>16} {:>26} {:>26} {:>12} {:>24} {:>8}",
+        "parameter", "mean (90 %)", "std (90 %)", "threshold", "PoD, % (90 %)", "exceeds"
+    );
+    let with = |value: Option<f64>, interval: Option<[f64; 2]>, scale: f64, digits: usize| match (value, interval) {
+        (Some(v), Some([low, high])) => {
+            format!("{:.digits$} ({:.digits$} … {:.digits$})", v * scale, low * scale, high * scale)
+        }
+        (Some(v), None) => format!("{:.digits$}", v * scale),
+        _ => "-".to_owned(),
+    };
     for q in &assessment.quantities {
-        let std = q.hyperparameters.std.map_or("-".to_owned(), |s| format!("{s:.4}"));
-        let damage = q.damage.as_ref().map_or(["-".to_owned(), "-".to_owned(), "-".to_owned()], |d| {
-            let exceeds = if d.exceeds { "yes" } else { "no" };
-            [format!("{:.4}", d.threshold), format!("{:.1} %", 100.0 * d.probability_of_damage), exceeds.to_owned()]
-        });
-        let [threshold, pod, exceeds] = damage;
-        println!("{:>16} {:>12.4} {std:>12} {threshold:>12} {pod:>8} {exceeds:>8}", q.name, q.hyperparameters.mean);
+        let damage = q.damage.as_ref();
+        println!(
+            "{:>16} {:>26} {:>26} {:>12} {:>24} {:>8}",
+            q.name,
+            with(Some(q.mean), q.mean_interval, 1.0, 4),
+            with(q.std, q.std_interval, 1.0, 4),
+            damage.map_or("-".to_owned(), |d| format!("{:.4}", d.threshold)),
+            with(damage.map(|d| d.probability_of_damage), damage.and_then(|d| d.probability_interval), 100.0, 1),
+            damage.map_or("-", |d| if d.exceeds { "yes" } else { "no" })
+        );
     }
     Ok(())
 }

@@ -1,7 +1,9 @@
 //! The door for people: one function a command.
 
 mod assess;
+mod calibrate;
 mod demo;
+mod design_alarm;
 mod serve;
 mod simulate;
 mod train;
@@ -30,6 +32,10 @@ enum Command {
     Demo(demo::DemoArgs),
     /// Train the baseline of a structure.
     Train(train::TrainArgs),
+    /// Measure whether a trained baseline is as sure as it should be.
+    Calibrate(calibrate::CalibrateArgs),
+    /// Simulate the alarm charts of a structure.
+    DesignAlarm(design_alarm::DesignAlarmArgs),
     /// Simulate measurements of a structure as CSV.
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
@@ -102,6 +108,8 @@ pub fn run() -> anyhow::Result<()> {
         Command::Train(args) => train::train(&args),
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),
+        Command::Calibrate(args) => calibrate::calibrate(&args),
+        Command::DesignAlarm(args) => design_alarm::design_alarm(&args),
         Command::Config { what: ConfigCommand::Print { default: true, .. } } => {
             print!("{DEFAULT_FILE}");
             Ok(())

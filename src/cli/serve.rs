@@ -40,6 +40,7 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let store = Store::open(&config.data_dir).await?;
     let monitor = Monitor::open(store.clone(), library, config.monitor).await?;
     monitor.resume();
+    monitor.watch_for_silence();
     let metrics = PrometheusBuilder::new()
         .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
         .install_recorder()?;

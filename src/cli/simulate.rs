@@ -23,6 +23,9 @@ pub struct SimulateArgs {
     /// Number of measurements
     #[arg(long, default_value_t = 50)]
     measurements: usize,
+    /// Noise as a multiple of the structure's; 0 for none
+    #[arg(long, default_value_t = 1.0)]
+    noise: f64,
     /// Seed of everything random
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -44,12 +47,13 @@ pub struct SimulateArgs {
 pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
     anyhow::ensure!(args.measurements > 0, "--measurements is 0: at least 1 is needed");
+    anyhow::ensure!(args.noise >= 0.0 && args.noise.is_finite(), "--noise is {}: it must be 0 or above", args.noise);
     let moments: Vec<(String, f64, f64)> = args.parameters.iter().map(|(name, n)| (name.clone(), n[0], n[1])).collect();
     let population = Population::new(simulator.space(), &moments)?;
-    let drawn = population.draw(&simulator, args.measurements, args.seed)?;
+    let drawn = population.draw(&simulator, args.measurements, args.noise, args.seed)?;
     let start = Timestamp::parse(&args.start).context("--start")?;
     let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
-    let measurements = at_intervals(&rows, start, args.interval_s)?;
+    let measurements = at_intervals(&rows, start, args.interval_s, None)?;
     let text = csv::write(&measurements);
     match &args.out {
         Some(path) => write_whole(path, text.as_bytes())?,
@@ -58,17 +62,22 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Complete measurements at equal intervals.
+/// Complete measurements at equal intervals, with a standard deviation as a share of each frequency, if one is given.
 ///
 /// # Errors
 /// [`OutOfRange`] for a frequency or time that is none.
-pub fn at_intervals(rows: &[Vec<f64>], start: Timestamp, interval_s: u32) -> Result<Vec<ModalMeasurement>, OutOfRange> {
+pub fn at_intervals(
+    rows: &[Vec<f64>],
+    start: Timestamp,
+    interval_s: u32,
+    relative_std: Option<f64>,
+) -> Result<Vec<ModalMeasurement>, OutOfRange> {
     let measurement = |(index, row): (usize, &Vec<f64>)| {
         let micros = start.micros() + index as i64 * i64::from(interval_s) * 1_000_000;
         Ok(ModalMeasurement {
             measured_at: Timestamp::from_micros(micros)?,
             frequencies_hz: row.iter().map(|f| Hertz::new(*f).map(Some)).collect::<Result<_, _>>()?,
-            std_hz: None,
+            std_hz: relative_std.map(|share| row.iter().map(|f| Some(share * f)).collect()),
             covariates: std::collections::BTreeMap::new(),
             settings: std::collections::BTreeMap::new(),
         })

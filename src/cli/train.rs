@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::write_whole;
 use crate::baseline::library::{find_structure, read_structure_file};
-use crate::baseline::manifest::ValidationRecord;
+use crate::baseline::manifest::{Manifest, NoiseRange, ValidationRecord};
 use crate::baseline::train::{diverged, train as train_baseline};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -23,12 +23,15 @@ pub struct TrainArgs {
     /// Folder for structure.toml, baseline.safetensors and baseline.json [default: models/<structure>]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Simulated training samples
-    #[arg(long, default_value_t = 10_000)]
-    samples: usize,
-    /// Passes over the training samples
-    #[arg(long, default_value_t = TrainSettings::default().epochs)]
-    epochs: usize,
+    /// Simulated training samples [default: 200000; 10000 for a structure without measurement noise]
+    #[arg(long)]
+    samples: Option<usize>,
+    /// Passes over the training samples [default: 80; 200 for a structure without measurement noise]
+    #[arg(long)]
+    epochs: Option<usize>,
+    /// Noise the baseline shall cover, as multiples of the structure's own
+    #[arg(long, value_name = "LOW,HIGH", value_parser = noise_range, default_value = "0.1,5")]
+    noise_range: NoiseRange,
     /// Seed of everything random; the same seed gives the same files
     #[arg(long, default_value_t = TrainSettings::default().seed)]
     seed: u64,
@@ -60,12 +63,15 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         );
     }
 
-    let settings = TrainSettings { epochs: args.epochs, seed: args.seed, ..TrainSettings::default() };
-    let bar = ProgressBar::new(args.epochs as u64);
+    let noisy = simulator.noise().std_hz(1.0) > 0.0;
+    let (samples, epochs) = if noisy { (200_000, 80) } else { (10_000, 200) };
+    let (samples, epochs) = (args.samples.unwrap_or(samples), args.epochs.unwrap_or(epochs));
+    let settings = TrainSettings { epochs, seed: args.seed, ..TrainSettings::default() };
+    let bar = ProgressBar::new(epochs as u64);
     let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
     bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
     let started = Instant::now();
-    let trained = train_baseline(&simulator, args.samples, &FlowSettings::default(), &settings, |epoch| {
+    let trained = train_baseline(&simulator, samples, args.noise_range, &FlowSettings::default(), &settings, |epoch| {
         bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
         bar.set_position(epoch.epoch as u64);
     })?;
@@ -84,6 +90,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         let report = serde_json::json!({
             "structure": manifest.structure, "model_digest": trained.baseline.digest(), "out": out,
             "seconds": seconds, "training": manifest.training, "validation": manifest.validation,
+            "calibration": manifest.calibration, "identifiability": manifest.identifiability,
         });
         println!("{}", serde_json::to_string_pretty(&report)?);
         return Ok(());
@@ -91,6 +98,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     println!("Trained {} in {seconds:.1} s: {}", simulator.id(), out.join("baseline.safetensors").display());
     println!("model digest {}", trained.baseline.digest());
     print_validation(&manifest.validation);
+    print_record(manifest);
     if diverged(manifest) {
         println!(
             "The loss was not finite at the end: the weights of epoch {} were kept.",
@@ -98,6 +106,33 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         );
     }
     Ok(())
+}
+
+fn print_record(manifest: &Manifest) {
+    for p in &manifest.identifiability.parameters {
+        let (name, left) = (&p.name, 100.0 * p.variance_left);
+        println!("one measurement leaves {left:.2} % of the prior variance of {name} (standard deviation {:.4})", p.posterior_std);
+    }
+    for group in &manifest.identifiability.groups {
+        println!("these modes cannot tell apart: {}", group.join(", "));
+    }
+    let calibration = &manifest.calibration;
+    if calibration.passed() {
+        println!("calibration passed in {} cells of {} simulations", calibration.cells.len(), calibration.simulations);
+        return;
+    }
+    println!("CALIBRATION FAILED: the service will not use this baseline unless it is told to");
+    for failure in &calibration.failures {
+        println!("  {failure}");
+    }
+}
+
+fn noise_range(text: &str) -> Result<NoiseRange, String> {
+    let numbers: Vec<f64> = text.split(',').filter_map(|t| t.trim().parse().ok()).collect();
+    match numbers[..] {
+        [lowest, highest] => Ok(NoiseRange { lowest, highest }),
+        _ => Err("two numbers with a comma between them, such as 0.1,5".to_owned()),
+    }
 }
 
 fn print_validation(validation: &ValidationRecord) {

@@ -1,8 +1,10 @@
 //! The conditional network: a 1-D convolutional network over the observation vector.
 
 use candle_core::{Result, Tensor, D};
-use candle_nn::{linear, Linear, Module as _, VarBuilder};
+use candle_nn::VarBuilder;
 
+use super::activation::silu;
+use super::dense::Dense;
 use super::Architecture;
 
 /// Reach of a convolution: each mode sees itself and its two neighbours.
@@ -19,7 +21,7 @@ const KERNEL: usize = 3;
 pub struct ContextNetwork {
     first: Convolution,
     second: Convolution,
-    features: Linear,
+    features: Dense,
     width: usize,
 }
 
@@ -33,7 +35,7 @@ impl ContextNetwork {
         Ok(Self {
             first: Convolution::new(architecture.channels, channels, &vb.pp("conv1"))?,
             second: Convolution::new(channels, channels, &vb.pp("conv2"))?,
-            features: linear(modes * channels, architecture.context_features, vb.pp("features"))?,
+            features: Dense::new(modes * channels, architecture.context_features, &vb.pp("features"))?,
             width: architecture.context_features + modes * architecture.channels,
         })
     }
@@ -49,9 +51,9 @@ impl ContextNetwork {
     /// A candle error when the shape of `y` is another.
     pub fn forward(&self, y: &Tensor) -> Result<Tensor> {
         let by_mode = y.transpose(1, 2)?.contiguous()?;
-        let hidden = self.first.forward(&by_mode)?.silu()?;
-        let hidden = self.second.forward(&hidden)?.silu()?;
-        let features = self.features.forward(&hidden.flatten_from(1)?)?.silu()?;
+        let hidden = silu(&self.first.forward(&by_mode)?)?;
+        let hidden = silu(&self.second.forward(&hidden)?)?;
+        let features = silu(&self.features.forward(&hidden.flatten_from(1)?)?)?;
         Tensor::cat(&[features, y.flatten_from(1)?.contiguous()?], 1)
     }
 }
@@ -61,12 +63,12 @@ impl ContextNetwork {
 /// candle's own `conv1d` copies to another layout and back for each call; for a handful of modes the unfolding below
 /// is faster forward and backward and gives the same numbers.
 struct Convolution {
-    weights: Linear,
+    weights: Dense,
 }
 
 impl Convolution {
     fn new(inputs: usize, outputs: usize, vb: &VarBuilder<'_>) -> Result<Self> {
-        Ok(Self { weights: linear(KERNEL * inputs, outputs, vb.clone())? })
+        Ok(Self { weights: Dense::new(KERNEL * inputs, outputs, vb)? })
     }
 
     /// `[n, modes, inputs]` to `[n, modes, outputs]`.

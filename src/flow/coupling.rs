@@ -1,8 +1,10 @@
 //! Conditional affine coupling: one half is scaled and shifted by functions of the other half and of the context.
 
 use candle_core::{Result, Tensor, D};
-use candle_nn::{linear, Init, Linear, Module as _, VarBuilder};
+use candle_nn::VarBuilder;
 
+use super::activation::silu;
+use super::dense::Dense;
 use super::Architecture;
 
 /// Conditional affine coupling unit (cACL): two affine couplings, so that both halves of x are transformed.
@@ -89,30 +91,26 @@ impl CouplingUnit {
 /// The clamp α bounds each scale to exp(±α), so that early training cannot overflow and far-off conditions cannot
 /// throw samples to infinity. W₃ and b₃ begin at 0: an untrained unit is the identity.
 struct Subnet {
-    input: Linear,
-    hidden: Linear,
-    output: Linear,
+    input: Dense,
+    hidden: Dense,
+    output: Dense,
     active: usize,
     clamp: f64,
 }
 
 impl Subnet {
     fn new(inputs: usize, width: usize, active: usize, clamp: f64, vb: &VarBuilder<'_>) -> Result<Self> {
-        let zero = Init::Const(0.0);
-        let last = vb.pp("output");
-        let weight = last.get_with_hints((2 * active, width), "weight", zero)?;
-        let bias = last.get_with_hints(2 * active, "bias", zero)?;
         Ok(Self {
-            input: linear(inputs, width, vb.pp("input"))?,
-            hidden: linear(width, width, vb.pp("hidden"))?,
-            output: Linear::new(weight, Some(bias)),
+            input: Dense::new(inputs, width, &vb.pp("input"))?,
+            hidden: Dense::new(width, width, &vb.pp("hidden"))?,
+            output: Dense::zero(width, 2 * active, &vb.pp("output"))?,
             active,
             clamp,
         })
     }
 
     fn scale_and_shift(&self, input: &Tensor) -> Result<(Tensor, Tensor)> {
-        let hidden = self.hidden.forward(&self.input.forward(input)?.silu()?)?.silu()?;
+        let hidden = silu(&self.hidden.forward(&silu(&self.input.forward(input)?)?)?)?;
         let output = self.output.forward(&hidden)?;
         let raw_scale = output.narrow(1, 0, self.active)?;
         let scale = ((raw_scale / self.clamp)?.tanh()? * self.clamp)?;

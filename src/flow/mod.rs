@@ -8,9 +8,11 @@
 //!
 //! Source: Wang et al. (2025), §3.2, Eq. 11–13 and 20.
 
+pub mod activation;
 pub mod checkpoint;
 pub mod context;
 pub mod coupling;
+pub mod dense;
 pub mod permutation;
 pub mod train;
 pub mod weights;
@@ -159,22 +161,21 @@ impl Flow {
         Ok(x)
     }
 
-    /// Log-density log q(x | y) of each row, nats. `x`: `[n, d]`, `y`: `[n, channels, modes]`; returns `[n]`.
+    /// Log-density log q(x | y) of each row, nats. `x`: `[n, d]`, `context`: S(y) `[n, context]`; returns `[n]`.
     ///
     /// # Errors
     /// A candle error when shapes do not fit.
-    pub fn log_prob(&self, x: &Tensor, y: &Tensor) -> Result<Tensor> {
-        let (z, log_det) = self.forward(x, &self.summarise(y)?)?;
+    pub fn log_prob(&self, x: &Tensor, context: &Tensor) -> Result<Tensor> {
+        let (z, log_det) = self.forward(x, context)?;
         let normaliser = 0.5 * x.dim(1)? as f64 * (2.0 * std::f64::consts::PI).ln();
         (log_det - (z.sqr()?.sum(D::Minus1)? * 0.5)?)? - normaliser
     }
 
-    /// `draws` samples of x for each row of `y`, in the order of the rows: `[n·draws, d]`.
+    /// `draws` samples of x for each row of `context`, S(y) `[n, context]`, in the order of the rows: `[n·draws, d]`.
     ///
     /// # Errors
-    /// A candle error when the shape of `y` is another.
-    pub fn sample(&self, y: &Tensor, draws: usize, stream: &mut Stream) -> Result<Tensor> {
-        let context = self.summarise(y)?;
+    /// A candle error when the shape of `context` is another.
+    pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<Tensor> {
         let (rows, features) = context.dims2()?;
         let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
         let z = standard_normal(rows * draws, self.architecture.parameters, stream).to_dtype(self.dtype)?;

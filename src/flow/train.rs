@@ -90,6 +90,8 @@ pub enum Error {
 
 /// Trains `flow`, whose variables are `weights`, and leaves in it the weights of the best validation loss.
 ///
+/// `training` gives the pairs of an epoch (from 1), always `rows` of them: the same ones, or with noise drawn afresh.
+///
 /// ```text
 ///  loss = 1/M Σ ( ½|z|² − log|det ∂z/∂x| ),   AdamW, learning rate falling to 0 along a half cosine
 /// ```
@@ -101,12 +103,12 @@ pub enum Error {
 pub fn train(
     flow: &Flow,
     weights: &Weights,
-    training: &Pairs,
+    rows: usize,
+    mut training: impl FnMut(usize) -> Result<Pairs, candle_core::Error>,
     validation: &Pairs,
     settings: &TrainSettings,
     mut on_epoch: impl FnMut(EpochReport),
 ) -> Result<TrainOutcome, Error> {
-    let rows = training.x.dim(0)?;
     let steps_per_epoch = rows.div_ceil(settings.batch);
     let total_steps = settings.epochs * steps_per_epoch;
     // Sorted by name, so that the optimiser meets the weights in the same order in every run.
@@ -119,6 +121,7 @@ pub fn train(
     let mut stopped = Stopped::Completed;
     'epochs: for epoch in 1..=settings.epochs {
         order.shuffle(&mut shuffle);
+        let training = training(epoch)?;
         let mut sum = 0.0;
         for (step, chosen) in order.chunks(settings.batch).enumerate() {
             let progress = ((epoch - 1) * steps_per_epoch + step) as f64 / total_steps as f64;

@@ -7,7 +7,8 @@ use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
 use crate::monitor::BatchView;
 use crate::quantity::Timestamp;
-use crate::store::{HistoryEntry, UndamagedRecord};
+use crate::store::{HistoryEntry, StoredChartPoint, UndamagedRecord};
+use crate::trust::{Finding, Verdict};
 
 /// One batch.
 #[derive(Debug, Serialize)]
@@ -26,6 +27,8 @@ pub struct Batch {
     next_step: Option<String>,
     content_digest: String,
     assessment: Option<AssessmentBody>,
+    /// Its points on the alarm charts.
+    charts: Vec<ChartBody>,
     #[serde(skip_serializing_if = "Option::is_none")]
     measurements: Option<Vec<ModalMeasurement>>,
 }
@@ -33,7 +36,7 @@ pub struct Batch {
 impl Batch {
     /// The answer for a batch, with its measurements if they are wanted.
     pub fn new(view: BatchView, with_measurements: bool) -> Self {
-        let BatchView { record, assessment, next_step } = view;
+        let BatchView { record, assessment, charts, next_step } = view;
         let (measured_from, measured_to) = record.batch.time_span();
         Self {
             structure: record.batch.structure.to_string(),
@@ -48,6 +51,7 @@ impl Batch {
             next_step,
             content_digest: record.content_digest.to_string(),
             assessment: assessment.map(AssessmentBody::from),
+            charts: charts.into_iter().map(ChartBody::from).collect(),
             measurements: with_measurements.then_some(record.batch.measurements),
         }
     }
@@ -70,34 +74,92 @@ pub struct AssessmentBody {
     measurements_used: usize,
     measurements_left_out: usize,
     measurements_outside: usize,
-    misfit_percent: Vec<f64>,
+    effective_sample_size: f64,
+    misfit_percent: Vec<Option<f64>>,
     assessed_at: Timestamp,
     exceeds: bool,
+    /// `accepted` or `rejected`; rejected withholds the probabilities of damage.
+    trust: Verdict,
+    extrapolated: bool,
+    fit_p_value: Option<f64>,
+    /// √(χ²/degrees of freedom): 1 where noise explains all that the simulation does not.
+    fit_distance: Option<f64>,
+    fit_degrees_of_freedom: usize,
     /// What a reader must know before believing the figures.
-    warnings: Vec<String>,
+    findings: Vec<Finding>,
     parameters: Vec<ParameterBody>,
 }
 
-/// One monitored quantity of a batch.
+/// One monitored quantity of a batch: mean and standard deviation are those of the population behind the batch, intervals
+/// have 90 % probability.
 #[derive(Debug, Serialize)]
 pub struct ParameterBody {
     name: String,
     unit: String,
     kind: QuantityKind,
     mean: f64,
+    mean_interval: Option<[f64; 2]>,
+    std: Option<f64>,
+    std_interval: Option<[f64; 2]>,
+    edge_mass: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    group: Option<String>,
+    threshold: Option<f64>,
+    probability_of_damage: Option<f64>,
+    probability_of_damage_interval: Option<[f64; 2]>,
+    exceeds: Option<bool>,
+    relative_change: Option<f64>,
+    relative_change_interval: Option<[f64; 2]>,
+    pooled: PooledBody,
+}
+
+/// The estimate of the paper: moments of all samples together.
+#[derive(Debug, Serialize)]
+pub struct PooledBody {
+    mean: f64,
     std: Option<f64>,
     variance_within: f64,
     variance_between: Option<f64>,
-    edge_mass: f64,
-    threshold: Option<f64>,
     probability_of_damage: Option<f64>,
-    exceeds: Option<bool>,
-    relative_change: Option<f64>,
+}
+
+/// A batch on an alarm chart.
+#[derive(Debug, Serialize)]
+pub struct ChartBody {
+    batch: String,
+    measured_to: Timestamp,
+    chart: String,
+    /// Towards damage, in standard errors; on the chart of the fit, 1 stands for rejected.
+    shift: f64,
+    shift_limit: f64,
+    ewma: f64,
+    ewma_limit: Option<f64>,
+    /// Probability of damage that stands at the limit, if the spread is the undamaged one.
+    probability_of_damage_limit: Option<f64>,
+    /// True when the batch moved nothing: maintenance, or a finding that holds alarms.
+    held: bool,
+    state: String,
+}
+
+impl From<StoredChartPoint> for ChartBody {
+    fn from(p: StoredChartPoint) -> Self {
+        Self {
+            batch: p.batch_id,
+            measured_to: p.measured_to,
+            chart: p.series,
+            shift: p.shift,
+            shift_limit: p.shift_limit,
+            ewma: p.ewma,
+            ewma_limit: p.ewma_limit,
+            probability_of_damage_limit: p.probability_limit,
+            held: p.held,
+            state: p.state,
+        }
+    }
 }
 
 impl From<Assessment> for AssessmentBody {
     fn from(a: Assessment) -> Self {
-        let warnings = a.warnings();
         let exceeds = a.quantities.iter().any(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
         Self {
             model_digest: a.model_digest.to_string(),
@@ -108,10 +170,16 @@ impl From<Assessment> for AssessmentBody {
             measurements_used: a.measurements_used,
             measurements_left_out: a.measurements_left_out,
             measurements_outside: a.measurements_outside,
+            effective_sample_size: a.effective_sample_size,
             misfit_percent: a.misfit_percent,
             assessed_at: a.assessed_at,
             exceeds,
-            warnings,
+            trust: a.trust.verdict,
+            extrapolated: a.trust.extrapolated(),
+            fit_p_value: a.trust.p_value,
+            fit_distance: a.trust.distance,
+            fit_degrees_of_freedom: a.trust.degrees_of_freedom,
+            findings: a.trust.findings,
             parameters: a.quantities.into_iter().map(ParameterBody::from).collect(),
         }
     }
@@ -121,15 +189,25 @@ impl From<QuantityAssessment> for ParameterBody {
     fn from(q: QuantityAssessment) -> Self {
         let damage = q.damage.as_ref();
         Self {
-            mean: q.hyperparameters.mean,
-            std: q.hyperparameters.std,
-            variance_within: q.hyperparameters.within,
-            variance_between: q.hyperparameters.between,
+            mean: q.mean,
+            mean_interval: q.mean_interval,
+            std: q.std,
+            std_interval: q.std_interval,
             edge_mass: q.edge_mass,
             threshold: damage.map(|d| d.threshold),
             probability_of_damage: damage.map(|d| d.probability_of_damage),
+            probability_of_damage_interval: damage.and_then(|d| d.probability_interval),
             exceeds: damage.map(|d| d.exceeds),
             relative_change: damage.map(|d| d.relative_change),
+            relative_change_interval: damage.and_then(|d| d.relative_change_interval),
+            pooled: PooledBody {
+                mean: q.pooled.mean,
+                std: q.pooled.std,
+                variance_within: q.pooled.within,
+                variance_between: q.pooled.between,
+                probability_of_damage: damage.map(|d| d.pooled_probability),
+            },
+            group: q.group,
             name: q.name,
             unit: q.unit,
             kind: q.kind,
@@ -169,7 +247,7 @@ impl From<HistoryEntry> for HistoryItem {
 }
 
 /// Columns of the history as CSV: one row for each batch and quantity, or one with empty places without an assessment.
-pub const HISTORY_COLUMNS: [&str; 16] = [
+pub const HISTORY_COLUMNS: [&str; 25] = [
     "batch",
     "source",
     "measured_from",
@@ -179,12 +257,21 @@ pub const HISTORY_COLUMNS: [&str; 16] = [
     "parameter",
     "unit",
     "mean",
+    "mean_low",
+    "mean_high",
     "std",
+    "std_low",
+    "std_high",
     "edge_mass",
     "threshold",
     "probability_of_damage",
+    "probability_of_damage_low",
+    "probability_of_damage_high",
     "exceeds",
     "relative_change",
+    "pooled_mean",
+    "pooled_std",
+    "trust",
     "model_digest",
 ];
 
@@ -200,19 +287,28 @@ impl HistoryItem {
             self.state.as_str().to_owned(),
         ];
         let Some(assessment) = &self.assessment else {
-            return vec![batch.into_iter().chain(vec![String::new(); 10]).collect()];
+            return vec![batch.into_iter().chain(vec![String::new(); 19]).collect()];
         };
         let row = |p: &ParameterBody| {
             let quantity = [
                 p.name.clone(),
                 p.unit.clone(),
                 p.mean.to_string(),
+                cell(p.mean_interval.map(|i| i[0])),
+                cell(p.mean_interval.map(|i| i[1])),
                 cell(p.std),
+                cell(p.std_interval.map(|i| i[0])),
+                cell(p.std_interval.map(|i| i[1])),
                 p.edge_mass.to_string(),
                 cell(p.threshold),
                 cell(p.probability_of_damage),
+                cell(p.probability_of_damage_interval.map(|i| i[0])),
+                cell(p.probability_of_damage_interval.map(|i| i[1])),
                 cell(p.exceeds),
                 cell(p.relative_change),
+                p.pooled.mean.to_string(),
+                cell(p.pooled.std),
+                if assessment.trust == Verdict::Accepted { "accepted" } else { "rejected" }.to_owned(),
                 assessment.model_digest.clone(),
             ];
             batch.iter().cloned().chain(quantity).collect()
@@ -235,6 +331,10 @@ pub struct Undamaged {
     threshold_probability: f64,
     measurement_count: usize,
     batches: Vec<String>,
+    /// Covariates under which it was taken.
+    conditions: std::collections::BTreeMap<String, crate::damage::SeenCovariate>,
+    /// What is doubtful about it.
+    doubts: Vec<String>,
     parameters: Vec<crate::damage::UndamagedQuantity>,
 }
 
@@ -249,6 +349,8 @@ impl Undamaged {
             threshold_probability: record.state.threshold_probability,
             measurement_count: record.state.measurements,
             batches: record.batches,
+            conditions: record.state.conditions,
+            doubts: record.state.doubts,
             parameters: record.state.quantities,
         }
     }

@@ -80,7 +80,7 @@ impl From<monitor::Error> for ApiError {
                 let pointer = format!("/measurements/{ordinal}");
                 Self::invalid("measurement_exists", detail.clone(), vec![Problem { pointer, message: detail }])
             }
-            E::RepeatedBatch(_) | E::Undamaged(_) | E::Assess { .. } => {
+            E::RepeatedBatch(_) | E::Undamaged(_) | E::Assess { .. } | E::UnfitForUndamaged { .. } => {
                 Self::invalid("unusable_baseline", detail, Vec::new())
             }
             E::QueueFull(_) => Self {

@@ -1,4 +1,4 @@
-//! `/v1/structures/{id}/history`, `/baseline` and `/alarms`: what the batches say over time.
+//! `/v1/structures/{id}/history`, `/baseline` and `/exceedances`: what the batches say over time.
 
 use axum::body::Body;
 use axum::extract::State;
@@ -42,15 +42,15 @@ struct HistoryPage {
 }
 
 #[derive(Debug, Serialize)]
-struct AlarmPage {
+struct ExceedancePage {
     structure: StructureId,
-    items: Vec<AlarmItem>,
+    items: Vec<ExceedanceItem>,
     next: Option<String>,
 }
 
 /// A probability of damage above the undamaged threshold.
 #[derive(Debug, Serialize)]
-struct AlarmItem {
+struct ExceedanceItem {
     batch: String,
     measured_from: Timestamp,
     measured_to: Timestamp,
@@ -86,6 +86,7 @@ pub async fn history(
     if let Some(name) = &query.parameter {
         let mut names: Vec<String> = watched.simulator.space().iter().map(|p| p.name.clone()).collect();
         names.extend(watched.simulator.derived_stiffnesses().into_iter().map(|s| s.name));
+        names.extend(watched.baseline.iter().flat_map(|b| b.groups()).map(|g| g.name));
         if !names.contains(name) {
             let message = format!("{} is none of {}", crate::quantity::shown(name), names.join(", "));
             return Err(ApiError::invalid_field("query/parameter", message));
@@ -106,11 +107,11 @@ pub async fn history(
     Ok(response)
 }
 
-/// `GET /v1/structures/{id}/alarms`: exceedances, newest first.
+/// `GET /v1/structures/{id}/exceedances`: probabilities of damage above the undamaged threshold, newest first.
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
-pub async fn alarms(
+pub async fn exceedances(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
     ApiQuery(query): ApiQuery<PageQuery>,
@@ -123,7 +124,7 @@ pub async fn alarms(
     let next = (found.len() == limit)
         .then(|| found.last().map(|e| format!("{}~{}", cursor(e.measured_from, &e.batch_id), e.quantity)))
         .flatten();
-    let item = |e: crate::store::Exceedance| AlarmItem {
+    let item = |e: crate::store::Exceedance| ExceedanceItem {
         batch: e.batch_id,
         measured_from: e.measured_from,
         measured_to: e.measured_to,
@@ -137,8 +138,8 @@ pub async fn alarms(
         model_digest: e.model_digest.to_string(),
     };
     let items = found.into_iter().map(item).collect();
-    let mut response = Json(AlarmPage { structure: id.clone(), items, next: next.clone() }).into_response();
-    link_next(&mut response, &format!("/v1/structures/{id}/alarms"), &query, next.as_deref());
+    let mut response = Json(ExceedancePage { structure: id.clone(), items, next: next.clone() }).into_response();
+    link_next(&mut response, &format!("/v1/structures/{id}/exceedances"), &query, next.as_deref());
     Ok(response)
 }
 

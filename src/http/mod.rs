@@ -1,5 +1,6 @@
 //! The door for programs: routes, and what each request passes on its way.
 
+mod alarms;
 mod answer;
 mod batches;
 mod error;
@@ -75,7 +76,12 @@ pub fn router(monitor: Monitor, metrics: PrometheusHandle, settings: &HttpSettin
         .route("/v1/structures/{id}/batches/{batch}", get(batches::read))
         .route("/v1/structures/{id}/history", get(history::history))
         .route("/v1/structures/{id}/baseline", post(history::declare_baseline))
-        .route("/v1/structures/{id}/alarms", get(history::alarms))
+        .route("/v1/structures/{id}/exceedances", get(history::exceedances))
+        .route("/v1/structures/{id}/alarms", get(alarms::list))
+        .route("/v1/structures/{id}/alarms/{alarm}/acknowledgement", post(alarms::acknowledge))
+        .route("/v1/structures/{id}/charts", get(alarms::charts))
+        .route("/v1/structures/{id}/maintenance", get(alarms::maintenance).post(alarms::add_maintenance))
+        .route("/v1/structures/{id}/identifiability", get(alarms::identifiability))
         .route("/healthz", get(operations::health))
         .route("/readyz", get(operations::ready))
         .route("/metrics", get(operations::metrics))

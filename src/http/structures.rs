@@ -37,6 +37,8 @@ struct ModelBody {
     program_version: String,
     training_samples: usize,
     validation: crate::baseline::manifest::ValidationRecord,
+    conditions: crate::baseline::manifest::Conditions,
+    calibration: crate::baseline::calibration::CalibrationRecord,
 }
 
 /// One line of the list.
@@ -135,6 +137,8 @@ fn body(id: &StructureId, watched: &Watched, undamaged: Option<super::answer::Un
         program_version: baseline.manifest().program_version.clone(),
         training_samples: baseline.manifest().training.samples,
         validation: baseline.manifest().validation.clone(),
+        conditions: baseline.manifest().conditions.clone(),
+        calibration: baseline.manifest().calibration.clone(),
     });
     let definition = serde_json::from_str(&watched.simulator.definition().canonical_json());
     StructureBody {

@@ -231,8 +231,9 @@ fn check_frequencies(
             None
         });
         if let Some(outside) = hertz.map(Hertz::get).filter(|f| !(lowest..=highest).contains(f)) {
+            let unit = if outside < lowest { "it looks like kHz" } else { "is it in Hz?" };
             let message = format!(
-                "{outside} Hz is far from anything this structure has ({lowest:.3e} to {highest:.3e} Hz): is it in Hz?"
+                "{outside} Hz is far from anything this structure has ({lowest:.3e} to {highest:.3e} Hz): {unit}"
             );
             problems.add(pointer(), message);
         }
@@ -240,17 +241,6 @@ fn check_frequencies(
     }
     if raw.frequencies_hz.iter().all(Option::is_none) {
         problems.add(raw.place.of(&Field::Frequencies), "all modes are missing: leave the measurement out");
-    }
-    let present: Vec<(usize, f64)> =
-        frequencies.iter().enumerate().filter_map(|(mode, f)| Some((mode, f.as_ref()?.get()))).collect();
-    for pair in present.windows(2).filter(|pair| pair[1].1 <= pair[0].1) {
-        let [(low, f_low), (high, f_high)] = [pair[0], pair[1]];
-        let message = format!(
-            "mode {} at {f_high} Hz is not above mode {} at {f_low} Hz: frequencies are ascending, mode by mode",
-            high + 1,
-            low + 1
-        );
-        problems.add(raw.place.of(&Field::Frequency(high)), message);
     }
     frequencies
 }

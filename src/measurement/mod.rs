@@ -41,7 +41,7 @@ pub enum CovariateValue {
     Category(String),
 }
 
-/// The natural frequencies identified from one record, ascending.
+/// The natural frequencies identified from one record, mode by mode.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ModalMeasurement {
     /// When it was measured.

@@ -1,124 +1,331 @@
 //! From the measurements of a batch to its assessment: pure, so that service and command line agree to the bit.
 
-use rayon::prelude::*;
+use std::collections::BTreeMap;
 
 use crate::assessment::Assessment;
-use crate::baseline::reach::{reach, Reach};
+use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
-use crate::damage::{self, QuantityKind, QuantitySamples, UndamagedState};
-use crate::measurement::ModalMeasurement;
+use crate::damage::{self, QuantityKind, QuantitySamples, SeenCovariate, UndamagedState};
+use crate::hierarchy::{populations, PopulationEstimate, Populations};
+use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::parameter::DamageDirection;
 use crate::posterior::PosteriorSamples;
-use crate::quantity::Timestamp;
+use crate::quantity::{Hertz, Timestamp};
 use crate::stats;
+use crate::trust::{cause, fit, quality, standing_findings, Code, Effect, Finding, Trust};
+
+/// Effective samples for each measurement below which the hyperparameters are drawn again with more.
+const FEW_EFFECTIVE: f64 = 8.0;
+
+/// How many more draws then.
+const MORE_DRAWS: usize = 4;
+
+/// Effective samples for each measurement below which the reader is warned.
+const TOO_FEW_EFFECTIVE: f64 = 3.0;
+
+/// Share of samples at a prior edge above which the prior is called too narrow.
+const MUCH_EDGE_MASS: f64 = 0.05;
 
 /// Why a batch was not assessed; the batch itself is kept.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No measurement with all modes.
-    #[error("all {measurements} measurements lack a mode: this baseline was trained on complete measurements")]
-    NoCompleteMeasurement {
+    /// No measurement that this baseline can use.
+    #[error(
+        "none of {measurements} measurements can be used: each lacks a mode that this baseline needs, or states more noise \
+         than it was trained for"
+    )]
+    NoUsableMeasurement {
         /// Measurements of the batch.
         measurements: usize,
     },
     /// The flow failed: a bug or a damaged baseline.
     #[error(transparent)]
     Inference(#[from] InferenceError),
-    /// The simulation failed at the posterior mean: a bug, since the prior box was checked.
-    #[error("the simulation failed at the posterior mean: {0}")]
+    /// The simulation failed inside the prior: a bug, since the prior box was checked.
+    #[error("the simulation failed inside the prior: {0}")]
     Simulation(#[from] crate::physics::Error),
+    /// The search for the cause of a misfit failed.
+    #[error(transparent)]
+    Cause(#[from] cause::Error),
 }
 
 /// How a batch is drawn from.
 #[derive(Debug, Clone, Copy)]
 pub struct Draws {
-    /// Posterior samples for each measurement.
+    /// Posterior samples of each measurement in the pool (paper).
     pub per_measurement: usize,
+    /// Posterior samples of each measurement for the population behind the batch.
+    pub for_population: usize,
     /// Seed of the latent draws.
     pub seed: u64,
 }
 
-/// Posterior samples of the measurements that have all modes.
+/// What a batch is compared with, and what came before it.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Context<'a> {
+    /// The undamaged state.
+    pub undamaged: Option<&'a UndamagedState>,
+    /// Frequencies of the measurement before the batch, of the same source.
+    pub previous: Option<&'a [Option<Hertz>]>,
+}
+
+/// Posterior samples of the measurements of a batch, and what was found on the way.
 #[derive(Debug)]
 pub struct BatchSamples {
     /// Samples of the parameters.
     pub posterior: PosteriorSamples,
-    /// Frequencies of the measurements used, Hz, complete rows.
-    pub frequencies_hz: Vec<Vec<f64>>,
-    /// Measurements left out because a mode is missing.
+    /// The population behind them.
+    pub populations: Populations,
+    /// The measurements used, as the flow was asked about them.
+    pub observations: Vec<Observation>,
+    /// How well the simulation reproduces the measurements that could be asked about.
+    pub fit: fit::Fit,
+    /// What was found.
+    pub findings: Vec<Finding>,
+    /// Measurements left out.
     pub left_out: usize,
-    /// Measurements that no point of the prior box gives; they are drawn from as their nearest point.
-    pub outside: usize,
 }
 
-/// Draws from the posterior of each complete measurement.
+/// Draws from the posterior of each measurement and estimates the population behind them.
 ///
 /// # Errors
-/// [`Error::NoCompleteMeasurement`] when each lacks a mode; [`Error::Inference`].
-pub fn draw(baseline: &Baseline, measurements: &[ModalMeasurement], draws: Draws) -> Result<BatchSamples, Error> {
-    let frequencies_hz: Vec<Vec<f64>> = measurements.iter().filter_map(ModalMeasurement::complete_hz).collect();
-    if frequencies_hz.is_empty() {
-        return Err(Error::NoCompleteMeasurement { measurements: measurements.len() });
-    }
-    let left_out = measurements.len() - frequencies_hz.len();
-    let posterior = baseline.infer(&frequencies_hz, draws.per_measurement, draws.seed)?;
-    let nearest = nearest_points(baseline, &posterior, &frequencies_hz)?;
-    let outside = nearest.iter().flatten().count();
-    if outside == 0 {
-        return Ok(BatchSamples { posterior, frequencies_hz, left_out, outside });
-    }
-    let given = |(nearest, measured): (Option<Vec<f64>>, &Vec<f64>)| nearest.unwrap_or_else(|| measured.clone());
-    let condition: Vec<Vec<f64>> = nearest.into_iter().zip(&frequencies_hz).map(given).collect();
-    let posterior = baseline.infer(&condition, draws.per_measurement, draws.seed)?;
-    Ok(BatchSamples { posterior, frequencies_hz, left_out, outside })
-}
-
-/// For each measurement that the simulation cannot give inside the prior box, the frequencies that come nearest.
-///
-/// A flow has seen nothing beyond the box: asked about it, it answers at random, in all parameters. The nearest point
-/// keeps the parameters that do fit and puts the others at the edge.
-fn nearest_points(
+/// [`Error`], see its variants.
+pub fn draw(
     baseline: &Baseline,
-    posterior: &PosteriorSamples,
-    frequencies_hz: &[Vec<f64>],
-) -> Result<Vec<Option<Vec<f64>>>, crate::physics::Error> {
-    let means = posterior.means();
-    let look = |(row, measured): (usize, &Vec<f64>)| {
-        let start: Vec<f64> = means.row(row).iter().copied().collect();
-        Ok(match reach(baseline.simulator(), measured, &start)? {
-            Reach::Inside => None,
-            Reach::Outside { nearest_hz } => Some(nearest_hz),
+    measurements: &[ModalMeasurement],
+    previous: Option<&[Option<Hertz>]>,
+    draws: Draws,
+) -> Result<BatchSamples, Error> {
+    let quality::Inspection { kept, mut findings } = quality::inspect(measurements, previous);
+    let (indices, observations) = admit(baseline, &kept, &mut findings);
+    if observations.is_empty() {
+        return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
+    }
+    let per_measurement = draws.for_population.max(draws.per_measurement);
+    let posterior = baseline.infer(&observations, per_measurement, draws.seed)?;
+    let starts = rows(&posterior.means());
+    let fit = fit::fit(baseline.simulator(), &observations, &starts)?;
+    findings.extend(fit.findings(baseline.simulator(), &indices));
+    if fit.rejected() {
+        findings.extend(cause::suspect(baseline, &observations, draws.seed)?);
+    }
+    // A flow has seen nothing beyond its box: asked about it, it answers at random, in all parameters. The nearest point
+    // keeps the parameters that do fit and puts the others at the edge. Gross outliers are left out, unless nothing else
+    // is there.
+    let leave_out = fit.gross.len() < observations.len();
+    let asked: Vec<Observation> = (0..observations.len())
+        .filter(|row| !(leave_out && fit.gross.contains(row)))
+        .map(|row| {
+            if fit.outside.contains(&row) || fit.gross.contains(&row) {
+                let nearest = fit.nearest[row].frequencies_hz.iter().copied().map(Some);
+                let there = observations[row].frequencies_hz.iter().map(Option::is_some);
+                let frequencies_hz = nearest.zip(there).map(|(f, there)| f.filter(|_| there)).collect();
+                Observation { frequencies_hz, noise_multiple: observations[row].noise_multiple.clone() }
+            } else {
+                observations[row].clone()
+            }
         })
+        .collect();
+    let mut posterior = if fit.outside.is_empty() && fit.gross.is_empty() {
+        posterior
+    } else {
+        baseline.infer(&asked, per_measurement, draws.seed)?
     };
-    frequencies_hz.par_iter().enumerate().map(look).collect()
+    let mut population = populations(&posterior, baseline.space(), draws.seed);
+    if population.effective_sample_size < FEW_EFFECTIVE && posterior.measurements() > 1 {
+        posterior = baseline.infer(&asked, MORE_DRAWS * per_measurement, draws.seed)?;
+        population = populations(&posterior, baseline.space(), draws.seed);
+    }
+    if population.effective_sample_size < TOO_FEW_EFFECTIVE && posterior.measurements() > 1 {
+        let message = format!(
+            "only {:.1} effective samples a measurement stand behind the hyperparameters: the noise drowns the spread; \
+             read them as rough",
+            population.effective_sample_size
+        );
+        findings.push(Finding::new(Code::FewEffectiveSamples, Effect::Note, message));
+    }
+    let left_out = measurements.len() - asked.len();
+    let used = if leave_out {
+        (0..observations.len()).filter(|row| !fit.gross.contains(row)).map(|row| observations[row].clone()).collect()
+    } else {
+        observations
+    };
+    Ok(BatchSamples { posterior, populations: population, observations: used, fit, findings, left_out })
 }
 
-/// Samples of everything that is monitored: each parameter, and the stiffness of each spring set through a law.
-pub fn monitored_quantities(baseline: &Baseline, posterior: &PosteriorSamples) -> Vec<QuantitySamples> {
-    let edge_mass = posterior.edge_mass(baseline.space());
+/// Why batches make no undamaged state; `batch` is the index of the one to blame.
+#[derive(Debug, thiserror::Error)]
+pub enum UndamagedError {
+    /// A batch could not be used at all.
+    #[error("batch {batch}: {source}")]
+    Assess {
+        /// The batch.
+        batch: usize,
+        /// The cause.
+        source: Error,
+    },
+    /// A batch is not to be trusted.
+    #[error("batch {batch} cannot be part of an undamaged state: {reason}")]
+    Untrusted {
+        /// The batch.
+        batch: usize,
+        /// What was found in it.
+        reason: String,
+    },
+    /// Together they make none.
+    #[error(transparent)]
+    State(#[from] damage::Error),
+}
+
+/// The undamaged state of several batches, each with its draws.
+///
+/// # Errors
+/// [`UndamagedError`].
+pub fn undamaged_state(
+    baseline: &Baseline,
+    batches: &[(&[ModalMeasurement], Draws)],
+    threshold_probability: f64,
+) -> Result<UndamagedState, UndamagedError> {
+    let (mut parts, mut sizes) = (Vec::new(), Vec::new());
+    for (batch, (measurements, draws)) in batches.iter().enumerate() {
+        let samples = draw(baseline, measurements, None, *draws)
+            .map_err(|source| UndamagedError::Assess { batch, source })?;
+        let trust = Trust::new(&samples.fit, samples.findings.clone());
+        // What cannot be trusted must not become the measure of everything after it.
+        if let Some(finding) = trust.findings.iter().find(|f| f.effect != Effect::Note) {
+            return Err(UndamagedError::Untrusted { batch, reason: finding.message.clone() });
+        }
+        sizes.push(samples.posterior.measurements());
+        parts.push(samples);
+    }
+    let Some((_, draws)) = batches.first() else {
+        let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
+        return Err(too_few.into());
+    };
+    let samples = joined(baseline, parts, draws.seed);
+    let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
+    let mut state = UndamagedState::from_samples(&quantities, &sizes, threshold_probability)?;
+    state.conditions = conditions(batches.iter().flat_map(|(measurements, _)| *measurements));
+    Ok(state)
+}
+
+/// Several batches as one, with the population behind all of them; at least one.
+fn joined(baseline: &Baseline, parts: Vec<BatchSamples>, seed: u64) -> BatchSamples {
+    // A batch whose samples were too few was drawn again with more: the others set the common number.
+    let draws = parts.iter().map(|part| part.posterior.draws()).min().expect("the caller has batches");
+    let cut: Vec<PosteriorSamples> = parts.iter().map(|part| part.posterior.first(draws)).collect();
+    let all: Vec<_> = cut.iter().flat_map(|samples| samples.theta().row_iter()).collect();
+    let posterior = PosteriorSamples::new(nalgebra::DMatrix::from_rows(&all), draws);
+    let mut parts = parts.into_iter();
+    let mut first = parts.next().expect("the caller has batches");
+    first.observations.extend(parts.flat_map(|part| part.observations));
+    BatchSamples { populations: populations(&posterior, baseline.space(), seed), posterior, ..first }
+}
+
+/// The measurements as the flow is asked about them, and their index in the batch.
+fn admit(
+    baseline: &Baseline,
+    kept: &[(usize, ModalMeasurement)],
+    findings: &mut Vec<Finding>,
+) -> (Vec<usize>, Vec<Observation>) {
+    let (mut indices, mut observations) = (Vec::new(), Vec::new());
+    let (mut below, mut above, mut unusable) = (Vec::new(), Vec::new(), Vec::new());
+    for (index, measurement) in kept {
+        let admitted = baseline.admit(measurement);
+        if admitted.below_range {
+            below.push(*index);
+        }
+        if admitted.above_range {
+            above.push(*index);
+        }
+        match admitted.observation {
+            Some(observation) => {
+                indices.push(*index);
+                observations.push(observation);
+            }
+            None => unusable.push(*index),
+        }
+    }
+    let range = baseline.manifest().conditions.noise_range.map_or([0.0; 2], |r| [r.lowest, r.highest]);
+    if !below.is_empty() {
+        let message = format!(
+            "{} measurements state less noise than {} times the structure's, the least this baseline was trained for: they \
+             count as that",
+            below.len(),
+            range[0]
+        );
+        findings.push(Finding::new(Code::NoiseBelowRange, Effect::Note, message).of(below));
+    }
+    if !above.is_empty() {
+        let message = format!(
+            "{} measurements have modes with more noise than {} times the structure's, the most this baseline was trained \
+             for: those modes are left out",
+            above.len(),
+            range[1]
+        );
+        findings.push(Finding::new(Code::NoiseAboveRange, Effect::Note, message).of(above));
+    }
+    if !unusable.is_empty() {
+        let message = format!(
+            "{} measurements are left out: they lack a mode that this baseline needs, or have no mode within its noise range",
+            unusable.len()
+        );
+        findings.push(Finding::new(Code::NotUsable, Effect::Note, message).of(unusable));
+    }
+    (indices, observations)
+}
+
+/// Samples of everything that is monitored: each parameter, the stiffness of each spring set through a law, and the mean
+/// of parameters that cannot be told apart.
+pub fn monitored_quantities(baseline: &Baseline, samples: &BatchSamples, per_measurement: usize) -> Vec<QuantitySamples> {
+    let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
+    let edge_mass = samples.posterior.edge_mass(baseline.space());
+    let population = |column: usize| &samples.populations.parameters[column];
+    let groups = baseline.groups();
+    let group_of = |column: usize| groups.iter().find(|g| g.columns.contains(&column)).map(|g| g.name.clone());
     let parameters = baseline.space().iter().enumerate().map(|(column, parameter)| QuantitySamples {
         name: parameter.name.clone(),
         unit: parameter.unit.clone(),
         kind: QuantityKind::Parameter,
         damage: parameter.damage,
-        pool: posterior.column(column),
-        draws: posterior.draws(),
+        pool: pooled.column(column),
+        draws: pooled.draws(),
+        population: population(column).clone(),
         edge_mass: edge_mass[column],
+        group: group_of(column),
     });
     let springs = baseline.simulator().derived_stiffnesses().into_iter().map(|spring| {
         let parameter = &baseline.space().as_slice()[spring.parameter];
         let watched = parameter.damage != DamageDirection::None;
         QuantitySamples {
-            pool: posterior.column(spring.parameter).into_iter().map(|p| spring.value(p)).collect(),
-            name: spring.name,
+            pool: pooled.column(spring.parameter).into_iter().map(|p| spring.value(p)).collect(),
+            population: population(spring.parameter).through(|p| spring.value(p)),
             unit: "N/m".to_owned(),
             kind: QuantityKind::SpringStiffness,
             damage: if watched { DamageDirection::Decrease } else { DamageDirection::None },
-            draws: posterior.draws(),
+            draws: pooled.draws(),
             edge_mass: edge_mass[spring.parameter],
+            group: group_of(spring.parameter),
+            name: spring.name,
         }
     });
-    parameters.chain(springs).collect()
+    let of_groups = groups.iter().map(|group| {
+        let members: Vec<Vec<f64>> = group.columns.iter().map(|&column| pooled.column(column)).collect();
+        let parts: Vec<&PopulationEstimate> = group.columns.iter().map(|&column| population(column)).collect();
+        let parameter = &baseline.space().as_slice()[group.columns[0]];
+        QuantitySamples {
+            name: group.name.clone(),
+            unit: parameter.unit.clone(),
+            kind: QuantityKind::Group,
+            damage: parameter.damage,
+            pool: (0..members[0].len()).map(|i| members.iter().map(|m| m[i]).sum::<f64>() / members.len() as f64).collect(),
+            draws: pooled.draws(),
+            population: PopulationEstimate::average(&parts),
+            edge_mass: group.columns.iter().map(|&column| edge_mass[column]).fold(0.0, f64::max),
+            group: None,
+        }
+    });
+    parameters.chain(springs).chain(of_groups).collect()
 }
 
 /// Assesses the measurements of one batch.
@@ -128,26 +335,117 @@ pub fn monitored_quantities(baseline: &Baseline, posterior: &PosteriorSamples) -
 pub fn assess(
     baseline: &Baseline,
     measurements: &[ModalMeasurement],
-    undamaged: Option<&UndamagedState>,
+    context: Context<'_>,
     draws: Draws,
 ) -> Result<Assessment, Error> {
-    let samples = draw(baseline, measurements, draws)?;
+    let mut samples = draw(baseline, measurements, context.previous, draws)?;
+    let mut findings = std::mem::take(&mut samples.findings);
+    if let Some(state) = context.undamaged {
+        findings.extend(compare_conditions(measurements, &state.conditions));
+    }
+    findings.extend(standing_findings(baseline));
+    let sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
+    for sample in sampled.iter().filter(|s| s.kind == QuantityKind::Parameter && s.edge_mass > MUCH_EDGE_MASS) {
+        let message = format!(
+            "{:.0} % of the samples of {} lie at an edge of its prior: widen it",
+            100.0 * sample.edge_mass,
+            sample.name
+        );
+        findings.push(Finding::new(Code::PriorEdge, Effect::Note, message));
+    }
+    let trust = Trust::new(&samples.fit, findings);
+    // Nothing is said of damage where the simulation does not hold.
+    let compared = context.undamaged.filter(|_| trust.accepted());
     Ok(Assessment {
         model_digest: baseline.digest().clone(),
         structure_digest: baseline.simulator().digest().clone(),
-        undamaged_version: undamaged.map(|state| state.version),
+        undamaged_version: context.undamaged.map(|state| state.version),
         seed: draws.seed,
         draws_per_measurement: draws.per_measurement,
-        measurements_used: samples.frequencies_hz.len(),
+        measurements_used: samples.observations.len(),
         measurements_left_out: samples.left_out,
-        measurements_outside: samples.outside,
+        measurements_outside: samples.fit.outside.len(),
+        effective_sample_size: samples.populations.effective_sample_size,
         misfit_percent: misfit_percent(baseline, &samples)?,
+        trust,
         assessed_at: Timestamp::now(),
-        quantities: damage::assess(&monitored_quantities(baseline, &samples.posterior), undamaged),
+        quantities: damage::assess(&sampled, compared),
     })
 }
 
-/// What the simulation cannot reproduce, for each mode, in per cent of the measured frequency.
+/// Covariates of the batch against those the undamaged state saw.
+fn compare_conditions(
+    measurements: &[ModalMeasurement],
+    seen: &BTreeMap<String, SeenCovariate>,
+) -> impl Iterator<Item = Finding> {
+    let (mut outside, mut missing) = (Vec::new(), Vec::new());
+    for (name, seen) in seen {
+        let mut strange: Option<String> = None;
+        let mut rows = Vec::new();
+        let mut lacking = 0;
+        for (index, measurement) in measurements.iter().enumerate() {
+            let odd = match (measurement.covariates.get(name), seen) {
+                (None, _) => {
+                    lacking += 1;
+                    None
+                }
+                (Some(CovariateValue::Number(x)), SeenCovariate::Range([low, high])) => {
+                    (!(low..=high).contains(&x)).then(|| format!("{name} = {x}, seen {low} to {high}"))
+                }
+                (Some(CovariateValue::Category(c)), SeenCovariate::Categories(all)) => {
+                    (!all.contains(c)).then(|| format!("{name} = {c}, seen {}", all.iter().cloned().collect::<Vec<_>>().join(", ")))
+                }
+                _ => None,
+            };
+            if let Some(odd) = odd {
+                rows.push(index);
+                strange.get_or_insert(odd);
+            }
+        }
+        if let Some(example) = strange {
+            let message = format!(
+                "outside what the undamaged state saw ({example}): a change may come from there, so no alarm follows from this batch"
+            );
+            outside.push(Finding::new(Code::Extrapolated, Effect::HoldAlarm, message).of(rows));
+        }
+        if lacking > 0 {
+            let message = format!(
+                "{lacking} measurements lack {name}, which the undamaged state has: no alarm follows from this batch"
+            );
+            missing.push(Finding::new(Code::CovariateMissing, Effect::HoldAlarm, message));
+        }
+    }
+    outside.into_iter().chain(missing)
+}
+
+/// The covariates under which measurements were taken.
+fn conditions<'a>(measurements: impl Iterator<Item = &'a ModalMeasurement>) -> BTreeMap<String, SeenCovariate> {
+    let mut seen = BTreeMap::<String, SeenCovariate>::new();
+    for (name, value) in measurements.flat_map(|m| &m.covariates) {
+        match value {
+            CovariateValue::Number(x) => {
+                let entry = seen.entry(name.clone()).or_insert(SeenCovariate::Range([*x, *x]));
+                if let SeenCovariate::Range([low, high]) = entry {
+                    (*low, *high) = (low.min(*x), high.max(*x));
+                }
+            }
+            CovariateValue::Category(c) => {
+                let entry = seen.entry(name.clone()).or_insert_with(|| SeenCovariate::Categories([c.clone()].into()));
+                if let SeenCovariate::Categories(all) = entry {
+                    all.insert(c.clone());
+                }
+            }
+        }
+    }
+    seen
+}
+
+fn rows(matrix: &nalgebra::DMatrix<f64>) -> Vec<Vec<f64>> {
+    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
+}
+
+/// What the simulation cannot reproduce, for each mode, in per cent of the measured frequency; `None` for a mode that no
+/// measurement has.
 ///
 /// ```text
 ///  100 · (mean measured f_i − f_i(x̄)) / mean measured f_i,    x̄ the mean of all posterior samples
@@ -155,12 +453,12 @@ pub fn assess(
 ///
 /// One simulation a batch, so that structures of hundreds of degrees of freedom stay fast; the curvature of f over the
 /// spread of x adds some (σ/x)²/8, below 0.1 % for a spread of 8 %.
-fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<f64>, Error> {
+fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Option<f64>>, Error> {
     let theta: Vec<f64> = samples.posterior.theta().row_mean().iter().copied().collect();
     let simulated = baseline.simulator().frequencies_hz(&theta)?;
     let misfit = |(mode, simulated): (usize, f64)| {
-        let measured: Vec<f64> = samples.frequencies_hz.iter().map(|row| row[mode]).collect();
-        100.0 * (1.0 - simulated / stats::mean(&measured))
+        let measured: Vec<f64> = samples.observations.iter().filter_map(|o| o.frequencies_hz[mode]).collect();
+        (!measured.is_empty()).then(|| 100.0 * (1.0 - simulated / stats::mean(&measured)))
     };
     Ok(simulated.into_iter().enumerate().map(misfit).collect())
 }

@@ -1,16 +1,19 @@
 //! What happens to a batch: store it, assess it, store the result; declare undamaged states; resume after a restart.
 
 pub mod assess;
+pub mod charts;
 pub mod compute;
+mod silence;
 mod undamaged;
 mod watched;
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, RwLock};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, RwLock};
 
 use serde::{Deserialize, Serialize};
 use tracing::{error, info, warn, Instrument as _};
 
+use crate::alarm::AlarmSettings;
 use crate::assessment::{Assessment, BatchState};
 use crate::baseline::library::{Library, Refusal};
 use crate::baseline::{assessment_seed, Baseline};
@@ -20,26 +23,40 @@ use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::simulator::Simulator;
-use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store};
-use assess::Draws;
+use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store, StoredChartPoint};
+use assess::{Context, Draws};
+use charts::KnownLimits;
 use compute::{Compute, ComputeSettings, QueueFull};
 pub use watched::Watched;
 
 /// How batches are taken and assessed.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MonitorSettings {
     /// Posterior samples drawn for each measurement (paper §5.2: 10).
     pub draws_per_measurement: usize,
+    /// Posterior samples drawn for each measurement to find the population behind a batch.
+    pub draws_for_population: usize,
     /// Most measurements of one batch.
     pub max_measurements: usize,
+    /// Digests of trained baselines that may be used although they did not pass their calibration; every answer says so.
+    pub accept_uncalibrated: Vec<String>,
+    /// How alarms are raised.
+    pub alarm: AlarmSettings,
     /// The queue in front of the processor.
     pub compute: ComputeSettings,
 }
 
 impl Default for MonitorSettings {
     fn default() -> Self {
-        Self { draws_per_measurement: 10, max_measurements: 5_000, compute: ComputeSettings::default() }
+        Self {
+            draws_per_measurement: 10,
+            draws_for_population: 64,
+            max_measurements: 5_000,
+            accept_uncalibrated: Vec::new(),
+            alarm: AlarmSettings::default(),
+            compute: ComputeSettings::default(),
+        }
     }
 }
 
@@ -103,6 +120,14 @@ pub enum Error {
         /// The cause.
         source: assess::Error,
     },
+    /// A batch that is not to be trusted cannot be part of an undamaged state.
+    #[error("batch {batch} cannot be part of an undamaged state: {reason}")]
+    UnfitForUndamaged {
+        /// The batch.
+        batch: String,
+        /// What was found in it.
+        reason: String,
+    },
     /// A stored definition is not readable any more: the database was written by another version.
     #[error("the stored definition of a structure is refused: {0}")]
     StoredDefinition(#[from] DefinitionError),
@@ -120,6 +145,8 @@ pub struct BatchView {
     pub record: BatchRecord,
     /// Its current assessment.
     pub assessment: Option<Assessment>,
+    /// Its points on the alarm charts.
+    pub charts: Vec<StoredChartPoint>,
     /// Why there is no assessment, or no comparison with an undamaged state; and what to do next.
     pub next_step: Option<String>,
 }
@@ -138,6 +165,9 @@ pub struct Monitor {
     store: Store,
     library: Arc<Library>,
     watched: Arc<RwLock<BTreeMap<StructureId, Arc<Watched>>>>,
+    known_limits: Arc<KnownLimits>,
+    /// Alarms that this process has logged.
+    reported: Arc<Mutex<BTreeSet<(StructureId, i64)>>>,
     compute: Compute,
     settings: MonitorSettings,
 }
@@ -155,6 +185,8 @@ impl Monitor {
             store,
             library: Arc::new(library),
             watched: Arc::default(),
+            known_limits: Arc::default(),
+            reported: Arc::default(),
             compute: Compute::new(settings.compute),
             settings,
         };
@@ -254,7 +286,8 @@ impl Monitor {
             }
             _ => None,
         };
-        Ok(BatchView { record, assessment, next_step })
+        let charts = self.store.chart_points(structure, batch_id).await?;
+        Ok(BatchView { record, assessment, charts, next_step })
     }
 
     async fn why_not_compared(
@@ -319,21 +352,30 @@ impl Monitor {
     async fn assess_stored(&self, watched: &Watched, record: BatchRecord, place: compute::Place) -> Result<(), Error> {
         let structure = record.batch.structure.clone();
         let baseline = baseline_of(&structure, watched)?;
-        let draws = draws(&baseline, &record, self.settings.draws_per_measurement);
-        let record = Arc::new(record);
+        let draws = self.draws(&baseline, &record);
+        let measured = record.batch.time_span();
+        let previous = self.store.frequencies_before(&structure, &record.batch.source, measured.0).await?;
+        let (record, previous) = (Arc::new(record), Arc::new(previous));
         let mut undamaged = self.comparable(&structure, &record, &baseline).await?;
         loop {
             let started = std::time::Instant::now();
             let version = undamaged.as_ref().map(|state| state.version);
             let (baseline_here, record_here) = (Arc::clone(&baseline), Arc::clone(&record));
-            let work =
-                move || assess::assess(&baseline_here, &record_here.batch.measurements, undamaged.as_ref(), draws);
+            let (known, settings, previous) = (Arc::clone(&self.known_limits), self.settings.alarm, Arc::clone(&previous));
+            let work = move || {
+                let context = Context { undamaged: undamaged.as_ref(), previous: previous.as_deref() };
+                let assessment = assess::assess(&baseline_here, &record_here.batch.measurements, context, draws)?;
+                let state = undamaged.as_ref();
+                let points = charts::points(&baseline_here, &assessment, state, measured, &settings, &known);
+                Ok::<_, assess::Error>((assessment, points))
+            };
             let reason = match place.run(work).await {
-                Ok(Ok(assessment)) => {
+                Ok(Ok((assessment, points))) => {
                     let seconds = started.elapsed().as_secs_f64();
                     metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                     report(&structure, &record.batch_id, &assessment, seconds);
-                    self.store.insert_assessment(&structure, &record.batch_id, &assessment).await?;
+                    self.store.insert_assessment(&structure, &record.batch_id, &assessment, points).await?;
+                    self.report_episodes(&structure).await;
                     // A state declared while this was computed did not find the batch assessed, and so did not send it
                     // back: it is compared now.
                     undamaged = self.comparable(&structure, &record, &baseline).await?;
@@ -365,6 +407,36 @@ impl Monitor {
         Ok(newest.filter(fits).map(|u| u.state))
     }
 
+    fn draws(&self, baseline: &Baseline, record: &BatchRecord) -> Draws {
+        Draws {
+            per_measurement: self.settings.draws_per_measurement,
+            for_population: self.settings.draws_for_population,
+            seed: assessment_seed(&record.content_digest, baseline.digest()),
+        }
+    }
+
+    /// Logs alarms that were raised since the last look, each once.
+    async fn report_episodes(&self, structure: &StructureId) {
+        let episodes = match self.store.episodes(structure, None, true, 20).await {
+            Ok(episodes) => episodes,
+            Err(failure) => {
+                error!(structure.id = %structure, error = %failure, "Could not look for new alarms of {structure}: {failure}");
+                return;
+            }
+        };
+        for episode in episodes {
+            let key = (structure.clone(), episode.number);
+            if !self.reported.lock().expect("no holder of this lock panics").insert(key) {
+                continue;
+            }
+            metrics::counter!("modalwatch_alarms_total", "kind" => episode.kind.clone()).increment(1);
+            warn!(
+                structure.id = %structure, episode = episode.number, kind = %episode.kind, series = %episode.series,
+                "Alarm {} of {structure}: {} ({}), since {}", episode.number, episode.kind, episode.series, episode.opened_at
+            );
+        }
+    }
+
     async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
         let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: crate::quantity::shown(batch_id) };
         self.store.batch(structure, batch_id).await?.ok_or_else(unknown)
@@ -376,9 +448,6 @@ fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baselin
     watched.baseline.as_ref().map(Arc::clone).map_err(missing)
 }
 
-fn draws(baseline: &Baseline, record: &BatchRecord, per_measurement: usize) -> Draws {
-    Draws { per_measurement, seed: assessment_seed(&record.content_digest, baseline.digest()) }
-}
 
 fn report(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
     metrics::counter!("modalwatch_assessments_total").increment(1);

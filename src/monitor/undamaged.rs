@@ -2,11 +2,10 @@
 
 use tracing::{info, Instrument as _};
 
-use super::{assess, baseline_of, draws, Error, Monitor};
-use crate::baseline::Baseline;
-use crate::damage::{QuantitySamples, UndamagedState};
+use super::assess::{self, Draws, UndamagedError};
+use super::{baseline_of, Error, Monitor};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::{BatchRecord, UndamagedRecord};
+use crate::store::UndamagedRecord;
 
 impl Monitor {
     /// Takes batches as the undamaged state. Other batches that are compared with none are assessed against it afterwards.
@@ -42,12 +41,22 @@ impl Monitor {
             }
             records.push(self.stored(structure, id).await?);
         }
-        let per_measurement = self.settings.draws_per_measurement;
+        let drawn: Vec<Draws> = records.iter().map(|record| self.draws(&baseline, record)).collect();
         let model_digest = baseline.digest().clone();
         let place = self.compute.reserve()?;
-        let pooled = place.run(move || pool(&baseline, &records, per_measurement)).await;
-        let samples = pooled.map_err(|_| Error::Panicked)??;
-        let state = UndamagedState::from_samples(0, &samples, threshold_probability)?;
+        let taken = place
+            .run(move || {
+                let batches: Vec<_> = records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
+                assess::undamaged_state(&baseline, &batches, threshold_probability)
+            })
+            .await;
+        let state = taken.map_err(|_| Error::Panicked)?.map_err(|error| match error {
+            UndamagedError::Assess { batch, source } => Error::Assess { batch: batch_ids[batch].clone(), source },
+            UndamagedError::Untrusted { batch, reason } => {
+                Error::UnfitForUndamaged { batch: batch_ids[batch].clone(), reason }
+            }
+            UndamagedError::State(error) => Error::Undamaged(error),
+        })?;
         let version =
             self.store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
         let batches = batch_ids.len();
@@ -56,21 +65,4 @@ impl Monitor {
         let stored = self.store.undamaged(structure).await?;
         Ok(stored.expect("it was stored a moment ago and is never deleted"))
     }
-}
-
-/// Samples of several batches as one pool for each quantity.
-fn pool(baseline: &Baseline, records: &[BatchRecord], per_measurement: usize) -> Result<Vec<QuantitySamples>, Error> {
-    let mut pooled: Vec<QuantitySamples> = Vec::new();
-    for record in records {
-        let failed = |source| Error::Assess { batch: record.batch_id.clone(), source };
-        let draws = draws(baseline, record, per_measurement);
-        let samples = assess::draw(baseline, &record.batch.measurements, draws).map_err(failed)?;
-        let quantities = assess::monitored_quantities(baseline, &samples.posterior);
-        if pooled.is_empty() {
-            pooled = quantities;
-        } else {
-            pooled.iter_mut().zip(quantities).for_each(|(all, more)| all.pool.extend(more.pool));
-        }
-    }
-    Ok(pooled)
 }

@@ -65,10 +65,20 @@ impl Monitor {
             return Err(format!("the trained baseline is for another definition of {id}: {train}"));
         }
         let refused = || self.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
-        entry.baseline.clone().ok_or_else(|| match refused() {
+        let baseline = entry.baseline.clone().ok_or_else(|| match refused() {
             Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
             None => format!("no trained baseline: {train}"),
-        })
+        })?;
+        let failures = &baseline.manifest().calibration.failures;
+        let digest = baseline.digest().as_str();
+        if failures.is_empty() || self.settings.accept_uncalibrated.iter().any(|accepted| accepted == digest) {
+            return Ok(baseline);
+        }
+        Err(format!(
+            "the trained baseline failed its calibration ({}): train again with more samples or epochs; to use it all the \
+             same, and have every answer say so, put its digest {digest} into monitor.accept_uncalibrated",
+            failures.join("; ")
+        ))
     }
 
     pub(super) fn lock_read(&self) -> RwLockReadGuard<'_, BTreeMap<StructureId, Arc<Watched>>> {

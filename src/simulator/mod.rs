@@ -12,7 +12,7 @@ use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use crate::measurement::Covariate;
-use crate::parameter::ParameterSpace;
+use crate::parameter::{Parameter, ParameterSpace};
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_hz, Structure};
 use crate::quantity::{Digest, StructureId};
 use crate::stats;
@@ -20,6 +20,9 @@ use definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
 
 /// How far outside its simulated range a frequency may lie before it is taken for a mistake of unit or place.
 const FREQUENCY_MARGIN: f64 = 100.0;
+
+/// Margin of the training box on each side, as a share of the prior's width.
+const MARGIN: f64 = 0.1;
 
 /// Tries to draw a noisy frequency that is positive before giving up.
 const NOISE_TRIES: usize = 100;
@@ -81,12 +84,12 @@ struct Parts {
     checked: check::Checked,
 }
 
-/// Simulated pairs of parameters and frequencies.
+/// Simulated pairs of parameters and exact frequencies.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingSet {
     /// `[n, d]`, uniform in the prior box, in parameter units.
     pub theta: DMatrix<f64>,
-    /// `[n, m]`, Hz, with the structure's measurement noise.
+    /// `[n, m]`, Hz, without noise.
     pub frequencies_hz: DMatrix<f64>,
     /// Seed of the draws.
     pub seed: u64,
@@ -218,32 +221,69 @@ impl Simulator {
         self.parts.checked.bindings.iter().filter_map(derived).collect()
     }
 
+    /// The prior box with a margin on each side, which a flow is trained in: a density is hardest to learn at an edge, and
+    /// with a margin the edges of the prior are no edges of what was learnt.
+    ///
+    /// A tenth of the prior's width, less where a stiffness would fall below half the least of the prior.
+    pub fn training_space(&self) -> ParameterSpace {
+        let padded = |(column, parameter): (usize, &Parameter)| {
+            let width = parameter.upper - parameter.lower;
+            let bindings = || self.parts.checked.bindings.iter().filter(move |b| b.parameter == column);
+            let margin = |edge: f64, outwards: f64| {
+                let stiff = |value: f64, b: &Binding| {
+                    let least = b.stiffness(parameter.lower).min(b.stiffness(parameter.upper));
+                    least > 0.0 && b.stiffness(value) >= 0.5 * least && b.stiffness(value).is_finite()
+                };
+                let tries = (0..12).map(|halvings| MARGIN * width * 0.5_f64.powi(halvings));
+                let fits = |margin: &f64| bindings().all(|b| stiff(edge + outwards * margin, b));
+                { tries }.find(fits).unwrap_or(0.0)
+            };
+            let (below, above) = (margin(parameter.lower, -1.0), margin(parameter.upper, 1.0));
+            Parameter { lower: parameter.lower - below, upper: parameter.upper + above, ..parameter.clone() }
+        };
+        ParameterSpace::new(self.space().iter().enumerate().map(padded).collect())
+    }
+
     /// `samples` pairs from the prior; the same seed gives the same bits on any number of threads.
     ///
     /// # Errors
-    /// [`Error`]; a checked definition has no mechanism in its prior, so only noise out of proportion can fail, or
-    /// stiffnesses of a prior that differ by twelve orders of magnitude.
+    /// As [`Self::pairs`].
     pub fn training_set(&self, samples: usize, seed: u64) -> Result<TrainingSet, Error> {
-        let space = self.space();
+        self.pairs(self.space(), samples, seed)
+    }
+
+    /// `samples` pairs, uniform in the box `space`; the same seed gives the same bits on any number of threads.
+    ///
+    /// # Errors
+    /// [`Error`]; a checked definition has no mechanism in its prior, so only stiffnesses of a prior that differ by twelve
+    /// orders of magnitude can fail.
+    pub fn pairs(&self, space: &ParameterSpace, samples: usize, seed: u64) -> Result<TrainingSet, Error> {
         let mut stream = stats::stream(seed, "prior");
         // Row by row, so that a longer set begins with the shorter one.
         let rows: Vec<Vec<f64>> =
             (0..samples).map(|_| space.iter().map(|p| p.from_unit(stream.random::<f64>())).collect()).collect();
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
-        Ok(TrainingSet { frequencies_hz: self.measure(&rows, seed)?, theta, seed })
+        let exact = self.exact(&rows)?;
+        let frequencies_hz = DMatrix::from_fn(samples, self.modes(), |row, mode| exact[row][mode]);
+        Ok(TrainingSet { frequencies_hz, theta, seed })
     }
 
-    /// Frequencies of each row of parameters with measurement noise, `[n, m]`, Hz.
-    fn measure(&self, rows: &[Vec<f64>], seed: u64) -> Result<DMatrix<f64>, Error> {
+    /// Exact frequencies of each row of parameters, Hz.
+    fn exact(&self, rows: &[Vec<f64>]) -> Result<Vec<Vec<f64>>, Error> {
         let simulate = |theta: &Vec<f64>| {
             self.frequencies_hz(theta).map_err(|source| Error::Physics { parameters: theta.clone(), source })
         };
-        let exact = rows.par_iter().map(simulate).collect::<Result<Vec<_>, _>>()?;
+        rows.par_iter().map(simulate).collect()
+    }
+
+    /// Frequencies of each row of parameters with measurement noise, `[n, m]`, Hz.
+    fn measure(&self, rows: &[Vec<f64>], noise_multiple: f64, seed: u64) -> Result<DMatrix<f64>, Error> {
+        let exact = self.exact(rows)?;
         let mut stream = stats::stream(seed, "measurement noise");
         let mut noisy = DMatrix::zeros(rows.len(), self.modes());
         for (row, frequencies) in exact.iter().enumerate() {
             for (mode, &frequency_hz) in frequencies.iter().enumerate() {
-                let std_hz = self.noise().std_hz(frequency_hz);
+                let std_hz = noise_multiple * self.noise().std_hz(frequency_hz);
                 let mut draw = || frequency_hz + std_hz * stream.sample::<f64, _>(StandardNormal);
                 let value = (0..NOISE_TRIES).map(|_| draw()).find(|f| *f > 0.0);
                 noisy[(row, mode)] = value.ok_or(Error::Noise { frequency_hz, std_hz })?;

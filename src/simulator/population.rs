@@ -80,7 +80,7 @@ impl Population {
         Ok(Self { mean, std })
     }
 
-    /// Draws measurements with the structure's measurement noise.
+    /// Draws measurements with `noise_multiple` times the structure's measurement noise; 0 makes them exact.
     ///
     /// The draws are not cut off at the prior: a population may leave it, as a damaged one does.
     ///
@@ -90,6 +90,7 @@ impl Population {
         &self,
         simulator: &Simulator,
         measurements: usize,
+        noise_multiple: f64,
         seed: u64,
     ) -> Result<SimulatedMeasurements, SimulationError> {
         let mut stream = stats::stream(seed, "population");
@@ -99,6 +100,6 @@ impl Population {
         };
         let rows: Vec<Vec<f64>> = (0..measurements).map(|_| one()).collect();
         let theta = DMatrix::from_fn(measurements, self.mean.len(), |row, column| rows[row][column]);
-        Ok(SimulatedMeasurements { frequencies_hz: simulator.measure(&rows, seed)?, theta })
+        Ok(SimulatedMeasurements { frequencies_hz: simulator.measure(&rows, noise_multiple, seed)?, theta })
     }
 }

@@ -4,10 +4,12 @@ use std::collections::BTreeMap;
 
 use sqlx::FromRow;
 
+use super::alarm::{chart, NewChartPoint};
 use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
 use crate::assessment::Assessment;
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use crate::quantity::{Digest, StructureId};
+use crate::trust::Trust;
 
 #[derive(FromRow)]
 struct AssessmentRow {
@@ -22,6 +24,8 @@ struct AssessmentRow {
     measurements_outside: i64,
     misfit_percent: Vec<u8>,
     assessed_at_us: i64,
+    effective_sample_size: Option<f64>,
+    trust: Option<String>,
 }
 
 #[derive(FromRow)]
@@ -41,13 +45,26 @@ struct QuantityRow {
     probability_of_damage: Option<f64>,
     exceeds: Option<bool>,
     relative_change: Option<f64>,
+    mean_low: Option<f64>,
+    mean_high: Option<f64>,
+    std_low: Option<f64>,
+    std_high: Option<f64>,
+    pooled_mean: Option<f64>,
+    pooled_std: Option<f64>,
+    probability_low: Option<f64>,
+    probability_high: Option<f64>,
+    pooled_probability: Option<f64>,
+    change_low: Option<f64>,
+    change_high: Option<f64>,
+    group_name: Option<String>,
 }
 
 /// Orders the assessments of a batch; the current one comes first.
 pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
 
 impl Store {
-    /// Stores an assessment and marks its batch as assessed; storing it again changes nothing.
+    /// Stores an assessment with its points on the alarm charts and marks its batch as assessed; storing it again changes
+    /// nothing.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -56,6 +73,7 @@ impl Store {
         structure: &StructureId,
         batch_id: &str,
         assessment: &Assessment,
+        charted: Vec<NewChartPoint>,
     ) -> Result<(), Error> {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.write(move |connection| {
@@ -74,7 +92,8 @@ impl Store {
                         .execute(&mut *connection)
                         .await?;
                 }
-                sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
+                let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
+                sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
                     .bind(&structure)
                     .bind(&id)
                     .bind(a.model_digest.as_str())
@@ -85,15 +104,18 @@ impl Store {
                     .bind(a.measurements_used as i64)
                     .bind(a.measurements_left_out as i64)
                     .bind(a.measurements_outside as i64)
-                    .bind(to_blob(a.misfit_percent.iter().copied()))
+                    .bind(to_blob(a.misfit_percent.iter().map(|misfit| misfit.unwrap_or(f64::NAN))))
                     .bind(a.assessed_at.micros())
+                    .bind(a.effective_sample_size)
+                    .bind(trust)
                     .execute(&mut *connection)
                     .await?;
                 for (position, q) in a.quantities.iter().enumerate() {
                     let damage = q.damage.as_ref();
                     sqlx::query(
                         "insert into quantity_assessment
-                         values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                         values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,
+                                 ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                     )
                     .bind(&structure)
                     .bind(&id)
@@ -103,18 +125,31 @@ impl Store {
                     .bind(position as i64)
                     .bind(&q.unit)
                     .bind(kind_name(q.kind))
-                    .bind(q.hyperparameters.mean)
-                    .bind(q.hyperparameters.std)
-                    .bind(q.hyperparameters.within)
-                    .bind(q.hyperparameters.between)
+                    .bind(q.mean)
+                    .bind(q.std)
+                    .bind(q.pooled.within)
+                    .bind(q.pooled.between)
                     .bind(q.edge_mass)
                     .bind(damage.map(|d| d.threshold))
                     .bind(damage.map(|d| d.probability_of_damage))
                     .bind(damage.map(|d| d.exceeds))
                     .bind(damage.map(|d| d.relative_change))
+                    .bind(q.mean_interval.map(|i| i[0]))
+                    .bind(q.mean_interval.map(|i| i[1]))
+                    .bind(q.std_interval.map(|i| i[0]))
+                    .bind(q.std_interval.map(|i| i[1]))
+                    .bind(q.pooled.mean)
+                    .bind(q.pooled.std)
+                    .bind(damage.and_then(|d| d.probability_interval).map(|i| i[0]))
+                    .bind(damage.and_then(|d| d.probability_interval).map(|i| i[1]))
+                    .bind(damage.map(|d| d.pooled_probability))
+                    .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[0]))
+                    .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[1]))
+                    .bind(&q.group)
                     .execute(&mut *connection)
                     .await?;
                 }
+                chart(connection, &structure, &id, charted, a.assessed_at).await?;
                 sqlx::query(
                     "update measurement_batch set state = 'assessed', failure = null
                      where structure_id = ? and batch_id = ?",
@@ -148,7 +183,8 @@ impl Store {
         let ids = serde_json::to_string(batch_ids).map_err(|e| bad_row("batch")(&e))?;
         let select = format!(
             "select batch_id, model_digest, undamaged_version, structure_digest, seed, draws_per_measurement,
-                    measurements_used, measurements_left_out, measurements_outside, misfit_percent, assessed_at_us
+                    measurements_used, measurements_left_out, measurements_outside, misfit_percent, assessed_at_us,
+                    effective_sample_size, trust
              from assessment where structure_id = ? and batch_id in (select value from json_each(?))
              order by batch_id, {CURRENT_FIRST}"
         );
@@ -159,7 +195,9 @@ impl Store {
             .await?;
         let quantities: Vec<QuantityRow> = sqlx::query_as(
             "select batch_id, model_digest, undamaged_version, quantity, unit, kind, mean, std, variance_within,
-                    variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change
+                    variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change, mean_low,
+                    mean_high, std_low, std_high, pooled_mean, pooled_std, probability_low, probability_high,
+                    pooled_probability, change_low, change_high, group_name
              from quantity_assessment
              where structure_id = ? and batch_id in (select value from json_each(?))
                and (?3 is null or quantity = ?3)
@@ -199,7 +237,12 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
         measurements_used: row.measurements_used as usize,
         measurements_left_out: row.measurements_left_out as usize,
         measurements_outside: row.measurements_outside as usize,
-        misfit_percent: from_blob("assessment", &row.misfit_percent)?,
+        misfit_percent: from_blob("assessment", &row.misfit_percent)?.into_iter().map(present).collect(),
+        effective_sample_size: row.effective_sample_size.unwrap_or(0.0),
+        trust: match row.trust {
+            Some(trust) => serde_json::from_str(&trust).map_err(|e| bad_row("assessment")(&e))?,
+            None => Trust::unknown(),
+        },
         assessed_at: timestamp("assessment", row.assessed_at_us)?,
         quantities: Vec::new(),
     })
@@ -208,7 +251,15 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
 fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
     let damage = match (row.threshold, row.probability_of_damage, row.exceeds, row.relative_change) {
         (Some(threshold), Some(probability_of_damage), Some(exceeds), Some(relative_change)) => {
-            Some(Damage { threshold, probability_of_damage, exceeds, relative_change })
+            Some(Damage {
+                threshold,
+                probability_of_damage,
+                probability_interval: both(row.probability_low, row.probability_high),
+                pooled_probability: row.pooled_probability.unwrap_or(probability_of_damage),
+                exceeds,
+                relative_change,
+                relative_change_interval: both(row.change_low, row.change_high),
+            })
         }
         _ => None,
     };
@@ -216,25 +267,40 @@ fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
         kind: kind_of(&row.kind)?,
         name: row.quantity,
         unit: row.unit,
-        hyperparameters: Hyperparameters {
-            mean: row.mean,
-            std: row.std,
+        mean: row.mean,
+        mean_interval: both(row.mean_low, row.mean_high),
+        std: row.std,
+        std_interval: both(row.std_low, row.std_high),
+        // Rows from before populations hold the pool's moments in `mean` and `std`.
+        pooled: Hyperparameters {
+            mean: row.pooled_mean.unwrap_or(row.mean),
+            std: row.pooled_mean.map_or(row.std, |_| row.pooled_std),
             within: row.variance_within,
             between: row.variance_between,
         },
         edge_mass: row.edge_mass,
+        group: row.group_name,
         damage,
     })
+}
+
+fn both(low: Option<f64>, high: Option<f64>) -> Option<[f64; 2]> {
+    Some([low?, high?])
+}
+
+fn present(value: f64) -> Option<f64> {
+    Some(value).filter(|v| !v.is_nan())
 }
 
 fn kind_name(kind: QuantityKind) -> &'static str {
     match kind {
         QuantityKind::Parameter => "parameter",
         QuantityKind::SpringStiffness => "spring_stiffness",
+        QuantityKind::Group => "group",
     }
 }
 
 fn kind_of(name: &str) -> Result<QuantityKind, Error> {
-    let kinds = [QuantityKind::Parameter, QuantityKind::SpringStiffness];
+    let kinds = [QuantityKind::Parameter, QuantityKind::SpringStiffness, QuantityKind::Group];
     kinds.into_iter().find(|kind| kind_name(*kind) == name).ok_or_else(|| bad_row("quantity")(&name))
 }

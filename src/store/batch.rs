@@ -131,6 +131,28 @@ impl Store {
         }))
     }
 
+    /// Frequencies of the last measurement of a source before a time.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn frequencies_before(
+        &self,
+        structure: &StructureId,
+        source: &str,
+        before: Timestamp,
+    ) -> Result<Option<Vec<Option<Hertz>>>, Error> {
+        let row: Option<(Vec<u8>,)> = sqlx::query_as(
+            "select frequency_hz from measurement where structure_id = ? and source = ? and measured_at_us < ?
+             order by measured_at_us desc limit 1",
+        )
+        .bind(structure.as_str())
+        .bind(source)
+        .bind(before.micros())
+        .fetch_optional(&self.reader)
+        .await?;
+        row.map(|(blob,)| frequencies("measurement", &blob)).transpose()
+    }
+
     /// Batches of a structure that wait for their assessment, oldest first.
     ///
     /// # Errors
@@ -270,19 +292,22 @@ async fn insert(
 
 fn measurement(row: MeasurementRow) -> Result<ModalMeasurement, Error> {
     let what = "measurement";
-    let frequency = |value: f64| match value {
-        missing if missing.is_nan() => Ok(None),
-        value => Hertz::new(value).map(Some).map_err(|e| bad_row(what)(&e)),
-    };
-    let frequencies = from_blob(what, &row.frequency_hz)?;
     let std = row.std_hz.map(|blob| from_blob(what, &blob)).transpose()?;
     Ok(ModalMeasurement {
         measured_at: timestamp(what, row.measured_at_us)?,
-        frequencies_hz: frequencies.into_iter().map(frequency).collect::<Result<_, _>>()?,
+        frequencies_hz: frequencies(what, &row.frequency_hz)?,
         std_hz: std.map(|values| values.into_iter().map(|s| Some(s).filter(|s| !s.is_nan())).collect()),
         covariates: serde_json::from_str(&row.covariates).map_err(|e| bad_row(what)(&e))?,
         settings: serde_json::from_str(&row.settings).map_err(|e| bad_row(what)(&e))?,
     })
+}
+
+fn frequencies(what: &'static str, blob: &[u8]) -> Result<Vec<Option<Hertz>>, Error> {
+    let frequency = |value: f64| match value {
+        missing if missing.is_nan() => Ok(None),
+        value => Hertz::new(value).map(Some).map_err(|e| bad_row(what)(&e)),
+    };
+    from_blob(what, blob)?.into_iter().map(frequency).collect()
 }
 
 /// The state of its name.

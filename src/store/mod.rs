@@ -3,6 +3,7 @@
 //! One SQLite file, one writer connection, WAL, `synchronous = FULL`: what was acknowledged survives a power loss. Every
 //! write is a task of its own in one `BEGIN IMMEDIATE` transaction, so that a caller who goes away never leaves one open.
 
+mod alarm;
 mod assessment;
 mod batch;
 mod history;
@@ -24,6 +25,7 @@ use sqlx::sqlite::{
 };
 use sqlx::Connection as _;
 
+pub use alarm::{Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, FIT_SERIES};
 pub use batch::{BatchRecord, InsertBatch};
 pub use history::{Exceedance, HistoryEntry, HistoryQuery};
 pub use structure::{PutStructure, StructureRecord, StructureSummary};

@@ -74,7 +74,7 @@ async fn csv_has_a_row_for_each_batch_and_parameter() {
 #[tokio::test]
 async fn exceedances_are_paged_newest_first() {
     let (service, _folder) = with_batches(6).await;
-    let all = service.read("/v1/structures/three-dof/alarms?parameter=k3").await;
+    let all = service.read("/v1/structures/three-dof/exceedances?parameter=k3").await;
     let found = ids(&all);
     assert!(found.len() >= 4, "k3 fell by up to 17 %: {all}");
     let times: Vec<&str> =
@@ -82,7 +82,7 @@ async fn exceedances_are_paged_newest_first() {
     assert!(times.iter().rev().is_sorted(), "{times:?}");
     let (mut walked, mut cursor) = (Vec::new(), String::new());
     loop {
-        let page = service.read(&format!("/v1/structures/three-dof/alarms?parameter=k3&limit=2{cursor}")).await;
+        let page = service.read(&format!("/v1/structures/three-dof/exceedances?parameter=k3&limit=2{cursor}")).await;
         walked.extend(ids(&page));
         let Some(next) = page["next"].as_str() else { break };
         cursor = format!("&cursor={next}");

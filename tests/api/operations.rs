@@ -253,7 +253,10 @@ fn the_demo_prints_its_table_as_json_and_ends() {
     for scenario in scenarios {
         for p in scenario["parameters"].as_array().unwrap() {
             let number = |key: &str| p[key].as_f64().unwrap_or_else(|| panic!("{key}: {p}"));
-            assert!((number("probability_of_damage") - number("realised_probability_of_damage")).abs() <= 0.04, "{p}");
+            let realised = number("realised_probability_of_damage");
+            assert!((number("pooled_probability_of_damage") - realised).abs() <= 0.04, "{p}");
+            let interval: [f64; 2] = serde_json::from_value(p["probability_of_damage_interval"].clone()).unwrap();
+            assert!((interval[0]..=interval[1]).contains(&number("probability_of_damage")), "{p}");
             assert!(number("target_mean") > 0.0 && number("target_std") > 0.0 && number("std") > 0.0);
             assert!((0.0..=1.0).contains(&number("target_probability_of_damage")));
             assert!(p["exceeds"].is_boolean() && p["name"].is_string());

@@ -100,7 +100,7 @@ fn the_density_integrates_to_one() {
     let (flow, _) = random_flow(&small(2, 3, 5), 5);
     let y = tensor(&normals(3, 5, "y"), (1, 1, 3));
     // Where the flow has its mass is seen from its own draws; the grid reaches a tenth beyond the outermost of 20,000.
-    let draws = flow.sample(&y, 20_000, &mut stats::stream(5, "latent")).unwrap();
+    let draws = flow.sample(&flow.summarise(&y).unwrap(), 20_000, &mut stats::stream(5, "latent")).unwrap();
     let side = |column: usize| {
         let values = draws.narrow(1, column, 1).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
         let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
@@ -115,7 +115,7 @@ fn the_density_integrates_to_one() {
     let ((x1, step1), (x2, step2)) = (axis(0), axis(1));
     let grid: Vec<f64> = x1.iter().flat_map(|a| x2.iter().flat_map(|b| [*a, *b])).collect();
     let y = y.expand((points * points, 1, 3)).unwrap().contiguous().unwrap();
-    let log_prob = flow.log_prob(&tensor(&grid, (points * points, 2)), &y).unwrap();
+    let log_prob = flow.log_prob(&tensor(&grid, (points * points, 2)), &flow.summarise(&y).unwrap()).unwrap();
     let mass: f64 = log_prob.to_vec1::<f64>().unwrap().iter().map(|l| l.exp() * step1 * step2).sum();
     // About 1/20,000 lies beyond the outermost draw on each of four sides.
     assert!((mass - 1.0).abs() < 5e-4, "{mass}");
@@ -125,7 +125,8 @@ fn the_density_integrates_to_one() {
 fn the_condition_changes_the_draws_and_the_seed_repeats_them() {
     let (flow, _) = random_flow(&small(3, 3, 2), 2);
     let draw = |y: &[f64], seed| {
-        let x = flow.sample(&tensor(y, (1, 1, 3)), 2, &mut stats::stream(seed, "latent")).unwrap();
+        let context = flow.summarise(&tensor(y, (1, 1, 3))).unwrap();
+        let x = flow.sample(&context, 2, &mut stats::stream(seed, "latent")).unwrap();
         x.flatten_all().unwrap().to_vec1::<f64>().unwrap()
     };
     assert_eq!(draw(&[0.1, 0.2, 0.3], 1), draw(&[0.1, 0.2, 0.3], 1));
@@ -166,14 +167,16 @@ fn a_trained_flow_finds_the_posterior_of_a_linear_gaussian_model() {
     let (flow, weights) = untrained_flow(&architecture, DType::F32, 1).unwrap();
     let settings = TrainSettings { epochs: 20, ..TrainSettings::default() };
     let (training, validation) = (model.pairs(10_000, 1), model.pairs(1_000, 2));
-    let outcome = train(&flow, &weights, &training, &validation, &settings, |_| {}).unwrap();
+    let epoch = |_| Ok(Pairs { x: training.x.clone(), y: training.y.clone() });
+    let outcome = train(&flow, &weights, 10_000, epoch, &validation, &settings, |_| {}).unwrap();
     assert!(outcome.best_epoch > 5, "{outcome:?}");
 
     for y in [[0.0, 0.0, 0.0], [1.0, -0.5, 0.7], [-0.8, 0.9, 0.2]] {
         let (mean, covariance) = model.posterior(&y);
         let condition = tensor(&y, (1, 1, 3)).to_dtype(DType::F32).unwrap();
         let draws = 4_000;
-        let samples = flow.sample(&condition, draws, &mut stats::stream(3, "latent")).unwrap();
+        let context = flow.summarise(&condition).unwrap();
+        let samples = flow.sample(&context, draws, &mut stats::stream(3, "latent")).unwrap();
         let samples = samples.to_dtype(DType::F64).unwrap().to_vec2::<f64>().unwrap();
         for k in 0..2 {
             let values: Vec<f64> = samples.iter().map(|row| row[k]).collect();
@@ -192,7 +195,7 @@ fn training_repeats_bit_for_bit_with_its_seed() {
     let bytes = |seed| {
         let (flow, weights) = untrained_flow(&small(2, 3, seed), DType::F32, seed).unwrap();
         let settings = TrainSettings { epochs: 2, seed, ..TrainSettings::default() };
-        train(&flow, &weights, &model.pairs(1_000, 1), &model.pairs(100, 2), &settings, |_| {}).unwrap();
+        train(&flow, &weights, 1_000, |_| Ok(model.pairs(1_000, 1)), &model.pairs(100, 2), &settings, |_| {}).unwrap();
         checkpoint::to_bytes(&weights).unwrap()
     };
     assert_eq!(bytes(1), bytes(1));
@@ -206,7 +209,8 @@ fn a_training_that_diverges_stops_and_keeps_the_best_weights() {
     let (flow, weights) = untrained_flow(&small(2, 3, 1), DType::F32, 1).unwrap();
     let settings = TrainSettings { epochs: 9, ..TrainSettings::default() };
     let mut validation_losses = Vec::new();
-    let outcome = train(&flow, &weights, &training, &validation, &settings, |report| {
+    let epoch = |_| Ok(Pairs { x: training.x.clone(), y: training.y.clone() });
+    let outcome = train(&flow, &weights, training.x.dim(0).unwrap(), epoch, &validation, &settings, |report| {
         validation_losses.push(report.validation_loss);
         if report.epoch == 4 {
             // What an overflow would leave behind.
@@ -218,7 +222,8 @@ fn a_training_that_diverges_stops_and_keeps_the_best_weights() {
     assert_eq!(outcome.stopped, Stopped::Diverged { epoch: 5 });
     // Epoch 4 was kept before its weights were poisoned.
     assert!(outcome.best_epoch <= 4 && validation_losses.len() == 4, "{outcome:?}");
-    let x = flow.sample(&validation.y, 1, &mut stats::stream(1, "z")).unwrap().to_vec2::<f32>().unwrap();
+    let context = flow.summarise(&validation.y).unwrap();
+    let x = flow.sample(&context, 1, &mut stats::stream(1, "z")).unwrap().to_vec2::<f32>().unwrap();
     assert!(x.iter().flatten().all(|v| v.is_finite()));
 }
 
@@ -230,7 +235,9 @@ fn a_training_that_diverges_at_once_is_an_error() {
     x[7] = f32::NAN;
     poisoned.x = Tensor::from_vec(x, (600, 2), &Device::Cpu).unwrap();
     let (flow, weights) = untrained_flow(&small(2, 3, 1), DType::F32, 1).unwrap();
-    let error = train(&flow, &weights, &poisoned, &model.pairs(100, 2), &TrainSettings::default(), |_| {}).unwrap_err();
+    let (rows, validation) = (poisoned.x.dim(0).unwrap(), model.pairs(100, 2));
+    let epoch = |_| Ok(Pairs { x: poisoned.x.clone(), y: poisoned.y.clone() });
+    let error = train(&flow, &weights, rows, epoch, &validation, &TrainSettings::default(), |_| {}).unwrap_err();
     assert!(error.to_string().contains("not finite in the first epoch"), "{error}");
 }
 
@@ -240,7 +247,10 @@ fn a_checkpoint_gives_back_the_same_flow_and_foreign_bytes_are_refused() {
     let (flow, weights) = untrained_flow(&architecture, DType::F32, 1).unwrap();
     let bytes = checkpoint::to_bytes(&weights).unwrap();
     let y = tensor(&normals(4, 1, "y"), (1, 1, 4)).to_dtype(DType::F32).unwrap();
-    let draws = |flow: &Flow| flow.sample(&y, 5, &mut stats::stream(1, "z")).unwrap().to_vec2::<f32>().unwrap();
+    let draws = |flow: &Flow| {
+        let context = flow.summarise(&y).unwrap();
+        flow.sample(&context, 5, &mut stats::stream(1, "z")).unwrap().to_vec2::<f32>().unwrap()
+    };
     let loaded = checkpoint::from_bytes(&bytes, &architecture, DType::F32).unwrap();
     assert_eq!(draws(&flow), draws(&loaded));
 

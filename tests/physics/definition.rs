@@ -172,14 +172,11 @@ fn a_training_set_repeats_with_its_seed_and_begins_with_the_shorter_one() {
 
 #[test]
 fn simulated_noise_has_the_stated_size() {
-    let quiet = RIG.replace("relative = 0.005", "relative = 0.0");
-    let noisy = Simulator::new(StructureDefinition::parse_toml(RIG).unwrap()).unwrap();
-    let quiet = Simulator::new(StructureDefinition::parse_toml(&quiet).unwrap()).unwrap();
-    let ratios = noisy
-        .training_set(4_000, 1)
-        .unwrap()
-        .frequencies_hz
-        .component_div(&quiet.training_set(4_000, 1).unwrap().frequencies_hz);
+    let rig = Simulator::new(StructureDefinition::parse_toml(RIG).unwrap()).unwrap();
+    let moments = [("p12".to_owned(), 0.05, 0.01), ("p23".to_owned(), 0.05, 0.01)];
+    let population = Population::new(rig.space(), &moments).unwrap();
+    let measured = |multiple| population.draw(&rig, 4_000, multiple, 1).unwrap().frequencies_hz;
+    let ratios = measured(1.0).component_div(&measured(0.0));
     let deviations: Vec<f64> = ratios.iter().map(|r| r - 1.0).collect();
     let std = modalwatch::stats::sample_std(&deviations).unwrap();
     // 12,000 draws: the standard error of a standard deviation is σ/√(2n) = 0.65 %; four of them.

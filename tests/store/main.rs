@@ -2,13 +2,16 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod alarms;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use modalwatch::assessment::{Assessment, BatchState};
-use modalwatch::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
+use modalwatch::damage::{ChartReference, SeenCovariate, Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
+use modalwatch::trust::{Code, Effect, Finding, Trust};
 use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
 
 fn bridge() -> StructureId {
@@ -44,13 +47,27 @@ async fn open() -> (Store, tempfile::TempDir) {
 }
 
 fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestamp) -> Assessment {
-    let damage = Damage { threshold: 3.5, probability_of_damage: 0.4, exceeds: true, relative_change: -0.1 };
+    let damage = Damage {
+        threshold: 3.5,
+        probability_of_damage: 0.4,
+        probability_interval: Some([0.3, 0.5]),
+        pooled_probability: 0.42,
+        exceeds: true,
+        relative_change: -0.1,
+        relative_change_interval: Some([-0.12, -0.08]),
+    };
+    let finding = Finding::new(Code::Outlier, Effect::Note, "one of them").of(vec![2]);
     let quantity = |name: &str| QuantityAssessment {
         name: name.to_owned(),
         unit: "N/m".to_owned(),
         kind: QuantityKind::Parameter,
-        hyperparameters: Hyperparameters { mean: 3.6, std: Some(0.3), within: 0.01, between: Some(0.08) },
+        mean: 3.6,
+        mean_interval: Some([3.5, 3.7]),
+        std: Some(0.3),
+        std_interval: Some([0.2, 0.5]),
+        pooled: Hyperparameters { mean: 3.61, std: Some(0.31), within: 0.01, between: Some(0.08) },
         edge_mass: 0.02,
+        group: Some("group:k1+k2".to_owned()),
         damage: undamaged_version.map(|_| damage.clone()),
     };
     Assessment {
@@ -62,7 +79,9 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
         measurements_used: 3,
         measurements_left_out: 1,
         measurements_outside: 2,
-        misfit_percent: vec![0.1, -0.2],
+        misfit_percent: vec![Some(0.1), None],
+        effective_sample_size: 41.5,
+        trust: Trust { p_value: Some(0.3), findings: vec![finding], ..Trust::unknown() },
         assessed_at,
         quantities: vec![quantity("k2"), quantity("k1")],
     }
@@ -85,7 +104,7 @@ async fn an_assessment_comes_back_as_it_was_given_and_the_newest_is_current() {
     store.insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
     let (old, new) = (assessment("m1", None, at(1)), assessment("m2", None, at(2)));
     for given in [&old, &new, &old, &old] {
-        store.insert_assessment(&bridge(), "b1", given).await.unwrap();
+        store.insert_assessment(&bridge(), "b1", given, Vec::new()).await.unwrap();
     }
     assert_eq!(store.assessment(&bridge(), "b1").await.unwrap().unwrap(), new);
     assert_eq!(store.batch(&bridge(), "b1").await.unwrap().unwrap().state, BatchState::Assessed);
@@ -152,10 +171,10 @@ async fn a_new_undamaged_state_sends_back_only_what_was_never_compared() {
             let state = undamaged();
             assert_eq!(store.insert_undamaged(&bridge(), &state, &model, &["b0".into()], at(5)).await.unwrap(), 1);
         }
-        store.insert_assessment(&bridge(), &id, &assessment("m", version, at(i))).await.unwrap();
+        store.insert_assessment(&bridge(), &id, &assessment("m", version, at(i)), Vec::new()).await.unwrap();
     }
     assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b1"]);
-    store.insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8))).await.unwrap();
+    store.insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8)), Vec::new()).await.unwrap();
     assert_eq!(store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".into()], at(9)).await.unwrap(), 2);
     assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b0"], "b0 was never compared; b2 was");
     let newest = store.undamaged(&bridge()).await.unwrap().unwrap();
@@ -175,7 +194,22 @@ fn undamaged() -> modalwatch::damage::UndamagedState {
             mean: 4.0,
             std: 0.3,
             threshold: Some(3.5),
+            threshold_interval: Some([3.4, 3.6]),
+            pooled_threshold: Some(3.49),
+            reference: ChartReference {
+                mean: 4.0,
+                std: 0.31,
+                within: 0.004,
+                measurements: 20,
+                batches: 2,
+                degrees_of_freedom: 18,
+                between_batches_std: 0.0,
+            },
+            mean_draws: vec![3.9, 4.1],
+            std_draws: vec![0.28, 0.33],
         }],
+        conditions: [("temperature_c".to_owned(), SeenCovariate::Range([-2.0, 7.5]))].into(),
+        doubts: vec!["k1: its batches differ".to_owned()],
     }
 }
 

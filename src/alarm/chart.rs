@@ -1,0 +1,211 @@
+//! Control charts: the mean of a batch in standard errors from the undamaged state, and its moving average.
+
+use serde::Serialize;
+
+use super::limits::{Limits, CLIP};
+use super::machine::{Event, State};
+use super::AlarmSettings;
+use crate::damage::{ChartReference, UndamagedQuantity};
+use crate::parameter::DamageDirection;
+use crate::stats;
+
+/// Least share of the undamaged variance that a batch is credited with, however exact it claims to be.
+const LEAST_VARIANCE: f64 = 0.1;
+
+/// A batch on the chart of one series, before its neighbours are known.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ChartPoint {
+    /// Shift towards damage, in standard errors; for the fit, 1 when rejected and 0 else.
+    pub shift: f64,
+    /// Limit of one shift.
+    pub limit: f64,
+    /// Limit of the moving average.
+    pub ewma_limit: f64,
+    /// True when the batch moves no chart.
+    pub held: bool,
+}
+
+/// What a point means among its neighbours.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ChartStatus {
+    /// Moving average of the shifts up to this point.
+    pub ewma: f64,
+    /// True when shift or moving average is above its limit.
+    pub above: bool,
+    /// State after this point.
+    pub state: State,
+}
+
+/// Shift of a batch towards damage.
+///
+/// ```text
+///  z = ±(μ_ud − x̄)/se,    se² = (s² + v − v_ud)/n + τ² + s²/n_ud + τ²/B
+/// ```
+///
+/// x̄ mean of the n posterior means of the batch; s² variance of a measurement in the undamaged state (n_ud measurements in
+/// B batches), v and v_ud mean posterior variance of a measurement now and then, τ between batches. The spread of the batch
+/// itself does not enter: of few measurements it is hardly known.
+///
+/// `None` when no change of the quantity is damage or the undamaged state has no scatter.
+pub fn shift(
+    reference: &ChartReference,
+    direction: DamageDirection,
+    mean: f64,
+    within: f64,
+    measurements: usize,
+) -> Option<f64> {
+    let towards = match direction {
+        DamageDirection::Decrease => 1.0,
+        DamageDirection::Increase => -1.0,
+        DamageDirection::None => return None,
+    };
+    let error = standard_error(reference, within, measurements);
+    (error > 0.0 && measurements > 0).then(|| towards * (reference.mean - mean) / error)
+}
+
+/// Standard error of the difference between a batch and the undamaged state, see [`shift`].
+pub fn standard_error(reference: &ChartReference, within: f64, measurements: usize) -> f64 {
+    let variance = reference.std.powi(2);
+    let here = (variance + within - reference.within).max(LEAST_VARIANCE * variance);
+    let between = reference.between_batches_std.powi(2);
+    let undamaged = variance / reference.measurements as f64 + between / reference.batches.max(1) as f64;
+    (here / measurements as f64 + between + undamaged).sqrt()
+}
+
+/// The probability of damage at which the mean of a batch stands on the limit, if its spread is the undamaged one: the
+/// limit of the chart in the unit of the probability of damage.
+pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, within: f64, measurements: usize) -> Option<f64> {
+    let threshold = quantity.threshold?;
+    let distance = (quantity.mean - threshold).abs() / quantity.std;
+    let moved = limit * standard_error(&quantity.reference, within, measurements) / quantity.std;
+    Some(stats::normal_cdf(moved - distance))
+}
+
+/// A series of points, taken in the order of their measurement.
+#[derive(Debug, Clone)]
+pub struct Series {
+    settings: AlarmSettings,
+    ewma: f64,
+    /// Whether the last points were above, the newest last.
+    recent: Vec<bool>,
+    state: State,
+}
+
+impl Series {
+    /// A series without points.
+    pub fn new(settings: AlarmSettings) -> Self {
+        Self { settings, ewma: 0.0, recent: Vec::new(), state: State::Normal }
+    }
+
+    /// A series that goes on behind stored points: the moving average and state of the last, and whether the last ones were
+    /// above, the newest last.
+    pub fn resume(settings: AlarmSettings, ewma: f64, state: State, recent: Vec<bool>) -> Self {
+        Self { settings, ewma, recent, state }
+    }
+
+    /// Points before a place that [`Self::resume`] needs.
+    pub fn memory(settings: &AlarmSettings) -> usize {
+        settings.window.max(settings.recovery)
+    }
+
+    /// Takes the next point.
+    pub fn take(&mut self, point: &ChartPoint) -> ChartStatus {
+        if point.held {
+            return ChartStatus { ewma: self.ewma, above: false, state: self.state };
+        }
+        let weight = self.settings.ewma_weight;
+        self.ewma = (1.0 - weight) * self.ewma + weight * point.shift.clamp(-CLIP, CLIP);
+        let lasting = weight > 0.0 && self.ewma > point.ewma_limit;
+        let single = point.shift > point.limit;
+        let above = single || lasting;
+        self.recent.push(above);
+        let memory = Self::memory(&self.settings);
+        if self.recent.len() > memory {
+            self.recent.remove(0);
+        }
+        let near = self.recent.iter().rev().take(self.settings.window).filter(|a| **a).count();
+        let clear = self.recent.iter().rev().take_while(|a| !**a).count();
+        // The moving average has its own memory: it needs no second point.
+        let event = match above {
+            true if lasting || near >= self.settings.needed => Event::Confirmed,
+            true => Event::Exceeds,
+            false if clear >= self.settings.recovery => Event::Cleared,
+            // A single point that was not followed up is over once it leaves the window.
+            false if near == 0 && !self.state.in_episode() => Event::Cleared,
+            false => Event::Clears,
+        };
+        self.state = self.state.after(event);
+        ChartStatus { ewma: self.ewma, above, state: self.state }
+    }
+}
+
+impl ChartPoint {
+    /// A point of a damage chart.
+    pub fn damage(shift: f64, limits: &Limits, held: bool) -> Self {
+        Self { shift, limit: limits.single, ewma_limit: limits.ewma, held }
+    }
+
+    /// A point of the chart of the simulation's fit.
+    pub fn fit(rejected: bool) -> Self {
+        Self { shift: f64::from(u8::from(rejected)), limit: 0.5, ewma_limit: f64::INFINITY, held: false }
+    }
+}
+
+/// How misfits become an event: two of three batches, so that the 1 % of healthy batches that are rejected stay quiet.
+pub fn fit_settings(settings: &AlarmSettings) -> AlarmSettings {
+    AlarmSettings { needed: 2, window: 3, ewma_weight: 0.0, ..*settings }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn states(settings: AlarmSettings, shifts: &[f64]) -> Vec<State> {
+        let mut series = Series::new(settings);
+        let point = |shift: &f64| ChartPoint { shift: *shift, limit: 3.0, ewma_limit: 1.0, held: shift.is_nan() };
+        shifts.iter().map(|shift| series.take(&point(shift)).state).collect()
+    }
+
+    #[test]
+    fn two_of_three_points_make_an_alarm_and_three_clear_ones_end_it() {
+        use State::{Alarming, Normal, Pending, Recovering};
+        let settings = AlarmSettings { needed: 2, window: 3, ewma_weight: 0.0, ..AlarmSettings::default() };
+        let found = states(settings, &[0.0, 4.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0]);
+        let expected = [
+            Normal, Pending, Pending, Alarming, Recovering, Recovering, Alarming, Recovering, Recovering, Normal, Pending,
+            Pending, Pending, Normal,
+        ];
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn a_small_lasting_shift_is_found_by_the_moving_average() {
+        let settings = AlarmSettings::default();
+        let found = states(settings, &[1.5; 12]);
+        // 1.5·(1 − 0.8^k) passes 1.0 at k = 5.
+        assert_eq!(found.iter().position(|s| *s == State::Alarming), Some(4));
+        assert!(states(settings, &[0.9; 50]).iter().all(|s| *s == State::Normal));
+    }
+
+    #[test]
+    fn a_held_batch_changes_nothing() {
+        let settings = AlarmSettings::default();
+        assert_eq!(states(settings, &[0.0, f64::NAN, 4.0, f64::NAN, f64::NAN]).last(), Some(&State::Alarming));
+    }
+
+    #[test]
+    fn a_series_taken_up_again_goes_on_as_if_it_had_never_stopped() {
+        let settings = AlarmSettings { needed: 2, window: 3, ..AlarmSettings::default() };
+        let shifts = [0.3, 4.0, 0.1, 3.5, 0.0, -1.0, 2.0, 0.0, 0.0, 0.0, 0.5, 3.1, 3.2];
+        let point = |shift: f64| ChartPoint { shift, limit: 3.0, ewma_limit: 1.5, held: false };
+        let mut whole = Series::new(settings);
+        let all: Vec<ChartStatus> = shifts.iter().map(|s| whole.take(&point(*s))).collect();
+        for cut in 1..shifts.len() {
+            let recent = all[..cut].iter().map(|s| s.above).collect::<Vec<_>>();
+            let recent = recent[cut.saturating_sub(Series::memory(&settings))..].to_vec();
+            let mut rest = Series::resume(settings, all[cut - 1].ewma, all[cut - 1].state, recent);
+            let found: Vec<ChartStatus> = shifts[cut..].iter().map(|s| rest.take(&point(*s))).collect();
+            assert_eq!(found, all[cut..], "cut at {cut}");
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! `modalwatch calibrate`: is a trained baseline as sure as it should be, with plots.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::Args;
+
+use super::write_whole;
+use crate::baseline::calibration::{calibrate as measure, CalibrationRecord, CellRanks, DRAWS};
+use crate::baseline::library::{find_structure, Library};
+use crate::baseline::Baseline;
+use crate::plot::{escaped, page, table, Line, Plot};
+
+/// Measure the calibration of a trained baseline.
+#[derive(Debug, Args)]
+pub struct CalibrateArgs {
+    /// Structure file (TOML or JSON), or the id of a shipped structure
+    #[arg(long)]
+    structure: String,
+    /// The trained baseline's .safetensors, with its .json beside it; the shipped one without it
+    #[arg(long)]
+    model: Option<PathBuf>,
+    /// Seed of the simulations; training has used others
+    #[arg(long, default_value_t = 1_000_003)]
+    seed: u64,
+    /// HTML page with the plots to write
+    #[arg(long)]
+    out: Option<PathBuf>,
+    /// Print the record as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Measures, prints, and fails when the calibration does.
+///
+/// # Errors
+/// A baseline that is refused, a file that cannot be written, a calibration that fails.
+pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
+    let baseline = load(&args.structure, args.model.as_deref())?;
+    let (record, ranks) = measure(&baseline, args.seed)?;
+    if let Some(path) = &args.out {
+        write_whole(path, html(&baseline, &record, &ranks).as_bytes())?;
+    }
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&record)?);
+    } else {
+        print(&record);
+    }
+    anyhow::ensure!(record.passed(), "the calibration failed: {}", record.failures.join("; "));
+    Ok(())
+}
+
+/// The shipped baseline of a structure, or one from a file.
+pub(super) fn load(structure: &str, model: Option<&Path>) -> anyhow::Result<std::sync::Arc<Baseline>> {
+    let simulator = find_structure(structure)?;
+    let Some(weights) = model else {
+        let entry = Library::open(None)?.get(simulator.id()).and_then(|e| e.baseline.clone());
+        return entry.with_context(|| format!("no baseline of {} is shipped: give --model", simulator.id()));
+    };
+    let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
+    let loaded = Baseline::load(&read(&weights.with_extension("json"))?, &read(weights)?, &simulator);
+    Ok(loaded.with_context(|| format!("{} is refused", weights.display()))?.into())
+}
+
+fn place(noise_multiple: f64, missing_mode: Option<usize>) -> String {
+    let what = missing_mode.map_or("complete".to_owned(), |mode| format!("without mode {mode}"));
+    format!("noise × {noise_multiple:.3}, {what}")
+}
+
+const HEADER: [&str; 6] =
+    ["noise and modes", "parameter", "90 % covers", "50 % covers", "ranks uniform, p", "TARP uniform, p"];
+
+fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
+    let cell_rows = record.cells.iter().flat_map(|cell| {
+        cell.parameters.iter().map(move |p| {
+            vec![
+                place(cell.noise_multiple, cell.missing_mode),
+                p.name.clone(),
+                format!("{:.3}", p.coverage_90),
+                format!("{:.3}", p.coverage_50),
+                format!("{:.3}", p.rank_p_value),
+                format!("{:.3}", cell.tarp_p_value),
+            ]
+        })
+    });
+    cell_rows.collect()
+}
+
+fn print(record: &CalibrationRecord) {
+    println!(
+        "{:>30} {:>12} {:>12} {:>12} {:>17} {:>16}",
+        HEADER[0], HEADER[1], HEADER[2], HEADER[3], HEADER[4], HEADER[5]
+    );
+    for row in rows(record) {
+        println!("{:>30} {:>12} {:>12} {:>12} {:>17} {:>16}", row[0], row[1], row[2], row[3], row[4], row[5]);
+    }
+    if record.passed() {
+        println!("passed: {} cells of {} simulations, {} draws each", record.cells.len(), record.simulations, record.draws);
+    }
+}
+
+fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) -> String {
+    let verdict = if record.passed() {
+        "<p>Passed: 90 % intervals cover about 90 % in every cell, ranks and TARP are uniform.</p>".to_owned()
+    } else {
+        let items: String = record.failures.iter().map(|f| format!("<li>{}</li>", escaped(f))).collect();
+        format!("<p class=\"bad\">Failed: the service does not use this baseline.</p><ul>{items}</ul>")
+    };
+    let names: Vec<String> = baseline.space().iter().map(|p| p.name.clone()).collect();
+    let plots: String = ranks.iter().map(|cell| plot(cell, &names).svg()).collect();
+    let explain = "<p>Each line: share of the simulations whose true value has at most this rank among the posterior draws, \
+                   less what a right posterior gives (0). Within the grey band 99 % of right posteriors stay. Above on the \
+                   left and below on the right: too sure; the other way: too unsure.</p>";
+    page(
+        &format!("Calibration of {}", baseline.simulator().id()),
+        &[
+            ("Verdict".to_owned(), verdict + &table(&HEADER, &rows(record))),
+            ("Ranks".to_owned(), format!("{explain}<div class=\"plots\">{plots}</div>")),
+        ],
+    )
+}
+
+/// Difference of the cumulative ranks from the uniform.
+fn plot(cell: &CellRanks, names: &[String]) -> Plot {
+    let difference = |ranks: &[usize]| -> Vec<(f64, f64)> {
+        let mut counts = vec![0_usize; DRAWS + 1];
+        ranks.iter().for_each(|rank| counts[*rank] += 1);
+        let mut below = 0;
+        counts
+            .iter()
+            .enumerate()
+            .map(|(rank, count)| {
+                below += count;
+                let expected = (rank + 1) as f64 / (DRAWS + 1) as f64;
+                (expected, below as f64 / ranks.len() as f64 - expected)
+            })
+            .collect()
+    };
+    let parameters = names.iter().zip(&cell.ranks);
+    let mut lines: Vec<Line> =
+        parameters.map(|(name, ranks)| Line { name: name.clone(), points: difference(ranks) }).collect();
+    lines.push(Line { name: "TARP".to_owned(), points: difference(&cell.tarp_ranks) });
+    // Largest excursion of an empirical distribution, 99 %: Kolmogorov's 1.63/√n.
+    let width = 1.63 / (cell.tarp_ranks.len() as f64).sqrt();
+    Plot {
+        title: cell.title.clone(),
+        x_label: "rank / number of draws".to_owned(),
+        y_label: "difference from uniform".to_owned(),
+        lines,
+        band: vec![(0.0, -width, width), (1.0, -width, width)],
+        marks: Vec::new(),
+    }
+}

@@ -1,0 +1,124 @@
+//! The activation of all hidden layers, as one pass over memory each way.
+//!
+//! candle composes the derivative of SiLU from six operations and calls the C library for each exponential; here both are
+//! one loop that the compiler turns into vector instructions. It halves the time of a training step.
+
+use candle_core::{bail, CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor};
+
+use crate::stats::exp_f32;
+
+/// silu(x) = x / (1 + exp(−x)), by element.
+///
+/// # Errors
+/// A candle error when `x` is neither f32 nor f64, or does not lie contiguous in the memory of the CPU.
+pub fn silu(x: &Tensor) -> Result<Tensor> {
+    x.apply_op1(Silu)
+}
+
+struct Silu;
+
+/// Derivative of [`Silu`] times the gradient of its result.
+struct SiluGradient;
+
+impl CustomOp1 for Silu {
+    fn name(&self) -> &'static str {
+        "silu"
+    }
+
+    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let result = match storage {
+            CpuStorage::F32(x) => CpuStorage::F32(silu_f32(contiguous(x, layout)?)),
+            CpuStorage::F64(x) => CpuStorage::F64(contiguous(x, layout)?.iter().map(|x| x / (1.0 + (-x).exp())).collect()),
+            _ => bail!("silu takes f32 or f64"),
+        };
+        Ok((result, layout.shape().clone()))
+    }
+
+    fn bwd(&self, x: &Tensor, _: &Tensor, gradient: &Tensor) -> Result<Option<Tensor>> {
+        Ok(Some(x.apply_op2_no_bwd(&gradient.contiguous()?, &SiluGradient)?))
+    }
+}
+
+impl CustomOp2 for SiluGradient {
+    fn name(&self) -> &'static str {
+        "silu-gradient"
+    }
+
+    fn cpu_fwd(&self, x: &CpuStorage, lx: &Layout, g: &CpuStorage, lg: &Layout) -> Result<(CpuStorage, Shape)> {
+        let result = match (x, g) {
+            (CpuStorage::F32(x), CpuStorage::F32(g)) => {
+                CpuStorage::F32(silu_gradient_f32(contiguous(x, lx)?, contiguous(g, lg)?))
+            }
+            (CpuStorage::F64(x), CpuStorage::F64(g)) => {
+                let one = |(x, g): (&f64, &f64)| {
+                    let sigmoid = 1.0 / (1.0 + (-x).exp());
+                    g * sigmoid * (1.0 + x * (1.0 - sigmoid))
+                };
+                CpuStorage::F64(contiguous(x, lx)?.iter().zip(contiguous(g, lg)?).map(one).collect())
+            }
+            _ => bail!("silu takes f32 or f64"),
+        };
+        Ok((result, lx.shape().clone()))
+    }
+}
+
+fn contiguous<'a, T>(values: &'a [T], layout: &Layout) -> Result<&'a [T]> {
+    match layout.contiguous_offsets() {
+        Some((start, end)) => Ok(&values[start..end]),
+        None => bail!("silu takes tensors that lie contiguous in memory"),
+    }
+}
+
+fn silu_f32(x: &[f32]) -> Vec<f32> {
+    let mut result = vec![0.0; x.len()];
+    pulp::Arch::new().dispatch(|| {
+        for (y, x) in result.iter_mut().zip(x) {
+            *y = x * sigmoid(*x);
+        }
+    });
+    result
+}
+
+fn silu_gradient_f32(x: &[f32], g: &[f32]) -> Vec<f32> {
+    let mut result = vec![0.0; x.len()];
+    pulp::Arch::new().dispatch(|| {
+        for ((y, x), g) in result.iter_mut().zip(x).zip(g) {
+            let sigmoid = sigmoid(*x);
+            *y = g * sigmoid * (1.0 + x * (1.0 - sigmoid));
+        }
+    });
+    result
+}
+
+/// 1 / (1 + exp(−x)).
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp_f32(-x))
+}
+
+#[cfg(test)]
+mod tests {
+    use candle_core::{Device, Var};
+
+    use super::*;
+
+    #[test]
+    fn values_and_gradients_are_those_of_the_formula() {
+        let points: Vec<f32> = (-4000..=4000).map(|i| i as f32 / 40.0).collect();
+        let x = Var::new(points.as_slice(), &Device::Cpu).unwrap();
+        let y = silu(&x).unwrap();
+        let gradient = y.sum_all().unwrap().backward().unwrap().get(&x).unwrap().to_vec1::<f32>().unwrap();
+        for ((x, y), slope) in points.iter().zip(y.to_vec1::<f32>().unwrap()).zip(gradient) {
+            let x = f64::from(*x);
+            let sigmoid = 1.0 / (1.0 + (-x).exp());
+            let expected = [x * sigmoid, sigmoid * (1.0 + x * (1.0 - sigmoid))];
+            for (found, expected) in [f64::from(y), f64::from(slope)].into_iter().zip(expected) {
+                // f32 has 6e-8, which x·(1 − sigmoid) multiplies by x; the slope crosses zero, where only the absolute
+                // error counts.
+                let tolerance = 4e-7 * (1.0 + expected.abs()) + 1.2e-7 * x.abs();
+                assert!((found - expected).abs() < tolerance, "at {x}: {found}, expected {expected}");
+            }
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! The slip behind a batch that does not fit: a unit, a shift of modes.
+
+use super::fit::fit;
+use super::{Code, Effect, Finding};
+use crate::baseline::observation::Observation;
+use crate::baseline::{Baseline, InferenceError};
+use crate::physics;
+
+/// Measurements that a suspicion is tried on.
+const TRIED: usize = 8;
+
+/// Draws that a search begins from the mean of.
+const DRAWS: usize = 16;
+
+/// Units that frequencies come in by mistake, and the factor that turns them into Hz.
+const UNITS: [(&str, f64); 3] = [("rad/s", 0.5 * std::f64::consts::FRAC_1_PI), ("kHz", 1e3), ("rpm", 1.0 / 60.0)];
+
+/// Why no suspicion could be tried.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The flow failed.
+    #[error(transparent)]
+    Inference(#[from] InferenceError),
+    /// The simulation failed.
+    #[error(transparent)]
+    Simulation(#[from] physics::Error),
+}
+
+/// Tries the common slips on a rejected batch and names the first that makes it fit.
+///
+/// # Errors
+/// [`Error`], which a loaded baseline rules out.
+pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> Result<Option<Finding>, Error> {
+    let step = observations.len().div_ceil(TRIED).max(1);
+    let some: Vec<&Observation> = observations.iter().step_by(step).collect();
+    let tried = |change: &dyn Fn(&Observation) -> Observation, must_be_tested: bool| -> Result<bool, Error> {
+        let changed: Vec<Observation> = some.iter().map(|o| change(o)).filter(|o| o.modes_present() > 0).collect();
+        if changed.is_empty() {
+            return Ok(false);
+        }
+        let means = baseline.infer(&changed, DRAWS, seed)?.means();
+        let starts: Vec<Vec<f64>> = means.row_iter().map(|row| row.iter().copied().collect()).collect();
+        let fit = fit(baseline.simulator(), &changed, &starts)?;
+        Ok(!fit.rejected() && (fit.p_value.is_some() || !must_be_tested))
+    };
+    for (unit, factor) in UNITS {
+        let in_hz = |o: &Observation| Observation {
+            frequencies_hz: o.frequencies_hz.iter().map(|f| f.map(|f| f * factor)).collect(),
+            noise_multiple: o.noise_multiple.clone(),
+        };
+        if tried(&in_hz, false)? {
+            let message = format!("taken as {unit} instead of Hz, the measurements fit: send Hz");
+            return Ok(Some(Finding::new(Code::UnitSuspected, Effect::Reject, message)));
+        }
+    }
+    // Mode j was missed and all above moved down: what came as mode i is mode i + 1 from j on, and the last is unknown.
+    let modes = baseline.simulator().modes();
+    for missed in 0..modes.saturating_sub(1) {
+        let shifted = |o: &Observation| {
+            let from = |mode: usize| if mode > missed { mode - 1 } else { mode };
+            Observation {
+                frequencies_hz: (0..modes).map(|i| o.frequencies_hz[from(i)].filter(|_| i != missed)).collect(),
+                noise_multiple: (0..modes).map(|i| if i == missed { 1.0 } else { o.noise_multiple[from(i)] }).collect(),
+            }
+        };
+        // With too few modes left to test anything, any shift would fit.
+        if tried(&shifted, true)? {
+            let message = format!(
+                "with mode {} missed and those above it taken one too low, the measurements fit: send null for the missed mode",
+                missed + 1
+            );
+            return Ok(Some(Finding::new(Code::ModesShifted, Effect::Reject, message)));
+        }
+    }
+    Ok(None)
+}

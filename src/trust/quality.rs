@@ -1,0 +1,197 @@
+//! What can be seen in the measurements without any simulation: order, repeats, resolution, outliers.
+
+use super::{too_many, Code, Effect, Finding};
+use crate::measurement::ModalMeasurement;
+use crate::quantity::Hertz;
+use crate::stats;
+
+/// Fewest values of a mode for a judgement on their scatter.
+const FEWEST: usize = 8;
+
+/// Distance from the median, in robust standard deviations, that no healthy scatter reaches.
+const FAR: f64 = 8.0;
+
+/// Share of distinct values below which a mode counts as quantised.
+const FEW_DISTINCT: f64 = 0.34;
+
+/// What was seen, and what is left to assess.
+#[derive(Debug, Clone)]
+pub struct Inspection {
+    /// The measurements to go on with, modes in ascending order, and their index in the batch; never empty.
+    pub kept: Vec<(usize, ModalMeasurement)>,
+    /// What was seen.
+    pub findings: Vec<Finding>,
+}
+
+/// Looks at the measurements of a batch; `previous` are the frequencies of the measurement before them of the same source.
+pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hertz>]>) -> Inspection {
+    let mut findings = Vec::new();
+    let mut kept: Vec<(usize, ModalMeasurement)> = measurements.iter().cloned().enumerate().collect();
+    sort_modes(&mut kept, &mut findings);
+    let coarse = quantised(&kept, &mut findings);
+    // On a coarse grid equal values are no sign of anything.
+    if !coarse {
+        drop_repeats(&mut kept, previous, &mut findings);
+    }
+    drop_outliers(&mut kept, &mut findings);
+    Inspection { kept, findings }
+}
+
+/// Names measurements whose modes are out of order. A few are left out; of a batch full of them the modes are put in order,
+/// for the figures, and the batch is rejected.
+fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let mut swapped = Vec::new();
+    let mut places = String::new();
+    for (index, measurement) in kept.iter_mut() {
+        let present: Vec<usize> =
+            (0..measurement.frequencies_hz.len()).filter(|&i| measurement.frequencies_hz[i].is_some()).collect();
+        let value = |m: &ModalMeasurement, mode: usize| m.frequencies_hz[mode].map_or(0.0, Hertz::get);
+        let Some(pair) = present.windows(2).find(|pair| value(measurement, pair[1]) <= value(measurement, pair[0]))
+        else {
+            continue;
+        };
+        if swapped.is_empty() {
+            let (low, high) = (value(measurement, pair[0]), value(measurement, pair[1]));
+            places = format!("mode {} at {low} Hz is not below mode {} at {high} Hz", pair[0] + 1, pair[1] + 1);
+        }
+        swapped.push(*index);
+        let mut order = present.clone();
+        order.sort_by(|&a, &b| value(measurement, a).total_cmp(&value(measurement, b)));
+        let before = measurement.clone();
+        for (&to, &from) in present.iter().zip(&order) {
+            measurement.frequencies_hz[to] = before.frequencies_hz[from];
+            if let (Some(now), Some(then)) = (&mut measurement.std_hz, &before.std_hz) {
+                now[to] = then[from];
+            }
+        }
+    }
+    if !swapped.is_empty() {
+        let many = too_many(swapped.len(), kept.len());
+        let message = format!(
+            "modes are out of order in {} of {} measurements (in the first, {places}): they seem swapped; {}",
+            swapped.len(),
+            kept.len(),
+            if many { "the figures are for ascending frequencies" } else { "these are left out" }
+        );
+        let effect = if many { Effect::Reject } else { Effect::Note };
+        findings.push(Finding::new(Code::ModesSwapped, effect, message).of(swapped.clone()));
+        if !many {
+            kept.retain(|(index, _)| !swapped.contains(index));
+        }
+    }
+}
+
+/// True when every mode that varies lies on a coarse grid; each mode that does is named.
+fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) -> bool {
+    let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
+    let (mut coarse, mut scattered) = (0, 0);
+    let mut parts = Vec::new();
+    for mode in 0..modes {
+        let mut values: Vec<f64> =
+            kept.iter().filter_map(|(_, m)| m.frequencies_hz[mode].map(Hertz::get)).collect();
+        let count = values.len();
+        values.sort_by(f64::total_cmp);
+        values.dedup();
+        if count < FEWEST || values.len() < 2 {
+            continue;
+        }
+        scattered += 1;
+        if values.len() as f64 > FEW_DISTINCT * count as f64 {
+            continue;
+        }
+        coarse += 1;
+        let step = values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
+        parts.push(format!("mode {} takes {} values in {count} measurements, {step:.3e} Hz apart", mode + 1, values.len()));
+    }
+    if !parts.is_empty() {
+        let message = format!("{}: record more digits, the scatter is finer than that", parts.join("; "));
+        findings.push(Finding::new(Code::Quantised, Effect::HoldAlarm, message));
+    }
+    coarse > 0 && coarse == scattered
+}
+
+fn drop_repeats(
+    kept: &mut Vec<(usize, ModalMeasurement)>,
+    previous: Option<&[Option<Hertz>]>,
+    findings: &mut Vec<Finding>,
+) {
+    let count = kept.len();
+    let repeats: Vec<usize> = kept
+        .iter()
+        .enumerate()
+        .filter(|(row, (_, m))| {
+            let same = |other: &[Option<Hertz>]| other == m.frequencies_hz.as_slice();
+            kept[..*row].iter().any(|(_, earlier)| same(&earlier.frequencies_hz)) || previous.is_some_and(same)
+        })
+        .map(|(row, _)| row)
+        .collect();
+    if repeats.is_empty() {
+        return;
+    }
+    let indices: Vec<usize> = repeats.iter().map(|&row| kept[row].0).collect();
+    // All repeat the measurement before the batch, or all the first of it.
+    if repeats.len() == count || (count >= 3 && repeats.len() + 1 == count) {
+        let message = match count {
+            1 => "the same frequencies as in the measurement before, to the last digit: the sensor or its gateway hangs".to_owned(),
+            _ => format!("all {count} measurements have the same frequencies to the last digit: the sensor or its gateway hangs"),
+        };
+        findings.push(Finding::new(Code::NoScatter, Effect::Reject, message));
+        kept.truncate(1);
+        return;
+    }
+    let effect = if too_many(repeats.len(), count) { Effect::HoldAlarm } else { Effect::Note };
+    let message = format!("{} of {count} measurements repeat an earlier one to the last digit and are left out", repeats.len());
+    findings.push(Finding::new(Code::StaleRepeat, effect, message).of(indices.clone()));
+    kept.retain(|(index, _)| !indices.contains(index));
+}
+
+/// Leaves out measurements with a mode far from what the others of the batch show.
+fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let count = kept.len();
+    let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
+    let mut far: Vec<(usize, String)> = Vec::new();
+    for mode in 0..modes {
+        let logs: Vec<(usize, f64)> =
+            kept.iter().filter_map(|(index, m)| Some((*index, m.frequencies_hz[mode]?.get().ln()))).collect();
+        if logs.len() < FEWEST {
+            continue;
+        }
+        let values: Vec<f64> = logs.iter().map(|(_, x)| *x).collect();
+        let median = stats::quantile(&values, 0.5);
+        let deviations: Vec<f64> = values.iter().map(|x| (x - median).abs()).collect();
+        // 1.4826 makes the median deviation of a normal distribution its standard deviation.
+        let spread = 1.4826 * stats::quantile(&deviations, 0.5);
+        if spread <= 0.0 {
+            continue;
+        }
+        for (index, x) in logs.into_iter().filter(|(_, x)| (x - median).abs() > FAR * spread) {
+            let text = format!(
+                "measurement {index} has mode {} at {:.6} Hz, where the others lie at {:.6} Hz ± {:.2} %",
+                mode + 1,
+                x.exp(),
+                median.exp(),
+                100.0 * spread
+            );
+            far.push((index, text));
+        }
+    }
+    if far.is_empty() {
+        return;
+    }
+    let mut indices: Vec<usize> = far.iter().map(|(index, _)| *index).collect();
+    indices.sort_unstable();
+    indices.dedup();
+    let examples: Vec<String> = far.into_iter().take(3).map(|(_, text)| text).collect();
+    let examples = examples.join("; ");
+    if too_many(indices.len(), count) {
+        let message = format!(
+            "{} of {count} measurements lie far from the others ({examples}): the batch mixes two states, or two instruments",
+            indices.len()
+        );
+        findings.push(Finding::new(Code::Outlier, Effect::Reject, message).of(indices));
+        return;
+    }
+    let message = format!("{} of {count} measurements are outliers and left out: {examples}", indices.len());
+    findings.push(Finding::new(Code::Outlier, Effect::Note, message).of(indices.clone()));
+    kept.retain(|(index, _)| !indices.contains(index));
+}

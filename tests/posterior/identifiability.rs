@@ -1,0 +1,74 @@
+//! Two stiffnesses that the modes cannot tell apart: damage is told for both together, and for neither alone.
+
+use modalwatch::baseline::observation::DEFAULT_NOISE_RANGE;
+use modalwatch::baseline::train::train;
+use modalwatch::damage::QuantityKind;
+use modalwatch::flow::train::TrainSettings;
+use modalwatch::flow::FlowSettings;
+use modalwatch::monitor::assess::{self, Context};
+use modalwatch::simulator::definition::StructureDefinition;
+use modalwatch::simulator::Simulator;
+use modalwatch::trust::Code;
+
+use super::population::{batch, undamaged, DRAWS};
+use super::shipped;
+
+/// Two equal masses between walls: the frequencies stay when left and right change places.
+const SYMMETRIC: &str = r#"
+id = "symmetric"
+modes = 2
+measurement_noise = { relative = 0.002 }
+mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 1.0 }]
+spring = [
+    { name = "left", from = "ground", to = "m1", n_per_m = 100.0 },
+    { name = "middle", from = "m1", to = "m2", n_per_m = 50.0 },
+    { name = "right", from = "m2", to = "ground", n_per_m = 100.0 },
+]
+parameter = [
+    { name = "left", prior = { uniform = [60.0, 140.0] }, sets = { spring = "left" } },
+    { name = "right", prior = { uniform = [60.0, 140.0] }, sets = { spring = "right" } },
+]
+"#;
+
+#[test]
+fn damage_of_one_of_two_is_told_for_the_group_and_blames_neither() {
+    let simulator = Simulator::new(StructureDefinition::parse_toml(SYMMETRIC).unwrap()).unwrap();
+    let settings = TrainSettings { epochs: 12, ..TrainSettings::default() };
+    let trained = train(&simulator, 20_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
+    let baseline = &trained.baseline;
+    let record = &baseline.manifest().identifiability;
+    println!("{record:#?}");
+    assert_eq!(record.groups, [["left".to_owned(), "right".to_owned()]]);
+    for p in &record.parameters {
+        // Local information sees two separate points, the posterior sees that there are two.
+        assert!(p.posterior_std > 1.5 * p.fisher_std, "{p:?}");
+    }
+    let state = undamaged(baseline, &batch(baseline, &[(100.0, 1.5), (100.0, 1.5)], 40, 1.0, 1));
+    let damaged = batch(baseline, &[(85.0, 1.5), (100.0, 1.5)], 20, 1.0, 2);
+    let context = Context { undamaged: Some(&state), previous: None };
+    let assessment = assess::assess(baseline, &damaged, context, DRAWS).unwrap();
+    assert!(assessment.trust.findings.iter().any(|f| f.code == Code::NotIdentifiable), "{:?}", assessment.trust);
+    for q in &assessment.quantities {
+        match q.kind {
+            QuantityKind::Group => {
+                let damage = q.damage.as_ref().unwrap();
+                println!("{}: PoD {:.2}, change {:.1} %", q.name, damage.probability_of_damage, 100.0 * damage.relative_change);
+                assert!(damage.probability_of_damage > 0.5, "{q:?}");
+                // Half of 15 % of one of two.
+                assert!((damage.relative_change + 0.075).abs() < 0.03, "{q:?}");
+            }
+            _ => assert!(q.damage.is_none() && q.group.as_deref() == Some("group:left+right"), "{q:?}"),
+        }
+    }
+}
+
+#[test]
+fn the_shipped_structures_can_be_told_apart() {
+    for id in ["three-dof", "rig"] {
+        let baseline = shipped(id);
+        assert_eq!(baseline.groups(), []);
+        for p in &baseline.manifest().identifiability.parameters {
+            assert!(p.variance_left < 0.05, "{id}: {p:?}");
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! Batches that the simulation can produce, and batches that it cannot.
+
+use modalwatch::measurement::ModalMeasurement;
+use modalwatch::monitor::assess::{self, BatchSamples, Draws};
+use modalwatch::quantity::Hertz;
+use modalwatch::trust::{Code, Trust};
+
+use super::population::{batch, TABLE_2};
+use super::shipped;
+
+/// A healthy rig: both links in the middle of their way.
+const RIG: [(f64, f64); 2] = [(0.0475, 0.004), (0.0475, 0.004)];
+
+/// Fewer draws than the service takes: only where a search begins depends on them.
+const DRAWS: Draws = Draws { per_measurement: 10, for_population: 10, seed: 5 };
+
+fn draw(id: &str, measured: &[ModalMeasurement]) -> BatchSamples {
+    assess::draw(&shipped(id), measured, None, DRAWS).unwrap()
+}
+
+fn moments(id: &str) -> &'static [(f64, f64)] {
+    if id == "rig" {
+        &RIG
+    } else {
+        &TABLE_2
+    }
+}
+
+#[test]
+fn healthy_batches_are_rejected_at_the_nominal_rate() {
+    for id in ["rig", "three-dof"] {
+        let baseline = shipped(id);
+        let count = 2_000;
+        let rejected = (0..count)
+            .filter(|seed| draw_with(&baseline, &batch(&baseline, moments(id), 20, 1.0, *seed)).fit.rejected())
+            .count();
+        let share = rejected as f64 / count as f64;
+        println!("{id}: {:.2} % of {count} healthy batches rejected", 100.0 * share);
+        // The share of 2,000 scatters by 0.22 %.
+        let low = if id == "rig" { 0.005 } else { 0.0 };
+        assert!((low..=0.02).contains(&share), "{id}: {share}");
+    }
+}
+
+fn draw_with(baseline: &modalwatch::baseline::Baseline, measured: &[ModalMeasurement]) -> BatchSamples {
+    assess::draw(baseline, measured, None, DRAWS).unwrap()
+}
+
+fn changed(measured: &[ModalMeasurement], change: impl Fn(usize, f64) -> f64) -> Vec<ModalMeasurement> {
+    let one = |m: &ModalMeasurement| {
+        let f = m.frequencies_hz.iter().enumerate();
+        let frequencies_hz = f.map(|(i, f)| f.map(|f| Hertz::new(change(i, f.get())).unwrap())).collect();
+        ModalMeasurement { frequencies_hz, std_hz: None, ..m.clone() }
+    };
+    measured.iter().map(one).collect()
+}
+
+#[test]
+fn units_and_swapped_modes_are_rejected_and_rightly_named() {
+    let repetitions = 100;
+    for id in ["three-dof", "rig"] {
+        let baseline = shipped(id);
+        let (mut radians, mut kilohertz, mut swapped) = (0, 0, 0);
+        for seed in 0..repetitions {
+            let measured = batch(&baseline, moments(id), 10, 1.0, seed);
+            let named = |measured: Vec<ModalMeasurement>, code: Code, word: &str| {
+                let samples = draw(id, &measured);
+                let trust = Trust::new(&samples.fit, samples.findings.clone());
+                let found = trust.findings.iter().any(|f| f.code == code && f.message.contains(word));
+                usize::from(found && !trust.accepted())
+            };
+            radians += named(changed(&measured, |_, f| f * 2.0 * std::f64::consts::PI), Code::UnitSuspected, "rad/s");
+            kilohertz += named(changed(&measured, |_, f| f / 1_000.0), Code::UnitSuspected, "kHz");
+            let mut other = measured.clone();
+            other.iter_mut().for_each(|m| m.frequencies_hz.swap(1, 2));
+            swapped += named(other, Code::ModesSwapped, "swapped");
+        }
+        println!("{id}, of {repetitions}: rad/s named {radians}, kHz {kilohertz}, swapped modes {swapped}");
+        for found in [radians, kilohertz, swapped] {
+            assert!(found as f64 >= 0.99 * repetitions as f64, "{id}: {found}");
+        }
+    }
+}
+
+#[test]
+fn three_per_cent_in_one_mode_of_the_rig_are_noticed() {
+    let (repetitions, baseline) = (100, shipped("rig"));
+    let mut rejected = 0;
+    for seed in 0..repetitions {
+        let mode = seed as usize % 3;
+        let measured = changed(&batch(&baseline, &RIG, 10, 1.0, seed), |i, f| if i == mode { 1.03 * f } else { f });
+        rejected += usize::from(draw("rig", &measured).fit.rejected());
+    }
+    println!("3 % in one mode of the rig: rejected {rejected} of {repetitions}");
+    assert!(f64::from(u32::try_from(rejected).unwrap()) >= 0.99 * repetitions as f64, "{rejected}");
+}
+
+#[test]
+fn three_dof_says_that_it_cannot_test_and_rejects_what_leaves_the_prior() {
+    let baseline = shipped("three-dof");
+    let healthy = draw("three-dof", &batch(&baseline, &TABLE_2, 10, 1.0, 1));
+    assert!(healthy.findings.iter().any(|f| f.code == Code::FitNotTestable), "{:?}", healthy.findings);
+    assert_eq!(healthy.fit.p_value, None);
+    let beyond = draw("three-dof", &batch(&baseline, &[(2.4, 0.1), (5.0, 0.1), (6.0, 0.2)], 10, 1.0, 1));
+    assert!(beyond.fit.rejected(), "{:?}", beyond.findings);
+}

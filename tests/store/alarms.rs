@@ -1,0 +1,156 @@
+//! Charts and episodes: batches that come late, twice, at the same time, in maintenance.
+
+use modalwatch::alarm::chart::ChartPoint;
+use modalwatch::alarm::AlarmSettings;
+use modalwatch::store::{Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, Store};
+
+use super::{assessment, at, batch, bridge, open, undamaged};
+
+/// Stores a batch that ends at `time` with one point of k1 on a chart with limit 3.
+async fn chart(store: &Store, id: &str, time: i64, shift: f64) {
+    let given = batch(id, time, 1);
+    let measured = given.time_span();
+    store.insert_batch(&given, id, at(time)).await.unwrap();
+    assess(store, id, measured, shift).await;
+}
+
+async fn assess(
+    store: &Store,
+    id: &str,
+    measured: (modalwatch::quantity::Timestamp, modalwatch::quantity::Timestamp),
+    shift: f64,
+) {
+    let settings = AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() };
+    let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, held: false };
+    let series = "k1".to_owned();
+    let point = NewChartPoint { series, undamaged_version: 1, measured, point, probability_limit: Some(0.3), settings };
+    store.insert_assessment(&bridge(), id, &assessment("m", Some(1), measured.1), vec![point]).await.unwrap();
+}
+
+async fn opened() -> (Store, tempfile::TempDir) {
+    let (store, folder) = open().await;
+    store.insert_batch(&batch("first", -5_000, 1), "b0", at(0)).await.unwrap();
+    let model = modalwatch::quantity::Digest::of(&[b"m"]);
+    store.insert_undamaged(&bridge(), &undamaged(), &model, &["b0".to_owned()], at(0)).await.unwrap();
+    (store, folder)
+}
+
+async fn episodes(store: &Store) -> Vec<Episode> {
+    store.episodes(&bridge(), None, false, 100).await.unwrap()
+}
+
+async fn states(store: &Store) -> Vec<String> {
+    store.charts(&bridge(), 100).await.unwrap().into_iter().map(|p| p.state).collect()
+}
+
+#[tokio::test]
+async fn one_alarm_is_one_episode_from_its_first_batch_to_its_recovery() {
+    let (store, _folder) = opened().await;
+    for (i, shift) in [0.0, 4.0, 5.0, 0.5, 6.0, 0.0, 0.0, 0.1].into_iter().enumerate() {
+        chart(&store, &format!("b{}", i + 1), 1_000 * (i as i64 + 1), shift).await;
+    }
+    let expected = ["normal", "alarming", "alarming", "recovering", "alarming", "recovering", "normal", "normal"];
+    assert_eq!(states(&store).await, expected);
+    let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
+    assert_eq!((episode.kind.as_str(), episode.series.as_str()), ("damage", "k1"));
+    assert_eq!(episode.opened_batch.as_deref(), Some("b2"));
+    assert_eq!(episode.opened_at, batch("b2", 2_000, 1).time_span().1);
+    assert_eq!(episode.ended_at, Some(batch("b7", 7_000, 1).time_span().1));
+    assert!((episode.peak_shift - 6.0).abs() < 1e-12 && !episode.withdrawn);
+}
+
+#[tokio::test]
+async fn assessing_a_batch_again_changes_no_alarm() {
+    let (store, _folder) = opened().await;
+    chart(&store, "b1", 1_000, 4.0).await;
+    chart(&store, "b2", 2_000, 5.0).await;
+    let before = episodes(&store).await;
+    assess(&store, "b1", batch("b1", 1_000, 1).time_span(), 4.0).await;
+    assess(&store, "b2", batch("b2", 2_000, 1).time_span(), 5.0).await;
+    assert_eq!(episodes(&store).await, before);
+}
+
+#[tokio::test]
+async fn a_batch_that_comes_late_moves_the_alarm_and_keeps_who_has_seen_it() {
+    let (store, _folder) = opened().await;
+    chart(&store, "b3", 3_000, 0.0).await;
+    chart(&store, "b5", 5_000, 4.0).await;
+    let seen = Acknowledgement { at: at(6_000), by: "night shift".to_owned(), note: None };
+    store.acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
+    let second = Acknowledgement { by: "somebody else".to_owned(), ..seen.clone() };
+    assert_eq!(store.acknowledge(&bridge(), 1, second).await.unwrap().unwrap().acknowledgement, Some(seen.clone()));
+    chart(&store, "b4", 4_000, 4.5).await;
+    let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
+    assert_eq!((episode.opened_batch.as_deref(), episode.acknowledgement.clone()), (Some("b4"), Some(seen)));
+    assert_eq!(states(&store).await, ["normal", "alarming", "alarming"]);
+    assert!(store.acknowledge(&bridge(), 9, Acknowledgement { at: at(1), by: "x".into(), note: None }).await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn an_alarm_that_a_corrected_batch_takes_back_is_withdrawn() {
+    let (store, _folder) = opened().await;
+    chart(&store, "b1", 1_000, 4.0).await;
+    chart(&store, "b2", 2_000, 0.0).await;
+    assess(&store, "b1", batch("b1", 1_000, 1).time_span(), 1.0).await;
+    assert!(episodes(&store).await[0].withdrawn);
+    assert_eq!(states(&store).await, ["normal", "normal"]);
+    assert!(store.episodes(&bridge(), None, true, 10).await.unwrap().is_empty());
+}
+
+#[tokio::test]
+async fn two_batches_of_the_same_time_share_one_alarm() {
+    let (store, _folder) = opened().await;
+    chart(&store, "b1", 1_000, 4.0).await;
+    chart(&store, "b2", 1_000, 5.0).await;
+    chart(&store, "b3", 2_000, 5.0).await;
+    let found = episodes(&store).await;
+    assert_eq!((found.len(), found[0].withdrawn, found[0].ended_at), (1, false, None));
+}
+
+#[tokio::test]
+async fn order_of_arrival_does_not_matter() {
+    let shifts = [0.0, 4.0, 0.0, 0.0, 3.5, 2.0, 4.0, 0.0, 0.0, 0.0];
+    let mut found = Vec::new();
+    for order in [[0, 1, 2, 3, 4, 5, 6, 7, 8, 9], [9, 8, 7, 6, 5, 4, 3, 2, 1, 0], [4, 0, 8, 2, 6, 1, 9, 3, 7, 5]] {
+        let (store, _folder) = opened().await;
+        for i in order {
+            chart(&store, &format!("b{}", i + 1), 1_000 * (i as i64 + 1), shifts[i]).await;
+        }
+        let lasting = episodes(&store).await.into_iter().filter(|e| !e.withdrawn);
+        let mut lasting: Vec<_> = lasting.map(|e| (e.opened_at, e.opened_batch, e.ended_at)).collect();
+        lasting.sort();
+        found.push((states(&store).await, lasting));
+    }
+    assert!(found.windows(2).all(|pair| pair[0] == pair[1]), "{found:#?}");
+    assert_eq!(found[0].1.len(), 2);
+}
+
+#[tokio::test]
+async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_state_begins_anew() {
+    let (store, _folder) = opened().await;
+    let window = MaintenanceWindow { from: at(1_500), to: at(2_500), reason: "bolts".to_owned() };
+    store.insert_maintenance(&bridge(), window.clone(), at(0)).await.unwrap();
+    assert_eq!(store.maintenance(&bridge()).await.unwrap(), [window]);
+    chart(&store, "b1", 1_000, 0.0).await;
+    chart(&store, "b2", 2_000, 9.0).await;
+    assert!(episodes(&store).await.is_empty());
+    chart(&store, "b3", 3_000, 9.0).await;
+    assert_eq!(episodes(&store).await.len(), 1);
+    let model = modalwatch::quantity::Digest::of(&[b"m"]);
+    store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".to_owned()], at(4_000)).await.unwrap();
+    assert_eq!(episodes(&store).await[0].ended_at, Some(at(4_000)));
+    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b0", "b2", "b3"], "b0 was never compared, and all after the undamaged batch come again");
+    // Computed before the new state, stored after it: it must not raise what has ended.
+    assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 8.0).await;
+    assert_eq!(store.episodes(&bridge(), None, true, 10).await.unwrap(), []);
+}
+
+#[tokio::test]
+async fn silence_is_one_alarm_until_something_comes() {
+    let (store, _folder) = opened().await;
+    assert!(store.set_silent(&bridge(), Some(at(10)), at(99)).await.unwrap());
+    assert!(!store.set_silent(&bridge(), Some(at(10)), at(100)).await.unwrap());
+    assert!(store.set_silent(&bridge(), None, at(120)).await.unwrap());
+    let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
+    assert_eq!((episode.kind.as_str(), episode.opened_at, episode.ended_at), ("silence", at(10), Some(at(120))));
+}
