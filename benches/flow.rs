@@ -29,7 +29,7 @@ fn flow(criterion: &mut Criterion) {
 
     let samples = baseline.infer(&rows, 64, 1).expect("the shipped baseline infers");
     criterion.bench_function("population behind 50 measurements x 64 draws", |bencher| {
-        bencher.iter(|| populations(black_box(&samples), baseline.space(), 1));
+        bencher.iter(|| populations(black_box(&samples), None, baseline.space(), 1));
     });
 
     let mut training = criterion.benchmark_group("training");

@@ -10,8 +10,9 @@
 //! The pool of all samples counts the noise twice, once in where each posterior sits and once in its width; here it
 //! counts not at all. Source: Hogg, Myers & Bovy (2010).
 
+use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
-use rand_distr::{Gamma, StandardNormal};
+use rand_distr::{ChiSquared, Gamma, StandardNormal};
 
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
@@ -27,6 +28,9 @@ pub const DRAWS: usize = 400;
 /// more noise hides of the spread.
 const THINNING: usize = 2;
 const BURN_IN: usize = 40;
+
+/// Share of the spread between measurements that the posterior of one must have for the noise to matter.
+const NOISY: f64 = 0.3;
 
 const EM_ITERATIONS: usize = 200;
 
@@ -133,11 +137,22 @@ pub fn interval(draws: &[f64]) -> [f64; 2] {
 ///  Gibbs:  s_j ~ w_j·,   σ | s ∝ σ^{1−n} exp(−Σ_j (x_j − x̄)²/2σ²),   μ | σ, s ~ N(x̄, σ²/n)
 /// ```
 ///
+/// Where noise hides much of the spread, the chosen samples hold σ where it is and the Gibbs sampler hardly moves; there a
+/// Metropolis step on L(μ, σ) itself, one parameter after the other, goes with every second sweep.
+///
 /// Priors: μ uniform in the prior box, σ uniform up to half the width of the prior (Gelman 2006). The second
 /// term of σ² is ours, the restricted likelihood of a normal population: it gives back what the fitted mean has absorbed,
 /// σ²/n for data without noise.
-pub fn populations(samples: &PosteriorSamples, space: &ParameterSpace, seed: u64) -> Populations {
-    let problem = Problem::new(samples, space);
+///
+/// `log_weights`: where the samples were drawn from another density r_j than q(· | y_j), ln q(x_js | y_j) − ln r_j(x_js) up to a
+/// constant for each measurement; they go with each w_js and into L.
+pub fn populations(
+    samples: &PosteriorSamples,
+    log_weights: Option<&[f64]>,
+    space: &ParameterSpace,
+    seed: u64,
+) -> Populations {
+    let problem = Problem::new(samples, log_weights, space);
     let mut stream = stats::stream(seed, "population draws");
     let dimension = space.len();
     let to_units = |column: usize, u: f64| space.as_slice()[column].from_unit(u);
@@ -151,12 +166,15 @@ pub fn populations(samples: &PosteriorSamples, space: &ParameterSpace, seed: u64
         let effective_sample_size = problem.draws as f64;
         return Populations { parameters: (0..dimension).map(one).collect(), effective_sample_size };
     }
-    let mut state = problem.maximise();
-    let effective_sample_size = problem.effective_sample_size(&state);
-    let point = state.clone();
+    let point = problem.maximise();
+    let effective_sample_size = problem.effective_sample_size(&point);
+    let mut state = point.clone();
     let (mut means, mut stds) = (vec![Vec::with_capacity(DRAWS); dimension], vec![Vec::with_capacity(DRAWS); dimension]);
     for sweep in 0..BURN_IN + DRAWS * THINNING {
         problem.sweep(&mut state, &mut stream);
+        if problem.noisy && sweep % 2 == 0 {
+            problem.collapsed(&mut state, &mut stream);
+        }
         if sweep >= BURN_IN && (sweep - BURN_IN) % THINNING == 0 {
             for column in 0..dimension {
                 means[column].push(to_units(column, state.mean[column]));
@@ -174,6 +192,83 @@ pub fn populations(samples: &PosteriorSamples, space: &ParameterSpace, seed: u64
     Populations { parameters, effective_sample_size }
 }
 
+/// The point estimate of [`populations`] alone, without draws, and its effective sample size.
+pub fn estimate(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Populations {
+    let problem = Problem::new(samples, log_weights, space);
+    let point = problem.maximise();
+    let effective_sample_size = problem.effective_sample_size(&point);
+    let one = |(column, p): (usize, &crate::parameter::Parameter)| PopulationEstimate {
+        mean: p.from_unit(point.mean[column]),
+        std: Some(point.std[column] * (p.upper - p.lower)),
+        mean_draws: Vec::new(),
+        std_draws: Vec::new(),
+    };
+    Populations { parameters: space.iter().enumerate().map(one).collect(), effective_sample_size }
+}
+
+/// Samples near where posterior and population meet, for batches whose noise hides the spread: few samples of the posterior
+/// itself fall there. Returns them with the logarithm of their density in the unit box.
+///
+/// ```text
+///  r_j = t₅(x; c_j, 1.5 C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
+/// ```
+///
+/// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them.
+pub fn proposals(
+    samples: &PosteriorSamples,
+    found: &Populations,
+    space: &ParameterSpace,
+    draws: usize,
+    seed: u64,
+) -> (PosteriorSamples, Vec<f64>) {
+    const DEGREES: f64 = 5.0;
+    const STRETCH: f64 = 1.5;
+    let (d, parameters) = (space.len(), space.as_slice());
+    let width = |k: usize| parameters[k].upper - parameters[k].lower;
+    let mean = DVector::from_fn(d, |k, _| parameters[k].to_unit(found.parameters[k].mean));
+    let precision = DMatrix::from_fn(d, d, |i, j| {
+        // A spread of nothing would leave no room to look for another.
+        let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(1e-6);
+        if i == j { std.powi(-2) } else { 0.0 }
+    });
+    let chi_squared = ChiSquared::new(DEGREES).expect("the degrees of freedom are positive");
+    let mut stream = stats::stream(seed, "population proposals");
+    let mut theta = DMatrix::zeros(samples.measurements() * draws, d);
+    let mut log_density = Vec::with_capacity(theta.nrows());
+    for measurement in 0..samples.measurements() {
+        let rows = measurement * samples.draws()..(measurement + 1) * samples.draws();
+        let unit = |row: usize, k: usize| parameters[k].to_unit(samples.theta()[(row, k)]);
+        let count = samples.draws() as f64;
+        let centre = DVector::from_fn(d, |k, _| rows.clone().map(|row| unit(row, k)).sum::<f64>() / count);
+        let mut covariance = DMatrix::identity(d, d) * 1e-12;
+        for row in rows {
+            let deviation = DVector::from_fn(d, |k, _| unit(row, k)) - &centre;
+            covariance += &deviation * deviation.transpose() / count;
+        }
+        let own = covariance.cholesky().map_or_else(|| DMatrix::identity(d, d) * 12.0, |c| c.inverse());
+        let together = (&own + &precision).cholesky().expect("a sum of positive definite matrices is one");
+        let (centre, covariance) = (together.solve(&(&own * &centre + &precision * &mean)), together.inverse() * STRETCH);
+        let factor = covariance.cholesky().expect("the inverse of a positive definite matrix is one");
+        let log_volume: f64 = factor.l_dirty().diagonal().iter().map(|x| x.ln()).sum();
+        for draw in 0..draws {
+            let normal = DVector::from_fn(d, |_, _| stream.sample::<f64, _>(StandardNormal));
+            let stretched = normal / (stream.sample(chi_squared) / DEGREES).sqrt();
+            let point = &centre + factor.l() * &stretched;
+            let inside = point.iter().all(|u| (0.0..=1.0).contains(u));
+            for k in 0..d {
+                theta[(measurement * draws + draw, k)] = parameters[k].from_unit(point[k].clamp(0.0, 1.0));
+            }
+            let log_t = -0.5 * (DEGREES + d as f64) * (1.0 + stretched.norm_squared() / DEGREES).ln() - log_volume;
+            // Beyond the prior nothing is possible.
+            log_density.push(if inside { log_t } else { IMPOSSIBLE });
+        }
+    }
+    (PosteriorSamples::new(theta, draws), log_density)
+}
+
+/// Logarithm of a density of a sample that counts for nothing.
+const IMPOSSIBLE: f64 = 1e9;
+
 /// μ and σ of every parameter in the unit box.
 #[derive(Debug, Clone)]
 struct State {
@@ -184,35 +279,45 @@ struct State {
 /// Samples in the unit box, `[column][measurement·draws + draw]`.
 struct Problem {
     columns: Vec<Vec<f64>>,
+    /// Logarithms of the weights that the samples have by themselves.
+    offsets: Vec<f64>,
     measurements: usize,
     draws: usize,
     /// Least σ of each column that the samples can resolve.
     floor: Vec<f64>,
+    /// Mean posterior standard deviation of one measurement, for each column.
+    within: Vec<f64>,
+    /// True when that is much of the spread of some column.
+    noisy: bool,
 }
 
 impl Problem {
-    fn new(samples: &PosteriorSamples, space: &ParameterSpace) -> Self {
+    fn new(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Self {
         let draws = samples.draws();
         let unit = |(column, p): (usize, &crate::parameter::Parameter)| -> Vec<f64> {
             samples.theta().column(column).iter().map(|x| p.to_unit(*x)).collect()
         };
         let columns: Vec<Vec<f64>> = space.iter().enumerate().map(unit).collect();
-        // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
-        let floor = |column: &Vec<f64>| {
+        let within = |column: &Vec<f64>| {
             let variance = |chunk: &[f64]| {
                 let centre = stats::mean(chunk);
                 chunk.iter().map(|x| (x - centre).powi(2)).sum::<f64>() / chunk.len() as f64
             };
-            let within = column.chunks(draws).map(variance).sum::<f64>() / samples.measurements() as f64;
-            (0.05 * within.sqrt()).clamp(1e-7, 0.1 * WIDEST)
+            (column.chunks(draws).map(variance).sum::<f64>() / samples.measurements() as f64).sqrt()
         };
-        let floor = columns.iter().map(floor).collect();
-        Self { columns, measurements: samples.measurements(), draws, floor }
+        let within: Vec<f64> = columns.iter().map(within).collect();
+        let spread = |column: &Vec<f64>| stats::sample_std(&column.chunks(draws).map(stats::mean).collect::<Vec<_>>());
+        let hides = |(column, within): (&Vec<f64>, &f64)| spread(column).is_none_or(|spread| *within > NOISY * spread);
+        let noisy = columns.iter().zip(&within).any(hides);
+        // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
+        let floor = within.iter().map(|within| (0.05 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
+        let offsets = log_weights.map_or_else(|| vec![0.0; samples.theta().nrows()], <[f64]>::to_vec);
+        Self { columns, offsets, measurements: samples.measurements(), draws, floor, within, noisy }
     }
 
     /// Normalised weights of the samples of one measurement under a population.
     fn weights(&self, measurement: usize, state: &State, weights: &mut [f64]) {
-        weights.fill(0.0);
+        weights.copy_from_slice(&self.offsets[measurement * self.draws..(measurement + 1) * self.draws]);
         for (k, column) in self.columns.iter().enumerate() {
             let (mean, precision) = (state.mean[k], 0.5 / state.std[k].powi(2));
             let samples = &column[measurement * self.draws..(measurement + 1) * self.draws];
@@ -285,6 +390,74 @@ impl Problem {
             1.0 / weights.iter().map(|w| w * w).sum::<f64>()
         };
         (0..self.measurements).map(&mut one).sum::<f64>() / self.measurements as f64
+    }
+
+    /// ln L(μ, σ) up to a constant, from the exponents of all samples.
+    fn log_likelihood(&self, exponents: &[f64], state: &State) -> f64 {
+        let one = |exponents: &[f64]| {
+            let largest = exponents.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let mut sum = 0.0_f32;
+            pulp::Arch::new().dispatch(|| {
+                // Sixteen partial sums: one after the other, additions would wait for each other.
+                let mut partial = [0.0_f32; 16];
+                let (blocks, rest) = exponents.as_chunks::<16>();
+                for block in blocks {
+                    for (partial, exponent) in partial.iter_mut().zip(block) {
+                        *partial += stats::exp_f32((exponent - largest) as f32);
+                    }
+                }
+                sum = partial.iter().sum::<f32>() + rest.iter().map(|e| stats::exp_f32((e - largest) as f32)).sum::<f32>();
+            });
+            largest + f64::from(sum).ln()
+        };
+        let likelihood: f64 = exponents.chunks(self.draws).map(one).sum();
+        likelihood - self.measurements as f64 * state.std.iter().map(|std| std.ln()).sum::<f64>()
+    }
+
+    /// Adds `sign` times the exponent of one parameter.
+    fn add_exponent(&self, exponents: &mut [f64], k: usize, state: &State, sign: f64) {
+        let (mean, precision) = (state.mean[k], sign * 0.5 / state.std[k].powi(2));
+        pulp::Arch::new().dispatch(|| {
+            for (exponent, x) in exponents.iter_mut().zip(&self.columns[k]) {
+                *exponent -= precision * (x - mean) * (x - mean);
+            }
+        });
+    }
+
+    /// One Metropolis step for each parameter on the likelihood with all samples in it.
+    fn collapsed(&self, state: &mut State, stream: &mut Stream) {
+        let mut exponents = self.offsets.clone();
+        (0..self.columns.len()).for_each(|k| self.add_exponent(&mut exponents, k, state, 1.0));
+        let mut current = self.log_likelihood(&exponents, state);
+        for k in 0..self.columns.len() {
+            // Steps of several sizes: how wide the likelihood is depends on how much the noise hides.
+            let size = [0.3, 1.0, 2.0][stream.random_range(0..3)];
+            let spread = ((state.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
+            let mut next = state.clone();
+            next.mean[k] += size * spread * stream.sample::<f64, _>(StandardNormal);
+            let ln_step = size * (1.0 + self.within[k] / state.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
+            next.std[k] *= (ln_step * stream.sample::<f64, _>(StandardNormal)).exp();
+            let threshold: f64 = stream.random();
+            if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
+                continue;
+            }
+            let mut proposed = exponents.clone();
+            self.add_exponent(&mut proposed, k, state, -1.0);
+            self.add_exponent(&mut proposed, k, &next, 1.0);
+            let likelihood = self.log_likelihood(&proposed, &next);
+            // The step is symmetric in ln σ but its size depends on σ, and σ is uniform a priori.
+            let back = size * (1.0 + self.within[k] / next.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
+            let moved = (next.std[k] / state.std[k]).ln();
+            let sizes = (ln_step / back).ln() + 0.5 * moved * moved * (ln_step.powi(-2) - back.powi(-2));
+            let next_spread = ((next.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
+            let shifted = (next.mean[k] - state.mean[k]) / size;
+            let shifts = (spread / next_spread).ln() + 0.5 * shifted * shifted * (spread.powi(-2) - next_spread.powi(-2));
+            if threshold.ln() < likelihood - current + moved + sizes + shifts {
+                *state = next;
+                exponents = proposed;
+                current = likelihood;
+            }
+        }
     }
 
     /// One sweep of the Gibbs sampler.

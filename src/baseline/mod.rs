@@ -260,7 +260,7 @@ impl Baseline {
         Admitted { observation: (observation.modes_present() > 0).then_some(observation), below_range, above_range }
     }
 
-    /// Log-density of each row of `theta` given the observation of the same row, in the unit box, nats.
+    /// Log-density of each row of `theta` given the observation of the same row, in the unit box of the prior, nats.
     ///
     /// ```text
     ///  log q(u | y) = log q(ℓ | y) − Σ log(v(1 − v)) − Σ log(wide/prior width) − log P(inside the prior | y)
@@ -279,23 +279,48 @@ impl Baseline {
         observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
         let context = self.flow.summarise(&self.condition(observations)?)?;
-        let x = to_real_line(theta, &self.training_space)?.to_dtype(self.flow.dtype())?;
-        let log_q = self.flow.log_prob(&x, &context)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
         let drawn = self.flow.sample(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
         let drawn = drawn.to_dtype(DType::F64)?.to_vec2::<f64>()?;
-        let one = |(row, log_q): (usize, &f64)| {
-            let stretch: f64 = self.training_space.iter().zip(self.space()).enumerate().map(|(column, (wide, prior))| {
+        let inside = |values: &&Vec<f64>| {
+            let pairs = values.iter().zip(self.training_space.iter().zip(self.space()));
+            { pairs }.all(|(x, (wide, prior))| (prior.lower..=prior.upper).contains(&wide.from_unit(logistic(*x))))
+        };
+        let share = |row: usize| {
+            let count = drawn[row * SHARE_DRAWS..(row + 1) * SHARE_DRAWS].iter().filter(inside).count();
+            (count.max(1) as f64 / SHARE_DRAWS as f64).ln()
+        };
+        let density = self.log_density(theta, &context)?;
+        Ok(density.into_iter().enumerate().map(|(row, log_q)| log_q - share(row)).collect())
+    }
+
+    /// Log-density of `draws` rows of `theta` for each observation, in the unit box of the prior and up to the share of the
+    /// posterior inside the prior, which is the same for all rows of one observation; nats.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes.
+    pub fn log_density_of_draws(
+        &self,
+        theta: &DMatrix<f64>,
+        observations: &[Observation],
+    ) -> Result<Vec<f64>, InferenceError> {
+        let context = self.flow.summarise(&self.condition(observations)?)?;
+        let (rows, features) = context.dims2()?;
+        let draws = theta.nrows() / rows.max(1);
+        let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
+        self.log_density(theta, &repeated)
+    }
+
+    fn log_density(&self, theta: &DMatrix<f64>, context: &Tensor) -> Result<Vec<f64>, InferenceError> {
+        let x = to_real_line(theta, &self.training_space)?.to_dtype(self.flow.dtype())?;
+        let log_q = self.flow.log_prob(&x, context)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
+        let stretch = |row: usize| -> f64 {
+            let one = |(column, (wide, prior)): (usize, (&Parameter, &Parameter))| {
                 let v = wide.to_unit(theta[(row, column)]);
                 (v * (1.0 - v)).ln() + ((wide.upper - wide.lower) / (prior.upper - prior.lower)).ln()
-            }).sum();
-            let inside = |values: &&Vec<f64>| {
-                let pairs = values.iter().zip(self.training_space.iter().zip(self.space()));
-                { pairs }.all(|(x, (wide, prior))| (prior.lower..=prior.upper).contains(&wide.from_unit(logistic(*x))))
             };
-            let count = drawn[row * SHARE_DRAWS..(row + 1) * SHARE_DRAWS].iter().filter(inside).count();
-            log_q - stretch - (count.max(1) as f64 / SHARE_DRAWS as f64).ln()
+            self.training_space.iter().zip(self.space()).enumerate().map(one).sum()
         };
-        Ok(log_q.iter().enumerate().map(one).collect())
+        Ok(log_q.into_iter().enumerate().map(|(row, log_q)| log_q - stretch(row)).collect())
     }
 
     /// The structure it was trained for.

@@ -32,8 +32,11 @@ pub struct Nearest {
     /// Modes present less the directions in which parameters, not at an edge of the box, absorb noise: what `chi_squared` is
     /// compared with.
     pub degrees_of_freedom: usize,
-    /// For each mode present, (ln f_i − ln f_i(x))/s_i.
-    pub standardised_residuals: Vec<Option<f64>>,
+    /// (ln f_i − ln f_i(x))/s_i of each mode, 0 where it is missing.
+    pub standardised_residuals: DVector<f64>,
+    /// Covariance of these residuals where the noise is all there is, `[m, m]`: the projector on what the parameters cannot
+    /// absorb.
+    pub projector: DMatrix<f64>,
 }
 
 /// Looks for the nearest point of the prior box, beginning at `start` (`[d]`, parameter units).
@@ -72,6 +75,7 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
         error.iter().zip(&relative_std).all(|(r, std)| r.abs() * std <= FLOW_ACCURACY + NOISE_MULTIPLE * std)
     };
     let (mut at_edge, mut absorbed) = (0, present.len().min(parameters.len()));
+    let mut projector = DMatrix::zeros(present.len(), present.len());
     if determined || !reached(&error) {
         let mut damping = 1e-3;
         for _ in 0..ITERATIONS {
@@ -89,10 +93,23 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
             at_edge = u.len() - free.len();
             if free.is_empty() {
                 absorbed = 0;
+                projector = DMatrix::identity(present.len(), present.len());
                 break;
             }
             let columns = scaled.select_columns(&free);
-            absorbed = columns.singular_values().iter().filter(|s| **s > ABSORBING).count();
+            if determined {
+                let svd = columns.clone().svd(true, false);
+                projector = DMatrix::identity(present.len(), present.len());
+                absorbed = 0;
+                for (direction, strength) in svd.u.iter().flat_map(|u| u.column_iter()).zip(svd.singular_values.iter()) {
+                    if *strength > ABSORBING {
+                        projector -= direction * direction.transpose();
+                        absorbed += 1;
+                    }
+                }
+            } else {
+                absorbed = columns.singular_values().iter().filter(|s| **s > ABSORBING).count();
+            }
             let mut normal = columns.transpose() * &columns;
             for i in 0..free.len() {
                 normal[(i, i)] += damping * (normal[(i, i)] + 1e-12);
@@ -118,13 +135,23 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
         }
     }
     let chi_squared = if determined || at_edge > 0 || !reached(&error) { error.norm_squared() } else { 0.0 };
-    let mut standardised_residuals = vec![None; simulator.modes()];
+    let (mut standardised_residuals, mut expanded) =
+        (DVector::zeros(simulator.modes()), DMatrix::zeros(simulator.modes(), simulator.modes()));
     for (row, &mode) in present.iter().enumerate() {
-        standardised_residuals[mode] = Some(error[row]);
+        standardised_residuals[mode] = error[row];
+        for (column, &other) in present.iter().enumerate() {
+            expanded[(mode, other)] = projector[(row, column)];
+        }
     }
     // Where nothing should be left over and something is, the measurement lies beyond what the simulation can give (a fold
     // of the map, not an edge of the box): that is told like an edge.
     let beyond = usize::from(chi_squared > 0.0 && !reached(&error));
     let degrees_of_freedom = present.len().saturating_sub(absorbed).max(beyond);
-    Ok(Nearest { frequencies_hz: frequencies, chi_squared, degrees_of_freedom, standardised_residuals })
+    Ok(Nearest {
+        frequencies_hz: frequencies,
+        chi_squared,
+        degrees_of_freedom,
+        standardised_residuals,
+        projector: expanded,
+    })
 }

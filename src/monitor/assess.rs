@@ -6,7 +6,7 @@ use crate::assessment::Assessment;
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
 use crate::damage::{self, QuantityKind, QuantitySamples, SeenCovariate, UndamagedState};
-use crate::hierarchy::{populations, PopulationEstimate, Populations};
+use crate::hierarchy::{estimate, populations, proposals, PopulationEstimate, Populations};
 use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::parameter::DamageDirection;
 use crate::posterior::PosteriorSamples;
@@ -14,11 +14,13 @@ use crate::quantity::{Hertz, Timestamp};
 use crate::stats;
 use crate::trust::{cause, fit, quality, standing_findings, Code, Effect, Finding, Trust};
 
-/// Effective samples for each measurement below which the hyperparameters are drawn again with more.
-const FEW_EFFECTIVE: f64 = 8.0;
+/// Effective samples for each measurement below which the hyperparameters are estimated again from samples that lie nearer: the
+/// logarithm of a mean of few weights is too low, and the more so the narrower the population, so that few samples make σ too
+/// large.
+const FEW_EFFECTIVE: f64 = 36.0;
 
-/// How many more draws then.
-const MORE_DRAWS: usize = 4;
+/// Samples of each measurement drawn then, near where its posterior meets the population.
+const NEAR_DRAWS: usize = 128;
 
 /// Effective samples for each measurement below which the reader is warned.
 const TOO_FEW_EFFECTIVE: f64 = 3.0;
@@ -76,7 +78,9 @@ pub struct BatchSamples {
     pub posterior: PosteriorSamples,
     /// The population behind them.
     pub populations: Populations,
-    /// The measurements used, as the flow was asked about them.
+    /// What the flow was asked: the measurements used, those beyond the prior as its nearest point.
+    pub asked: Vec<Observation>,
+    /// The measurements used.
     pub observations: Vec<Observation>,
     /// How well the simulation reproduces the measurements that could be asked about.
     pub fit: fit::Fit,
@@ -126,16 +130,12 @@ pub fn draw(
             }
         })
         .collect();
-    let mut posterior = if fit.outside.is_empty() && fit.gross.is_empty() {
+    let posterior = if fit.outside.is_empty() && fit.gross.is_empty() {
         posterior
     } else {
         baseline.infer(&asked, per_measurement, draws.seed)?
     };
-    let mut population = populations(&posterior, baseline.space(), draws.seed);
-    if population.effective_sample_size < FEW_EFFECTIVE && posterior.measurements() > 1 {
-        posterior = baseline.infer(&asked, MORE_DRAWS * per_measurement, draws.seed)?;
-        population = populations(&posterior, baseline.space(), draws.seed);
-    }
+    let population = population_behind(baseline, &posterior, &asked, draws.seed)?;
     if population.effective_sample_size < TOO_FEW_EFFECTIVE && posterior.measurements() > 1 {
         let message = format!(
             "only {:.1} effective samples a measurement stand behind the hyperparameters: the noise drowns the spread; \
@@ -150,7 +150,37 @@ pub fn draw(
     } else {
         observations
     };
-    Ok(BatchSamples { posterior, populations: population, observations: used, fit, findings, left_out })
+    Ok(BatchSamples { posterior, populations: population, asked, observations: used, fit, findings, left_out })
+}
+
+/// The population behind posterior samples, drawn again where the noise hides it.
+fn population_behind(
+    baseline: &Baseline,
+    posterior: &PosteriorSamples,
+    observations: &[Observation],
+    seed: u64,
+) -> Result<Populations, InferenceError> {
+    let space = baseline.space();
+    if posterior.measurements() < 2 {
+        return Ok(populations(posterior, None, space, seed));
+    }
+    let mut found = estimate(posterior, None, space);
+    if found.effective_sample_size >= FEW_EFFECTIVE {
+        return Ok(populations(posterior, None, space, seed));
+    }
+    // Twice: the first estimate of the spread, from few effective samples, is too wide.
+    let mut nearer = None;
+    for round in 0..2 {
+        let (samples, log_density) = proposals(posterior, &found, space, NEAR_DRAWS, seed ^ round);
+        let log_posterior = baseline.log_density_of_draws(samples.theta(), observations)?;
+        let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
+        found = estimate(&samples, Some(&log_weights), space);
+        nearer = Some((samples, log_weights));
+    }
+    Ok(match nearer {
+        Some((samples, log_weights)) => populations(&samples, Some(&log_weights), space, seed),
+        None => populations(posterior, None, space, seed),
+    })
 }
 
 /// Why batches make no undamaged state; `batch` is the index of the one to blame.
@@ -202,7 +232,8 @@ pub fn undamaged_state(
         let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
         return Err(too_few.into());
     };
-    let samples = joined(baseline, parts, draws.seed);
+    let samples =
+        joined(baseline, parts, draws.seed).map_err(|e| UndamagedError::Assess { batch: 0, source: e.into() })?;
     let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
     let mut state = UndamagedState::from_samples(&quantities, &sizes, threshold_probability)?;
     state.conditions = conditions(batches.iter().flat_map(|(measurements, _)| *measurements));
@@ -210,16 +241,18 @@ pub fn undamaged_state(
 }
 
 /// Several batches as one, with the population behind all of them; at least one.
-fn joined(baseline: &Baseline, parts: Vec<BatchSamples>, seed: u64) -> BatchSamples {
-    // A batch whose samples were too few was drawn again with more: the others set the common number.
-    let draws = parts.iter().map(|part| part.posterior.draws()).min().expect("the caller has batches");
-    let cut: Vec<PosteriorSamples> = parts.iter().map(|part| part.posterior.first(draws)).collect();
-    let all: Vec<_> = cut.iter().flat_map(|samples| samples.theta().row_iter()).collect();
+fn joined(baseline: &Baseline, parts: Vec<BatchSamples>, seed: u64) -> Result<BatchSamples, InferenceError> {
+    let draws = parts.first().map_or(1, |part| part.posterior.draws());
+    let all: Vec<_> = parts.iter().flat_map(|part| part.posterior.theta().row_iter()).collect();
     let posterior = PosteriorSamples::new(nalgebra::DMatrix::from_rows(&all), draws);
     let mut parts = parts.into_iter();
     let mut first = parts.next().expect("the caller has batches");
-    first.observations.extend(parts.flat_map(|part| part.observations));
-    BatchSamples { populations: populations(&posterior, baseline.space(), seed), posterior, ..first }
+    for part in parts {
+        first.observations.extend(part.observations);
+        first.asked.extend(part.asked);
+    }
+    let populations = population_behind(baseline, &posterior, &first.asked, seed)?;
+    Ok(BatchSamples { populations, posterior, ..first })
 }
 
 /// The measurements as the flow is asked about them, and their index in the batch.

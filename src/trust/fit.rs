@@ -1,5 +1,6 @@
 //! What the simulation leaves unexplained of a batch, set against what noise alone would leave.
 
+use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
@@ -38,11 +39,16 @@ pub struct Fit {
 /// Looks for each measurement in the prior box, beginning at `starts`.
 ///
 /// ```text
-///  T = Σ_j min_x Σ_i ((ln f_ij − ln f_i(x))/s_ij)²,   p = P(χ²_ν ≥ T),   ν = Σ_j (modes − free parameters)
+///  T = Σ_j min_x Σ_i r_ij²,   r_ij = (ln f_ij − ln f_i(x))/s_ij,   p_T = P(χ²_ν ≥ T),   ν = Σ_j (modes − free parameters)
+///  M = Rᵀ P⁺ R,   R = Σ_j r_j,   P = Σ_j P_j,   p_M = P(χ²_rank ≥ M),      p = 2·min(p_T, p_M)
 /// ```
 ///
+/// T sees measurements that do not fit, each in its own way; M, with the projectors P_j on what the parameters cannot absorb,
+/// sees a mode that is off by the same little in all of them.
+///
 /// A measurement whose own p falls below 0.001/n does not enter T: it is named instead, so that one bad record does not
-/// take the others with it.
+/// take the others with it. Nor do measurements with no more modes than parameters, which leave something over only at an
+/// edge of the prior.
 ///
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
@@ -51,14 +57,18 @@ pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f6
     let nearest = observations.par_iter().zip(starts).map(look).collect::<Result<Vec<_>, _>>()?;
     let (mut outside, mut gross) = (Vec::new(), Vec::new());
     let (mut chi_squared, mut degrees_of_freedom) = (0.0, 0);
+    let modes = simulator.modes();
+    let (mut sum, mut covariance) = (DVector::zeros(modes), DMatrix::zeros(modes, modes));
     for (row, (point, observation)) in nearest.iter().zip(observations).enumerate() {
         if upper_tail(point.chi_squared, point.degrees_of_freedom) < SINGLE_LEVEL / observations.len() as f64 {
             let misfit = |(mode, f): (usize, &Option<f64>)| f.map_or(0.0, |f| (f / point.frequencies_hz[mode]).ln().abs());
             let largest = observation.frequencies_hz.iter().enumerate().map(misfit).fold(0.0, f64::max);
             if largest > GROSS { &mut gross } else { &mut outside }.push(row);
-        } else if point.degrees_of_freedom > 0 {
+        } else if observation.modes_present() > simulator.space().len() {
             chi_squared += point.chi_squared;
             degrees_of_freedom += point.degrees_of_freedom;
+            sum += &point.standardised_residuals;
+            covariance += &point.projector;
         }
     }
     let testable = degrees_of_freedom > 0;
@@ -66,7 +76,10 @@ pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f6
         nearest,
         outside,
         gross,
-        p_value: testable.then(|| upper_tail(chi_squared, degrees_of_freedom)),
+        p_value: testable.then(|| {
+            let each = upper_tail(chi_squared, degrees_of_freedom);
+            (2.0 * each.min(common_misfit(&sum, covariance))).min(1.0)
+        }),
         distance: testable.then(|| (chi_squared / degrees_of_freedom as f64).sqrt()),
         degrees_of_freedom,
     })
@@ -130,14 +143,30 @@ impl Fit {
     fn worst_mode(&self) -> String {
         let modes = self.nearest.first().map_or(0, |n| n.standardised_residuals.len());
         let mean = |mode: usize| {
-            let residuals: Vec<f64> = self.nearest.iter().filter_map(|n| n.standardised_residuals[mode]).collect();
-            (mode, residuals.iter().sum::<f64>() / (residuals.len().max(1) as f64).sqrt())
+            let sum: f64 = self.nearest.iter().map(|n| n.standardised_residuals[mode]).sum();
+            let variance: f64 = self.nearest.iter().map(|n| n.projector[(mode, mode)]).sum();
+            (mode, if variance > 0.01 { sum / variance.sqrt() } else { 0.0 })
         };
         let worst = (0..modes).map(mean).max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
         worst.filter(|(_, z)| z.abs() > 3.0).map_or_else(String::new, |(mode, z)| {
             format!("; mode {} is {} the simulation's", mode + 1, if z > 0.0 { "above" } else { "below" })
         })
     }
+}
+
+/// p-value of a misfit that is the same in all measurements: residuals summed, against the sum of their covariances.
+fn common_misfit(sum: &DVector<f64>, covariance: DMatrix<f64>) -> f64 {
+    let largest = covariance.diagonal().max();
+    let eigen = covariance.symmetric_eigen();
+    let (mut statistic, mut rank) = (0.0, 0);
+    for (value, direction) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
+        // Directions in which only some measurements have anything left over are no common ones.
+        if *value > 0.3 * largest {
+            statistic += direction.dot(sum).powi(2) / value;
+            rank += 1;
+        }
+    }
+    upper_tail(statistic, rank)
 }
 
 /// P(χ²_ν ≥ x); 1 without degrees of freedom.

@@ -106,12 +106,12 @@ fn healthy_operation_runs_as_long_as_wanted_to_a_false_alarm() {
         let baseline = shipped(id);
         let healthy = bank(&baseline, moments, 60_000, 1);
         for size in [5, 20, 50] {
-            let (operations, longest) = (150, 10_000);
+            let (operations, longest) = (300, 10_000);
             let mut stream = stats::stream(size as u64, "test: healthy operation");
             let (mut runs, mut known) = (Vec::new(), None);
             for _ in 0..operations {
-                // An undamaged state of fifty batches: with fewer the run is longer, by design.
-                let mut operation = Operation::new(&healthy, moments.len(), size, 50 * size, &mut known, &mut stream);
+                // An undamaged state of a hundred batches: with fewer the mean run is longer, by design.
+                let mut operation = Operation::new(&healthy, moments.len(), size, 100 * size, &mut known, &mut stream);
                 let run = (1..=longest).find(|_| operation.take(&healthy, size, &mut stream)).unwrap_or(longest);
                 runs.push(run as f64);
             }
