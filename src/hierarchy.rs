@@ -213,7 +213,8 @@ pub fn estimate(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: 
 ///  r_j = t₅(x; c_j, 1.5 C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
 /// ```
 ///
-/// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them.
+/// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them, its spread at least
+/// half that of one posterior.
 pub fn proposals(
     samples: &PosteriorSamples,
     found: &Populations,
@@ -225,10 +226,11 @@ pub fn proposals(
     const STRETCH: f64 = 1.5;
     let (d, parameters) = (space.len(), space.as_slice());
     let width = |k: usize| parameters[k].upper - parameters[k].lower;
+    let within = Problem::new(samples, None, space).within;
     let mean = DVector::from_fn(d, |k, _| parameters[k].to_unit(found.parameters[k].mean));
     let precision = DMatrix::from_fn(d, d, |i, j| {
-        // A spread of nothing would leave no room to look for another.
-        let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(1e-6);
+        // A first estimate of nearly nothing must leave room to look for another.
+        let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(0.5 * within[i]).max(1e-6);
         if i == j { std.powi(-2) } else { 0.0 }
     });
     let chi_squared = ChiSquared::new(DEGREES).expect("the degrees of freedom are positive");

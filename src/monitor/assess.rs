@@ -164,23 +164,14 @@ fn population_behind(
     if posterior.measurements() < 2 {
         return Ok(populations(posterior, None, space, seed));
     }
-    let mut found = estimate(posterior, None, space);
+    let found = estimate(posterior, None, space);
     if found.effective_sample_size >= FEW_EFFECTIVE {
         return Ok(populations(posterior, None, space, seed));
     }
-    // Twice: the first estimate of the spread, from few effective samples, is too wide.
-    let mut nearer = None;
-    for round in 0..2 {
-        let (samples, log_density) = proposals(posterior, &found, space, NEAR_DRAWS, seed ^ round);
-        let log_posterior = baseline.log_density_of_draws(samples.theta(), observations)?;
-        let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
-        found = estimate(&samples, Some(&log_weights), space);
-        nearer = Some((samples, log_weights));
-    }
-    Ok(match nearer {
-        Some((samples, log_weights)) => populations(&samples, Some(&log_weights), space, seed),
-        None => populations(posterior, None, space, seed),
-    })
+    let (samples, log_density) = proposals(posterior, &found, space, NEAR_DRAWS, seed);
+    let log_posterior = baseline.log_density_of_draws(samples.theta(), observations)?;
+    let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
+    Ok(populations(&samples, Some(&log_weights), space, seed))
 }
 
 /// Why batches make no undamaged state; `batch` is the index of the one to blame.
