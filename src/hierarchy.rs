@@ -85,8 +85,7 @@ impl PopulationEstimate {
     #[must_use]
     pub fn through(&self, function: impl Fn(f64) -> f64) -> Self {
         const NODES: usize = 41;
-        let nodes: Vec<f64> =
-            (0..NODES).map(|i| stats::normal_quantile((i as f64 + 0.5) / NODES as f64)).collect();
+        let nodes: Vec<f64> = (0..NODES).map(|i| stats::normal_quantile((i as f64 + 0.5) / NODES as f64)).collect();
         // The nodes' own spread falls short of 1 by what lies beyond the outermost.
         let scale = 1.0 / (nodes.iter().map(|z| z * z).sum::<f64>() / NODES as f64).sqrt();
         let moments = |mean: f64, std: f64| {
@@ -169,22 +168,32 @@ pub fn populations(
     let point = problem.maximise();
     let effective_sample_size = problem.effective_sample_size(&point);
     let mut state = point.clone();
-    let (mut means, mut stds) = (vec![Vec::with_capacity(DRAWS); dimension], vec![Vec::with_capacity(DRAWS); dimension]);
+    let (mut means, mut stds) =
+        (vec![Vec::with_capacity(DRAWS); dimension], vec![Vec::with_capacity(DRAWS); dimension]);
     for sweep in 0..BURN_IN + DRAWS * THINNING {
         problem.sweep(&mut state, &mut stream);
         if problem.noisy && sweep % 2 == 0 {
             problem.collapsed(&mut state, &mut stream);
         }
-        if sweep >= BURN_IN && (sweep - BURN_IN) % THINNING == 0 {
+        if sweep >= BURN_IN && (sweep - BURN_IN).is_multiple_of(THINNING) {
             for column in 0..dimension {
                 means[column].push(to_units(column, state.mean[column]));
                 stds[column].push(state.std[column] * width(column));
             }
         }
     }
+    // Of few measurements the most probable σ can lie below all that is probable: the median then stands for it.
+    let within = |point: f64, draws: &[f64]| {
+        let [low, high] = interval(draws);
+        if (low..=high).contains(&point) {
+            point
+        } else {
+            stats::quantile(draws, 0.5)
+        }
+    };
     let one = |(column, (mean_draws, std_draws)): (usize, (Vec<f64>, Vec<f64>))| PopulationEstimate {
-        mean: to_units(column, point.mean[column]),
-        std: Some(point.std[column] * width(column)),
+        mean: within(to_units(column, point.mean[column]), &mean_draws),
+        std: Some(within(point.std[column] * width(column), &std_draws)),
         mean_draws,
         std_draws,
     };
@@ -231,7 +240,11 @@ pub fn proposals(
     let precision = DMatrix::from_fn(d, d, |i, j| {
         // A first estimate of nearly nothing must leave room to look for another.
         let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(0.5 * within[i]).max(1e-6);
-        if i == j { std.powi(-2) } else { 0.0 }
+        if i == j {
+            std.powi(-2)
+        } else {
+            0.0
+        }
     });
     let chi_squared = ChiSquared::new(DEGREES).expect("the degrees of freedom are positive");
     let mut stream = stats::stream(seed, "population proposals");
@@ -249,7 +262,8 @@ pub fn proposals(
         }
         let own = covariance.cholesky().map_or_else(|| DMatrix::identity(d, d) * 12.0, |c| c.inverse());
         let together = (&own + &precision).cholesky().expect("a sum of positive definite matrices is one");
-        let (centre, covariance) = (together.solve(&(&own * &centre + &precision * &mean)), together.inverse() * STRETCH);
+        let (centre, covariance) =
+            (together.solve(&(&own * &centre + &precision * &mean)), together.inverse() * STRETCH);
         let factor = covariance.cholesky().expect("the inverse of a positive definite matrix is one");
         let log_volume: f64 = factor.l_dirty().diagonal().iter().map(|x| x.ln()).sum();
         for draw in 0..draws {
@@ -312,7 +326,7 @@ impl Problem {
         let hides = |(column, within): (&Vec<f64>, &f64)| spread(column).is_none_or(|spread| *within > NOISY * spread);
         let noisy = columns.iter().zip(&within).any(hides);
         // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
-        let floor = within.iter().map(|within| (0.05 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
+        let floor = within.iter().map(|within| (0.25 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
         let offsets = log_weights.map_or_else(|| vec![0.0; samples.theta().nrows()], <[f64]>::to_vec);
         Self { columns, offsets, measurements: samples.measurements(), draws, floor, within, noisy }
     }
@@ -336,7 +350,9 @@ impl Problem {
             }
         });
         let sum: f64 = weights.iter().sum();
-        weights.iter_mut().for_each(|weight| *weight /= sum);
+        for weight in weights.iter_mut() {
+            *weight /= sum;
+        }
     }
 
     fn maximise(&self) -> State {
@@ -408,7 +424,8 @@ impl Problem {
                         *partial += stats::exp_f32((exponent - largest) as f32);
                     }
                 }
-                sum = partial.iter().sum::<f32>() + rest.iter().map(|e| stats::exp_f32((e - largest) as f32)).sum::<f32>();
+                sum = partial.iter().sum::<f32>()
+                    + rest.iter().map(|e| stats::exp_f32((e - largest) as f32)).sum::<f32>();
             });
             largest + f64::from(sum).ln()
         };
@@ -437,7 +454,8 @@ impl Problem {
             let spread = ((state.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
             let mut next = state.clone();
             next.mean[k] += size * spread * stream.sample::<f64, _>(StandardNormal);
-            let ln_step = size * (1.0 + self.within[k] / state.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
+            let ln_step =
+                size * (1.0 + self.within[k] / state.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
             next.std[k] *= (ln_step * stream.sample::<f64, _>(StandardNormal)).exp();
             let threshold: f64 = stream.random();
             if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
@@ -453,7 +471,8 @@ impl Problem {
             let sizes = (ln_step / back).ln() + 0.5 * moved * moved * (ln_step.powi(-2) - back.powi(-2));
             let next_spread = ((next.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
             let shifted = (next.mean[k] - state.mean[k]) / size;
-            let shifts = (spread / next_spread).ln() + 0.5 * shifted * shifted * (spread.powi(-2) - next_spread.powi(-2));
+            let shifts =
+                (spread / next_spread).ln() + 0.5 * shifted * shifted * (spread.powi(-2) - next_spread.powi(-2));
             if threshold.ln() < likelihood - current + moved + sizes + shifts {
                 *state = next;
                 exponents = proposed;

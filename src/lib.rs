@@ -15,13 +15,16 @@
 //!  monitor                               the office     what happens to a batch
 //!  store                                 the archive    the only room that speaks SQL
 //!  assessment                            the result of one batch
-//!  damage                                judgement on posterior samples
+//!  alarm                                 charts, limits, states: when to wake somebody
+//!  damage                                judgement on the population behind a batch
+//!  trust                                 whether an answer may be believed
+//!  hierarchy                             the population behind posterior samples
 //!  baseline                              a trained flow, its record, and where it is found
 //!  posterior                             samples of the parameters, whoever drew them
 //!  simulator                             the bench      parameters in, natural frequencies out
 //!  physics | flow                        two workshops  structures without networks | networks without structures
 //!  parameter · measurement               what is unknown · what arrives
-//!  quantity · stats                      the foundation
+//!  quantity · stats · plot               the foundation
 //! ```
 //!
 //! # Reading order
@@ -40,8 +43,11 @@
 //! | model digest | SHA-256 of the manifest; names the baseline in every result |
 //! | undamaged state | the batches later ones are compared with; made by `POST …/baseline` |
 //! | threshold δ | μ_ud − 1.645 σ_ud: below it a value counts as damaged |
-//! | probability of damage | share of a batch's samples below δ |
+//! | population | normal distribution of a parameter over the measurements of a batch, free of their noise |
+//! | pool | all posterior samples of a batch together: the paper's estimate, noise included |
+//! | probability of damage | P(x < δ) of the population behind a batch; of the pool, its share below δ |
 //! | exceedance | a probability of damage above that of the undamaged state, 5 % |
+//! | chart, episode | shift of a batch from the undamaged state in standard errors; an alarm from its first batch to its end |
 //! | outside | a measurement that no parameters of the prior give |
 //!
 //! # References
@@ -54,6 +60,12 @@
 //! - R. B. Nelson (1976), Simplified calculation of eigenvector derivatives, AIAA Journal 14, 1201–1205,
 //!   doi:10.2514/3.7211; I. U. Ojalvo (1988), Efficient computation of modal sensitivities for systems with repeated
 //!   frequencies, AIAA Journal 26, 361–366, doi:10.2514/3.9897. Derivatives of eigenvalues.
+//! - D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
+//!   2166–2175. Populations from posterior samples. A. Gelman (2006), Prior distributions for variance parameters in
+//!   hierarchical models, Bayesian Analysis 1, 515–533. The prior of their spread.
+//! - S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
+//!   arXiv:1804.06788; P. Lemos et al. (2023), Sampling-based accuracy testing of posterior estimators for general
+//!   inference, ICML. Ranks and TARP.
 //! - R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
 //!   doi:10.1080/00031305.1996.10473566.
 

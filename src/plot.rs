@@ -66,7 +66,11 @@ impl Plot {
         let range = |values: &mut dyn Iterator<Item = f64>| {
             let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
             let margin = 0.04 * (high - low).max(1e-9);
-            if low.is_finite() { low - margin..high + margin } else { 0.0..1.0 }
+            if low.is_finite() {
+                low - margin..high + margin
+            } else {
+                0.0..1.0
+            }
         };
         let root = SVGBackend::with_string(svg, (WIDTH, HEIGHT)).into_drawing_area();
         let font = |size: i32| (FontFamily::SansSerif, size);
@@ -132,7 +136,8 @@ pub fn page(title: &str, sections: &[(String, String)]) -> String {
     )
     .expect("writing to memory cannot fail");
     for (heading, content) in sections {
-        write!(html, "<section><h2>{}</h2>{content}</section>", escaped(heading)).expect("writing to memory cannot fail");
+        write!(html, "<section><h2>{}</h2>{content}</section>", escaped(heading))
+            .expect("writing to memory cannot fail");
     }
     html.push_str("</body></html>\n");
     html
@@ -141,8 +146,8 @@ pub fn page(title: &str, sections: &[(String, String)]) -> String {
 /// A table as HTML.
 pub fn table(header: &[&str], rows: &[Vec<String>]) -> String {
     let line = |tag: &str, cells: &mut dyn Iterator<Item = String>| {
-        let cells: String = cells.map(|cell| format!("<{tag}>{}</{tag}>", escaped(&cell))).collect();
-        format!("<tr>{cells}</tr>")
+        let cells: Vec<String> = cells.map(|cell| format!("<{tag}>{}</{tag}>", escaped(&cell))).collect();
+        format!("<tr>{}</tr>", cells.concat())
     };
     let head = line("th", &mut header.iter().map(ToString::to_string));
     let body: String = rows.iter().map(|row| line("td", &mut row.iter().cloned())).collect();

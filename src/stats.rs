@@ -23,7 +23,6 @@ pub fn stream(seed: u64, purpose: &str) -> Stream {
 /// By Cody–Waite reduction to |r| ≤ ½ ln 2 and a polynomial of degree 6, free of branches and calls, so that loops over it
 /// become vector instructions.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
 pub fn exp_f32(x: f32) -> f32 {
     // Adding 1.5·2²³ rounds to the nearest whole number and leaves it in the lowest bits.
     const ROUND: f32 = 12_582_912.0;
@@ -33,8 +32,8 @@ pub fn exp_f32(x: f32) -> f32 {
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
     let whole = shifted - ROUND;
     let r = (x - whole * LN_2_HIGH) - whole * LN_2_LOW;
-    let polynomial = 1.0
-        + r * (1.0 + r * (0.5 + r * (1.666_666_7e-1 + r * (4.166_664e-2 + r * (8.333_161e-3 + r * 1.392_695e-3)))));
+    let polynomial =
+        1.0 + r * (1.0 + r * (0.5 + r * (1.666_666_7e-1 + r * (4.166_664e-2 + r * (8.333_161e-3 + r * 1.392_695e-3)))));
     polynomial * f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
 }
 

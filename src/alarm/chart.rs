@@ -172,8 +172,8 @@ mod tests {
         let settings = AlarmSettings { needed: 2, window: 3, ewma_weight: 0.0, ..AlarmSettings::default() };
         let found = states(settings, &[0.0, 4.0, 0.0, 4.0, 0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0]);
         let expected = [
-            Normal, Pending, Pending, Alarming, Recovering, Recovering, Alarming, Recovering, Recovering, Normal, Pending,
-            Pending, Pending, Normal,
+            Normal, Pending, Pending, Alarming, Recovering, Recovering, Alarming, Recovering, Recovering, Normal,
+            Pending, Pending, Pending, Normal,
         ];
         assert_eq!(found, expected);
     }

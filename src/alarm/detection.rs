@@ -95,7 +95,9 @@ pub fn detection(
             let mut operation = Operation::new(situation, settings, &mut stream);
             // An operation that alarms before the damage says nothing of finding it.
             let quiet = (0..BEFORE).all(|_| !operation.next(0.0, limits, &mut stream));
-            quiet.then(|| (1..=LONGEST_WAIT).find(|_| operation.next(shift, limits, &mut stream)).unwrap_or(LONGEST_WAIT))
+            quiet.then(|| {
+                (1..=LONGEST_WAIT).find(|_| operation.next(shift, limits, &mut stream)).unwrap_or(LONGEST_WAIT)
+            })
         };
         let runs: Vec<f64> = (0..DAMAGED_OPERATIONS).into_par_iter().filter_map(one).map(|run| run as f64).collect();
         let share = |most: usize| runs.iter().filter(|run| **run <= most as f64).count() as f64 / runs.len() as f64;

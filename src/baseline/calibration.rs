@@ -114,11 +114,11 @@ impl CalibrationRecord {
 /// [`InferenceError`] when a draw is not finite; a simulation that fails inside the prior counts as such.
 pub fn calibrate(baseline: &Baseline, seed: u64) -> Result<(CalibrationRecord, Vec<CellRanks>), InferenceError> {
     let Some(range) = baseline.manifest().conditions.noise_range else {
-        let failure = "the structure has no measurement noise: posteriors of exact data are points, and no interval of \
+        let failure =
+            "the structure has no measurement noise: posteriors of exact data are points, and no interval of \
                        them means anything; state the noise"
-            .to_owned();
-        let record =
-            CalibrationRecord { simulations: 0, draws: 0, failures: vec![failure], cells: Vec::new() };
+                .to_owned();
+        let record = CalibrationRecord { simulations: 0, draws: 0, failures: vec![failure], cells: Vec::new() };
         return Ok((record, Vec::new()));
     };
     let modes = baseline.simulator().modes();
@@ -127,7 +127,8 @@ pub fn calibrate(baseline: &Baseline, seed: u64) -> Result<(CalibrationRecord, V
         masks.extend((0..modes).map(Some));
     }
     let (mut cells, mut ranks) = (Vec::new(), Vec::new());
-    let mut noises = vec![(2.0 * range.lowest).min(range.highest), 1.0_f64.clamp(range.lowest, range.highest), range.highest];
+    let mut noises =
+        vec![(2.0 * range.lowest).min(range.highest), 1.0_f64.clamp(range.lowest, range.highest), range.highest];
     noises.dedup();
     for noise in noises {
         for missing in &masks {
@@ -151,7 +152,9 @@ fn measure_cell(
     use rand::RngCore as _;
     let mut stream = stats::stream(seed, purpose);
     let simulator = baseline.simulator();
-    let set = simulator.training_set(SIMULATIONS, stream.next_u64()).map_err(|e| InferenceError::Simulation(e.to_string()))?;
+    let set = simulator
+        .training_set(SIMULATIONS, stream.next_u64())
+        .map_err(|e| InferenceError::Simulation(e.to_string()))?;
     let observations: Vec<_> = set
         .frequencies_hz
         .row_iter()
@@ -186,7 +189,8 @@ fn measure_cell(
         for simulation in 0..SIMULATIONS {
             let draws: Vec<f64> = (simulation * DRAWS..(simulation + 1) * DRAWS).map(|row| unit(row, column)).collect();
             let x = truth(simulation, column);
-            let [low, q25, median, q75, high] = [0.05, 0.25, 0.5, 0.75, 0.95].map(|level| quantile_of_draws(&draws, level));
+            let [low, q25, median, q75, high] =
+                [0.05, 0.25, 0.5, 0.75, 0.95].map(|level| quantile_of_draws(&draws, level));
             inside_50 += usize::from((q25..=q75).contains(&x));
             inside_90 += usize::from((low..=high).contains(&x));
             let half = if x < median { median - low } else { high - median };
@@ -236,7 +240,8 @@ pub fn uniform_p_value(ranks: &[usize]) -> f64 {
 
 fn failures(cells: &[Cell]) -> Vec<String> {
     let parameters: usize = cells.iter().map(|cell| cell.parameters.len()).sum();
-    let chance = -stats::normal_quantile(0.5 * LEVEL / parameters.max(1) as f64) * (0.9 * 0.1 / SIMULATIONS as f64).sqrt();
+    let chance =
+        -stats::normal_quantile(0.5 * LEVEL / parameters.max(1) as f64) * (0.9 * 0.1 / SIMULATIONS as f64).sqrt();
     let tolerance = COVERAGE_TOLERANCE.max(chance);
     let mut failures = Vec::new();
     for cell in cells {
@@ -246,12 +251,11 @@ fn failures(cells: &[Cell]) -> Vec<String> {
             if (p.coverage_90 - 0.9).abs() > tolerance {
                 failures.push(format!("{place}: 90 % intervals of {} cover {:.3}", p.name, p.coverage_90));
             }
-            // Not `<`: a NaN must fail too.
-            if !(p.rank_p_value * parameters as f64 >= LEVEL) {
+            if p.rank_p_value.is_nan() || p.rank_p_value * (parameters as f64) < LEVEL {
                 failures.push(format!("{place}: ranks of {} are not uniform (p = {:.1e})", p.name, p.rank_p_value));
             }
         }
-        if !(cell.tarp_p_value * cells.len() as f64 >= LEVEL) {
+        if cell.tarp_p_value.is_nan() || cell.tarp_p_value * (cells.len() as f64) < LEVEL {
             failures.push(format!("{place}: TARP coverage is not uniform (p = {:.1e})", cell.tarp_p_value));
         }
     }

@@ -91,16 +91,19 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
         for row in rows {
             for i in 0..d {
                 for j in 0..d {
-                    covariance[(i, j)] += (unit(row, i) - mean[i]) * (unit(row, j) - mean[j]) / (POINTS * (DRAWS - 1)) as f64;
+                    covariance[(i, j)] +=
+                        (unit(row, i) - mean[i]) * (unit(row, j) - mean[j]) / (POINTS * (DRAWS - 1)) as f64;
                 }
             }
         }
     }
-    let correlation = |i: usize, j: usize| covariance[(i, j)] / (covariance[(i, i)] * covariance[(j, j)]).sqrt().max(1e-300);
+    let correlation =
+        |i: usize, j: usize| covariance[(i, j)] / (covariance[(i, i)] * covariance[(j, j)]).sqrt().max(1e-300);
     let parameters = space.iter().enumerate().map(|(k, p)| {
         let width = p.upper - p.lower;
         let local: Vec<f64> = fisher.iter().map(|c| c[(k, k)].sqrt() * width).collect();
-        let partner = (0..d).filter(|&j| j != k).max_by(|&a, &b| correlation(k, a).abs().total_cmp(&correlation(k, b).abs()));
+        let partner =
+            (0..d).filter(|&j| j != k).max_by(|&a, &b| correlation(k, a).abs().total_cmp(&correlation(k, b).abs()));
         ParameterIdentifiability {
             name: p.name.clone(),
             fisher_std: stats::quantile(&local, 0.5),
@@ -111,7 +114,8 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
     });
     let parameters: Vec<ParameterIdentifiability> = parameters.collect();
     let together = |i: usize, j: usize| {
-        let alike = space.as_slice()[i].unit == space.as_slice()[j].unit && space.as_slice()[i].damage == space.as_slice()[j].damage;
+        let alike = space.as_slice()[i].unit == space.as_slice()[j].unit
+            && space.as_slice()[i].damage == space.as_slice()[j].damage;
         alike
             && parameters[i].variance_left > UNRESOLVED
             && parameters[j].variance_left > UNRESOLVED

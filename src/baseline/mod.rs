@@ -194,7 +194,8 @@ impl Baseline {
         // Draws beyond the prior, in the margin of the training box, are drawn again. Where hardly any falls inside, the
         // measurement lies outside, and the nearest point of the box has to do.
         for round in 1..=ROUNDS {
-            let pending: Vec<u32> = (0..observations.len() as u32).filter(|&row| filled[row as usize] < draws).collect();
+            let pending: Vec<u32> =
+                (0..observations.len() as u32).filter(|&row| filled[row as usize] < draws).collect();
             if pending.is_empty() {
                 break;
             }
@@ -213,7 +214,7 @@ impl Baseline {
                         return Err(InferenceError::NotFinite { row: place, parameter: parameter.name.clone() });
                     }
                     let inside = value.clamp(parameter.lower, parameter.upper);
-                    if inside == value || round == ROUNDS {
+                    if parameter.prior().contains(&value) || round == ROUNDS {
                         draw.push(inside);
                     }
                 }

@@ -52,8 +52,7 @@ pub struct Nearest {
 /// [`physics::Error`], which a checked prior rules out.
 pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) -> Result<Nearest, physics::Error> {
     let parameters = simulator.space().as_slice();
-    let present: Vec<usize> =
-        (0..simulator.modes()).filter(|&i| observation.frequencies_hz[i].is_some()).collect();
+    let present: Vec<usize> = (0..simulator.modes()).filter(|&i| observation.frequencies_hz[i].is_some()).collect();
     let measured = |mode: usize| observation.frequencies_hz[mode].expect("only present modes are asked for");
     let relative_std: Vec<f64> = present
         .iter()
@@ -64,10 +63,8 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
         let one = |(&mode, std): (&usize, &f64)| (measured(mode) / frequencies[mode]).ln() / std;
         DVector::from_iterator(present.len(), present.iter().zip(&relative_std).map(one))
     };
-    let mut u = DVector::from_iterator(
-        start.len(),
-        parameters.iter().zip(start).map(|(p, x)| p.to_unit(*x).clamp(0.0, 1.0)),
-    );
+    let mut u =
+        DVector::from_iterator(start.len(), parameters.iter().zip(start).map(|(p, x)| p.to_unit(*x).clamp(0.0, 1.0)));
     let mut frequencies = simulator.frequencies_hz(&theta(&u))?;
     let mut error = residual(&frequencies);
     let determined = present.len() > parameters.len();
@@ -101,7 +98,8 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
                 let svd = columns.clone().svd(true, false);
                 projector = DMatrix::identity(present.len(), present.len());
                 absorbed = 0;
-                for (direction, strength) in svd.u.iter().flat_map(|u| u.column_iter()).zip(svd.singular_values.iter()) {
+                for (direction, strength) in svd.u.iter().flat_map(|u| u.column_iter()).zip(svd.singular_values.iter())
+                {
                     if *strength > ABSORBING {
                         projector -= direction * direction.transpose();
                         absorbed += 1;
@@ -129,7 +127,7 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
             } else {
                 damping *= 5.0;
             }
-            if moved < 1e-10 || damping > 1e8 || (gain >= 0.0 && gain < 1e-4) {
+            if moved < 1e-10 || damping > 1e8 || (0.0..1e-4).contains(&gain) {
                 break;
             }
         }

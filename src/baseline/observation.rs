@@ -99,12 +99,7 @@ impl Conditions {
 /// ```text
 ///  f̃_i = f_i + a_i·s_i(f_i)·N(0, 1),    a_i the noise multiple, s_i the structure's own standard deviation
 /// ```
-pub fn measure(
-    simulator: &Simulator,
-    exact_hz: &[f64],
-    multiples: &[Option<f64>],
-    stream: &mut Stream,
-) -> Observation {
+pub fn measure(simulator: &Simulator, exact_hz: &[f64], multiples: &[Option<f64>], stream: &mut Stream) -> Observation {
     let one = |(exact, multiple): (&f64, &Option<f64>)| {
         // Drawn for missing modes too: the stream then does not depend on the masks.
         let normal: f64 = stream.sample(StandardNormal);
@@ -150,14 +145,20 @@ impl Encoder {
         for observation in observations {
             let logs = self.completed_logs(observation);
             let start = values.len();
-            for i in 0..modes {
+            for (i, (log, mean)) in logs.iter().zip(&self.whitening.mean).enumerate() {
                 // Forward substitution with the lower triangular factor.
                 let known: f64 = (0..i).map(|j| self.whitening.factor[i][j] * values[start + j]).sum();
-                values.push((logs[i] - self.whitening.mean[i] - known) / self.whitening.factor[i][i]);
+                values.push((log - mean - known) / self.whitening.factor[i][i]);
             }
             if let Some(range) = &self.conditions.noise_range {
                 let present = |mode: usize| observation.frequencies_hz[mode].is_some();
-                values.extend((0..modes).map(|mode| if present(mode) { range.position(observation.noise_multiple[mode]) } else { 0.0 }));
+                values.extend((0..modes).map(|mode| {
+                    if present(mode) {
+                        range.position(observation.noise_multiple[mode])
+                    } else {
+                        0.0
+                    }
+                }));
                 values.extend((0..modes).map(|mode| if present(mode) { 0.0 } else { 1.0 }));
             }
         }
@@ -180,7 +181,9 @@ impl Encoder {
             let shift: f64 = present.iter().zip(&weights).map(|(&i, w)| self.covariance[(mode, i)] * w).sum();
             mean[mode] + shift
         };
-        (0..frequencies.len()).map(|mode| if frequencies[mode].is_some() { ln(mode) } else { conditional(mode) }).collect()
+        (0..frequencies.len())
+            .map(|mode| if frequencies[mode].is_some() { ln(mode) } else { conditional(mode) })
+            .collect()
     }
 }
 

@@ -6,7 +6,8 @@ use nalgebra::DMatrix;
 use super::calibration::{calibrate, CalibrationRecord};
 use super::identifiability::{identifiability, IdentifiabilityRecord};
 use super::manifest::{
-    Conditions, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening, FORMAT,
+    Conditions, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening,
+    FORMAT,
 };
 use super::observation::{measure, Encoder, Observation};
 use super::{to_real_line, Baseline, InferenceError};
@@ -189,12 +190,7 @@ pub fn diverged(manifest: &Manifest) -> bool {
     matches!(manifest.training.stopped, Stopped::Diverged { .. })
 }
 
-fn check(
-    samples: usize,
-    noise_range: NoiseRange,
-    flow: &FlowSettings,
-    settings: &TrainSettings,
-) -> Result<(), Error> {
+fn check(samples: usize, noise_range: NoiseRange, flow: &FlowSettings, settings: &TrainSettings) -> Result<(), Error> {
     let NoiseRange { lowest, highest } = noise_range;
     if !(lowest > 0.0 && highest.is_finite() && lowest < highest && (lowest..=highest).contains(&1.0)) {
         return Err(Error::NoiseRange { lowest, highest });
@@ -249,8 +245,7 @@ pub fn validate(
     seed: u64,
 ) -> Result<ValidationRecord, InferenceError> {
     let count = observations.len();
-    let losses: Vec<f64> =
-        baseline.log_density_unit_box(theta, observations)?.iter().map(|log_q| -log_q).collect();
+    let losses: Vec<f64> = baseline.log_density_unit_box(theta, observations)?.iter().map(|log_q| -log_q).collect();
     let samples = baseline.infer(observations, HELD_OUT_DRAWS, seed)?;
     let means = samples.means();
     let validation = |(column, parameter): (usize, &crate::parameter::Parameter)| {
@@ -276,7 +271,11 @@ pub fn validate(
 }
 
 /// Largest |u − u'| after x → z → x', u the position in the prior box.
-fn inverse_error(baseline: &Baseline, theta: &DMatrix<f64>, observations: &[Observation]) -> Result<f64, InferenceError> {
+fn inverse_error(
+    baseline: &Baseline,
+    theta: &DMatrix<f64>,
+    observations: &[Observation],
+) -> Result<f64, InferenceError> {
     let x = to_real_line(theta, &baseline.training_space)?.to_dtype(DType::F32)?;
     let context = baseline.flow.summarise(&baseline.condition(observations)?)?;
     let (z, _) = baseline.flow.forward(&x, &context)?;

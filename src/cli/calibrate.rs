@@ -95,7 +95,12 @@ fn print(record: &CalibrationRecord) {
         println!("{:>30} {:>12} {:>12} {:>12} {:>17} {:>16}", row[0], row[1], row[2], row[3], row[4], row[5]);
     }
     if record.passed() {
-        println!("passed: {} cells of {} simulations, {} draws each", record.cells.len(), record.simulations, record.draws);
+        println!(
+            "passed: {} cells of {} simulations, {} draws each",
+            record.cells.len(),
+            record.simulations,
+            record.draws
+        );
     }
 }
 
@@ -103,8 +108,8 @@ fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) ->
     let verdict = if record.passed() {
         "<p>Passed: 90 % intervals cover about 90 % in every cell, ranks and TARP are uniform.</p>".to_owned()
     } else {
-        let items: String = record.failures.iter().map(|f| format!("<li>{}</li>", escaped(f))).collect();
-        format!("<p class=\"bad\">Failed: the service does not use this baseline.</p><ul>{items}</ul>")
+        let items: Vec<String> = record.failures.iter().map(|f| format!("<li>{}</li>", escaped(f))).collect();
+        format!("<p class=\"bad\">Failed: the service does not use this baseline.</p><ul>{}</ul>", items.concat())
     };
     let names: Vec<String> = baseline.space().iter().map(|p| p.name.clone()).collect();
     let plots: String = ranks.iter().map(|cell| plot(cell, &names).svg()).collect();
@@ -124,7 +129,9 @@ fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) ->
 fn plot(cell: &CellRanks, names: &[String]) -> Plot {
     let difference = |ranks: &[usize]| -> Vec<(f64, f64)> {
         let mut counts = vec![0_usize; DRAWS + 1];
-        ranks.iter().for_each(|rank| counts[*rank] += 1);
+        for rank in ranks {
+            counts[*rank] += 1;
+        }
         let mut below = 0;
         counts
             .iter()

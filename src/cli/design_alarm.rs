@@ -116,9 +116,8 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     }
     let moments = moments(&simulator, &args.parameters)?;
     let noise_std = noise_std(&simulator, &moments, args.noise)?;
-    let watched: Vec<usize> = (0..moments.len())
-        .filter(|&k| simulator.space().as_slice()[k].damage != DamageDirection::None)
-        .collect();
+    let watched: Vec<usize> =
+        (0..moments.len()).filter(|&k| simulator.space().as_slice()[k].damage != DamageDirection::None).collect();
     anyhow::ensure!(!watched.is_empty(), "no parameter of {} has a damaged side", simulator.id());
     let reference = |k: usize| ChartReference {
         mean: moments[k].0,
@@ -186,8 +185,14 @@ fn moments(simulator: &Simulator, given: &[(String, Vec<f64>)]) -> anyhow::Resul
     let triples: Vec<(String, f64, f64)> = given.iter().map(|(name, n)| (name.clone(), n[0], n[1])).collect();
     crate::simulator::population::Population::new(simulator.space(), &triples)?;
     let one = |p: &crate::parameter::Parameter| {
-        let (name, mean, std) = triples.iter().find(|(name, ..)| *name == p.name).context("every parameter is given")?;
-        anyhow::ensure!(p.prior().contains(mean), "the mean {mean} of {name} is outside its prior, {} to {}", p.lower, p.upper);
+        let (name, mean, std) =
+            triples.iter().find(|(name, ..)| *name == p.name).context("every parameter is given")?;
+        anyhow::ensure!(
+            p.prior().contains(mean),
+            "the mean {mean} of {name} is outside its prior, {} to {}",
+            p.lower,
+            p.upper
+        );
         Ok((*mean, *std))
     };
     simulator.space().iter().map(one).collect()
@@ -218,15 +223,15 @@ fn print(report: &Report) {
         report.structure, report.measurements, report.baseline_measurements, report.noise_multiple
     );
     let ewma = report.ewma_limit_standard_errors.map_or("off".to_owned(), |l| format!("{l:.2}"));
-    println!(
-        "limits: one batch {:.2} standard errors, moving average {ewma}",
-        report.shift_limit_standard_errors
-    );
+    println!("limits: one batch {:.2} standard errors, moving average {ewma}", report.shift_limit_standard_errors);
     println!(
         "healthy operation: {:.0} ± {:.0} batches to the first false alarm (wanted {:.0})",
         report.healthy_run_batches, report.healthy_run_error, report.wanted_run_batches
     );
-    println!("\n{:>16} {:>10} {:>10} {:>12} {:>14} {:>22}", "parameter", "mean", "std", "noise std", "std error", "found with 90 % (a90)");
+    println!(
+        "\n{:>16} {:>10} {:>10} {:>12} {:>14} {:>22}",
+        "parameter", "mean", "std", "noise std", "std error", "found with 90 % (a90)"
+    );
     for p in &report.parameters {
         let a90 = p.a90.map_or("not found".to_owned(), |a| format!("{:.2} %", 100.0 * a));
         println!(
@@ -298,9 +303,6 @@ fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
 }
 
 /// A delay over the shift, from where it is short enough to be seen.
-fn delays(
-    found: &Detection,
-    value: impl Fn(&crate::alarm::detection::DetectionPoint) -> f64,
-) -> Vec<(f64, f64)> {
+fn delays(found: &Detection, value: impl Fn(&crate::alarm::detection::DetectionPoint) -> f64) -> Vec<(f64, f64)> {
     found.curve.iter().map(|p| (p.shift, value(p))).filter(|(_, run)| *run <= 30.0).collect()
 }

@@ -71,10 +71,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
     bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
     let started = Instant::now();
-    let trained = train_baseline(&simulator, samples, args.noise_range, &FlowSettings::default(), &settings, |epoch| {
-        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
-        bar.set_position(epoch.epoch as u64);
-    })?;
+    let trained =
+        train_baseline(&simulator, samples, args.noise_range, &FlowSettings::default(), &settings, |epoch| {
+            bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
+            bar.set_position(epoch.epoch as u64);
+        })?;
     bar.finish_and_clear();
     let seconds = started.elapsed().as_secs_f64();
 
@@ -111,7 +112,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 fn print_record(manifest: &Manifest) {
     for p in &manifest.identifiability.parameters {
         let (name, left) = (&p.name, 100.0 * p.variance_left);
-        println!("one measurement leaves {left:.2} % of the prior variance of {name} (standard deviation {:.4})", p.posterior_std);
+        println!(
+            "one measurement leaves {left:.2} % of the prior variance of {name} (standard deviation {:.4})",
+            p.posterior_std
+        );
     }
     for group in &manifest.identifiability.groups {
         println!("these modes cannot tell apart: {}", group.join(", "));

@@ -28,7 +28,9 @@ impl CustomOp1 for Silu {
     fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
         let result = match storage {
             CpuStorage::F32(x) => CpuStorage::F32(silu_f32(contiguous(x, layout)?)),
-            CpuStorage::F64(x) => CpuStorage::F64(contiguous(x, layout)?.iter().map(|x| x / (1.0 + (-x).exp())).collect()),
+            CpuStorage::F64(x) => {
+                CpuStorage::F64(contiguous(x, layout)?.iter().map(|x| x / (1.0 + (-x).exp())).collect())
+            }
             _ => bail!("silu takes f32 or f64"),
         };
         Ok((result, layout.shape().clone()))

@@ -110,9 +110,7 @@ impl From<Episode> for AlarmItem {
             opened_batch: e.opened_batch,
             ended_at: e.ended_at,
             noticed_at: e.noticed_at,
-            acknowledgement: e
-                .acknowledgement
-                .map(|a| AcknowledgementItem { at: a.at, by: a.by, note: a.note }),
+            acknowledgement: e.acknowledgement.map(|a| AcknowledgementItem { at: a.at, by: a.by, note: a.note }),
         }
     }
 }

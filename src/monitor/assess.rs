@@ -209,8 +209,8 @@ pub fn undamaged_state(
 ) -> Result<UndamagedState, UndamagedError> {
     let (mut parts, mut sizes) = (Vec::new(), Vec::new());
     for (batch, (measurements, draws)) in batches.iter().enumerate() {
-        let samples = draw(baseline, measurements, None, *draws)
-            .map_err(|source| UndamagedError::Assess { batch, source })?;
+        let samples =
+            draw(baseline, measurements, None, *draws).map_err(|source| UndamagedError::Assess { batch, source })?;
         let trust = Trust::new(&samples.fit, samples.findings.clone());
         // What cannot be trusted must not become the measure of everything after it.
         if let Some(finding) = trust.findings.iter().find(|f| f.effect != Effect::Note) {
@@ -243,7 +243,7 @@ fn joined(baseline: &Baseline, parts: Vec<BatchSamples>, seed: u64) -> Result<Ba
         first.asked.extend(part.asked);
     }
     let populations = population_behind(baseline, &posterior, &first.asked, seed)?;
-    Ok(BatchSamples { populations, posterior, ..first })
+    Ok(BatchSamples { posterior, populations, ..first })
 }
 
 /// The measurements as the flow is asked about them, and their index in the batch.
@@ -301,7 +301,11 @@ fn admit(
 
 /// Samples of everything that is monitored: each parameter, the stiffness of each spring set through a law, and the mean
 /// of parameters that cannot be told apart.
-pub fn monitored_quantities(baseline: &Baseline, samples: &BatchSamples, per_measurement: usize) -> Vec<QuantitySamples> {
+pub fn monitored_quantities(
+    baseline: &Baseline,
+    samples: &BatchSamples,
+    per_measurement: usize,
+) -> Vec<QuantitySamples> {
     let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
     let edge_mass = samples.posterior.edge_mass(baseline.space());
     let population = |column: usize| &samples.populations.parameters[column];
@@ -342,7 +346,9 @@ pub fn monitored_quantities(baseline: &Baseline, samples: &BatchSamples, per_mea
             unit: parameter.unit.clone(),
             kind: QuantityKind::Group,
             damage: parameter.damage,
-            pool: (0..members[0].len()).map(|i| members.iter().map(|m| m[i]).sum::<f64>() / members.len() as f64).collect(),
+            pool: (0..members[0].len())
+                .map(|i| members.iter().map(|m| m[i]).sum::<f64>() / members.len() as f64)
+                .collect(),
             draws: pooled.draws(),
             population: PopulationEstimate::average(&parts),
             edge_mass: group.columns.iter().map(|&column| edge_mass[column]).fold(0.0, f64::max),
@@ -416,9 +422,8 @@ fn compare_conditions(
                 (Some(CovariateValue::Number(x)), SeenCovariate::Range([low, high])) => {
                     (!(low..=high).contains(&x)).then(|| format!("{name} = {x}, seen {low} to {high}"))
                 }
-                (Some(CovariateValue::Category(c)), SeenCovariate::Categories(all)) => {
-                    (!all.contains(c)).then(|| format!("{name} = {c}, seen {}", all.iter().cloned().collect::<Vec<_>>().join(", ")))
-                }
+                (Some(CovariateValue::Category(c)), SeenCovariate::Categories(all)) => (!all.contains(c))
+                    .then(|| format!("{name} = {c}, seen {}", all.iter().cloned().collect::<Vec<_>>().join(", "))),
                 _ => None,
             };
             if let Some(odd) = odd {

@@ -361,7 +361,8 @@ impl Monitor {
             let started = std::time::Instant::now();
             let version = undamaged.as_ref().map(|state| state.version);
             let (baseline_here, record_here) = (Arc::clone(&baseline), Arc::clone(&record));
-            let (known, settings, previous) = (Arc::clone(&self.known_limits), self.settings.alarm, Arc::clone(&previous));
+            let (known, settings, previous) =
+                (Arc::clone(&self.known_limits), self.settings.alarm, Arc::clone(&previous));
             let work = move || {
                 let context = Context { undamaged: undamaged.as_ref(), previous: previous.as_deref() };
                 let assessment = assess::assess(&baseline_here, &record_here.batch.measurements, context, draws)?;
@@ -447,7 +448,6 @@ fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baselin
     let missing = |reason: &String| Error::NoModel { structure: structure.clone(), reason: reason.clone() };
     watched.baseline.as_ref().map(Arc::clone).map_err(missing)
 }
-
 
 fn report(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
     metrics::counter!("modalwatch_assessments_total").increment(1);

@@ -46,7 +46,8 @@ impl Monitor {
         let place = self.compute.reserve()?;
         let taken = place
             .run(move || {
-                let batches: Vec<_> = records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
+                let batches: Vec<_> =
+                    records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
                 assess::undamaged_state(&baseline, &batches, threshold_probability)
             })
             .await;

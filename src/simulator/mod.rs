@@ -265,7 +265,7 @@ impl Simulator {
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
         let exact = self.exact(&rows)?;
         let frequencies_hz = DMatrix::from_fn(samples, self.modes(), |row, mode| exact[row][mode]);
-        Ok(TrainingSet { frequencies_hz, theta, seed })
+        Ok(TrainingSet { theta, frequencies_hz, seed })
     }
 
     /// Exact frequencies of each row of parameters, Hz.

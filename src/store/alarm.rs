@@ -159,10 +159,11 @@ pub(super) async fn chart(
     points: Vec<NewChartPoint>,
     now: Timestamp,
 ) -> Result<(), Error> {
-    let (newest,): (u32,) = sqlx::query_as("select coalesce(max(version), 0) from undamaged_state where structure_id = ?")
-        .bind(structure)
-        .fetch_one(&mut *connection)
-        .await?;
+    let (newest,): (u32,) =
+        sqlx::query_as("select coalesce(max(version), 0) from undamaged_state where structure_id = ?")
+            .bind(structure)
+            .fetch_one(&mut *connection)
+            .await?;
     // A state declared while this was computed has ended the charts of the one before.
     for new in points.into_iter().filter(|new| [0, newest].contains(&new.undamaged_version)) {
         let stored: Option<(f64, f64, Option<f64>, bool)> = sqlx::query_as(
@@ -303,7 +304,7 @@ async fn replay(
             }
             unchanged = if same && !first { unchanged + usize::from(!row.held) } else { 0 };
             if unchanged > memory && !inside {
-                episodes.nothing_behind((row.measured_to_us, row.batch_id.clone()));
+                episodes.nothing_behind(&(row.measured_to_us, row.batch_id.clone()));
                 break 'pages;
             }
         }
@@ -420,8 +421,8 @@ impl Episodes {
     }
 
     /// Nothing changes behind this point: episodes that open there stay as they are.
-    fn nothing_behind(&mut self, place: (i64, String)) {
-        self.stored.retain(|(_, at, batch, ..)| (*at, batch.clone().unwrap_or_default()) <= place);
+    fn nothing_behind(&mut self, place: &(i64, String)) {
+        self.stored.retain(|(_, at, batch, ..)| (*at, batch.clone().unwrap_or_default()) <= *place);
     }
 
     async fn store(
@@ -432,13 +433,15 @@ impl Episodes {
         now: Timestamp,
     ) -> Result<(), Error> {
         if let Some((number, peak)) = self.running {
-            sqlx::query("update alarm_episode set ended_at_us = ?, peak_shift = ? where structure_id = ? and episode = ?")
-                .bind(self.running_end)
-                .bind(peak)
-                .bind(structure)
-                .bind(number)
-                .execute(&mut *connection)
-                .await?;
+            sqlx::query(
+                "update alarm_episode set ended_at_us = ?, peak_shift = ? where structure_id = ? and episode = ?",
+            )
+            .bind(self.running_end)
+            .bind(peak)
+            .bind(structure)
+            .bind(number)
+            .execute(&mut *connection)
+            .await?;
         }
         for found in self.found {
             // The same one: opened by the same batch, or, since late data can move its beginning, at the same time.
@@ -636,7 +639,12 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn set_silent(&self, structure: &StructureId, since: Option<Timestamp>, now: Timestamp) -> Result<bool, Error> {
+    pub async fn set_silent(
+        &self,
+        structure: &StructureId,
+        since: Option<Timestamp>,
+        now: Timestamp,
+    ) -> Result<bool, Error> {
         let id = structure.to_string();
         self.write(move |connection| {
             Box::pin(async move {
@@ -758,9 +766,7 @@ fn stored_point(row: PointRow) -> Result<StoredChartPoint, Error> {
 fn episode(row: EpisodeRow) -> Result<Episode, Error> {
     let what = "alarm episode";
     let acknowledgement = match (row.acknowledged_at_us, row.acknowledged_by) {
-        (Some(at), Some(by)) => {
-            Some(Acknowledgement { at: timestamp(what, at)?, by, note: row.acknowledgement_note })
-        }
+        (Some(at), Some(by)) => Some(Acknowledgement { at: timestamp(what, at)?, by, note: row.acknowledgement_note }),
         _ => None,
     };
     Ok(Episode {

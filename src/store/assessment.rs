@@ -250,17 +250,15 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
 
 fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
     let damage = match (row.threshold, row.probability_of_damage, row.exceeds, row.relative_change) {
-        (Some(threshold), Some(probability_of_damage), Some(exceeds), Some(relative_change)) => {
-            Some(Damage {
-                threshold,
-                probability_of_damage,
-                probability_interval: both(row.probability_low, row.probability_high),
-                pooled_probability: row.pooled_probability.unwrap_or(probability_of_damage),
-                exceeds,
-                relative_change,
-                relative_change_interval: both(row.change_low, row.change_high),
-            })
-        }
+        (Some(threshold), Some(probability_of_damage), Some(exceeds), Some(relative_change)) => Some(Damage {
+            threshold,
+            probability_of_damage,
+            probability_interval: both(row.probability_low, row.probability_high),
+            pooled_probability: row.pooled_probability.unwrap_or(probability_of_damage),
+            exceeds,
+            relative_change,
+            relative_change_interval: both(row.change_low, row.change_high),
+        }),
         _ => None,
     };
     Ok(QuantityAssessment {

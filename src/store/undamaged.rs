@@ -129,7 +129,8 @@ impl Store {
         .bind(structure.as_str())
         .fetch_optional(&self.reader)
         .await?;
-        let Some((version, model_digest, created, threshold_probability, measurements, conditions, doubts)) = row else {
+        let Some((version, model_digest, created, threshold_probability, measurements, conditions, doubts)) = row
+        else {
             return Ok(None);
         };
         let batches: Vec<(String,)> = sqlx::query_as(

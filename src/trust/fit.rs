@@ -61,7 +61,8 @@ pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f6
     let (mut sum, mut covariance) = (DVector::zeros(modes), DMatrix::zeros(modes, modes));
     for (row, (point, observation)) in nearest.iter().zip(observations).enumerate() {
         if upper_tail(point.chi_squared, point.degrees_of_freedom) < SINGLE_LEVEL / observations.len() as f64 {
-            let misfit = |(mode, f): (usize, &Option<f64>)| f.map_or(0.0, |f| (f / point.frequencies_hz[mode]).ln().abs());
+            let misfit =
+                |(mode, f): (usize, &Option<f64>)| f.map_or(0.0, |f| (f / point.frequencies_hz[mode]).ln().abs());
             let largest = observation.frequencies_hz.iter().enumerate().map(misfit).fold(0.0, f64::max);
             if largest > GROSS { &mut gross } else { &mut outside }.push(row);
         } else if observation.modes_present() > simulator.space().len() {

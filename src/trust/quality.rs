@@ -87,8 +87,7 @@ fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) ->
     let (mut coarse, mut scattered) = (0, 0);
     let mut parts = Vec::new();
     for mode in 0..modes {
-        let mut values: Vec<f64> =
-            kept.iter().filter_map(|(_, m)| m.frequencies_hz[mode].map(Hertz::get)).collect();
+        let mut values: Vec<f64> = kept.iter().filter_map(|(_, m)| m.frequencies_hz[mode].map(Hertz::get)).collect();
         let count = values.len();
         values.sort_by(f64::total_cmp);
         values.dedup();
@@ -101,7 +100,11 @@ fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) ->
         }
         coarse += 1;
         let step = values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
-        parts.push(format!("mode {} takes {} values in {count} measurements, {step:.3e} Hz apart", mode + 1, values.len()));
+        parts.push(format!(
+            "mode {} takes {} values in {count} measurements, {step:.3e} Hz apart",
+            mode + 1,
+            values.len()
+        ));
     }
     if !parts.is_empty() {
         let message = format!("{}: record more digits, the scatter is finer than that", parts.join("; "));
@@ -132,15 +135,21 @@ fn drop_repeats(
     // All repeat the measurement before the batch, or all the first of it.
     if repeats.len() == count || (count >= 3 && repeats.len() + 1 == count) {
         let message = match count {
-            1 => "the same frequencies as in the measurement before, to the last digit: the sensor or its gateway hangs".to_owned(),
-            _ => format!("all {count} measurements have the same frequencies to the last digit: the sensor or its gateway hangs"),
+            1 => {
+                "the same frequencies as in the measurement before, to the last digit: the sensor or its gateway hangs"
+                    .to_owned()
+            }
+            _ => format!(
+                "all {count} measurements have the same frequencies to the last digit: the sensor or its gateway hangs"
+            ),
         };
         findings.push(Finding::new(Code::NoScatter, Effect::Reject, message));
         kept.truncate(1);
         return;
     }
     let effect = if too_many(repeats.len(), count) { Effect::HoldAlarm } else { Effect::Note };
-    let message = format!("{} of {count} measurements repeat an earlier one to the last digit and are left out", repeats.len());
+    let message =
+        format!("{} of {count} measurements repeat an earlier one to the last digit and are left out", repeats.len());
     findings.push(Finding::new(Code::StaleRepeat, effect, message).of(indices.clone()));
     kept.retain(|(index, _)| !indices.contains(index));
 }

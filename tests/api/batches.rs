@@ -57,7 +57,11 @@ async fn the_example_of_the_readme_is_taken() {
     let answer = created(service.post_text(BATCHES, "application/json", body).await).await;
     assert_eq!(answer["measurement_count"], 2);
     let assessment = &answer["assessment"];
-    assert_eq!((&assessment["measurements_outside"], &assessment["trust"]), (&json!(0), &json!("accepted")), "{answer}");
+    assert_eq!(
+        (&assessment["measurements_outside"], &assessment["trust"]),
+        (&json!(0), &json!("accepted")),
+        "{answer}"
+    );
     let mean = assessment["parameters"][0]["mean"].as_f64().unwrap();
     assert!(readme.contains(&format!("\"mean\": {mean:.4}")), "README shows another mean of k1 than {mean}");
 }
@@ -204,7 +208,11 @@ async fn a_missing_mode_widens_the_answer_and_leaves_nothing_out() {
     }
     let answer = service.post_batch("three-dof", &rows).await;
     let assessment = &answer["assessment"];
-    assert_eq!((&assessment["measurements_used"], &assessment["measurements_left_out"]), (&json!(4), &json!(0)), "{answer}");
+    assert_eq!(
+        (&assessment["measurements_used"], &assessment["measurements_left_out"]),
+        (&json!(4), &json!(0)),
+        "{answer}"
+    );
     assert_eq!(assessment["misfit_percent"][0], Value::Null);
     let within = |answer: &Value| answer["assessment"]["parameters"][0]["pooled"]["variance_within"].as_f64().unwrap();
     assert!(within(&answer) > 2.0 * within(&complete), "{answer}");
@@ -235,13 +243,16 @@ async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
         ("unit_suspected", changed(100_000, &|f| f.iter_mut().for_each(|f| *f *= 2.0 * std::f64::consts::PI))),
         ("modes_swapped", changed(200_000, &|f| f.swap(0, 1))),
         ("simulation_does_not_fit", changed(300_000, &|f| f[1] *= 0.8)),
-        ("no_scatter", changed(400_000, &|f| {
-            let seen = first.take();
-            if !seen.is_empty() {
-                f.clone_from(&seen);
-            }
-            first.set(f.clone());
-        })),
+        (
+            "no_scatter",
+            changed(400_000, &|f| {
+                let seen = first.take();
+                if !seen.is_empty() {
+                    f.clone_from(&seen);
+                }
+                first.set(f.clone());
+            }),
+        ),
     ];
     for (code, rows) in cases {
         let answer = service.post_batch("three-dof", &rows).await;
@@ -304,7 +315,11 @@ async fn damage_becomes_one_alarm_which_somebody_sees() {
     let answer = service.post_batch("three-dof", &measurements([4.0, 5.0, 5.0], 20, 910_000)).await;
     assert!(answer["charts"].as_array().unwrap().iter().all(|c| c["held"] == true), "{answer}");
     let charts = service.read("/v1/structures/three-dof/charts").await;
-    assert_eq!(charts["items"].as_array().unwrap().len(), 4 * 5 + 1, "four charts, five batches, and the fit of the first");
+    assert_eq!(
+        charts["items"].as_array().unwrap().len(),
+        4 * 5 + 1,
+        "four charts, five batches, and the fit of the first"
+    );
 }
 
 #[tokio::test]

@@ -116,7 +116,9 @@ fn case_1_hyperparameters_are_those_of_the_realised_sample() {
     }
     for (estimate, name) in ["pool", "population"].into_iter().enumerate() {
         let (mean_error, std_error) = (mean_error[estimate], std_error[estimate]);
-        println!("{name}: mean absolute error of the mean {mean_error:.5?}, of the standard deviation {std_error:.5?} N/m");
+        println!(
+            "{name}: mean absolute error of the mean {mean_error:.5?}, of the standard deviation {std_error:.5?} N/m"
+        );
         assert!(mean_error.iter().all(|e| *e <= 0.003), "{name}: {mean_error:?}");
         assert!(std_error.iter().all(|e| *e <= 0.005), "{name}: {std_error:?}");
     }

@@ -64,7 +64,14 @@ struct Operation {
 }
 
 impl Operation {
-    fn new(bank: &Bank, charts: usize, size: usize, baseline: usize, known: &mut Option<Limits>, stream: &mut Stream) -> Self {
+    fn new(
+        bank: &Bank,
+        charts: usize,
+        size: usize,
+        baseline: usize,
+        known: &mut Option<Limits>,
+        stream: &mut Stream,
+    ) -> Self {
         let settings = AlarmSettings::default();
         let rows = bank.rows(baseline, stream);
         let reference = |k: usize| {
@@ -113,9 +120,9 @@ fn healthy_operation_runs_as_long_as_wanted_to_a_false_alarm() {
                 // An undamaged state of a hundred batches: with fewer the mean run is longer, by design.
                 let mut operation = Operation::new(&healthy, moments.len(), size, 100 * size, &mut known, &mut stream);
                 let run = (1..=longest).find(|_| operation.take(&healthy, size, &mut stream)).unwrap_or(longest);
-                runs.push(run as f64);
+                runs.push(f64::from(run));
             }
-            let (mean, error) = (stats::mean(&runs), stats::sample_std(&runs).unwrap() / (operations as f64).sqrt());
+            let (mean, error) = (stats::mean(&runs), stats::sample_std(&runs).unwrap() / f64::from(operations).sqrt());
             println!("{id}, batches of {size}: mean run to a false alarm {mean:.0} ± {error:.0} batches (wanted 1000)");
             assert!((1_000.0 / 1.5..=1_500.0).contains(&mean), "{id}, {size}: {mean} ± {error}");
         }
@@ -135,7 +142,8 @@ fn a_tenth_less_of_k1_is_alarmed_within_three_batches() {
         for _ in 0..10 {
             operation.take(&healthy, size, &mut stream);
         }
-        runs.push((1..=50).find(|_| operation.take(&damaged, size, &mut stream)).unwrap_or(50) as f64);
+        let run = (1..=50).find(|_| operation.take(&damaged, size, &mut stream)).unwrap_or(50);
+        runs.push(f64::from(run));
         // The rule of the paper on a healthy batch: share of the measurements below δ above 5 % for some parameter.
         let rows = healthy.rows(size, &mut stream);
         let beyond = |k: usize| {

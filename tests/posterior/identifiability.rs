@@ -52,7 +52,12 @@ fn damage_of_one_of_two_is_told_for_the_group_and_blames_neither() {
         match q.kind {
             QuantityKind::Group => {
                 let damage = q.damage.as_ref().unwrap();
-                println!("{}: PoD {:.2}, change {:.1} %", q.name, damage.probability_of_damage, 100.0 * damage.relative_change);
+                println!(
+                    "{}: PoD {:.2}, change {:.1} %",
+                    q.name,
+                    damage.probability_of_damage,
+                    100.0 * damage.relative_change
+                );
                 assert!(damage.probability_of_damage > 0.5, "{q:?}");
                 // Half of 15 % of one of two.
                 assert!((damage.relative_change + 0.075).abs() < 0.03, "{q:?}");

@@ -18,7 +18,13 @@ pub const TABLE_2: [(f64, f64); 3] = [(4.0, 0.3), (5.0, 0.1), (6.0, 0.2)];
 pub const DRAWS: Draws = Draws { per_measurement: 10, for_population: 64, seed: 5 };
 
 /// Measurements of a population, with their noise stated.
-pub fn batch(baseline: &Baseline, moments: &[(f64, f64)], count: usize, multiple: f64, seed: u64) -> Vec<ModalMeasurement> {
+pub fn batch(
+    baseline: &Baseline,
+    moments: &[(f64, f64)],
+    count: usize,
+    multiple: f64,
+    seed: u64,
+) -> Vec<ModalMeasurement> {
     let named: Vec<(String, f64, f64)> =
         baseline.space().iter().zip(moments).map(|(p, (mean, std))| (p.name.clone(), *mean, *std)).collect();
     let population = Population::new(baseline.space(), &named).unwrap();

@@ -72,7 +72,9 @@ fn units_and_swapped_modes_are_rejected_and_rightly_named() {
             radians += named(changed(&measured, |_, f| f * 2.0 * std::f64::consts::PI), Code::UnitSuspected, "rad/s");
             kilohertz += named(changed(&measured, |_, f| f / 1_000.0), Code::UnitSuspected, "kHz");
             let mut other = measured.clone();
-            other.iter_mut().for_each(|m| m.frequencies_hz.swap(1, 2));
+            for m in &mut other {
+                m.frequencies_hz.swap(1, 2);
+            }
             swapped += named(other, Code::ModesSwapped, "swapped");
         }
         println!("{id}, of {repetitions}: rad/s named {radians}, kHz {kilohertz}, swapped modes {swapped}");
@@ -93,7 +95,10 @@ fn three_per_cent_in_one_mode_of_the_rig_are_noticed_where_the_links_cannot_abso
         }
     }
     println!("3 % in one mode of the rig, batches of 50: rejected {noticed:?} of {repetitions} for modes 1, 2, 3");
-    assert!(noticed[0] as f64 >= 0.99 * repetitions as f64 && noticed[2] as f64 >= 0.99 * repetitions as f64, "{noticed:?}");
+    assert!(
+        noticed[0] as f64 >= 0.99 * repetitions as f64 && noticed[2] as f64 >= 0.99 * repetitions as f64,
+        "{noticed:?}"
+    );
     // Mode 2 follows p12 alone (paper Fig. 17): 2.5 % of its shift are left over once p12 has moved, 0.15 standard
     // deviations of the noise. No test of the fit can see that; as a change of p12 it shows.
     let base = draw("rig", &batch(&baseline, &RIG, 50, 1.0, 1)).populations.parameters[0].mean;

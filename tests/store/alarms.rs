@@ -83,7 +83,11 @@ async fn a_batch_that_comes_late_moves_the_alarm_and_keeps_who_has_seen_it() {
     let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
     assert_eq!((episode.opened_batch.as_deref(), episode.acknowledgement.clone()), (Some("b4"), Some(seen)));
     assert_eq!(states(&store).await, ["normal", "alarming", "alarming"]);
-    assert!(store.acknowledge(&bridge(), 9, Acknowledgement { at: at(1), by: "x".into(), note: None }).await.unwrap().is_none());
+    assert!(store
+        .acknowledge(&bridge(), 9, Acknowledgement { at: at(1), by: "x".into(), note: None })
+        .await
+        .unwrap()
+        .is_none());
 }
 
 #[tokio::test]
@@ -139,7 +143,11 @@ async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_state_begins_a
     let model = modalwatch::quantity::Digest::of(&[b"m"]);
     store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".to_owned()], at(4_000)).await.unwrap();
     assert_eq!(episodes(&store).await[0].ended_at, Some(at(4_000)));
-    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b0", "b2", "b3"], "b0 was never compared, and all after the undamaged batch come again");
+    assert_eq!(
+        store.pending(&bridge(), 9).await.unwrap(),
+        ["b0", "b2", "b3"],
+        "b0 was never compared, and all after the undamaged batch come again"
+    );
     // Computed before the new state, stored after it: it must not raise what has ended.
     assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 8.0).await;
     assert_eq!(store.episodes(&bridge(), None, true, 10).await.unwrap(), []);

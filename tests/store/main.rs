@@ -8,11 +8,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use modalwatch::assessment::{Assessment, BatchState};
-use modalwatch::damage::{ChartReference, SeenCovariate, Damage, Hyperparameters, QuantityAssessment, QuantityKind};
+use modalwatch::damage::{ChartReference, Damage, Hyperparameters, QuantityAssessment, QuantityKind, SeenCovariate};
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
-use modalwatch::trust::{Code, Effect, Finding, Trust};
 use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
+use modalwatch::trust::{Code, Effect, Finding, Trust};
 
 fn bridge() -> StructureId {
     StructureId::parse("bridge").unwrap()
