@@ -6,6 +6,7 @@ mod bad_input;
 mod batches;
 mod helpers;
 mod history;
+mod hostile;
 mod operations;
 mod restart;
 mod ruler_frame;
