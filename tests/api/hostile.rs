@@ -6,8 +6,11 @@ use serde_json::{json, Value};
 
 use crate::helpers::{created, measurements, spawn, time};
 
+/// Frequency and standard deviation of one mode, Hz.
+type Mode = (Option<f64>, Option<f64>);
+
 /// One mode: missing, far off within the limits, or near what the structure has; with or without its noise.
-fn mode(nominal: f64) -> impl Strategy<Value = (Option<f64>, Option<f64>)> {
+fn mode(nominal: f64) -> impl Strategy<Value = Mode> {
     let frequency = prop_oneof![
         1 => Just(None),
         2 => (0.02..50.0_f64).prop_map(move |factor| Some(nominal * factor)),
@@ -18,12 +21,12 @@ fn mode(nominal: f64) -> impl Strategy<Value = (Option<f64>, Option<f64>)> {
     (frequency, std)
 }
 
-fn measurement() -> impl Strategy<Value = [(Option<f64>, Option<f64>); 3]> {
+fn measurement() -> impl Strategy<Value = [Mode; 3]> {
     let one = (mode(0.49), mode(0.92), mode(1.24)).prop_map(|(a, b, c)| [a, b, c]);
     one.prop_filter("a measurement has a mode", |m| m.iter().any(|(f, _)| f.is_some()))
 }
 
-fn batch() -> impl Strategy<Value = Vec<[(Option<f64>, Option<f64>); 3]>> {
+fn batch() -> impl Strategy<Value = Vec<[Mode; 3]>> {
     prop_oneof![
         prop::collection::vec(measurement(), 1..12),
         // The same again and again.
@@ -63,7 +66,7 @@ async fn no_number_that_is_none_leaves_the_service() {
         let start = std::cell::Cell::new(1_000_000_usize);
         let result = runner.run(&batch(), |rows| {
             start.set(start.get() + 20_000);
-            let row = |(i, modes): (usize, &[(Option<f64>, Option<f64>); 3])| {
+            let row = |(i, modes): (usize, &[Mode; 3])| {
                 let (f, s): (Vec<_>, Vec<_>) = modes.iter().copied().unzip();
                 json!({ "measured_at": time(start.get() + 600 * i), "frequencies_hz": f, "std_hz": s })
             };
