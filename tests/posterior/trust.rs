@@ -86,7 +86,7 @@ fn units_and_swapped_modes_are_rejected_and_rightly_named() {
 
 #[test]
 fn three_per_cent_in_one_mode_of_the_rig_are_noticed_where_the_links_cannot_absorb_them() {
-    let (repetitions, baseline) = (200, shipped("rig"));
+    let (repetitions, baseline) = (100, shipped("rig"));
     let mut noticed = [0; 3];
     for (mode, noticed) in noticed.iter_mut().enumerate() {
         for seed in 0..repetitions {
