@@ -9,15 +9,11 @@ use serde::{Deserialize, Serialize};
 
 use super::answer::ChartBody;
 use super::error::ApiError;
-use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery};
+use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
 use super::Shared;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::store::{Acknowledgement, Episode, MaintenanceWindow};
 
-/// Items of a page unless the client asks for another number.
-const DEFAULT_LIMIT: usize = 100;
-/// Most items of a page.
-const MAX_LIMIT: usize = 1_000;
 /// Longest name or note.
 const LONGEST_TEXT: usize = 500;
 
@@ -126,7 +122,7 @@ pub async fn list(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let limit = limit(query.limit.as_deref(), DEFAULT_LIMIT)?;
+    let limit = page_limit(query.limit.as_deref())?;
     let open_only = match query.state.as_deref() {
         None | Some("any") => false,
         Some("open") => true,
@@ -155,7 +151,7 @@ pub async fn acknowledge(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let body: AcknowledgementBody = json_body(&shared, &headers, body).await?;
+    let body: AcknowledgementBody = json_body(&headers, body, shared.limits).await?;
     check_text("/by", &body.by)?;
     body.note.as_deref().map(|note| check_text("/note", note)).transpose()?;
     let unknown = || {
@@ -179,7 +175,7 @@ pub async fn charts(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let points = shared.monitor.store().charts(&id, limit(query.limit.as_deref(), DEFAULT_LIMIT)?).await?;
+    let points = shared.monitor.store().charts(&id, page_limit(query.limit.as_deref())?).await?;
     let items: Vec<ChartBody> = points.into_iter().map(ChartBody::from).collect();
     Ok(Json(serde_json::json!({ "structure": id, "items": items })).into_response())
 }
@@ -196,7 +192,7 @@ pub async fn add_maintenance(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let body: MaintenanceBody = json_body(&shared, &headers, body).await?;
+    let body: MaintenanceBody = json_body(&headers, body, shared.limits).await?;
     let time = |pointer: &str, text: &str| {
         Timestamp::parse(text).map_err(|e| ApiError::invalid_field(pointer.to_owned(), e.to_string()))
     };
@@ -240,18 +236,6 @@ pub async fn identifiability(State(shared): State<Shared>, ApiPath(id): ApiPath<
     Ok(Json(body).into_response())
 }
 
-async fn json_body<T: serde::de::DeserializeOwned>(
-    shared: &Shared,
-    headers: &HeaderMap,
-    body: Body,
-) -> Result<T, ApiError> {
-    match media_type(headers).as_deref() {
-        Some("application/json") => {}
-        other => return Err(unsupported_media_type(other, "application/json")),
-    }
-    parse_json(&read_body(body, headers, shared.limits).await?)
-}
-
 fn check_text(pointer: &str, text: &str) -> Result<(), ApiError> {
     let length = text.chars().count();
     if (1..=LONGEST_TEXT).contains(&length) && !text.chars().any(char::is_control) {
@@ -259,12 +243,4 @@ fn check_text(pointer: &str, text: &str) -> Result<(), ApiError> {
     }
     let message = format!("{} must have 1 to {LONGEST_TEXT} printable characters", shown(text));
     Err(ApiError::invalid_field(pointer.to_owned(), message))
-}
-
-fn limit(text: Option<&str>, default: usize) -> Result<usize, ApiError> {
-    let Some(text) = text else { return Ok(default) };
-    text.parse().ok().filter(|n| (1..=MAX_LIMIT).contains(n)).ok_or_else(|| {
-        let message = format!("{} must be a whole number from 1 to {MAX_LIMIT}", shown(text));
-        ApiError::invalid_field("query/limit", message)
-    })
 }

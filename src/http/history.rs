@@ -9,15 +9,11 @@ use serde::{Deserialize, Serialize};
 
 use super::answer::{HistoryItem, Undamaged, HISTORY_COLUMNS};
 use super::error::ApiError;
-use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery};
+use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
 use super::Shared;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::HistoryQuery;
 
-/// Items of a page unless the client asks for another number.
-const DEFAULT_LIMIT: usize = 100;
-/// Most items of a page.
-const MAX_LIMIT: usize = 1_000;
 /// p of the damage threshold unless the client gives another (paper §4).
 const DEFAULT_THRESHOLD_PROBABILITY: f64 = 0.05;
 
@@ -155,11 +151,7 @@ pub async fn declare_baseline(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    match media_type(&headers).as_deref() {
-        Some("application/json") => {}
-        other => return Err(unsupported_media_type(other, "application/json")),
-    }
-    let body: BaselineBody = parse_json(&read_body(body, &headers, shared.limits).await?)?;
+    let body: BaselineBody = json_body(&headers, body, shared.limits).await?;
     if body.batches.is_empty() {
         return Err(ApiError::invalid_field("/batches", "name at least one batch"));
     }
@@ -177,13 +169,7 @@ fn page(query: &PageQuery) -> Result<HistoryQuery, ApiError> {
         };
         text.as_ref().map(parse).transpose()
     };
-    let limit = match &query.limit {
-        None => DEFAULT_LIMIT,
-        Some(text) => text.parse().ok().filter(|n| (1..=MAX_LIMIT).contains(n)).ok_or_else(|| {
-            let message = format!("{} must be a whole number from 1 to {MAX_LIMIT}", crate::quantity::shown(text));
-            ApiError::invalid_field("query/limit", message)
-        })?,
-    };
+    let limit = page_limit(query.limit.as_deref())?;
     let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
     let (after, after_quantity) = after.map_or((None, None), |(time, batch, quantity)| (Some((time, batch)), quantity));
     Ok(HistoryQuery {

@@ -213,3 +213,36 @@ pub fn structure_id(text: &str) -> Result<crate::quantity::StructureId, ApiError
     };
     crate::quantity::StructureId::parse(text).map_err(invalid)
 }
+
+/// A JSON body.
+///
+/// # Errors
+/// 415 for another content type, else as [`read_body`] and [`parse_json`].
+pub async fn json_body<T: DeserializeOwned>(
+    headers: &HeaderMap,
+    body: Body,
+    limits: BodyLimits,
+) -> Result<T, ApiError> {
+    match media_type(headers).as_deref() {
+        Some("application/json") => {}
+        other => return Err(unsupported_media_type(other, "application/json")),
+    }
+    parse_json(&read_body(body, headers, limits).await?)
+}
+
+/// Items of a page unless the client asks for another number.
+const DEFAULT_LIMIT: usize = 100;
+/// Most items of a page.
+const MAX_LIMIT: usize = 1_000;
+
+/// The `limit` of a query.
+///
+/// # Errors
+/// 422 for anything but a whole number from 1 to 1000.
+pub fn page_limit(text: Option<&str>) -> Result<usize, ApiError> {
+    let Some(text) = text else { return Ok(DEFAULT_LIMIT) };
+    text.parse().ok().filter(|n| (1..=MAX_LIMIT).contains(n)).ok_or_else(|| {
+        let message = format!("{} must be a whole number from 1 to {MAX_LIMIT}", crate::quantity::shown(text));
+        ApiError::invalid_field("query/limit", message)
+    })
+}
