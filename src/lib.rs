@@ -75,6 +75,7 @@ pub mod baseline;
 pub mod cli;
 pub mod config;
 pub mod damage;
+pub mod discrepancy;
 pub mod flow;
 pub mod hierarchy;
 pub mod http;

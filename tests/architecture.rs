@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 const FOUNDATION: [&str; 4] = ["quantity", "stats", "parameter", "measurement"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
-const TABLE: [(&str, &[&str], bool); 22] = [
+const TABLE: [(&str, &[&str], bool); 23] = [
     ("quantity", &[], false),
     ("stats", &[], false),
     ("plot", &[], false),
@@ -23,6 +23,7 @@ const TABLE: [(&str, &[&str], bool); 22] = [
     ("baseline", &["flow", "simulator", "posterior", "physics"], true),
     ("hierarchy", &["posterior"], true),
     ("trust", &["baseline", "simulator", "physics"], true),
+    ("discrepancy", &["physics", "plot", "simulator"], true),
     ("damage", &["hierarchy", "posterior"], true),
     ("alarm", &["damage"], true),
     ("assessment", &["damage", "trust"], true),
@@ -53,6 +54,7 @@ const TABLE: [(&str, &[&str], bool); 22] = [
             "baseline",
             "config",
             "damage",
+            "discrepancy",
             "flow",
             "http",
             "monitor",

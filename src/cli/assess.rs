@@ -111,7 +111,7 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
 fn read_batch(args: &AssessArgs, path: &Path, baseline: &Baseline) -> anyhow::Result<MeasurementBatch> {
     let simulator = baseline.simulator();
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let options = CsvOptions { times: Times::RowNumber, ignore: args.ignore.clone() };
+    let options = CsvOptions { times: Times::RowNumber, ignore: args.ignore.clone(), time_column: None };
     let expectation = Expectation {
         modes: simulator.modes(),
         frequency_limits_hz: simulator.frequency_limits_hz(),

@@ -4,6 +4,7 @@ mod assess;
 mod calibrate;
 mod demo;
 mod design_alarm;
+mod diagnose;
 mod serve;
 mod simulate;
 mod train;
@@ -40,6 +41,8 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
     Assess(assess::AssessArgs),
+    /// Find what the simulation gets wrong, name the cause and measure what naming it gains.
+    Diagnose(diagnose::DiagnoseArgs),
     /// Look at the configuration.
     Config {
         #[command(subcommand)]
@@ -108,6 +111,7 @@ pub fn run() -> anyhow::Result<()> {
         Command::Train(args) => train::train(&args),
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),
+        Command::Diagnose(args) => diagnose::diagnose(&args),
         Command::Calibrate(args) => calibrate::calibrate(&args),
         Command::DesignAlarm(args) => design_alarm::design_alarm(&args),
         Command::Config { what: ConfigCommand::Print { default: true, .. } } => {

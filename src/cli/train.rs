@@ -29,6 +29,9 @@ pub struct TrainArgs {
     /// Passes over the training samples [default: 80; 200 for a structure without measurement noise]
     #[arg(long)]
     epochs: Option<usize>,
+    /// Coupling units of the flow; more bend more and cost more [default: 4]
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=64))]
+    units: Option<u16>,
     /// Noise the baseline shall cover, as multiples of the structure's own
     #[arg(long, value_name = "LOW,HIGH", value_parser = noise_range, default_value = "0.1,5")]
     noise_range: NoiseRange,
@@ -67,15 +70,16 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let (samples, epochs) = if noisy { (200_000, 80) } else { (10_000, 200) };
     let (samples, epochs) = (args.samples.unwrap_or(samples), args.epochs.unwrap_or(epochs));
     let settings = TrainSettings { epochs, seed: args.seed, ..TrainSettings::default() };
+    let mut flow = FlowSettings::default();
+    flow.units = args.units.map_or(flow.units, usize::from);
     let bar = ProgressBar::new(epochs as u64);
     let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
     bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
     let started = Instant::now();
-    let trained =
-        train_baseline(&simulator, samples, args.noise_range, &FlowSettings::default(), &settings, |epoch| {
-            bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
-            bar.set_position(epoch.epoch as u64);
-        })?;
+    let trained = train_baseline(&simulator, samples, args.noise_range, &flow, &settings, |epoch| {
+        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
+        bar.set_position(epoch.epoch as u64);
+    })?;
     bar.finish_and_clear();
     let seconds = started.elapsed().as_secs_f64();
 

@@ -121,7 +121,7 @@ fn parse_batch(
         Some("text/csv") => {
             let ignore = query.ignore.as_deref().unwrap_or_default().split(',').map(|c| c.trim().to_owned());
             let ignore = ignore.filter(|column| !column.is_empty()).collect();
-            let options = CsvOptions { times: Times::Required, ignore };
+            let options = CsvOptions { times: Times::Required, ignore, time_column: None };
             let simulator = &watched.simulator;
             let raw = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
             (None, raw.map_err(ApiError::invalid_input)?)

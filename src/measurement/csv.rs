@@ -25,6 +25,86 @@ pub struct CsvOptions {
     pub times: Times,
     /// Columns that are not read.
     pub ignore: Vec<String>,
+    /// Column of the time, where it is not `measured_at`.
+    pub time_column: Option<String>,
+}
+
+/// A column that the structure does not declare, and what it seems to be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Offered {
+    /// A covariate of this kind.
+    Covariate(Covariate),
+    /// Text with so many different values that it says nothing.
+    Ignored {
+        /// The column.
+        name: String,
+        /// Different values.
+        values: usize,
+    },
+}
+
+/// What the undeclared columns of a table seem to be: numbers where every cell is one, categories where text has at most
+/// `most_categories` values.
+///
+/// # Errors
+/// As [`read`] for a table that cannot be read at all.
+pub fn offered(
+    bytes: &[u8],
+    covariates: &[Covariate],
+    options: &CsvOptions,
+    most_categories: usize,
+) -> Result<Vec<Offered>, Vec<Problem>> {
+    let text = text(bytes)?;
+    let separator = separator(text);
+    let problem = |error: &csv::Error| {
+        let line = error.position().map_or(1, csv::Position::line);
+        vec![Problem::new(format!("line {line}"), error.to_string())]
+    };
+    let mut records = reader(text, separator).into_records();
+    let Some(header) = records.next() else { return Ok(Vec::new()) };
+    let header = header.map_err(|e| problem(&e))?;
+    let unknown: Vec<usize> =
+        (0..header.len()).filter(|i| column(&header[*i], covariates, options).is_none()).collect();
+    let mut cells: Vec<std::collections::BTreeSet<String>> = vec![std::collections::BTreeSet::new(); unknown.len()];
+    let mut numeric = vec![true; unknown.len()];
+    for record in records {
+        let record = record.map_err(|e| problem(&e))?;
+        for (place, index) in unknown.iter().enumerate() {
+            let Some(cell) = record.get(*index).filter(|cell| !cell.is_empty()) else { continue };
+            numeric[place] &= number(cell, separator != b',').is_ok();
+            if cells[place].len() <= most_categories {
+                cells[place].insert(cell.to_owned());
+            }
+        }
+    }
+    let offer = |(place, index): (usize, &usize)| {
+        let (name, values) = (header[*index].to_owned(), cells[place].len());
+        if numeric[place] {
+            Offered::Covariate(Covariate { name, kind: CovariateKind::Number })
+        } else if values <= most_categories {
+            Offered::Covariate(Covariate { name, kind: CovariateKind::Category })
+        } else {
+            Offered::Ignored { name, values }
+        }
+    };
+    Ok(unknown.iter().enumerate().map(offer).collect())
+}
+
+fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
+    let text = std::str::from_utf8(bytes).map_err(|e| {
+        let line = bytes[..e.valid_up_to()].split(|b| *b == b'\n').count();
+        vec![Problem::new(format!("line {line}"), "not UTF-8: save the table as UTF-8")]
+    })?;
+    Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
+}
+
+fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
+    csv::ReaderBuilder::new()
+        .delimiter(separator)
+        .has_headers(false)
+        .flexible(true)
+        .trim(csv::Trim::All)
+        .from_reader(text.as_bytes())
 }
 
 /// What a column holds.
@@ -48,18 +128,9 @@ pub fn read(
     covariates: &[Covariate],
     options: &CsvOptions,
 ) -> Result<Vec<RawMeasurement>, Vec<Problem>> {
-    let text = std::str::from_utf8(bytes).map_err(|e| {
-        let line = bytes[..e.valid_up_to()].split(|b| *b == b'\n').count();
-        vec![Problem::new(format!("line {line}"), "not UTF-8: save the table as UTF-8")]
-    })?;
-    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    let text = text(bytes)?;
     let separator = separator(text);
-    let mut reader = csv::ReaderBuilder::new()
-        .delimiter(separator)
-        .has_headers(false)
-        .flexible(true)
-        .trim(csv::Trim::All)
-        .from_reader(text.as_bytes());
+    let mut reader = reader(text, separator);
     let mut records = reader.records();
     let mut next = || match records.next() {
         None => Ok(None),
@@ -149,7 +220,7 @@ fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<
     if options.ignore.iter().any(|ignored| ignored.eq_ignore_ascii_case(name)) {
         return Some(Column::Ignored);
     }
-    if lower == "measured_at" {
+    if options.time_column.as_ref().map_or(lower == "measured_at", |column| column.eq_ignore_ascii_case(name)) {
         return Some(Column::Time);
     }
     if let Some(covariate) = covariates.iter().find(|c| c.name.eq_ignore_ascii_case(name)) {

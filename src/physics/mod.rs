@@ -1,6 +1,7 @@
 //! Structures without networks: masses and springs, and their natural frequencies.
 
 pub mod assembly;
+pub mod effect;
 pub mod modes;
 
 use std::collections::BTreeSet;
@@ -95,6 +96,14 @@ pub enum Error {
     Mechanism {
         /// Name of a floating mass.
         mass: String,
+    },
+    /// An effect so large that hardly any stiffness, mass or frequency is left.
+    #[error("effect number {number} has a size of {size}: it leaves less than a fiftieth of what it acts on")]
+    Effect {
+        /// Index of the effect.
+        number: usize,
+        /// Its size.
+        size: f64,
     },
     /// More modes than degrees of freedom.
     #[error("asked for {asked} modes of a structure with {available}")]

@@ -2,6 +2,7 @@
 
 mod check;
 pub mod definition;
+pub mod law;
 pub mod population;
 
 use std::sync::Arc;
@@ -13,6 +14,7 @@ use rayon::prelude::*;
 
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
+use crate::physics::effect::{respond, Target};
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_hz, Structure};
 use crate::quantity::{Digest, StructureId};
 use crate::stats;
@@ -82,6 +84,17 @@ struct Parts {
     definition: StructureDefinition,
     digest: Digest,
     checked: check::Checked,
+}
+
+/// Frequencies under effects and their derivatives.
+#[derive(Debug, Clone)]
+pub struct Response {
+    /// As the data would have them, Hz, `[m]`.
+    pub frequencies_hz: Vec<f64>,
+    /// Hz per parameter unit, `[m, d]`.
+    pub by_parameter: DMatrix<f64>,
+    /// Hz per unit of each size, `[m, sizes]`.
+    pub by_size: DMatrix<f64>,
 }
 
 /// Simulated pairs of parameters and exact frequencies.
@@ -196,6 +209,59 @@ impl Simulator {
         Ok(jacobian)
     }
 
+    /// The lowest `modes` frequencies at `theta` under further effects, and their derivatives; `sizes` as in [`respond`].
+    ///
+    /// # Errors
+    /// As [`Self::frequencies_hz`] and [`respond`].
+    pub fn respond(
+        &self,
+        theta: &[f64],
+        modes: usize,
+        targets: &[Target],
+        sizes: &[f64],
+    ) -> Result<Response, physics::Error> {
+        let mut theta = theta.to_vec();
+        let mut set_scale = vec![1.0; theta.len()];
+        let mut first = 0;
+        for target in targets {
+            match target {
+                Target::SettingOffset(column) => theta[*column] += sizes[first],
+                Target::SettingScale(column) => {
+                    theta[*column] *= 1.0 + sizes[first];
+                    set_scale[*column] *= 1.0 + sizes[first];
+                }
+                _ => {}
+            }
+            first += target.sizes();
+        }
+        let mut response = respond(&self.structure_at(&theta)?, modes, targets, sizes)?;
+        let mut by_parameter = DMatrix::zeros(modes, theta.len());
+        for binding in &self.parts.checked.bindings {
+            let slope = binding.slope(theta[binding.parameter]);
+            for mode in 0..modes {
+                by_parameter[(mode, binding.parameter)] += response.by_spring[(mode, binding.spring)] * slope;
+            }
+        }
+        first = 0;
+        for target in targets {
+            for mode in 0..modes {
+                match target {
+                    Target::SettingOffset(column) => response.by_size[(mode, first)] = by_parameter[(mode, *column)],
+                    Target::SettingScale(column) => {
+                        response.by_size[(mode, first)] =
+                            by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
+                    }
+                    _ => {}
+                }
+            }
+            first += target.sizes();
+        }
+        for (column, scale) in set_scale.iter().enumerate() {
+            by_parameter.column_mut(column).scale_mut(*scale);
+        }
+        Ok(Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size: response.by_size })
+    }
+
     /// Natural frequencies at the nominal stiffnesses, Hz.
     pub fn nominal_frequencies_hz(&self) -> Vec<f64> {
         self.parts.checked.nominal_frequencies_hz.clone()
@@ -219,6 +285,16 @@ impl Simulator {
             Some(DerivedStiffness { name, parameter: binding.parameter, law: binding.law? })
         };
         self.parts.checked.bindings.iter().filter_map(derived).collect()
+    }
+
+    /// Springs that one parameter sets together, with the parameter's name.
+    pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
+        let group = |(column, parameter): (usize, &Parameter)| {
+            let bindings = self.parts.checked.bindings.iter().filter(|b| b.parameter == column);
+            let springs: Vec<usize> = bindings.map(|b| b.spring).collect();
+            (springs.len() > 1).then(|| (parameter.name.clone(), springs))
+        };
+        self.space().iter().enumerate().filter_map(group).collect()
     }
 
     /// The prior box with a margin on each side, which a flow is trained in: a density is hardest to learn at an edge, and

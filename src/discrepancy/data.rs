@@ -1,0 +1,161 @@
+//! Measurements as the study of discrepancies takes them: rows in time order, logarithms of frequencies, covariates.
+
+use std::collections::BTreeMap;
+
+use crate::measurement::{CovariateValue, ModalMeasurement};
+use crate::quantity::{Digest, Hertz};
+use crate::simulator::law::{lagged, Input, Law, LawKind};
+use crate::simulator::Simulator;
+
+/// Name of time among the covariates; its unit is days since the first row.
+pub const TIME: &str = "time";
+
+/// Least relative standard deviation of a frequency: a structure without noise still has data of finite precision.
+const LEAST_NOISE: f64 = 1e-5;
+
+/// Most categories that a text column may have to be a covariate.
+pub const MOST_LEVELS: usize = 12;
+
+const MICROS_A_DAY: f64 = 86_400e6;
+
+/// Values of a covariate.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Values {
+    /// NaN where missing.
+    Numbers(Vec<f64>),
+    /// Names, and for each row an index among them.
+    Categories(Vec<String>, Vec<Option<usize>>),
+}
+
+/// A covariate of the rows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Column {
+    /// Its name with its unit.
+    pub name: String,
+    /// Its values.
+    pub values: Values,
+}
+
+/// Rows of measurements in the order of time.
+#[derive(Debug, Clone)]
+pub struct Data {
+    /// Days since the first row.
+    pub times_days: Vec<f64>,
+    /// ln f, `[n][m]`, f in Hz; NaN where a mode is missing.
+    pub log_frequencies: Vec<Vec<f64>>,
+    /// Relative standard deviation of each frequency as stated by the row or the structure, `[n][m]`.
+    pub noise: Vec<Vec<f64>>,
+    /// Parameters set by the experimenter, `[n][d]`.
+    pub settings: Vec<Vec<Option<f64>>>,
+    /// Covariates, time last.
+    pub columns: Vec<Column>,
+    /// Digest of the measurements.
+    pub digest: Digest,
+}
+
+impl Data {
+    /// Sorts measurements by time and turns them into rows.
+    pub fn new(simulator: &Simulator, measurements: &[ModalMeasurement]) -> Self {
+        let mut sorted: Vec<&ModalMeasurement> = measurements.iter().collect();
+        sorted.sort_by_key(|m| m.measured_at);
+        let start = sorted.first().map_or(0, |m| m.measured_at.micros());
+        let times_days: Vec<f64> =
+            sorted.iter().map(|m| (m.measured_at.micros() - start) as f64 / MICROS_A_DAY).collect();
+        let noise_of = |m: &ModalMeasurement, mode: usize, f: f64| {
+            let stated = m.std_hz.as_ref().and_then(|stds| stds[mode]).unwrap_or_else(|| simulator.noise().std_hz(f));
+            (stated / f).max(LEAST_NOISE)
+        };
+        let row = |m: &&ModalMeasurement| -> (Vec<f64>, Vec<f64>) {
+            let cell = |(mode, f): (usize, &Option<Hertz>)| {
+                f.map_or((f64::NAN, LEAST_NOISE), |f| (f.get().ln(), noise_of(m, mode, f.get())))
+            };
+            m.frequencies_hz.iter().enumerate().map(cell).unzip()
+        };
+        let (log_frequencies, noise) = sorted.iter().map(row).unzip();
+        let setting = |m: &&ModalMeasurement| {
+            simulator.space().iter().map(|p| m.settings.get(&p.name).copied()).collect::<Vec<_>>()
+        };
+        let mut names: BTreeMap<&str, bool> = BTreeMap::new();
+        for m in &sorted {
+            for (name, value) in &m.covariates {
+                *names.entry(name).or_default() |= matches!(value, CovariateValue::Category(_));
+            }
+        }
+        let mut columns: Vec<Column> =
+            names.into_iter().map(|(name, category)| column(name, category, &sorted)).collect();
+        columns.push(Column { name: TIME.to_owned(), values: Values::Numbers(times_days.clone()) });
+        let content = serde_json::to_vec(&sorted).expect("checked measurements are plain data");
+        Self {
+            settings: sorted.iter().map(setting).collect(),
+            digest: Digest::of(&[&content]),
+            times_days,
+            log_frequencies,
+            noise,
+            columns,
+        }
+    }
+
+    /// Number of rows n.
+    pub fn rows(&self) -> usize {
+        self.times_days.len()
+    }
+
+    /// The covariate of a name.
+    pub fn column(&self, name: &str) -> Option<&Column> {
+        self.columns.iter().find(|c| c.name == name)
+    }
+
+    /// The covariate of a law at each row; `lag_days` where the law has one.
+    ///
+    /// A lag is followed over all rows, so this must be asked of all rows, not of a part of them.
+    pub fn inputs(&self, law: &Law, lag_days: Option<f64>) -> Vec<Input> {
+        let Some(column) = law.covariate.as_deref().and_then(|name| self.column(name)) else {
+            return vec![if law.covariate.is_none() { Input::Number(0.0) } else { Input::Missing }; self.rows()];
+        };
+        match &column.values {
+            Values::Numbers(values) if law.kind == LawKind::Lagged => {
+                let lag = lag_days.unwrap_or(1.0).max(1e-3);
+                lagged(&self.times_days, values, lag).into_iter().map(|(v, slope)| Input::Lagged(v, slope)).collect()
+            }
+            Values::Numbers(values) => {
+                let input = |v: &f64| if v.is_finite() { Input::Number(*v) } else { Input::Missing };
+                values.iter().map(input).collect()
+            }
+            Values::Categories(names, indices) => {
+                let place = |index: usize| law.levels.iter().position(|level| *level == names[index]);
+                indices.iter().map(|i| i.map_or(Input::Missing, |i| Input::Level(place(i)))).collect()
+            }
+        }
+    }
+}
+
+impl Column {
+    /// Its numbers where they are known, in the order of `rows`.
+    pub fn numbers(&self, rows: &[usize]) -> Vec<f64> {
+        match &self.values {
+            Values::Numbers(values) => rows.iter().map(|r| values[*r]).filter(|v| v.is_finite()).collect(),
+            Values::Categories(..) => Vec::new(),
+        }
+    }
+}
+
+fn column(name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
+    let values = || sorted.iter().map(|m| m.covariates.get(name));
+    if !category {
+        let number = |value: Option<&CovariateValue>| match value {
+            Some(CovariateValue::Number(number)) => *number,
+            _ => f64::NAN,
+        };
+        return Column { name: name.to_owned(), values: Values::Numbers(values().map(number).collect()) };
+    }
+    let text = |value: &CovariateValue| match value {
+        CovariateValue::Category(text) => text.clone(),
+        CovariateValue::Number(number) => number.to_string(),
+    };
+    let mut levels: Vec<String> = values().flatten().map(text).collect();
+    levels.sort();
+    levels.dedup();
+    let index = |value: Option<&CovariateValue>| value.and_then(|v| levels.binary_search(&text(v)).ok());
+    let indices = values().map(index).collect();
+    Column { name: name.to_owned(), values: Values::Categories(levels, indices) }
+}

@@ -1,0 +1,231 @@
+//! Measuring: what an extension gains on rows that no fit and no choice has seen.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{DMatrix, DVector};
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+use statrs::distribution::{ContinuousCDF as _, StudentsT};
+
+use super::model::{Fit, RowView, Study};
+use crate::parameter::DamageDirection;
+use crate::stats;
+
+/// Rows of one batch, for shifts of parameters and alarms.
+const BATCH: usize = 10;
+
+/// Share of healthy batches that may raise an alarm.
+const ALARM_RATE: f64 = 0.001;
+
+/// Bootstrap samples of blocks.
+const BOOTSTRAPS: usize = 500;
+const BLOCKS: usize = 20;
+
+/// A figure before and after the extension.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Change<T> {
+    /// By the simulation as it was.
+    pub before: T,
+    /// With the causes that were found.
+    pub after: T,
+}
+
+/// Log predictive density.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DensityChange {
+    /// Nats a row, simulation as it was.
+    pub before: f64,
+    /// Nats a row, with the causes.
+    pub after: f64,
+    /// After minus before.
+    pub difference: f64,
+    /// Standard error of the difference, over blocks of rows.
+    pub standard_error: f64,
+}
+
+/// The gain table.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Gain {
+    /// Rows it was measured on.
+    pub holdout_rows: usize,
+    /// Root mean square error of each predicted frequency, per cent.
+    pub rms_error_percent: Change<Vec<f64>>,
+    /// 90 % interval of after minus before for each mode, by bootstrap over blocks.
+    pub rms_difference_interval90: Vec<[f64; 2]>,
+    /// Log predictive density of the logarithms of the frequencies.
+    pub log_density_per_row: DensityChange,
+    /// Share of frequencies inside their 90 % interval.
+    pub coverage90: Change<f64>,
+    /// Standard deviation of each parameter over healthy batches of ten rows, per cent of its mean.
+    pub spread_of_parameters_percent: Change<BTreeMap<String, f64>>,
+    /// Batches of ten healthy rows whose parameters lie beyond a limit set for 1 in 1000.
+    pub false_alarms_per_1000: Change<f64>,
+    /// Loss of the parameter that is seen worst, detected with 90 % probability in one batch of ten rows at a limit that
+    /// healthy batches really keep.
+    pub smallest_detectable_loss_percent: Change<f64>,
+}
+
+struct Side {
+    rms: Vec<f64>,
+    densities: Vec<f64>,
+    coverage: f64,
+    spread: BTreeMap<String, f64>,
+    false_alarms: f64,
+    detectable: f64,
+    errors: Vec<Vec<f64>>,
+}
+
+/// The gain of `after` over `before` on `holdout`; `training` gives the scatter that alarm limits must live with.
+pub fn gain(
+    study: &Study<'_>,
+    training: &[usize],
+    holdout: &[usize],
+    before: &Fit,
+    after: &Fit,
+    seed: u64,
+) -> Option<Gain> {
+    let (a, b) = (side(study, training, holdout, before)?, side(study, training, holdout, after)?);
+    let n = holdout.len();
+    let differences: Vec<f64> = b.densities.iter().zip(&a.densities).map(|(b, a)| b - a).collect();
+    let mean = stats::mean(&differences);
+    let block = |place: usize| place * BLOCKS / n;
+    let sums = (0..BLOCKS).map(|k| {
+        let of = differences.iter().enumerate().filter(|(p, _)| block(*p) == k).map(|(_, d)| d - mean);
+        of.sum::<f64>().powi(2)
+    });
+    let standard_error = sums.sum::<f64>().sqrt() / n as f64;
+
+    let mut stream = stats::stream(seed, "bootstrap of the gain");
+    let modes = a.rms.len();
+    let mut draws: Vec<Vec<f64>> = vec![Vec::new(); modes];
+    for _ in 0..BOOTSTRAPS {
+        let chosen: Vec<usize> = (0..BLOCKS).map(|_| stream.random_range(0..BLOCKS)).collect();
+        for (mode, draws) in draws.iter_mut().enumerate() {
+            let rms = |errors: &[Vec<f64>]| {
+                let (mut sum, mut count) = (0.0, 0.0);
+                for k in &chosen {
+                    for place in (k * n).div_ceil(BLOCKS)..((k + 1) * n).div_ceil(BLOCKS).min(n) {
+                        let error = errors[place][mode];
+                        if error.is_finite() {
+                            sum += error * error;
+                            count += 1.0;
+                        }
+                    }
+                }
+                100.0 * (sum / f64::max(count, 1.0)).sqrt()
+            };
+            draws.push(rms(&b.errors) - rms(&a.errors));
+        }
+    }
+    let interval = |d: &Vec<f64>| [stats::quantile(d, 0.05), stats::quantile(d, 0.95)];
+    Some(Gain {
+        holdout_rows: n,
+        rms_error_percent: Change { before: a.rms, after: b.rms },
+        rms_difference_interval90: draws.iter().map(interval).collect(),
+        log_density_per_row: DensityChange {
+            before: stats::mean(&a.densities),
+            after: stats::mean(&b.densities),
+            difference: mean,
+            standard_error,
+        },
+        coverage90: Change { before: a.coverage, after: b.coverage },
+        spread_of_parameters_percent: Change { before: a.spread, after: b.spread },
+        false_alarms_per_1000: Change { before: a.false_alarms, after: b.false_alarms },
+        smallest_detectable_loss_percent: Change { before: a.detectable, after: b.detectable },
+    })
+}
+
+fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> Option<Side> {
+    let views = study.view(holdout, fit)?;
+    let modes = study.simulator.modes();
+    let error = |view: &RowView| {
+        let mut errors = vec![f64::NAN; modes];
+        for (place, mode) in view.present.iter().enumerate() {
+            errors[*mode] = view.residual[place];
+        }
+        errors
+    };
+    let errors: Vec<Vec<f64>> = views.iter().map(error).collect();
+    let rms = |mode: usize| {
+        let known: Vec<f64> = errors.iter().map(|e| e[mode]).filter(|e| e.is_finite()).map(|e| e * e).collect();
+        100.0 * stats::mean(&known).sqrt()
+    };
+    let edge = if fit.tails.is_finite() {
+        StudentsT::new(0.0, 1.0, fit.tails).ok()?.inverse_cdf(0.95)
+    } else {
+        stats::normal_quantile(0.95)
+    };
+    let inside = |view: &RowView| {
+        let within = |place: usize| view.residual[place].abs() <= edge * view.covariance[(place, place)].sqrt();
+        (0..view.present.len()).filter(|p| within(*p)).count()
+    };
+    let cells: usize = views.iter().map(|v| v.present.len()).sum();
+    let coverage = views.iter().map(inside).sum::<usize>() as f64 / cells.max(1) as f64;
+
+    let space = study.simulator.space().as_slice();
+    let shifts = shifts(study, &views);
+    let healthy = study.view(training, fit)?;
+    let own = self::shifts(study, &healthy);
+    let limit = -stats::normal_quantile(ALARM_RATE / study.free().len().max(1) as f64);
+    let damaging = |k: usize, value: f64| match space[k].damage {
+        DamageDirection::Decrease => -value,
+        DamageDirection::Increase => value,
+        DamageDirection::None => f64::NEG_INFINITY,
+    };
+    let alarms = shifts.iter().filter(|s| s.iter().any(|(k, shift, std)| damaging(*k, shift / std) > limit)).count();
+    let mut spread = BTreeMap::new();
+    let mut detectable: f64 = 0.0;
+    for (place, &k) in study.free().iter().enumerate() {
+        let share = |s: &Vec<(usize, f64, f64)>| s[place].1 / fit.mean[k];
+        let held: Vec<f64> = shifts.iter().map(share).collect();
+        spread.insert(space[k].name.clone(), 100.0 * stats::sample_std(&held).unwrap_or(f64::NAN));
+        let known: Vec<f64> = own.iter().map(share).map(|s| s * s).collect();
+        let scatter = stats::mean(&known).sqrt();
+        detectable = detectable.max(100.0 * (limit + stats::normal_quantile(0.9)) * scatter);
+    }
+    Some(Side {
+        rms: (0..modes).map(rms).collect(),
+        densities: views.iter().map(|v| v.log_density).collect(),
+        coverage,
+        spread,
+        false_alarms: 1000.0 * alarms as f64 / shifts.len().max(1) as f64,
+        detectable,
+        errors,
+    })
+}
+
+/// For each run of ten rows and each free parameter: (parameter, shift of its mean, standard error of the shift).
+///
+/// ```text
+///  δ = (Σ w JᵀV⁻¹J)⁻¹ Σ w JᵀV⁻¹e
+/// ```
+fn shifts(study: &Study<'_>, views: &[RowView]) -> Vec<Vec<(usize, f64, f64)>> {
+    let free = study.free();
+    let d = free.len();
+    let parts: Vec<(DMatrix<f64>, DVector<f64>)> = views
+        .iter()
+        .map(|view| {
+            let slopes = view.by_parameter.select_columns(free);
+            let solved = view.covariance.clone().cholesky().expect("noise is never 0");
+            let information = slopes.tr_mul(&solved.solve(&slopes)) * view.weight;
+            (information, slopes.tr_mul(&solved.solve(&view.residual)) * view.weight)
+        })
+        .collect();
+    if d == 0 || parts.is_empty() {
+        return Vec::new();
+    }
+    let size = BATCH.min(parts.len());
+    parts
+        .windows(size)
+        .filter_map(|window| {
+            let (mut information, mut along) = (DMatrix::zeros(d, d), DVector::zeros(d));
+            for (i, a) in window {
+                information += i;
+                along += a;
+            }
+            let covariance = information.try_inverse()?;
+            let shift = &covariance * along;
+            Some(free.iter().enumerate().map(|(p, k)| (*k, shift[p], covariance[(p, p)].sqrt())).collect())
+        })
+        .collect()
+}

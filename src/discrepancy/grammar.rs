@@ -1,0 +1,331 @@
+//! The grammar of effects: every target × covariate that data can have, and the laws of each.
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+
+use super::data::{Column, Data, Values, TIME};
+use super::model::{Effect, Number};
+use crate::physics::effect::Target;
+use crate::physics::Node;
+use crate::simulator::law::{Law, LawKind};
+use crate::simulator::Simulator;
+use crate::stats;
+
+/// Springs are added between all pairs of nodes up to this many masses; beyond it only between neighbours' neighbours.
+const ALL_PAIRS_MASSES: usize = 12;
+
+/// Most springs that may be added at all.
+const MOST_ADDED: usize = 400;
+
+/// What kind of thing a cause is, which says how plausible it is and what to do about it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Class {
+    /// Weather, load, moisture.
+    Environment,
+    /// The measuring chain.
+    Instrument,
+    /// Who measured, how, and with what settings.
+    SetUp,
+    /// The simulation describes the structure wrongly.
+    Structure,
+    /// The structure has changed with time.
+    PossibleDamage,
+}
+
+/// A target with a covariate: what could be the cause. Its laws are ways to write it down.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Candidate {
+    /// What changes.
+    pub target: Target,
+    /// Under which covariate; `None` for a constant.
+    pub covariate: Option<String>,
+    /// The category that differs; `None` for other covariates, or when each category has its own number.
+    pub level: Option<String>,
+    /// Kind of cause.
+    pub class: Class,
+    /// Springs or masses that there are, for a target of either.
+    pub of: usize,
+    /// Weight before seeing data, relative to the others; ties only, a factor of a few.
+    pub weight: f64,
+}
+
+/// All candidates of a structure and its data, with their priors summing to 1.
+pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
+    let mut all = Vec::new();
+    for target in targets(simulator, data) {
+        let mut add = |covariate: Option<&str>, level: Option<&str>| {
+            let (class, weight) = plausibility(&target, covariate, is_category(data, covariate));
+            let (covariate, level) = (covariate.map(str::to_owned), level.map(str::to_owned));
+            let of = match &target {
+                Target::Springs(_) => simulator.structure().springs().len(),
+                Target::Masses(_) => simulator.structure().masses().len(),
+                _ => 0,
+            };
+            all.push(Candidate { target: target.clone(), covariate, level, class, of, weight });
+        };
+        add(None, None);
+        if matches!(target, Target::Oscillator(_) | Target::ModeOrder(_)) {
+            continue;
+        }
+        for column in &data.columns {
+            match &column.values {
+                Values::Numbers(_) => {
+                    if spread(column, rows) > 0.0 {
+                        add(Some(&column.name), None);
+                    }
+                }
+                Values::Categories(names, indices) => {
+                    let used: BTreeSet<usize> = rows.iter().filter_map(|r| indices[*r]).collect();
+                    if used.len() < 2 || used.len() > super::data::MOST_LEVELS {
+                        continue;
+                    }
+                    // Of two categories either can be the odd one; the later in the alphabet is taken.
+                    let skipped = usize::from(used.len() == 2);
+                    for level in used.iter().skip(skipped) {
+                        add(Some(&column.name), Some(&names[*level]));
+                    }
+                    if used.len() > 2 {
+                        add(Some(&column.name), None);
+                    }
+                }
+            }
+        }
+    }
+    let total: f64 = all.iter().map(|c| c.weight).sum();
+    for candidate in &mut all {
+        candidate.weight /= total;
+    }
+    all
+}
+
+fn is_category(data: &Data, covariate: Option<&str>) -> bool {
+    covariate.and_then(|c| data.column(c)).is_some_and(|c| matches!(c.values, Values::Categories(..)))
+}
+
+/// Everything that could change.
+pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
+    let structure = simulator.structure();
+    let (springs, masses, modes) = (structure.springs().len(), structure.masses().len(), simulator.modes());
+    let mut targets: Vec<Target> = (0..springs).map(|s| Target::Springs(vec![s])).collect();
+    targets.extend(simulator.spring_groups().into_iter().map(|(_, group)| Target::Springs(group)));
+    if springs > 1 {
+        targets.push(Target::Springs((0..springs).collect()));
+    }
+    targets.extend((0..masses).map(|m| Target::Masses(vec![m])));
+    if masses > 1 {
+        targets.push(Target::Masses((0..masses).collect()));
+    }
+    targets.extend([Target::FrequencyScale(None), Target::FrequencyOffset(None)]);
+    if modes > 1 {
+        targets.extend((0..modes).flat_map(|m| [Target::FrequencyScale(Some(m)), Target::FrequencyOffset(Some(m))]));
+    }
+    for column in 0..simulator.space().len() {
+        if data.settings.iter().any(|row| row[column].is_some()) {
+            targets.extend([Target::SettingOffset(column), Target::SettingScale(column)]);
+        }
+    }
+    targets.extend(missing_springs(simulator).into_iter().map(|(from, to)| Target::AddedSpring(from, to)));
+    targets.extend((0..masses).map(Target::Oscillator));
+    // A mode that was overlooked, or two neighbours taken for each other.
+    if masses > modes {
+        let skipping = |skipped: usize| (0..modes).map(|m| m + usize::from(m >= skipped)).collect();
+        targets.extend((0..modes).map(|skipped| Target::ModeOrder(skipping(skipped))));
+    }
+    for low in 0..modes.saturating_sub(1) {
+        let mut order: Vec<usize> = (0..modes).collect();
+        order.swap(low, low + 1);
+        targets.push(Target::ModeOrder(order));
+    }
+    targets
+}
+
+/// Pairs of nodes that no spring joins.
+fn missing_springs(simulator: &Simulator) -> Vec<(Node, Node)> {
+    let structure = simulator.structure();
+    let masses = structure.masses().len();
+    let joined =
+        |a: Node, b: Node| structure.springs().iter().any(|s| (s.from, s.to) == (a, b) || (s.from, s.to) == (b, a));
+    let near = |a: usize, b: usize| {
+        masses <= ALL_PAIRS_MASSES
+            || (0..masses).any(|c| joined(Node::Mass(a), Node::Mass(c)) && joined(Node::Mass(c), Node::Mass(b)))
+    };
+    let mut pairs = Vec::new();
+    for a in 0..masses {
+        if !joined(Node::Ground, Node::Mass(a)) {
+            pairs.push((Node::Ground, Node::Mass(a)));
+        }
+        for b in a + 1..masses {
+            if !joined(Node::Mass(a), Node::Mass(b)) && near(a, b) {
+                pairs.push((Node::Mass(a), Node::Mass(b)));
+            }
+        }
+    }
+    pairs.truncate(MOST_ADDED);
+    pairs
+}
+
+/// Class and relative weight of a cause. Weights differ by a few only: they order what data cannot tell apart, and must not
+/// outvote them.
+fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
+    let time = covariate == Some(TIME);
+    match target {
+        Target::Springs(_) | Target::AddedSpring(..) => match covariate {
+            _ if time => (Class::PossibleDamage, 1.0),
+            Some(_) if category => (Class::SetUp, 0.5),
+            Some(_) => (Class::Environment, if matches!(target, Target::Springs(_)) { 1.0 } else { 0.3 }),
+            None => (Class::Structure, 0.5),
+        },
+        Target::Masses(_) => match covariate {
+            _ if time => (Class::Structure, 0.4),
+            Some(_) if category => (Class::SetUp, 0.5),
+            Some(_) => (Class::Environment, 0.5),
+            None => (Class::Structure, 0.5),
+        },
+        Target::FrequencyScale(mode) | Target::FrequencyOffset(mode) => {
+            let one = if mode.is_some() { 0.2 } else { 1.0 };
+            (Class::Instrument, if category || covariate.is_none() || time { one } else { 0.4 * one })
+        }
+        Target::SettingOffset(_) | Target::SettingScale(_) => {
+            (Class::SetUp, if category || covariate.is_none() { 1.0 } else { 0.3 })
+        }
+        Target::Oscillator(_) => (Class::Structure, 0.4),
+        Target::ModeOrder(_) => (Class::SetUp, 0.5),
+    }
+}
+
+/// Standard deviation of a numeric covariate over rows; 0 for a constant.
+pub fn spread(column: &Column, rows: &[usize]) -> f64 {
+    let numbers = column.numbers(rows);
+    let std = stats::sample_std(&numbers).unwrap_or(0.0);
+    let size = numbers.iter().fold(0.0, |a: f64, v| a.max(v.abs()));
+    // A constant that rounding moves is a constant.
+    if std > 1e-9 * size {
+        std
+    } else {
+        0.0
+    }
+}
+
+impl Candidate {
+    /// Whether it moves all frequencies by one share: all springs, all masses and the instrument's scale do the same.
+    pub fn acts_on_all(&self) -> bool {
+        match &self.target {
+            Target::Springs(indices) | Target::Masses(indices) => indices.len() == self.of,
+            Target::FrequencyScale(mode) => mode.is_none(),
+            _ => false,
+        }
+    }
+
+    /// Laws by which it can be written.
+    pub fn laws(&self, data: &Data) -> Vec<LawKind> {
+        let Some(name) = &self.covariate else { return vec![LawKind::Constant] };
+        if is_category(data, Some(name)) {
+            return vec![LawKind::Category];
+        }
+        if name == TIME {
+            return vec![LawKind::Step, LawKind::Linear];
+        }
+        use LawKind::{Bilinear, Exponential, Lagged, Linear, Quadratic};
+        vec![Linear, Quadratic, Bilinear, Exponential, Lagged]
+    }
+
+    /// Categories that get a number of their own; the most frequent one is what the others are compared with.
+    pub fn levels(&self, data: &Data, rows: &[usize]) -> Vec<String> {
+        let column = self.covariate.as_deref().and_then(|name| data.column(name));
+        let Some(Values::Categories(names, indices)) = column.map(|c| &c.values) else { return Vec::new() };
+        if let Some(level) = &self.level {
+            return vec![level.clone()];
+        }
+        let used: BTreeSet<usize> = rows.iter().filter_map(|r| indices[*r]).collect();
+        let count = |l: &usize| rows.iter().filter(|r| indices[**r] == Some(*l)).count();
+        let most = used.iter().copied().max_by_key(count);
+        used.iter().filter(|l| Some(**l) != most).map(|l| names[*l].clone()).collect()
+    }
+
+    /// The effect under a law; `reference` of a step is its time in days.
+    pub fn effect(
+        &self,
+        simulator: &Simulator,
+        data: &Data,
+        rows: &[usize],
+        kind: LawKind,
+        with_level: bool,
+        step_days: f64,
+    ) -> Effect {
+        let column = self.covariate.as_deref().and_then(|c| data.column(c));
+        let size = self.typical_size(simulator);
+        let mut levels = Vec::new();
+        let mut reference = if kind == LawKind::Step { step_days } else { 0.0 };
+        let mut width = 1.0;
+        let mut range = (f64::NEG_INFINITY, f64::INFINITY);
+        let mut middle = 0.0;
+        if let Some(column) = column {
+            match &column.values {
+                Values::Categories(..) => {
+                    levels = self.levels(data, rows);
+                }
+                Values::Numbers(_) => {
+                    let numbers = column.numbers(rows);
+                    width = spread(column, rows).max(f64::MIN_POSITIVE);
+                    middle = stats::quantile(&numbers, 0.5);
+                    range = (stats::quantile(&numbers, 0.03), stats::quantile(&numbers, 0.97));
+                    if kind != LawKind::Step {
+                        reference = stats::mean(&numbers);
+                    }
+                }
+            }
+        }
+        let law = Law { kind, covariate: self.covariate.clone(), reference, with_level, levels };
+        let span = data.times_days.last().copied().unwrap_or(0.0).max(1e-6);
+        let free = (f64::NEG_INFINITY, f64::INFINITY);
+        let number = |name: String| {
+            let (prior_mean, prior_std, bounds) = match name.as_str() {
+                "level" => (0.0, 2.0 * size, free),
+                "slope_per_unit" => (0.0, size / (2.0 * width), free),
+                "slope_below_per_unit" | "slope_above_per_unit" => (0.0, size / width, free),
+                "curvature_per_unit2" => (0.0, size / (2.0 * width).powi(2), free),
+                "rate_per_unit" => (0.0, 1.0 / width, (-4.0 / width, 4.0 / width)),
+                "knee" => (middle, width, range),
+                "lag_days" => (span / 20.0, span / 10.0, (span / 2_000.0, span / 3.0)),
+                _ => (0.0, size, free),
+            };
+            Number { name, prior_mean, prior_std, bounds }
+        };
+        let mut numbers: Vec<Number> = match &self.target {
+            Target::ModeOrder(_) => Vec::new(),
+            _ => law.numbers().into_iter().map(number).collect(),
+        };
+        if let Target::Oscillator(_) = self.target {
+            let f = simulator.nominal_frequencies_hz();
+            let (low, high) = (0.3 * f[0], 2.0 * f[f.len() - 1]);
+            numbers[0].bounds = (1e-4 * size, 20.0 * size);
+            let (prior_mean, prior_std) = (f64::midpoint(low, high), 0.5 * (high - low));
+            numbers.push(Number { name: "frequency_hz".to_owned(), prior_mean, prior_std, bounds: (low, high) });
+        }
+        Effect { target: self.target.clone(), law, numbers }
+    }
+
+    /// Size that such an effect typically has: the scale of its prior.
+    pub fn typical_size(&self, simulator: &Simulator) -> f64 {
+        let structure = simulator.structure();
+        match &self.target {
+            Target::Springs(_) | Target::Masses(_) => 0.1,
+            Target::FrequencyScale(_) => 0.01,
+            Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
+            Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],
+            Target::SettingOffset(column) => {
+                let p = &simulator.space().as_slice()[*column];
+                0.1 * (p.upper - p.lower)
+            }
+            Target::SettingScale(_) => 0.1,
+            Target::AddedSpring(..) => {
+                let stiffness: Vec<f64> = structure.springs().iter().map(|s| s.n_per_m).collect();
+                0.15 * stats::mean(&stiffness)
+            }
+            Target::Oscillator(host) => 0.05 * structure.masses()[*host].kg,
+            Target::ModeOrder(_) => 1.0,
+        }
+    }
+}

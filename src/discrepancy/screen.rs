@@ -1,0 +1,306 @@
+//! Score tests: what each candidate promises, without fitting it.
+//!
+//! With e the residual of the present fit, D the slope of its mean by the numbers of a candidate at size 0, N that by what
+//! is fitted already, and ⟨a, b⟩ = Σ_j w_j aᵀ V_j⁻¹ b:
+//!
+//! ```text
+//!  S = ⟨D, e⟩,   I = ⟨D, D⟩ − ⟨D, N⟩⟨N, N⟩⁻¹⟨N, D⟩,    promised gain = ½ Sᵀ I⁻¹ S  nats,    first guess ψ = I⁻¹ S
+//! ```
+
+use nalgebra::{DMatrix, DVector};
+
+use super::data::{Data, Values};
+use super::grammar::Candidate;
+use super::model::{Fit, RowView, Study};
+use crate::physics::effect::Target;
+use crate::simulator::law::{lagged, LawKind};
+use crate::stats;
+
+/// Share of a direction that must be left when what is fitted already is taken out of it.
+const IDENTIFIABLE: f64 = 1e-5;
+
+/// What a candidate promises under one law.
+#[derive(Debug, Clone)]
+pub struct Promise {
+    /// Index among the candidates.
+    pub candidate: usize,
+    /// The law.
+    pub law: LawKind,
+    /// Whether the law gets a level of its own.
+    pub with_level: bool,
+    /// Promised gain, nats.
+    pub nats: f64,
+    /// Number of linear numbers behind it.
+    pub numbers: usize,
+    /// First guess of the law's numbers, in its order.
+    pub psi: Vec<f64>,
+    /// Time of a step, days.
+    pub step_days: f64,
+}
+
+/// The present fit, whitened row by row.
+pub struct Whitened {
+    /// L⁻¹e √w, `[n]`.
+    pub residual: Vec<DVector<f64>>,
+    /// L⁻¹N √w, `[n]`.
+    pub nuisance: Vec<DMatrix<f64>>,
+    /// ⟨N, N⟩ with a little of the prior, inverted.
+    inverse: DMatrix<f64>,
+    factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
+}
+
+/// Sums of one direction per row: ⟨T, e⟩, ⟨T, T⟩, ⟨T, N⟩.
+pub struct Sums {
+    along: Vec<f64>,
+    square: Vec<f64>,
+    nuisance: Vec<DVector<f64>>,
+}
+
+/// A score test.
+pub struct Score {
+    /// Promised gain, nats; twice that is χ² with [`Self::numbers`] degrees of freedom.
+    pub nats: f64,
+    /// First guess of the numbers; 0 for those that cannot be told.
+    pub psi: Vec<f64>,
+    /// Numbers that can be told.
+    pub numbers: usize,
+}
+
+impl Whitened {
+    /// Whitens the rows of a fit.
+    pub fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, views: &[RowView]) -> Option<Self> {
+        let slopes = study.nuisance(rows, fit)?;
+        let mut factors = Vec::with_capacity(rows.len());
+        let (mut residual, mut nuisance) = (Vec::new(), Vec::new());
+        for (view, slopes) in views.iter().zip(&slopes) {
+            let inverse = view.covariance.clone().cholesky()?.l().try_inverse()?;
+            let root = view.weight.sqrt();
+            residual.push(&inverse * &view.residual * root);
+            let present = slopes.select_rows(&view.present);
+            nuisance.push(&inverse * present * root);
+            factors.push((inverse, view.present.clone(), root));
+        }
+        let size = nuisance.first().map_or(0, DMatrix::ncols);
+        let mut square = DMatrix::zeros(size, size);
+        for n in &nuisance {
+            square += n.transpose() * n;
+        }
+        // Directions without any information would make it singular.
+        let ridge = 1e-10;
+        for i in 0..size {
+            square[(i, i)] *= 1.0 + ridge;
+            square[(i, i)] += f64::MIN_POSITIVE.max(1e-12 * square.trace() / size as f64);
+        }
+        let inverse = if size == 0 { square } else { square.try_inverse()? };
+        Some(Self { residual, nuisance, inverse, factors })
+    }
+
+    /// Sums of a direction given row by row, over all modes.
+    pub fn sums(&self, direction: impl Fn(usize) -> DVector<f64>) -> Sums {
+        let mut sums = Sums { along: Vec::new(), square: Vec::new(), nuisance: Vec::new() };
+        for (place, (inverse, present, root)) in self.factors.iter().enumerate() {
+            let all = direction(place);
+            let white = inverse * DVector::from_iterator(present.len(), present.iter().map(|m| all[*m])) * *root;
+            sums.along.push(white.dot(&self.residual[place]));
+            sums.square.push(white.norm_squared());
+            sums.nuisance.push(self.nuisance[place].tr_mul(&white));
+        }
+        sums
+    }
+
+    /// The score of numbers that act through one direction, with basis values `[q][n]`.
+    pub fn score(&self, sums: &Sums, basis: &[Vec<f64>]) -> Score {
+        let q = basis.len();
+        let mut score = DVector::zeros(q);
+        let mut information = DMatrix::zeros(q, q);
+        let mut cross = DMatrix::zeros(q, self.inverse.nrows());
+        for place in 0..sums.along.len() {
+            for a in 0..q {
+                let value = basis[a][place];
+                if value == 0.0 {
+                    continue;
+                }
+                score[a] += value * sums.along[place];
+                for b in 0..=a {
+                    information[(a, b)] += value * basis[b][place] * sums.square[place];
+                }
+                for (column, n) in sums.nuisance[place].iter().enumerate() {
+                    cross[(a, column)] += value * n;
+                }
+            }
+        }
+        for a in 0..q {
+            for b in a + 1..q {
+                information[(a, b)] = information[(b, a)];
+            }
+        }
+        self.solve(score, information, &cross)
+    }
+
+    /// The score of an arbitrary response of each mode to one function of the row, `[n]`.
+    pub fn free_score(&self, function: &[f64], modes: usize) -> Score {
+        let columns = self.inverse.nrows();
+        let (mut score, mut information, mut cross) =
+            (DVector::zeros(modes), DMatrix::zeros(modes, modes), DMatrix::zeros(modes, columns));
+        for (place, (inverse, present, root)) in self.factors.iter().enumerate() {
+            let value = function[place] * root;
+            if value == 0.0 {
+                continue;
+            }
+            let along = inverse.tr_mul(&self.residual[place]) * value;
+            let square = inverse.tr_mul(inverse) * (value * value);
+            let with = inverse.tr_mul(&self.nuisance[place]) * value;
+            for (i, a) in present.iter().enumerate() {
+                score[*a] += along[i];
+                for (j, b) in present.iter().enumerate() {
+                    information[(*a, *b)] += square[(i, j)];
+                }
+                for column in 0..columns {
+                    cross[(*a, column)] += with[(i, column)];
+                }
+            }
+        }
+        self.solve(score, information, &cross)
+    }
+
+    fn solve(&self, score: DVector<f64>, information: DMatrix<f64>, cross: &DMatrix<f64>) -> Score {
+        let q = score.len();
+        // Each residual score is corrected too: at a maximum with priors ⟨N, e⟩ is not quite 0.
+        let mut along = DVector::zeros(self.inverse.nrows());
+        for (n, e) in self.nuisance.iter().zip(&self.residual) {
+            along += n.tr_mul(e);
+        }
+        let score = score - cross * &self.inverse * along;
+        let left = &information - cross * &self.inverse * cross.transpose();
+        // In units of what each direction had before: what is left of it is a share then.
+        let scale: Vec<f64> = (0..q).map(|a| information[(a, a)].max(f64::MIN_POSITIVE).sqrt()).collect();
+        let shares = DMatrix::from_fn(q, q, |a, b| left[(a, b)] / (scale[a] * scale[b]));
+        let eigen = shares.symmetric_eigen();
+        let (mut nats, mut numbers) = (0.0, 0);
+        let mut psi = DVector::zeros(q);
+        let scaled = DVector::from_fn(q, |a, _| score[a] / scale[a]);
+        for (index, value) in eigen.eigenvalues.iter().enumerate() {
+            if *value > IDENTIFIABLE {
+                let vector = eigen.eigenvectors.column(index);
+                let along = vector.dot(&scaled);
+                nats += 0.5 * along * along / value;
+                psi += vector * (along / value);
+                numbers += 1;
+            }
+        }
+        Score { nats, psi: psi.iter().zip(&scale).map(|(p, s)| p / s).collect(), numbers }
+    }
+}
+
+/// What every candidate promises under each of its laws; those that the fit cannot tell from itself are left out.
+pub fn promises(
+    study: &Study<'_>,
+    rows: &[usize],
+    whitened: &Whitened,
+    fit: &Fit,
+    candidates: &[Candidate],
+) -> Option<Vec<Promise>> {
+    let mut targets: Vec<&Target> = Vec::new();
+    for candidate in candidates {
+        let screened = !matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_));
+        if screened && !targets.contains(&&candidate.target) {
+            targets.push(&candidate.target);
+        }
+    }
+    let owned: Vec<Target> = targets.iter().map(|t| (*t).clone()).collect();
+    let directions = study.directions(rows, fit, &owned)?;
+    let mut found = Vec::new();
+    for (column, target) in targets.iter().enumerate() {
+        let sums = whitened.sums(|place| directions[place].column(column).into_owned());
+        let ones = vec![vec![1.0; rows.len()]];
+        let told = whitened.score(&sums, &ones).numbers == 1;
+        for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.target == **target) {
+            let mut best: Vec<Promise> = Vec::new();
+            for (law, basis, further, step_days) in bases(candidate, study.data, rows) {
+                let levelled = told && law.has_level();
+                let basis: Vec<Vec<f64>> = if levelled { [ones.clone(), basis].concat() } else { basis };
+                let score = whitened.score(&sums, &basis);
+                // Everything that the law can do must be more than what is fitted already.
+                if score.numbers == 0 || (score.numbers == 1 && levelled) {
+                    continue;
+                }
+                let psi = score.psi.iter().copied().chain(further).collect();
+                let (nats, numbers) = (score.nats, score.numbers);
+                let promise = Promise { candidate: index, law, with_level: levelled, nats, numbers, psi, step_days };
+                match best.iter_mut().find(|p| p.law == law) {
+                    Some(known) if known.nats >= nats => {}
+                    Some(known) => *known = promise,
+                    None => best.push(promise),
+                }
+            }
+            found.extend(best);
+        }
+    }
+    Some(found)
+}
+
+/// Ways in which a law can act at small sizes: the law, basis values `[q][n]`, numbers beyond the linear ones, and the time
+/// of a step.
+type Basis = (LawKind, Vec<Vec<f64>>, Vec<f64>, f64);
+
+fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
+    let Some(column) = candidate.covariate.as_deref().and_then(|name| data.column(name)) else {
+        return vec![(LawKind::Constant, vec![vec![1.0; rows.len()]], Vec::new(), 0.0)];
+    };
+    let values = match &column.values {
+        Values::Categories(..) => {
+            let effect_levels = candidate.levels(data, rows);
+            let Values::Categories(names, indices) = &column.values else { unreachable!("matched above") };
+            let of = |level: &String| {
+                let is = |row: &usize| f64::from(u8::from(indices[*row].is_some_and(|i| names[i] == *level)));
+                rows.iter().map(is).collect::<Vec<f64>>()
+            };
+            return vec![(LawKind::Category, effect_levels.iter().map(of).collect(), Vec::new(), 0.0)];
+        }
+        Values::Numbers(values) => values,
+    };
+    let numbers = column.numbers(rows);
+    let (mean, std) = (stats::mean(&numbers), super::grammar::spread(column, rows));
+    let at = |function: &dyn Fn(f64) -> f64| -> Vec<f64> {
+        rows.iter().map(|row| if values[*row].is_finite() { function(values[*row]) } else { 0.0 }).collect()
+    };
+    let mut all = Vec::new();
+    for law in candidate.laws(data) {
+        match law {
+            LawKind::Linear => all.push((law, vec![at(&|c| c - mean)], Vec::new(), 0.0)),
+            LawKind::Quadratic => {
+                all.push((law, vec![at(&|c| c - mean), at(&|c| (c - mean).powi(2))], Vec::new(), 0.0));
+            }
+            LawKind::Bilinear => {
+                for level in [0.1, 0.2, 0.35, 0.5, 0.7] {
+                    let knee = stats::quantile(&numbers, level);
+                    let basis = vec![at(&|c| (c - knee).min(0.0)), at(&|c| (c - knee).max(0.0))];
+                    all.push((law, basis, vec![knee], 0.0));
+                }
+            }
+            LawKind::Exponential => {
+                for rate in [-1.0 / std, -0.4 / std, 0.4 / std, 1.0 / std] {
+                    let basis = vec![at(&|c| (rate * (c - mean)).exp_m1() / rate)];
+                    all.push((law, basis, vec![rate], 0.0));
+                }
+            }
+            LawKind::Step => {
+                for share in 1..20 {
+                    let days = stats::quantile(&numbers, f64::from(share) / 20.0);
+                    all.push((law, vec![at(&|c| f64::from(u8::from(c >= days)))], Vec::new(), days));
+                }
+            }
+            LawKind::Lagged => {
+                let span = data.times_days.last().copied().unwrap_or(0.0).max(1e-6);
+                for divisor in [400.0, 150.0, 60.0, 30.0, 15.0, 7.0] {
+                    let lag = span / divisor;
+                    let followed = lagged(&data.times_days, values, lag);
+                    let basis = vec![rows.iter().map(|row| followed[*row].0 - mean).collect()];
+                    all.push((law, basis, vec![lag], 0.0));
+                }
+            }
+            LawKind::Constant | LawKind::Category => {}
+        }
+    }
+    all
+}

@@ -1,0 +1,198 @@
+//! Effects: what acts on a structure beside its parameters, such as temperature, an instrument, a forgotten spring.
+//!
+//! An effect is a [`Target`], which says what changes, and a law (`simulator::effect`), which says by how much under
+//! which covariate. Here are the targets: written into K, M and the frequencies, with derivatives by the size of each.
+
+use nalgebra::DMatrix;
+
+use super::{frequency_sensitivity, modes, Error, Mass, Node, Spring, Structure};
+
+/// Least share of a stiffness or mass that an effect may leave.
+const LEAST_FACTOR: f64 = 0.02;
+
+/// Least mass of an oscillator, kg: without any mass it has no frequency.
+const LEAST_OSCILLATOR_KG: f64 = 1e-9;
+
+/// What an effect of size g acts on.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Target {
+    /// Stiffness of these springs, k → k(1 + g).
+    Springs(Vec<usize>),
+    /// Mass of these bodies, m → m(1 + g).
+    Masses(Vec<usize>),
+    /// The instrument's scale, f → f(1 + g), of one mode or of all.
+    FrequencyScale(Option<usize>),
+    /// The instrument's offset, f → f + g (Hz), of one mode or of all.
+    FrequencyOffset(Option<usize>),
+    /// A parameter that the experimenter set, p → p + g (the parameter's unit); acts before there are stiffnesses.
+    SettingOffset(usize),
+    /// A parameter that the experimenter set, p → p(1 + g).
+    SettingScale(usize),
+    /// A further spring of stiffness g, N/m, between two nodes.
+    AddedSpring(Node, Node),
+    /// A further body of g₁ kg on a spring tuned to g₂ Hz, attached to a mass.
+    Oscillator(usize),
+    /// Mode i of the data is mode `order[i]` of the structure; has no size.
+    ModeOrder(Vec<usize>),
+}
+
+impl Target {
+    /// Number of sizes it has: 1, for an oscillator 2, for an order of modes 0.
+    pub fn sizes(&self) -> usize {
+        match self {
+            Self::Oscillator(_) => 2,
+            Self::ModeOrder(_) => 0,
+            _ => 1,
+        }
+    }
+}
+
+/// Frequencies of a structure under effects, and their derivatives.
+#[derive(Debug, Clone)]
+pub struct Response {
+    /// As the data would have them, Hz, `[m]`; ascending unless an order of modes says otherwise.
+    pub frequencies_hz: Vec<f64>,
+    /// By the stiffness of each spring of the structure without effects, Hz per N/m, `[m, springs]`.
+    pub by_spring: DMatrix<f64>,
+    /// By the size of each effect, Hz per unit of the size, `[m, sizes]`.
+    pub by_size: DMatrix<f64>,
+}
+
+/// The lowest `count` frequencies of a structure under effects of the sizes `sizes` (all sizes of the first target, then
+/// those of the next).
+///
+/// ```text
+///  ∂f/∂g:   k(1 + g):  Σ k ∂f/∂k      m(1 + g):  Σ m ∂f/∂m      f(1 + g):  f      f + g:  1      added spring:  ∂f/∂k
+///  oscillator (m, ν), k = (2πν)² m:   ∂f/∂m + (2πν)² ∂f/∂k,   8π² ν m ∂f/∂k
+/// ```
+///
+/// # Errors
+/// [`Error::Effect`] for sizes that leave hardly any stiffness or mass; as [`modes`].
+pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &[f64]) -> Result<Response, Error> {
+    let places = places(targets);
+    let total = places.last().map_or(0, |(first, target)| first + target.sizes());
+    assert_eq!(sizes.len(), total, "one size for each target, two for an oscillator");
+    let (originals, bodies) = (structure.springs().len(), structure.masses().len());
+
+    let mut spring_factor = vec![1.0; originals];
+    let mut mass_factor = vec![1.0; bodies];
+    let mut springs: Vec<Spring> = structure.springs().to_vec();
+    let mut masses: Vec<Mass> = structure.masses().to_vec();
+    // Index of the spring, and of the mass of an oscillator, that an effect adds.
+    let mut added: Vec<(usize, usize)> = vec![(0, 0); targets.len()];
+    let mut order: Vec<usize> = (0..count).collect();
+    for (number, (first, target)) in places.iter().enumerate() {
+        let size = sizes.get(*first).copied().unwrap_or(0.0);
+        let factor = |index: usize| {
+            let enough = size.is_finite() && 1.0 + size >= LEAST_FACTOR;
+            enough.then_some(1.0 + size).ok_or(Error::Effect { number: index, size })
+        };
+        match target {
+            Target::Springs(indices) => {
+                let factor = factor(number)?;
+                indices.iter().for_each(|i| spring_factor[*i] *= factor);
+            }
+            Target::Masses(indices) => {
+                let factor = factor(number)?;
+                indices.iter().for_each(|i| mass_factor[*i] *= factor);
+            }
+            Target::AddedSpring(from, to) => {
+                added[number].0 = springs.len();
+                springs.push(Spring { name: String::new(), from: *from, to: *to, n_per_m: size });
+            }
+            Target::Oscillator(host) => {
+                let (kg, frequency_hz) = (size.max(LEAST_OSCILLATOR_KG), sizes[first + 1]);
+                added[number] = (springs.len(), masses.len());
+                let n_per_m = angular(frequency_hz).powi(2) * kg;
+                let (from, to) = (Node::Mass(*host), Node::Mass(masses.len()));
+                springs.push(Spring { name: String::new(), from, to, n_per_m });
+                masses.push(Mass { name: String::new(), kg });
+            }
+            Target::ModeOrder(modes) => order.clone_from(modes),
+            Target::FrequencyScale(_) => {
+                factor(number)?;
+            }
+            Target::FrequencyOffset(_) | Target::SettingOffset(_) | Target::SettingScale(_) => {}
+        }
+    }
+    for (spring, factor) in springs.iter_mut().zip(&spring_factor) {
+        spring.n_per_m *= factor;
+    }
+    for (mass, factor) in masses.iter_mut().zip(&mass_factor) {
+        mass.kg *= factor;
+    }
+    // The parts were checked before, and what effects did to them above; a stiffness below zero shows in the eigenvalues.
+    let changed = Structure { masses, springs };
+    let needed = order.iter().max().map_or(count, |highest| highest + 1);
+    let modes = modes(&changed, needed)?;
+    let sensitivity = frequency_sensitivity(&changed, &modes);
+
+    let structural: Vec<f64> = order.iter().map(|mode| modes.frequencies_hz[*mode]).collect();
+    let rows = structural.len();
+    let spring_slope = |row: usize, spring: usize| sensitivity.by_spring[(order[row], spring)];
+    let mass_slope = |row: usize, mass: usize| sensitivity.by_mass[(order[row], mass)];
+
+    // The instrument: f = (structural + Σ structural g) + Σ offsets, scales after one another.
+    let mut scale = vec![1.0; rows];
+    let mut offset_hz = vec![0.0; rows];
+    for (first, target) in &places {
+        for row in 0..rows {
+            match target {
+                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
+                    scale[row] *= 1.0 + sizes[*first]
+                }
+                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => offset_hz[row] += sizes[*first],
+                _ => {}
+            }
+        }
+    }
+    let mut by_size = DMatrix::zeros(rows, total);
+    for (number, (first, target)) in places.iter().enumerate() {
+        for row in 0..rows {
+            let slopes = match target {
+                Target::Springs(indices) => {
+                    let sum: f64 = indices.iter().map(|i| spring_slope(row, *i) * changed.springs[*i].n_per_m).sum();
+                    [scale[row] * sum / (1.0 + sizes[*first]), 0.0]
+                }
+                Target::Masses(indices) => {
+                    let sum: f64 = indices.iter().map(|i| mass_slope(row, *i) * changed.masses[*i].kg).sum();
+                    [scale[row] * sum / (1.0 + sizes[*first]), 0.0]
+                }
+                Target::AddedSpring(..) => [scale[row] * spring_slope(row, added[number].0), 0.0],
+                Target::Oscillator(_) => {
+                    let (spring, mass) = added[number];
+                    let (frequency_hz, kg) = (sizes[first + 1], changed.masses[mass].kg);
+                    let (by_k, by_m) = (spring_slope(row, spring), mass_slope(row, mass));
+                    let by_tuning = 2.0 * angular(frequency_hz) * std::f64::consts::TAU * kg * by_k;
+                    [scale[row] * (by_m + angular(frequency_hz).powi(2) * by_k), scale[row] * by_tuning]
+                }
+                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
+                    [structural[row] * scale[row] / (1.0 + sizes[*first]), 0.0]
+                }
+                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => [1.0, 0.0],
+                _ => [0.0, 0.0],
+            };
+            for which in 0..target.sizes() {
+                by_size[(row, first + which)] = slopes[which];
+            }
+        }
+    }
+    let by_spring = DMatrix::from_fn(rows, originals, |row, s| scale[row] * spring_slope(row, s) * spring_factor[s]);
+    let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
+    Ok(Response { frequencies_hz, by_spring, by_size })
+}
+
+/// Column of the first size of each target.
+fn places(targets: &[Target]) -> Vec<(usize, &Target)> {
+    let mut first = 0;
+    let place = |target| {
+        let place = (first, target);
+        first += Target::sizes(target);
+        place
+    };
+    targets.iter().map(place).collect()
+}
+
+fn angular(frequency_hz: f64) -> f64 {
+    std::f64::consts::TAU * frequency_hz
+}

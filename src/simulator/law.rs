@@ -1,0 +1,250 @@
+//! Laws of effects: the size of an effect as a function of a covariate.
+
+use serde::{Deserialize, Serialize};
+
+/// Rate times distance below which an exponential is taken by its series.
+const SERIES: f64 = 1e-4;
+
+/// Form of a law. u = c − reference.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LawKind {
+    /// g = size.
+    Constant,
+    /// g = level + slope·u.
+    Linear,
+    /// g = level + slope_below·min(c − knee, 0) + slope_above·max(c − knee, 0).
+    Bilinear,
+    /// g = level + slope·u + curvature·u².
+    Quadratic,
+    /// g = level + slope·(exp(rate·u) − 1)/rate.
+    Exponential,
+    /// g = the number of the category; 0 for categories that are not named.
+    Category,
+    /// g = size from the time `reference` on.
+    Step,
+    /// g = level + slope·(c̃ − reference), c̃ the covariate after a first-order lag: dc̃/dt = (c − c̃)/lag.
+    Lagged,
+}
+
+/// A law with what is not fitted: its covariate, its reference, its categories.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Law {
+    /// Its form.
+    pub kind: LawKind,
+    /// Name of the covariate; `None` for a constant, `time` for a step.
+    pub covariate: Option<String>,
+    /// Value of the covariate at which g = level; for a step the time in days.
+    pub reference: f64,
+    /// Whether the law has a level of its own, or it is 0.
+    pub with_level: bool,
+    /// Categories that have a number, for [`LawKind::Category`].
+    pub levels: Vec<String>,
+}
+
+/// One value of a covariate, as a law takes it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Input {
+    /// A number; days for time.
+    Number(f64),
+    /// A number after its lag, and its derivative by the lag, per day.
+    Lagged(f64, f64),
+    /// Index in the law's `levels`, or none of them.
+    Level(Option<usize>),
+    /// Not known: the effect has no size then.
+    Missing,
+}
+
+impl LawKind {
+    /// As in files.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Constant => "constant",
+            Self::Linear => "linear",
+            Self::Bilinear => "bilinear",
+            Self::Quadratic => "quadratic",
+            Self::Exponential => "exponential",
+            Self::Category => "category",
+            Self::Step => "step",
+            Self::Lagged => "lagged",
+        }
+    }
+
+    /// Names of its numbers, the level first; a category has one of each level instead.
+    pub const fn numbers(self) -> &'static [&'static str] {
+        match self {
+            Self::Constant | Self::Step => &["size"],
+            Self::Linear => &["level", "slope_per_unit"],
+            Self::Bilinear => &["level", "slope_below_per_unit", "slope_above_per_unit", "knee"],
+            Self::Quadratic => &["level", "slope_per_unit", "curvature_per_unit2"],
+            Self::Exponential => &["level", "slope_per_unit", "rate_per_unit"],
+            Self::Category => &[],
+            Self::Lagged => &["level", "slope_per_unit", "lag_days"],
+        }
+    }
+
+    /// Whether it can have a level.
+    pub fn has_level(self) -> bool {
+        self.numbers().first() == Some(&"level")
+    }
+}
+
+impl Law {
+    /// Names of the numbers ψ that it takes, in order.
+    pub fn numbers(&self) -> Vec<String> {
+        if self.kind == LawKind::Category {
+            return self.levels.clone();
+        }
+        let skipped = usize::from(self.kind.has_level() && !self.with_level);
+        self.kind.numbers()[skipped..].iter().map(ToString::to_string).collect()
+    }
+
+    /// Size g of the effect and its derivatives ∂g/∂ψ, at one value of the covariate.
+    ///
+    /// # Panics
+    /// When `psi` or `slopes` is not as long as [`Self::numbers`].
+    pub fn size(&self, input: Input, psi: &[f64], slopes: &mut [f64]) -> f64 {
+        slopes.fill(0.0);
+        let c = match input {
+            Input::Missing => return 0.0,
+            Input::Level(level) => {
+                let Some(level) = level else { return 0.0 };
+                slopes[level] = 1.0;
+                return psi[level];
+            }
+            Input::Number(c) | Input::Lagged(c, _) => c,
+        };
+        let first = usize::from(self.kind.has_level() && self.with_level);
+        let level = if first == 1 {
+            slopes[0] = 1.0;
+            psi[0]
+        } else {
+            0.0
+        };
+        let (psi, slopes) = (&psi[first..], &mut slopes[first..]);
+        let u = c - self.reference;
+        level
+            + match self.kind {
+                LawKind::Constant => {
+                    slopes[0] = 1.0;
+                    psi[0]
+                }
+                LawKind::Step => {
+                    slopes[0] = f64::from(u8::from(u >= 0.0));
+                    psi[0] * slopes[0]
+                }
+                LawKind::Linear => {
+                    slopes[0] = u;
+                    psi[0] * u
+                }
+                LawKind::Quadratic => {
+                    slopes[0] = u;
+                    slopes[1] = u * u;
+                    psi[0] * u + psi[1] * u * u
+                }
+                LawKind::Bilinear => {
+                    let from_knee = c - psi[2];
+                    slopes[0] = from_knee.min(0.0);
+                    slopes[1] = from_knee.max(0.0);
+                    slopes[2] = if from_knee < 0.0 { -psi[0] } else { -psi[1] };
+                    psi[0] * slopes[0] + psi[1] * slopes[1]
+                }
+                LawKind::Exponential => {
+                    let x = psi[1] * u;
+                    // (eˣ − 1)/x and its derivative by x.
+                    let (shape, slope) = if x.abs() < SERIES {
+                        (1.0 + x / 2.0, 0.5 + x / 3.0)
+                    } else {
+                        let shape = x.exp_m1() / x;
+                        (shape, (x.exp() - shape) / x)
+                    };
+                    slopes[0] = u * shape;
+                    slopes[1] = psi[0] * u * u * slope;
+                    psi[0] * u * shape
+                }
+                LawKind::Lagged => {
+                    slopes[0] = u;
+                    slopes[1] = if let Input::Lagged(_, by_lag) = input { psi[0] * by_lag } else { 0.0 };
+                    psi[0] * u
+                }
+                LawKind::Category => 0.0,
+            }
+    }
+}
+
+/// A covariate after a first-order lag, and its derivative by the lag, at increasing times; values that are missing (NaN)
+/// leave it where it was.
+///
+/// ```text
+///  c̃_j = c̃_{j−1} + (1 − e^{−Δ/τ}) (c_j − c̃_{j−1}),    c̃_0 = c_0
+/// ```
+pub fn lagged(times_days: &[f64], values: &[f64], lag_days: f64) -> Vec<(f64, f64)> {
+    let start = values.iter().copied().find(|v| v.is_finite()).unwrap_or(0.0);
+    let (mut state, mut slope, mut before) = (start, 0.0, times_days.first().copied().unwrap_or(0.0));
+    let follow = |(&time, &value): (&f64, &f64)| {
+        if value.is_finite() {
+            let elapsed = (time - before).max(0.0) / lag_days;
+            let kept = (-elapsed).exp();
+            // ∂kept/∂τ = kept·Δ/τ²
+            slope = slope * kept + (state - value) * kept * elapsed / lag_days;
+            state = value + (state - value) * kept;
+            before = time;
+        }
+        (state, slope)
+    };
+    times_days.iter().zip(values).map(follow).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slopes_of_every_law_are_its_central_differences() {
+        let law = |kind: LawKind, with_level| Law {
+            kind,
+            covariate: None,
+            reference: 0.7,
+            with_level,
+            levels: if kind == LawKind::Category { vec!["a".into(), "b".into()] } else { Vec::new() },
+        };
+        let kinds = [
+            (LawKind::Constant, vec![0.3]),
+            (LawKind::Linear, vec![0.1, -0.2]),
+            (LawKind::Bilinear, vec![0.1, -0.4, -0.05, 0.2]),
+            (LawKind::Quadratic, vec![0.1, -0.2, 0.05]),
+            (LawKind::Exponential, vec![0.1, -0.2, 0.3]),
+            (LawKind::Exponential, vec![0.1, -0.2, 1e-6]),
+            (LawKind::Step, vec![0.2]),
+            (LawKind::Category, vec![0.2, -0.1]),
+        ];
+        for (kind, psi) in kinds {
+            for c in [-2.0, 0.71, 3.0] {
+                let input = if kind == LawKind::Category { Input::Level(Some(1)) } else { Input::Number(c) };
+                let law = law(kind, true);
+                let mut slopes = vec![0.0; psi.len()];
+                law.size(input, &psi, &mut slopes);
+                for (i, slope) in slopes.iter().enumerate() {
+                    let at = |h: f64| {
+                        let mut moved = psi.clone();
+                        moved[i] += h;
+                        law.size(input, &moved, &mut vec![0.0; psi.len()])
+                    };
+                    let difference = (at(1e-6) - at(-1e-6)) / 2e-6;
+                    assert!((difference - slope).abs() < 1e-7, "{kind:?} {i} at {c}: {difference} {slope}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_lag_follows_a_step_exponentially_and_its_slope_is_the_difference() {
+        let times: Vec<f64> = (0..50).map(|i| f64::from(i) * 0.5).collect();
+        let values: Vec<f64> = (0..50).map(|i| if i == 0 { 0.0 } else { 1.0 }).collect();
+        for ((value, slope), time) in lagged(&times, &values, 4.0).into_iter().zip(&times) {
+            assert!((value - (1.0 - (-time / 4.0).exp())).abs() < 1e-12);
+            let exact = -(-time / 4.0_f64).exp() * time / 16.0;
+            assert!((slope - exact).abs() < 1e-12, "{slope} {exact}");
+        }
+    }
+}
