@@ -158,11 +158,12 @@ fn measure_cell(
     let observations: Vec<_> = set
         .frequencies_hz
         .row_iter()
-        .map(|row| {
+        .zip(&set.effect_sizes)
+        .map(|(row, sizes)| {
             let exact: Vec<f64> = row.iter().copied().collect();
             let multiples: Vec<Option<f64>> =
                 (0..exact.len()).map(|mode| (Some(mode) != missing).then_some(noise_multiple)).collect();
-            measure(simulator, &exact, &multiples, &mut stream)
+            measure(simulator, &exact, sizes, &multiples, &mut stream)
         })
         .collect();
     let samples = baseline.infer(&observations, DRAWS, stream.next_u64())?;

@@ -75,10 +75,16 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
     for row in 0..POINTS {
         let theta: Vec<f64> = set.theta.row(row).iter().copied().collect();
         let exact: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
-        fisher.push(local_covariance(simulator, &theta, &exact).map_err(|e| failed(&e))?);
+        let sizes = &set.effect_sizes[row];
+        let there = simulator.under(sizes);
+        fisher.push(local_covariance(&there, &theta, &exact).map_err(|e| failed(&e))?);
         observations.push(match baseline.manifest().conditions.noise_range {
-            Some(_) => measure(simulator, &exact, &vec![Some(1.0); exact.len()], &mut stream),
-            None => Observation { noise_multiple: vec![0.0; exact.len()], ..Observation::complete(&exact) },
+            Some(_) => measure(simulator, &exact, sizes, &vec![Some(1.0); exact.len()], &mut stream),
+            None => Observation {
+                noise_multiple: vec![0.0; exact.len()],
+                effect_sizes: sizes.clone(),
+                ..Observation::complete(&exact)
+            },
         });
     }
     let samples = baseline.infer(&observations, DRAWS, seed)?;

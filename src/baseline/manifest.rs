@@ -63,6 +63,21 @@ pub struct Conditions {
     pub training_box: Vec<[f64; 2]>,
     /// Noise of the frequencies; `None` for a structure without noise, whose measurements must be complete and exact.
     pub noise_range: Option<NoiseRange>,
+    /// Effects that a covariate moves: the flow is told their sizes.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub effects: Vec<EffectRange>,
+}
+
+/// Sizes of one effect that a flow was trained for.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EffectRange {
+    /// Its place among all sizes of the structure's effects.
+    pub column: usize,
+    /// Least size.
+    pub lowest: f64,
+    /// Greatest size.
+    pub highest: f64,
 }
 
 /// The noise a flow was trained for, as multiples of the structure's own; modes may be missing within it.

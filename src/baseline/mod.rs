@@ -178,9 +178,50 @@ impl Baseline {
 
     /// Posterior samples of each measurement, `draws` for each.
     ///
+    /// Where a covariate is not known, the samples go through its possible values in turn:
+    ///
+    /// ```text
+    ///  p(x | y) ≈ mean over c of p(x | y, c)
+    /// ```
+    ///
     /// # Errors
     /// [`InferenceError`] for another number of modes or a draw that is not finite.
     pub fn infer(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        seed: u64,
+    ) -> Result<PosteriorSamples, InferenceError> {
+        if observations.iter().all(|o| o.possible_sizes.is_empty()) {
+            return self.infer_known(observations, draws, seed);
+        }
+        let possible = |o: &Observation| o.possible_sizes.len().clamp(1, draws.max(1));
+        // Each possible value is an observation of its own; of its samples the first few are taken.
+        let expand = |o: &Observation| -> Vec<Observation> {
+            let count = possible(o);
+            // Fewer draws than values: the values at equal steps.
+            let pick = |i: usize| o.possible_sizes[i * o.possible_sizes.len() / count].clone();
+            match o.possible_sizes.len() {
+                0 => vec![o.clone()],
+                _ => (0..count).map(|i| Observation { effect_sizes: pick(i), ..o.clone() }).collect(),
+            }
+        };
+        let expanded: Vec<Observation> = observations.iter().flat_map(expand).collect();
+        let samples = self.infer_known(&expanded, draws, seed)?;
+        let mut theta = DMatrix::zeros(observations.len() * draws, self.space().len());
+        let mut first = 0;
+        for (row, observation) in observations.iter().enumerate() {
+            let count = possible(observation);
+            for draw in 0..draws {
+                let source = (first + draw % count) * draws + draw / count;
+                theta.set_row(row * draws + draw, &samples.theta().row(source));
+            }
+            first += count;
+        }
+        Ok(PosteriorSamples::new(theta, draws))
+    }
+
+    fn infer_known(
         &self,
         observations: &[Observation],
         draws: usize,
@@ -257,8 +298,17 @@ impl Baseline {
             None if frequencies_hz.iter().any(Option::is_none) => frequencies_hz.fill(None),
             None => noise_multiple.fill(0.0),
         }
-        let observation = Observation { frequencies_hz, noise_multiple };
-        Admitted { observation: (observation.modes_present() > 0).then_some(observation), below_range, above_range }
+        let sizes = self.simulator.effect_sizes(&measurement.covariates);
+        let possible_sizes =
+            if sizes.missing.is_empty() { Vec::new() } else { self.simulator.possible_sizes(&measurement.covariates) };
+        let observation = Observation { frequencies_hz, noise_multiple, effect_sizes: sizes.values, possible_sizes };
+        Admitted {
+            observation: (observation.modes_present() > 0).then_some(observation),
+            below_range,
+            above_range,
+            covariates_missing: sizes.missing,
+            covariates_beyond: sizes.beyond,
+        }
     }
 
     /// Log-density of each row of `theta` given the observation of the same row, in the unit box of the prior, nats.

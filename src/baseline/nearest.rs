@@ -51,6 +51,7 @@ pub struct Nearest {
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
 pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) -> Result<Nearest, physics::Error> {
+    let simulator = &observation.simulator(simulator);
     let parameters = simulator.space().as_slice();
     let present: Vec<usize> = (0..simulator.modes()).filter(|&i| observation.frequencies_hz[i].is_some()).collect();
     let measured = |mode: usize| observation.frequencies_hz[mode].expect("only present modes are asked for");
@@ -67,13 +68,15 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
         DVector::from_iterator(start.len(), parameters.iter().zip(start).map(|(p, x)| p.to_unit(*x).clamp(0.0, 1.0)));
     let mut frequencies = simulator.frequencies_hz(&theta(&u))?;
     let mut error = residual(&frequencies);
-    let determined = present.len() > parameters.len();
+    // What is not known of the effects may be anything: such a measurement tests nothing.
+    let known = observation.possible_sizes.is_empty();
+    let determined = known && present.len() > parameters.len();
     let reached = |error: &DVector<f64>| {
         error.iter().zip(&relative_std).all(|(r, std)| r.abs() * std <= FLOW_ACCURACY + NOISE_MULTIPLE * std)
     };
-    let (mut at_edge, mut absorbed) = (0, present.len().min(parameters.len()));
+    let (mut at_edge, mut absorbed) = (0, if known { present.len().min(parameters.len()) } else { present.len() });
     let mut projector = DMatrix::zeros(present.len(), present.len());
-    if determined || !reached(&error) {
+    if known && (determined || !reached(&error)) {
         let mut damping = 1e-3;
         for _ in 0..ITERATIONS {
             let jacobian = simulator.jacobian(&theta(&u))?;
@@ -132,7 +135,8 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
             }
         }
     }
-    let chi_squared = if determined || at_edge > 0 || !reached(&error) { error.norm_squared() } else { 0.0 };
+    let tested = known && (determined || at_edge > 0 || !reached(&error));
+    let chi_squared = if tested { error.norm_squared() } else { 0.0 };
     let (mut standardised_residuals, mut expanded) =
         (DVector::zeros(simulator.modes()), DMatrix::zeros(simulator.modes(), simulator.modes()));
     for (row, &mode) in present.iter().enumerate() {

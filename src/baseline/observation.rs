@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
-use super::manifest::{Conditions, NoiseRange, Whitening};
+use super::manifest::{Conditions, EffectRange, NoiseRange, Whitening};
 use crate::simulator::Simulator;
 use crate::stats::Stream;
 
@@ -24,6 +24,11 @@ pub struct Observation {
     pub frequencies_hz: Vec<Option<f64>>,
     /// Standard deviation of each frequency as a multiple of the structure's own; 1 where a mode is missing.
     pub noise_multiple: Vec<f64>,
+    /// Sizes of the structure's effects under the covariates of the measurement; empty where nothing is known of them, or
+    /// there are none.
+    pub effect_sizes: Vec<f64>,
+    /// Sizes to go through, each as probable as the others, where a covariate is not known.
+    pub possible_sizes: Vec<Vec<f64>>,
 }
 
 impl Observation {
@@ -32,6 +37,17 @@ impl Observation {
         Self {
             frequencies_hz: frequencies_hz.iter().copied().map(Some).collect(),
             noise_multiple: vec![1.0; frequencies_hz.len()],
+            effect_sizes: Vec::new(),
+            possible_sizes: Vec::new(),
+        }
+    }
+
+    /// The simulation under the effects of this measurement.
+    pub fn simulator(&self, simulator: &Simulator) -> Simulator {
+        if simulator.effects().is_empty() {
+            simulator.clone()
+        } else {
+            simulator.under(&self.effect_sizes)
         }
     }
 
@@ -55,16 +71,18 @@ pub struct Admitted {
     pub below_range: bool,
     /// Some mode had more, and is left out.
     pub above_range: bool,
+    /// Covariates that an effect needs and the measurement lacks.
+    pub covariates_missing: Vec<String>,
+    /// Covariates beyond what an effect was learnt from.
+    pub covariates_beyond: Vec<String>,
 }
 
 impl Conditions {
-    /// Numbers the flow is given for each mode: the whitened log-frequency, and with noise its size and the mask.
+    /// Numbers the flow is given for each mode: the whitened log-frequency, with noise its size and the mask,
+    /// and the size of each effect that a covariate moves.
     pub fn channels(&self) -> usize {
-        if self.noise_range.is_some() {
-            3
-        } else {
-            1
-        }
+        let own = if self.noise_range.is_some() { 3 } else { 1 };
+        own + self.effects.len()
     }
 
     /// Noise multiples and a mask for one simulated measurement: `None` where a mode is missing.
@@ -99,7 +117,13 @@ impl Conditions {
 /// ```text
 ///  f̃_i = f_i + a_i·s_i(f_i)·N(0, 1),    a_i the noise multiple, s_i the structure's own standard deviation
 /// ```
-pub fn measure(simulator: &Simulator, exact_hz: &[f64], multiples: &[Option<f64>], stream: &mut Stream) -> Observation {
+pub fn measure(
+    simulator: &Simulator,
+    exact_hz: &[f64],
+    effect_sizes: &[f64],
+    multiples: &[Option<f64>],
+    stream: &mut Stream,
+) -> Observation {
     let one = |(exact, multiple): (&f64, &Option<f64>)| {
         // Drawn for missing modes too: the stream then does not depend on the masks.
         let normal: f64 = stream.sample(StandardNormal);
@@ -110,6 +134,8 @@ pub fn measure(simulator: &Simulator, exact_hz: &[f64], multiples: &[Option<f64>
     Observation {
         frequencies_hz: exact_hz.iter().zip(multiples).map(one).collect(),
         noise_multiple: multiples.iter().map(|m| m.unwrap_or(1.0)).collect(),
+        effect_sizes: effect_sizes.to_vec(),
+        possible_sizes: Vec::new(),
     }
 }
 
@@ -161,6 +187,10 @@ impl Encoder {
                 }));
                 values.extend((0..modes).map(|mode| if present(mode) { 0.0 } else { 1.0 }));
             }
+            for effect in &self.conditions.effects {
+                let position = observation.effect_sizes.get(effect.column).map_or(0.0, |size| effect.position(*size));
+                values.extend(std::iter::repeat_n(position, modes));
+            }
         }
         Tensor::from_vec(values, (observations.len(), channels, modes), &Device::Cpu)
     }
@@ -184,6 +214,13 @@ impl Encoder {
         (0..frequencies.len())
             .map(|mode| if frequencies[mode].is_some() { ln(mode) } else { conditional(mode) })
             .collect()
+    }
+}
+
+impl EffectRange {
+    /// Position of a size in the range, −1 at the lowest and 1 at the highest.
+    pub fn position(&self, size: f64) -> f64 {
+        (2.0 * size - self.lowest - self.highest) / (self.highest - self.lowest)
     }
 }
 

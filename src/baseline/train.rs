@@ -6,7 +6,7 @@ use nalgebra::DMatrix;
 use super::calibration::{calibrate, CalibrationRecord};
 use super::identifiability::{identifiability, IdentifiabilityRecord};
 use super::manifest::{
-    Conditions, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening,
+    Conditions, EffectRange, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening,
     FORMAT,
 };
 use super::observation::{measure, Encoder, Observation};
@@ -104,9 +104,10 @@ pub fn train(
     let space = simulator.training_space();
     let noisy = simulator.noise().std_hz(1.0) > 0.0;
     let training_box = space.iter().map(|p| [p.lower, p.upper]).collect();
-    let conditions = Conditions { training_box, noise_range: noisy.then_some(noise_range) };
     let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
     let training = draw(samples, "training set")?;
+    let effects = effect_ranges(simulator, &training);
+    let conditions = Conditions { training_box, noise_range: noisy.then_some(noise_range), effects };
     let whitening = Whitening::fit(&rows(&training.frequencies_hz)).ok_or(Error::Degenerate)?;
     let encoder = Encoder::new(&whitening, &conditions);
     let observed = |set: &TrainingSet, purpose: &str| {
@@ -220,6 +221,25 @@ fn purpose_seed(seed: u64, purpose: &str) -> u64 {
     stats::stream(seed, purpose).next_u64()
 }
 
+/// Sizes that the effects moved by a covariate have in a training set.
+fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
+    let mut first = 0;
+    let mut ranges = Vec::new();
+    for effect in simulator.effects() {
+        let column = first;
+        first += effect.target.sizes();
+        if effect.varies() {
+            let sizes = || set.effect_sizes.iter().map(|sizes| sizes[column]);
+            let (lowest, highest) = (sizes().fold(f64::INFINITY, f64::min), sizes().fold(f64::NEG_INFINITY, f64::max));
+            // An effect that never moves is no condition.
+            if lowest < highest {
+                ranges.push(EffectRange { column, lowest, highest });
+            }
+        }
+    }
+    ranges
+}
+
 /// A measurement of each pair, with noise and missing modes drawn as in training.
 pub fn observe(
     simulator: &Simulator,
@@ -227,11 +247,11 @@ pub fn observe(
     set: &TrainingSet,
     stream: &mut stats::Stream,
 ) -> Vec<Observation> {
-    let one = |exact: Vec<f64>| {
+    let one = |(exact, sizes): (Vec<f64>, &Vec<f64>)| {
         let multiples = conditions.draw(exact.len(), stream);
-        measure(simulator, &exact, &multiples, stream)
+        measure(simulator, &exact, sizes, &multiples, stream)
     };
-    rows(&set.frequencies_hz).into_iter().map(one).collect()
+    rows(&set.frequencies_hz).into_iter().zip(&set.effect_sizes).map(one).collect()
 }
 
 /// Measures a baseline on pairs it has not seen: likelihood, R² (paper Fig. 8), inverse error.

@@ -155,6 +155,6 @@ fn plot(cell: &CellRanks, names: &[String]) -> Plot {
         y_label: "difference from uniform".to_owned(),
         lines,
         band: vec![(0.0, -width, width), (1.0, -width, width)],
-        marks: Vec::new(),
+        ..Plot::default()
     }
 }

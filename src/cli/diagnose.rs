@@ -9,17 +9,21 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::write_whole;
 use crate::baseline::library::find_structure;
+use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::{Data, MOST_LEVELS};
-use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Step};
+use crate::discrepancy::extend::extend as extend_structure;
+use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
+use crate::flow::train::TrainSettings;
+use crate::flow::FlowSettings;
 use crate::measurement::check::{check_measurements, Expectation, RawMeasurement};
 use crate::measurement::csv::{self, CsvOptions, Offered, Times};
 use crate::measurement::{Covariate, CovariateKind, ModalMeasurement};
 use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 
-/// Find what the simulation gets wrong.
+/// What is diagnosed.
 #[derive(Debug, Args)]
-pub struct DiagnoseArgs {
+pub struct StudyArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
@@ -41,6 +45,13 @@ pub struct DiagnoseArgs {
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
     seed: u64,
+}
+
+/// Find what the simulation gets wrong.
+#[derive(Debug, Args)]
+pub struct DiagnoseArgs {
+    #[command(flatten)]
+    study: StudyArgs,
     /// Write the report as one HTML page
     #[arg(long)]
     report: Option<PathBuf>,
@@ -75,27 +86,15 @@ pub struct TableArgs<'a> {
 /// # Errors
 /// Files that are refused, data that no verdict can stand on.
 pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
-    let simulator = find_structure(&args.structure)?;
-    let how = TableArgs { time: args.time.as_deref(), settings: &args.settings, ignore: &args.ignore };
-    let tables = read_tables(&simulator, &args.data, &how)?;
-    let data = Data::new(&simulator, &tables.measurements);
-    let bar = ProgressBar::new_spinner();
-    bar.set_style(
-        ProgressStyle::with_template("{spinner} {elapsed} {msg}").context("the template of the progress bar")?,
-    );
-    bar.enable_steady_tick(std::time::Duration::from_millis(100));
-    let progress = |step: Step| bar.set_message(said(step));
-    let mut study = run(&simulator, &data, &args.holdout, args.seed, &progress)?;
-    bar.finish_and_clear();
-    study.diagnosis.notes.splice(0..0, tables.notes);
+    let Study { simulator, data, outcome } = studied(&args.study)?;
     if let Some(path) = &args.report {
-        let html = report::html(&simulator, &data, &study).context("the report cannot be drawn")?;
+        let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;
     }
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&study.diagnosis)?);
+        println!("{}", serde_json::to_string_pretty(&outcome.diagnosis)?);
     } else {
-        print(&study.diagnosis);
+        print(&outcome.diagnosis);
         if let Some(path) = &args.report {
             println!("report: {}", path.display());
         }
@@ -103,14 +102,81 @@ pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What a step is called.
-pub fn said(step: Step) -> String {
-    match step {
-        Step::Showing => "fitting the simulation as it is".to_owned(),
-        Step::Searching { cause, of } => format!("looking for cause {cause} of at most {of}"),
-        Step::LookingAgain { cause, of } => format!("looking again at cause {cause} of {of}"),
-        Step::Measuring => "measuring the gain".to_owned(),
+struct Study {
+    simulator: Simulator,
+    data: Data,
+    outcome: Outcome,
+}
+
+fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
+    let simulator = find_structure(&args.structure)?;
+    let how = TableArgs { time: args.time.as_deref(), settings: &args.settings, ignore: &args.ignore };
+    let tables = read_tables(&simulator, &args.data, &how)?;
+    let data = Data::new(&simulator, &tables.measurements);
+    let bar = ProgressBar::new_spinner();
+    let style = ProgressStyle::with_template("{spinner} {elapsed} {msg}");
+    bar.set_style(style.context("the template of the progress bar")?);
+    bar.enable_steady_tick(std::time::Duration::from_millis(100));
+    let progress = |step: Step| bar.set_message(step.to_string());
+    let mut outcome = run(&simulator, &data, &args.holdout, args.seed, &progress)?;
+    bar.finish_and_clear();
+    outcome.diagnosis.notes.splice(0..0, tables.notes);
+    Ok(Study { simulator, data, outcome })
+}
+
+/// Diagnose, write the causes into a new version of the structure, and train its baseline.
+#[derive(Debug, Args)]
+pub struct ExtendArgs {
+    #[command(flatten)]
+    study: StudyArgs,
+    /// Folder for structure.json, baseline.safetensors and baseline.json
+    #[arg(long)]
+    out: PathBuf,
+    /// Write the structure only; train later with `modalwatch train`
+    #[arg(long)]
+    no_training: bool,
+    /// Simulated training samples [default: as `modalwatch train`]
+    #[arg(long)]
+    samples: Option<usize>,
+    /// Passes over the training samples [default: as `modalwatch train`]
+    #[arg(long)]
+    epochs: Option<usize>,
+    /// Write the report of the diagnosis as one HTML page
+    #[arg(long)]
+    report: Option<PathBuf>,
+}
+
+/// Diagnoses, extends and trains.
+///
+/// # Errors
+/// As [`diagnose`]; nothing to extend with; a training that gives no flow.
+pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
+    let Study { simulator, data, outcome } = studied(&args.study)?;
+    println!("{}", outcome.diagnosis.summary);
+    if let Some(path) = &args.report {
+        let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
+        write_whole(path, html.as_bytes())?;
     }
+    let extended = extend_structure(&simulator, &data, &outcome)?;
+    for added in &extended.added {
+        println!("added: {added}");
+    }
+    for left in &extended.left_out {
+        println!("not added: {left}");
+    }
+    let text = serde_json::to_string_pretty(&extended.definition)?;
+    write_whole(&args.out.join("structure.json"), format!("{text}\n").as_bytes())?;
+    println!("structure: {}", args.out.join("structure.json").display());
+    if args.no_training {
+        return Ok(());
+    }
+    let simulator = Simulator::new(extended.definition)?;
+    let (samples, epochs) = super::train::sizes(&simulator, args.samples, args.epochs);
+    let settings = TrainSettings { epochs, seed: args.study.seed, ..TrainSettings::default() };
+    let flow = FlowSettings::default();
+    let trained = super::train::train_into(&args.out, &simulator, samples, DEFAULT_NOISE_RANGE, &flow, &settings)?;
+    super::train::print_record(trained.baseline.manifest());
+    Ok(())
 }
 
 fn print(d: &Diagnosis) {

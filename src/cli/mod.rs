@@ -43,6 +43,8 @@ enum Command {
     Assess(assess::AssessArgs),
     /// Find what the simulation gets wrong, name the cause and measure what naming it gains.
     Diagnose(diagnose::DiagnoseArgs),
+    /// Diagnose, write the causes into a new version of the structure, and train its baseline.
+    Extend(diagnose::ExtendArgs),
     /// Look at the configuration.
     Config {
         #[command(subcommand)]
@@ -112,6 +114,7 @@ pub fn run() -> anyhow::Result<()> {
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),
         Command::Diagnose(args) => diagnose::diagnose(&args),
+        Command::Extend(args) => diagnose::extend(&args),
         Command::Calibrate(args) => calibrate::calibrate(&args),
         Command::DesignAlarm(args) => design_alarm::design_alarm(&args),
         Command::Config { what: ConfigCommand::Print { default: true, .. } } => {

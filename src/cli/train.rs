@@ -10,9 +10,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::write_whole;
 use crate::baseline::library::{find_structure, read_structure_file};
 use crate::baseline::manifest::{Manifest, NoiseRange, ValidationRecord};
-use crate::baseline::train::{diverged, train as train_baseline};
+use crate::baseline::train::{diverged, train as train_baseline, Trained};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
+use crate::simulator::Simulator;
 
 /// Train the baseline of a structure.
 #[derive(Debug, Args)]
@@ -66,9 +67,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         );
     }
 
-    let noisy = simulator.noise().std_hz(1.0) > 0.0;
-    let (samples, epochs) = if noisy { (200_000, 80) } else { (10_000, 200) };
-    let (samples, epochs) = (args.samples.unwrap_or(samples), args.epochs.unwrap_or(epochs));
+    let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
     let settings = TrainSettings { epochs, seed: args.seed, ..TrainSettings::default() };
     let mut flow = FlowSettings::default();
     flow.units = args.units.map_or(flow.units, usize::from);
@@ -113,7 +112,36 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn print_record(manifest: &Manifest) {
+/// Samples and epochs of a training, where they are not given.
+pub(super) fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize>) -> (usize, usize) {
+    let noisy = simulator.noise().std_hz(1.0) > 0.0;
+    let (usual_samples, usual_epochs) = if noisy { (200_000, 80) } else { (10_000, 200) };
+    (samples.unwrap_or(usual_samples), epochs.unwrap_or(usual_epochs))
+}
+
+/// Trains with a progress bar and writes the two files of the baseline into a folder.
+pub(super) fn train_into(
+    out: &std::path::Path,
+    simulator: &Simulator,
+    samples: usize,
+    noise_range: NoiseRange,
+    flow: &FlowSettings,
+    settings: &TrainSettings,
+) -> anyhow::Result<Trained> {
+    let bar = ProgressBar::new(settings.epochs as u64);
+    let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
+    bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
+    let trained = train_baseline(simulator, samples, noise_range, flow, settings, |epoch| {
+        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
+        bar.set_position(epoch.epoch as u64);
+    })?;
+    bar.finish_and_clear();
+    write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
+    write_whole(&out.join("baseline.json"), &trained.manifest_json)?;
+    Ok(trained)
+}
+
+pub(super) fn print_record(manifest: &Manifest) {
     for p in &manifest.identifiability.parameters {
         let (name, left) = (&p.name, 100.0 * p.variance_left);
         println!(

@@ -2,10 +2,11 @@
 //!
 //! [`data`] holds the rows, [`grammar`] what could be wrong, [`model`] the likelihood, [`screen`] quick tests of every
 //! candidate, [`select`] the choice among them, [`misfit`] what is odd before and after, [`gain`] what the extension is
-//! worth on rows that nothing has seen, [`describe`] the words, [`report`] the page.
+//! worth on rows that nothing has seen, [`describe`] the words, [`report`] the page, [`extend`] the structure with the causes.
 
 pub mod data;
 pub mod describe;
+pub mod extend;
 pub mod gain;
 pub mod grammar;
 pub mod misfit;
@@ -24,7 +25,7 @@ use describe::Cause;
 use gain::Gain;
 use grammar::{candidates, spread, Class};
 use misfit::{misfits, remainder, Misfit, Remainder};
-use model::{Fit, Study};
+use model::{Effect, Fit, Study};
 use select::{select, Ranked};
 
 /// Fewest rows that a verdict can stand on.
@@ -124,8 +125,10 @@ pub struct Outcome {
     pub diagnosis: Diagnosis,
     /// The simulation as it is.
     pub before: Fit,
-    /// With the causes.
+    /// With the causes: after the effects that the structure has, those of `causes`.
     pub after: Fit,
+    /// The chosen candidates.
+    pub causes: Vec<Ranked>,
     /// Rows held out.
     pub holdout: Vec<usize>,
     /// Rows that causes were looked for in.
@@ -153,6 +156,17 @@ pub enum Step {
     },
     /// The gain is measured.
     Measuring,
+}
+
+impl std::fmt::Display for Step {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Showing => f.write_str("fitting the simulation as it is"),
+            Self::Searching { cause, of } => write!(f, "looking for cause {cause} of at most {of}"),
+            Self::LookingAgain { cause, of } => write!(f, "looking again at cause {cause} of {of}"),
+            Self::Measuring => f.write_str("measuring the gain"),
+        }
+    }
 }
 
 /// Called at each step.
@@ -221,10 +235,12 @@ fn run(
     seed: u64,
     progress: &Progress<'_>,
 ) -> Result<Outcome, Error> {
-    let study = Study::new(simulator, data);
+    let bare = simulator.without_effects();
+    let known: Vec<Effect> = simulator.effects().iter().map(Effect::known).collect();
+    let study = Study::new(&bare, data);
     progress(Step::Showing);
     let candidates = candidates(simulator, data, &training);
-    let selection = select(&study, &training, &candidates, progress).ok_or(Error::NoFit)?;
+    let selection = select(&study, &training, &known, &candidates, progress).ok_or(Error::NoFit)?;
     let mut misfit = misfits(&study, &training, &selection.base).ok_or(Error::NoFit)?;
     misfit.retain(|m| m.p_value < MISFIT_SHOWN);
     let share = selection.independent_share;
@@ -241,7 +257,7 @@ fn run(
         let described = |r: &Ranked| {
             // The chosen one is described by the final fit, the others by their own.
             let (fit, place) =
-                if std::ptr::eq(r, best) { (&selection.fit, index) } else { (&r.fit, r.fit.effects.len() - 1) };
+                if std::ptr::eq(r, best) { (&selection.fit, known.len() + index) } else { (&r.fit, r.fit.effects.len() - 1) };
             describe::cause(simulator, data, r, fit, place, share)
         };
         let unsure = best.probability <= SURE;
@@ -295,7 +311,15 @@ fn run(
         structure_digest: simulator.digest().clone(),
     };
     diagnosis.summary = summary(&diagnosis);
-    Ok(Outcome { diagnosis, before: selection.base, after: selection.fit, holdout, training })
+    let chosen = selection.slots.into_iter().map(|slot| slot.ranked.into_iter().next()).collect::<Option<Vec<_>>>();
+    Ok(Outcome {
+        diagnosis,
+        before: selection.base,
+        after: selection.fit,
+        causes: chosen.unwrap_or_default(),
+        holdout,
+        training,
+    })
 }
 
 /// Places of the candidates that an unsure answer names: the best of each set of exact equivalents first, until they cover

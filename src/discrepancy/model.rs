@@ -59,6 +59,25 @@ pub struct Effect {
 }
 
 impl Effect {
+    /// An effect that the structure has already, with what is known of its numbers as their prior.
+    pub fn known(effect: &crate::simulator::effect::Effect) -> Self {
+        let mut names = effect.law.numbers();
+        match effect.target {
+            Target::Oscillator(_) => names.push("frequency_hz".to_owned()),
+            Target::ModeOrder(_) => names.clear(),
+            _ => {}
+        }
+        let number = |((name, mean), std): ((String, &f64), f64)| Number {
+            name,
+            prior_mean: *mean,
+            // An exact number may move by next to nothing.
+            prior_std: std.max(1e-6 * mean.abs()).max(1e-12),
+            bounds: (f64::NEG_INFINITY, f64::INFINITY),
+        };
+        let numbers = names.into_iter().zip(&effect.psi).zip(effect.psi_std()).map(number).collect();
+        Self { target: effect.target.clone(), law: effect.law.clone(), numbers }
+    }
+
     /// Column of the lag among the numbers.
     pub fn lag(&self) -> Option<usize> {
         (self.law.kind == LawKind::Lagged).then(|| self.numbers.len() - 1)

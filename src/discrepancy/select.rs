@@ -61,9 +61,9 @@ pub struct Slot {
 
 /// The causes that were found.
 pub struct Selection {
-    /// Fit without effects.
+    /// Fit with the effects that the structure has already.
     pub base: Fit,
-    /// Fit with all causes; each slot's cause is the effect of the same index.
+    /// Fit with all causes beside those; the effects of the slots come last, in the same order.
     pub fit: Fit,
     /// The causes.
     pub slots: Vec<Slot>,
@@ -77,10 +77,11 @@ pub struct Selection {
 pub fn select(
     study: &Study<'_>,
     rows: &[usize],
+    known: &[Effect],
     candidates: &[Candidate],
     progress: &Progress<'_>,
 ) -> Option<Selection> {
-    let base = study.fit(rows, &[], None)?;
+    let base = study.fit(rows, known, None)?;
     let mut fit = base.clone();
     let mut slots: Vec<Slot> = Vec::new();
     let tried = candidates.iter().map(|c| c.laws(study.data).len()).sum();
@@ -99,7 +100,7 @@ pub fn select(
         slots.push(Slot { ranked, cross_validation });
     }
     if slots.len() > 1 {
-        fit = look_again(study, rows, candidates, fit, &mut slots, progress)?;
+        fit = look_again(study, rows, candidates, known.len(), fit, &mut slots, progress)?;
     }
     Some(Selection { base, fit, slots, tried, independent_share })
 }
@@ -109,6 +110,7 @@ fn look_again(
     study: &Study<'_>,
     rows: &[usize],
     candidates: &[Candidate],
+    known: usize,
     mut fit: Fit,
     slots: &mut Vec<Slot>,
     progress: &Progress<'_>,
@@ -118,8 +120,11 @@ fn look_again(
         progress(Step::LookingAgain { cause: number + 1, of: found });
         // The first goes out and comes back last, so that slots and effects keep the same order.
         let old = slots.remove(0);
-        let psi = fit.psi[1..].iter().cloned().map(Some).collect();
-        let without = study.fit(rows, &fit.effects[1..], Some(&Start { fit: &fit, psi }))?;
+        let (mut effects, mut psi) = (fit.effects.clone(), fit.psi.clone());
+        effects.remove(known);
+        psi.remove(known);
+        let start = Start { fit: &fit, psi: psi.into_iter().map(Some).collect() };
+        let without = study.fit(rows, &effects, Some(&start))?;
         let (ranked, _) = rank(study, rows, &without, candidates)?;
         let needed = log_sum(ranked.iter().map(|r| r.log_odds)) > ACCEPTED_NATS;
         let Some(best) = ranked.first().filter(|_| needed) else {
@@ -131,8 +136,8 @@ fn look_again(
     }
     for index in 0..slots.len() {
         let (mut effects, mut psi) = (fit.effects.clone(), fit.psi.clone());
-        effects.remove(index);
-        psi.remove(index);
+        effects.remove(known + index);
+        psi.remove(known + index);
         let start = Start { fit: &fit, psi: psi.into_iter().map(Some).collect() };
         let without = study.fit(rows, &effects, Some(&start))?;
         slots[index].cross_validation = cross_validate(study, rows, &without, &fit)?;

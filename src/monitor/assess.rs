@@ -124,7 +124,7 @@ pub fn draw(
                 let nearest = fit.nearest[row].frequencies_hz.iter().copied().map(Some);
                 let there = observations[row].frequencies_hz.iter().map(Option::is_some);
                 let frequencies_hz = nearest.zip(there).map(|(f, there)| f.filter(|_| there)).collect();
-                Observation { frequencies_hz, noise_multiple: observations[row].noise_multiple.clone() }
+                Observation { frequencies_hz, ..observations[row].clone() }
             } else {
                 observations[row].clone()
             }
@@ -272,6 +272,7 @@ fn admit(
 ) -> (Vec<usize>, Vec<Observation>) {
     let (mut indices, mut observations) = (Vec::new(), Vec::new());
     let (mut below, mut above, mut unusable) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut blind, mut beyond) = (BTreeMap::<String, Vec<usize>>::new(), BTreeMap::<String, Vec<usize>>::new());
     for (index, measurement) in kept {
         let admitted = baseline.admit(measurement);
         if admitted.below_range {
@@ -280,6 +281,11 @@ fn admit(
         if admitted.above_range {
             above.push(*index);
         }
+        for (names, found) in [(&admitted.covariates_missing, &mut blind), (&admitted.covariates_beyond, &mut beyond)] {
+            for name in names {
+                found.entry(name.clone()).or_default().push(*index);
+            }
+        }
         match admitted.observation {
             Some(observation) => {
                 indices.push(*index);
@@ -287,6 +293,21 @@ fn admit(
             }
             None => unusable.push(*index),
         }
+    }
+    for (name, rows) in blind {
+        let message = format!(
+            "{} measurements lack {name}, which the simulation depends on: they are taken at all values it was learnt from, and \
+             the answer is wider for it",
+            rows.len()
+        );
+        findings.push(Finding::new(Code::CovariateMissing, Effect::HoldAlarm, message).of(rows));
+    }
+    for (name, rows) in beyond {
+        let message = format!(
+            "{} measurements have a {name} beyond the range that its effect was learnt from: the effect is extrapolated",
+            rows.len()
+        );
+        findings.push(Finding::new(Code::Extrapolated, Effect::HoldAlarm, message).of(rows));
     }
     let range = baseline.manifest().conditions.noise_range.map_or([0.0; 2], |r| [r.lowest, r.highest]);
     if !below.is_empty() {
@@ -502,7 +523,12 @@ fn rows(matrix: &nalgebra::DMatrix<f64>) -> Vec<Vec<f64>> {
 /// spread of x adds some (σ/x)²/8, below 0.1 % for a spread of 8 %.
 fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Option<f64>>, Error> {
     let theta: Vec<f64> = samples.posterior.theta().row_mean().iter().copied().collect();
-    let simulated = baseline.simulator().frequencies_hz(&theta)?;
+    // Under the mean of the effects' sizes.
+    let count = samples.observations.len() as f64;
+    let known: Vec<&Vec<f64>> = samples.observations.iter().map(|o| &o.effect_sizes).filter(|s| !s.is_empty()).collect();
+    let sizes: Vec<f64> =
+        (0..known.first().map_or(0, |s| s.len())).map(|i| known.iter().map(|s| s[i]).sum::<f64>() / count).collect();
+    let simulated = baseline.simulator().under(&sizes).frequencies_hz(&theta)?;
     let misfit = |(mode, simulated): (usize, f64)| {
         let measured: Vec<f64> = samples.observations.iter().filter_map(|o| o.frequencies_hz[mode]).collect();
         (!measured.is_empty()).then(|| 100.0 * (1.0 - simulated / stats::mean(&measured)))

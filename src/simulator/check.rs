@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use super::definition::{
     DefinitionProblem, Law, MeasurementNoise, ParameterDefinition, Prior, SpringDefinition, StructureDefinition,
 };
+use super::effect::{self, Effect};
 use super::Binding;
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
@@ -23,6 +24,7 @@ pub(super) struct Checked {
     pub space: ParameterSpace,
     pub bindings: Vec<Binding>,
     pub covariates: Vec<Covariate>,
+    pub effects: Vec<Effect>,
 }
 
 type Problems = Vec<DefinitionProblem>;
@@ -51,8 +53,14 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
     // Tied to the ground is not enough: values far apart can drown the lowest frequency in rounding.
     let nominal_frequencies_hz = natural_frequencies_hz(&structure, definition.modes)
         .map_err(|e| vec![DefinitionProblem::new("/spring", format!("at the nominal stiffnesses: {e}"))])?;
-    let covariates = definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
-    Ok(Checked { id, structure, nominal_frequencies_hz, space, bindings, covariates })
+    let covariates: Vec<Covariate> =
+        definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
+    check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
+    let effects = effect::check(definition, &structure, &covariates, &mut problems);
+    if !problems.is_empty() {
+        return Err(problems);
+    }
+    Ok(Checked { id, structure, nominal_frequencies_hz, space, bindings, covariates, effects })
 }
 
 fn check_head(definition: &StructureDefinition, problems: &mut Problems) {

@@ -2,6 +2,7 @@
 //!
 //! `models/three-dof/structure.toml` is an example; README lists the keys.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::ops::Range;
 
@@ -9,6 +10,7 @@ use serde::de::{self, DeserializeOwned, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::check;
+use super::law::LawKind;
 use crate::measurement::CovariateKind;
 use crate::parameter::DamageDirection;
 use crate::quantity::{json_pointer, Digest};
@@ -39,6 +41,63 @@ pub struct StructureDefinition {
     /// What is measured beside the frequencies.
     #[serde(rename = "covariate", default, skip_serializing_if = "Vec::is_empty")]
     pub covariates: Vec<CovariateDefinition>,
+    /// What acts on the structure beside its parameters.
+    #[serde(rename = "effect", default, skip_serializing_if = "Vec::is_empty")]
+    pub effects: Vec<EffectDefinition>,
+    /// Digest of the definition that this one extends.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parent: Option<String>,
+}
+
+/// An effect: target × law × covariate, with what is known of its numbers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EffectDefinition {
+    /// Unique name.
+    pub name: String,
+    /// For people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub description: Option<String>,
+    /// What changes.
+    pub target: TargetDefinition,
+    /// Form of the law.
+    pub law: LawKind,
+    /// Under which declared covariate; none for a constant.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub covariate: Option<String>,
+    /// Value of the covariate at which the effect has its `level`.
+    #[serde(default)]
+    pub reference: f64,
+    /// Numbers of the law by name: their means. A category has one for each category that is named.
+    pub numbers: BTreeMap<String, f64>,
+    /// Their covariance, in the order of their names; none where they are exact.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub covariance: Vec<Vec<f64>>,
+    /// Values of a numeric covariate that the effect was learnt from: quantiles at equal steps from the least to the
+    /// greatest, at least two. Training draws between the ends; a measurement without the covariate is taken at all of
+    /// them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub seen: Vec<f64>,
+}
+
+/// What an effect changes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TargetDefinition {
+    /// Stiffness of these springs, k(1 + g).
+    Springs(Vec<String>),
+    /// Mass of these bodies, m(1 + g).
+    Masses(Vec<String>),
+    /// Scale of the measured frequency of this mode, from 1; of all modes for 0: f(1 + g).
+    FrequencyScale(usize),
+    /// Offset of the measured frequency of this mode, from 1; of all modes for 0: f + g, Hz.
+    FrequencyOffset(usize),
+    /// A spring of stiffness g, N/m, between two nodes.
+    AddedSpring([String; 2]),
+    /// A body of `size` kg on a spring tuned to `frequency_hz`, attached to this mass.
+    Oscillator(String),
+    /// Mode i of the data is this mode of the structure, from 1.
+    ModeOrder(Vec<usize>),
 }
 
 /// Standard deviation of one measured frequency.

@@ -2,9 +2,11 @@
 
 mod check;
 pub mod definition;
+pub mod effect;
 pub mod law;
 pub mod population;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
@@ -12,13 +14,14 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
-use crate::measurement::Covariate;
+use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::physics::effect::{respond, Target};
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_hz, Structure};
 use crate::quantity::{Digest, StructureId};
 use crate::stats;
 use definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
+use effect::Effect;
 
 /// How far outside its simulated range a frequency may lie before it is taken for a mistake of unit or place.
 const FREQUENCY_MARGIN: f64 = 100.0;
@@ -77,6 +80,8 @@ pub enum Error {
 #[derive(Debug, Clone)]
 pub struct Simulator {
     parts: Arc<Parts>,
+    /// Sizes of the effects; where nothing was said of them, their means over what they were learnt from.
+    sizes: Arc<[f64]>,
 }
 
 #[derive(Debug)]
@@ -104,6 +109,9 @@ pub struct TrainingSet {
     pub theta: DMatrix<f64>,
     /// `[n, m]`, Hz, without noise.
     pub frequencies_hz: DMatrix<f64>,
+    /// Sizes of the structure's effects under the covariates of each row, as their laws' mean numbers give them, `[n]`; the
+    /// frequencies have sizes by numbers drawn from what is known of them.
+    pub effect_sizes: Vec<Vec<f64>>,
     /// Seed of the draws.
     pub seed: u64,
 }
@@ -134,7 +142,45 @@ impl Simulator {
     pub fn new(definition: StructureDefinition) -> Result<Self, DefinitionError> {
         let checked = check::check(&definition).map_err(|problems| DefinitionError { problems })?;
         let digest = definition.digest();
-        Ok(Self { parts: Arc::new(Parts { definition, digest, checked }) })
+        let sizes = effect::typical_sizes(&checked.effects).into();
+        Ok(Self { parts: Arc::new(Parts { definition, digest, checked }), sizes })
+    }
+
+    /// Sizes of the effects at all values that covariates which are missing may have; those of several effects go through
+    /// their values together, so that effects of one covariate agree.
+    pub fn possible_sizes(&self, covariates: &BTreeMap<String, CovariateValue>) -> Vec<Vec<f64>> {
+        effect::possible_sizes(self.effects(), covariates)
+    }
+
+    /// The structure without its effects.
+    #[must_use]
+    pub fn without_effects(&self) -> Self {
+        let parts = &self.parts;
+        let checked = check::Checked { effects: Vec::new(), ..parts.checked.clone() };
+        let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
+        Self { parts: Arc::new(Parts { definition, digest, checked }), sizes: Arc::new([]) }
+    }
+
+    /// Effects of the structure file.
+    pub fn effects(&self) -> &[Effect] {
+        &self.parts.checked.effects
+    }
+
+    /// The simulation under effects of these sizes (all sizes of the first effect first); under their means for none.
+    ///
+    /// # Panics
+    /// When there are sizes, but not one for each.
+    pub fn under(&self, sizes: &[f64]) -> Self {
+        if sizes.is_empty() {
+            return Self { sizes: effect::typical_sizes(self.effects()).into(), ..self.clone() };
+        }
+        assert_eq!(sizes.len(), self.sizes.len(), "one size for each of the structure's effects");
+        Self { sizes: sizes.into(), ..self.clone() }
+    }
+
+    /// Sizes of the effects under the covariates of a measurement.
+    pub fn effect_sizes(&self, covariates: &BTreeMap<String, CovariateValue>) -> effect::Sizes {
+        effect::sizes(self.effects(), covariates)
     }
 
     /// Id of the structure.
@@ -182,7 +228,10 @@ impl Simulator {
     /// # Errors
     /// [`physics::Error`] for parameters that give a negative stiffness or a mechanism.
     pub fn frequencies_hz(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
-        natural_frequencies_hz(&self.structure_at(theta)?, self.modes())
+        if self.effects().is_empty() {
+            return natural_frequencies_hz(&self.structure_at(theta)?, self.modes());
+        }
+        self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz)
     }
 
     /// Derivatives of the frequencies at `theta`, Hz per parameter unit, `[m, d]`.
@@ -196,6 +245,9 @@ impl Simulator {
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn jacobian(&self, theta: &[f64]) -> Result<DMatrix<f64>, physics::Error> {
+        if !self.effects().is_empty() {
+            return self.respond(theta, self.modes(), &[], &[]).map(|response| response.by_parameter);
+        }
         let structure = self.structure_at(theta)?;
         let modes = modes(&structure, self.modes())?;
         let sensitivity = frequency_sensitivity(&structure, &modes);
@@ -209,7 +261,7 @@ impl Simulator {
         Ok(jacobian)
     }
 
-    /// The lowest `modes` frequencies at `theta` under further effects, and their derivatives; `sizes` as in [`respond`].
+    /// The lowest `modes` frequencies at `theta` under the structure's effects and further ones, and their derivatives; `sizes` as in [`respond`].
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`] and [`respond`].
@@ -220,6 +272,10 @@ impl Simulator {
         targets: &[Target],
         sizes: &[f64],
     ) -> Result<Response, physics::Error> {
+        let own: usize = self.sizes.len();
+        let targets: Vec<Target> = self.effects().iter().map(|e| &e.target).chain(targets).cloned().collect();
+        let sizes: Vec<f64> = self.sizes.iter().chain(sizes).copied().collect();
+        let (targets, sizes) = (targets.as_slice(), sizes.as_slice());
         let mut theta = theta.to_vec();
         let mut set_scale = vec![1.0; theta.len()];
         let mut first = 0;
@@ -259,7 +315,8 @@ impl Simulator {
         for (column, scale) in set_scale.iter().enumerate() {
             by_parameter.column_mut(column).scale_mut(*scale);
         }
-        Ok(Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size: response.by_size })
+        let by_size = response.by_size.columns(own, sizes.len() - own).into_owned();
+        Ok(Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size })
     }
 
     /// Natural frequencies at the nominal stiffnesses, Hz.
@@ -339,9 +396,25 @@ impl Simulator {
         let rows: Vec<Vec<f64>> =
             (0..samples).map(|_| space.iter().map(|p| p.from_unit(stream.random::<f64>())).collect()).collect();
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
-        let exact = self.exact(&rows)?;
+        let mut stream = stats::stream(seed, "covariates");
+        let mut effect_sizes = vec![Vec::new(); samples];
+        let exact = if self.effects().is_empty() {
+            self.exact(&rows)?
+        } else {
+            let mut drawn = Vec::with_capacity(samples);
+            for known in &mut effect_sizes {
+                let covariates = effect::draw_covariates(self.effects(), &mut stream);
+                *known = self.effect_sizes(&covariates).values;
+                drawn.push(effect::draw_sizes(self.effects(), &covariates, &mut stream));
+            }
+            let simulate = |(theta, sizes): (&Vec<f64>, &Vec<f64>)| {
+                let failed = |source| Error::Physics { parameters: theta.clone(), source };
+                self.under(sizes).frequencies_hz(theta).map_err(failed)
+            };
+            rows.par_iter().zip(&drawn).map(simulate).collect::<Result<Vec<_>, _>>()?
+        };
         let frequencies_hz = DMatrix::from_fn(samples, self.modes(), |row, mode| exact[row][mode]);
-        Ok(TrainingSet { theta, frequencies_hz, seed })
+        Ok(TrainingSet { theta, frequencies_hz, effect_sizes, seed })
     }
 
     /// Exact frequencies of each row of parameters, Hz.

@@ -46,7 +46,7 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
     for (unit, factor) in UNITS {
         let in_hz = |o: &Observation| Observation {
             frequencies_hz: o.frequencies_hz.iter().map(|f| f.map(|f| f * factor)).collect(),
-            noise_multiple: o.noise_multiple.clone(),
+            ..o.clone()
         };
         if tried(&in_hz, false)? {
             let message = format!("taken as {unit} instead of Hz, the measurements fit: send Hz");
@@ -61,6 +61,7 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
             Observation {
                 frequencies_hz: (0..modes).map(|i| o.frequencies_hz[from(i)].filter(|_| i != missed)).collect(),
                 noise_multiple: (0..modes).map(|i| if i == missed { 1.0 } else { o.noise_multiple[from(i)] }).collect(),
+                ..o.clone()
             }
         };
         // With too few modes left to test anything, any shift would fit.

@@ -59,6 +59,8 @@ pub struct World {
     pub truths: Vec<Truth>,
     /// The effect in words where no law of the program describes it.
     pub outside: Option<&'static str>,
+    /// What that effect acts on: kind, name and the swing; its columns, joined by [`AND`], as the covariate.
+    pub outside_target: Option<Truth>,
     /// Log-likelihood of the true model less that of the best model without effect, on the first 75 % of the rows.
     pub nats: f64,
     /// Mean over the modes of the rms relative error of prediction on the last 25 % of the rows: without the effect,
@@ -112,6 +114,9 @@ const OUTSIDE: [&str; 3] = [
 
 /// Targets that all shift every frequency by the same share.
 const GLOBAL: [&str; 3] = ["spring_group", "mass_group", "frequency_scale"];
+
+/// Between the columns of an effect that follows two at once.
+pub const AND: &str = " and ";
 
 /// Least gain of the true model for one effect, and for an effect outside the laws.
 const LEAST_NATS: (f64, f64) = (20.0, 30.0);
@@ -174,6 +179,11 @@ fn search(seed: u64, rng: &mut ChaCha8Rng, families: &[Family], outside: Option<
     })
 }
 
+/// Rows that models are fitted to: all but the last share, as the program rounds it.
+fn training_rows(rows: usize) -> usize {
+    rows - ((1.0 - TRAINING_SHARE) * rows as f64).round() as usize
+}
+
 fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'static str>) -> Option<World> {
     let structure = Structure::draw(rng, families)?;
     let population = structure
@@ -195,8 +205,7 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
     }
     measure(rng, &structure, &population, &effects, &mut rows)?;
 
-    let training = (TRAINING_SHARE * rows.len() as f64).round() as usize;
-    let (seen, unseen) = rows.split_at(training);
+    let (seen, unseen) = rows.split_at(training_rows(rows.len()));
     let all = effects.iter().collect::<Vec<_>>();
     let truth = Fit {
         theta: population.iter().map(|p| p.0).chain(effects.iter().map(|_| 1.0)).collect(),
@@ -222,7 +231,9 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
         }
     }
     let scored = unseen.iter().filter(|r| !r.outlier).count() as f64;
-    let truths = if outside.is_some() { Vec::new() } else { effects.iter().map(|e| e.truth.clone()).collect() };
+    let hidden = effects.iter().map(|e| e.truth.clone()).collect::<Vec<_>>();
+    let (truths, outside_target) =
+        if outside.is_some() { (Vec::new(), hidden.first().cloned()) } else { (hidden, None) };
     Some(World {
         seed: 0,
         structure_toml: structure.toml(),
@@ -230,6 +241,7 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
         description: describe(&structure, rows.len(), &truths, outside, nats),
         truths,
         outside,
+        outside_target,
         nats,
         holdout_rms_percent: (
             Data::rms_percent(&structure, &[], unseen, &base)?,
@@ -633,6 +645,7 @@ fn measure(
 ) -> Option<()> {
     let missing = rng.random_range(0.0..0.03);
     let gross = if rng.random_bool(0.25) { 0.01 } else { 0.0 };
+    let training = training_rows(rows.len());
     for (index, row) in rows.iter_mut().enumerate() {
         let free = population.iter().map(|(mean, sd)| mean + sd * normal(rng)).collect::<Vec<_>>();
         let gains = effects.iter().map(|e| (&e.target, e.signal[index])).collect::<Vec<_>>();
@@ -643,7 +656,8 @@ fn measure(
         }
         for log_f in noisy {
             let mut log_f = log_f;
-            if rng.random_bool(gross) {
+            // None on the rows held out: there they would drown what the figures are compared for.
+            if rng.random_bool(gross) && index < training {
                 let error: f64 = rng.random_range(0.05..0.15);
                 log_f += (if rng.random_bool(0.5) { error } else { -error }).ln_1p();
                 row.outlier = true;
@@ -815,7 +829,7 @@ fn draw_scale(rng: &mut ChaCha8Rng, structure: &Structure, kind: &str) -> f64 {
 /// A law of size ±1: the sign is given, but for `bilinear`, which is always stiffer in the cold.
 fn draw_shape(rng: &mut ChaCha8Rng, weather: &Weather, rows: &[Row], law: &str, sign: f64) -> Option<Shape> {
     let plain = |covariate, level, values| Some(Shape { covariate, level, values, size: sign });
-    let training = (TRAINING_SHARE * rows.len() as f64).round() as usize;
+    let training = training_rows(rows.len());
     match law {
         "constant" => plain(None, None, vec![sign; rows.len()]),
         "category" => {
@@ -893,9 +907,10 @@ fn draw_curve(rng: &mut ChaCha8Rng, rows: &[Row], training: usize, law: &str, si
 /// An effect that no law of the families describes.
 fn draw_outside(rng: &mut ChaCha8Rng, structure: &Structure, weather: &Weather, rows: &[Row], name: &str) -> Effect {
     let spring = rng.random_range(0..structure.springs.len());
-    let (target, raw) = if name == OUTSIDE[0] {
+    let (target, columns, raw) = if name == OUTSIDE[0] {
         let values = rows.iter().map(|r| (r.temperature_c - 15.0) * (r.humidity_percent - 50.0)).collect::<Vec<_>>();
-        (Target::Mass(rng.random_range(0..structure.masses_kg.len())), values)
+        let mass = rng.random_range(0..structure.masses_kg.len());
+        (Target::Mass(mass), vec!["temperature_c", "humidity_percent"], values)
     } else if name == OUTSIDE[1] {
         let half_width_c = rng.random_range(3.0..6.0);
         let mut centre_c = weather.hourly_c[0];
@@ -904,20 +919,25 @@ fn draw_outside(rng: &mut ChaCha8Rng, structure: &Structure, weather: &Weather, 
             centre_c
         };
         let behind_c = weather.hourly_c.iter().map(play).collect::<Vec<_>>();
-        (Target::Spring(spring), rows.iter().map(|r| Weather::at(&behind_c, r.day) - 15.0).collect())
+        let values = rows.iter().map(|r| Weather::at(&behind_c, r.day) - 15.0).collect();
+        (Target::Spring(spring), vec!["temperature_c"], values)
     } else {
         let values = rows.iter().map(|r| (r.temperature_c - 15.0) * (r.amplitude_um - 1.0)).collect();
-        (Target::Spring(spring), values)
+        (Target::Spring(spring), vec!["temperature_c", "amplitude_um"], values)
     };
     let (low, high) = quantiles(raw.clone());
     let swing = rng.random_range(0.05..0.15) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
     let signal = raw.iter().map(|v| (swing * v / (high - low)).clamp(-0.6, 2.0)).collect();
+    let (kind, name) = match target {
+        Target::Mass(mass) => ("mass", mass_name(mass)),
+        _ => ("spring", structure.springs[spring].name.clone()),
+    };
     let truth = Truth {
-        kind: "outside",
-        name: String::new(),
+        kind,
+        name,
         between: None,
         law: "outside",
-        covariate: None,
+        covariate: Some(columns.join(AND)),
         level: None,
         size: swing,
     };

@@ -36,7 +36,7 @@ fn prior_measurements(
     let mut one = |row: usize| {
         let f: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
         let multiples: Vec<Option<f64>> = (0..f.len()).map(|i| (Some(i) != missing).then_some(multiple)).collect();
-        measure(baseline.simulator(), &f, &multiples, &mut stream)
+        measure(baseline.simulator(), &f, &[], &multiples, &mut stream)
     };
     let observations = (0..count).map(&mut one).collect();
     (set.theta.row_iter().map(|r| r.iter().copied().collect()).collect(), observations)

@@ -1,0 +1,430 @@
+//! `modalwatch diagnose` on worlds whose secret is known: the place, the size, the gain, the silence where nothing is
+//! hidden, and the honesty where no law fits. The program is run as people run it, on files.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
+mod spectrum;
+mod world;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Output};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::Mutex;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
+use serde_json::Value;
+use world::{Kind, Truth, World};
+
+/// Log evidence, nats, within which data do not tell two causes apart.
+const EQUIVALENT_NATS: f64 = 5.0;
+
+/// Share of the true model's gain on the rows held out that naming a cause should bring.
+const GAIN: f64 = 0.8;
+
+// ---- Running ----
+
+/// Runs `modalwatch diagnose` on a structure and measurements.
+fn diagnose(structure_toml: &str, csv: &str, options: &[&str]) -> Output {
+    let folder = tempfile::tempdir().unwrap();
+    let (structure, data) = (folder.path().join("world.toml"), folder.path().join("world.csv"));
+    fs::write(&structure, structure_toml).unwrap();
+    fs::write(&data, csv).unwrap();
+    let file = |name: &str, path: &Path| [name.to_owned(), path.to_str().unwrap().to_owned()];
+    Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .arg("diagnose")
+        .args(file("--structure", &structure))
+        .args(file("--data", &data))
+        .args(options)
+        .output()
+        .unwrap()
+}
+
+/// The answer as JSON, of a run that should succeed.
+fn answer(structure_toml: &str, csv: &str, options: &[&str]) -> Value {
+    let output = diagnose(structure_toml, csv, &[&["--json"], options].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+/// The complaint of a run that should fail.
+fn refusal(structure_toml: &str, csv: &str, options: &[&str]) -> String {
+    let output = diagnose(structure_toml, csv, options);
+    assert!(!output.status.success(), "should have been refused: {}", String::from_utf8_lossy(&output.stdout));
+    String::from_utf8(output.stderr).unwrap()
+}
+
+/// A world to draw: of one family, or of a kind.
+#[derive(Clone, Copy)]
+enum Order {
+    Family(u64, &'static str, &'static str),
+    Kind(u64, Kind),
+}
+
+impl Order {
+    fn draw(self) -> (Kind, World) {
+        match self {
+            Self::Family(seed, target, law) => (Kind::Single, world::draw_single(seed, target, law)),
+            Self::Kind(seed, kind) => (kind, world::draw(seed, kind)),
+        }
+    }
+}
+
+/// Draws worlds, runs the program on each and judges it; as many at a time as there are cores, in the order given.
+fn judged(orders: &[Order]) -> Vec<Judged> {
+    let next = AtomicUsize::new(0);
+    let done = Mutex::new(BTreeMap::new());
+    let work = || loop {
+        let index = next.fetch_add(1, Ordering::Relaxed);
+        let Some(order) = orders.get(index) else { break };
+        let (kind, world) = order.draw();
+        let answer = answer(&world.structure_toml, &world.csv, &[]);
+        done.lock().unwrap().insert(index, Judged::new(kind, world, answer));
+    };
+    let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    std::thread::scope(|scope| (0..threads).for_each(|_| drop(scope.spawn(work))));
+    done.into_inner().unwrap().into_values().collect()
+}
+
+// ---- Judging ----
+
+/// Whether a target moves every frequency by one share: three names of one thing.
+fn acts_on_all(kind: &str, name: &str) -> bool {
+    matches!((kind, name), ("spring_group" | "mass_group", "all") | ("frequency_scale", ""))
+}
+
+/// Share by which all frequencies are multiplied by an effect of such a kind, and back.
+fn to_frequency(kind: &str, size: f64) -> f64 {
+    match kind {
+        "spring_group" => (1.0 + size).sqrt(),
+        "mass_group" => 1.0 / (1.0 + size).sqrt(),
+        _ => 1.0 + size,
+    }
+}
+
+fn from_frequency(kind: &str, factor: f64) -> f64 {
+    match kind {
+        "spring_group" => factor * factor - 1.0,
+        "mass_group" => 1.0 / (factor * factor) - 1.0,
+        _ => factor - 1.0,
+    }
+}
+
+fn list<'a>(value: &'a Value, name: &str) -> &'a [Value] {
+    value[name].as_array().map_or(&[], Vec::as_slice)
+}
+
+fn target(cause: &Value) -> (&str, &str) {
+    let part = |name: &str| cause["target"][name].as_str().unwrap();
+    (part("kind"), part("name"))
+}
+
+/// Whether a cause is the hidden effect: its place, its covariate and its category; not its law.
+fn names(cause: &Value, truth: &Truth) -> bool {
+    let (kind, name) = target(cause);
+    let between = || {
+        let ends = list(&cause["target"], "between").iter().filter_map(Value::as_str).collect::<Vec<_>>();
+        truth.between.as_ref().is_some_and(|(from, to)| ends == [from, to])
+    };
+    let place = match truth.kind {
+        "added_spring" => kind == "added_spring" && between(),
+        "mode_assignment" => kind == "mode_assignment",
+        _ if acts_on_all(truth.kind, &truth.name) => acts_on_all(kind, name),
+        _ => (kind, name) == (truth.kind, truth.name.as_str()),
+    };
+    // Where each category has its own number the cause has no level.
+    let level = cause["target"]["level"].as_str();
+    let same_level = truth.level.is_none() || level.is_none() || level == truth.level.as_deref();
+    place && cause["covariate"].as_str() == truth.covariate.as_deref() && same_level
+}
+
+/// Whether the true size lies in the 90 % interval of a cause that names it; none where there is no size to compare.
+fn size_inside(cause: &Value, truth: &Truth) -> Option<bool> {
+    let first = list(cause, "parameters").first()?;
+    let (kind, _) = target(cause);
+    // A wrong setting can also be written as a share of itself.
+    let incomparable = kind == "setting" && first["unit"] == "share";
+    if incomparable || truth.kind == "mode_assignment" {
+        return None;
+    }
+    let size = if kind == truth.kind { truth.size } else { from_frequency(kind, to_frequency(truth.kind, truth.size)) };
+    let edge = |side: usize| first["interval90"][side].as_f64().unwrap();
+    Some((edge(0)..=edge(1)).contains(&size))
+}
+
+/// A world, the answer and what it is worth.
+struct Judged {
+    kind: Kind,
+    world: World,
+    answer: Value,
+    /// What is asked of a world of its kind.
+    right: bool,
+    /// Of a single effect in the right place: whether the size is inside its interval.
+    size_inside: Option<bool>,
+    /// Gain of the answer on the rows held out, as a share of the true model's.
+    gain: f64,
+}
+
+impl Judged {
+    fn new(kind: Kind, world: World, answer: Value) -> Self {
+        let right = match kind {
+            Kind::Nothing => answer["verdict"] == "nothing_found",
+            Kind::Single => named(&answer, &world.truths[0]).is_some(),
+            Kind::Two => both_named(&answer, &world.truths),
+            Kind::Outside => confident_wrong_name(&answer, world.outside_target.as_ref().unwrap()).is_none(),
+        };
+        let size_inside = match &world.truths[..] {
+            [truth] => named(&answer, truth).and_then(|cause| size_inside(cause, truth)),
+            _ => None,
+        };
+        let (base, truth) = world.holdout_log_density;
+        // Nothing found is nothing gained.
+        let gain = answer["gain"]["log_density_per_row"]["after"].as_f64().map_or(0.0, |a| (a - base) / (truth - base));
+        Self { kind, world, answer, right, size_inside, gain }
+    }
+
+    fn verdict(&self) -> &str {
+        self.answer["verdict"].as_str().unwrap()
+    }
+
+    /// The world and the answer, for people.
+    fn told(&self) -> String {
+        let World { seed, description, holdout_rms_percent: (base, truth), .. } = &self.world;
+        let mut text = format!("seed {seed}: {description}; held out {base:.3} % -> {truth:.3} %");
+        let inside = self.size_inside.map_or("", |inside| if inside { ", size inside" } else { ", size OUTSIDE" });
+        let _ = write!(text, "\n    {}, gain {:.2}{inside}", self.verdict(), self.gain);
+        let one = |cause: &Value| {
+            let (kind, name) = target(cause);
+            let between = list(&cause["target"], "between").iter().filter_map(Value::as_str).collect::<Vec<_>>();
+            let word = |value: &Value| value.as_str().unwrap_or("-").to_owned();
+            let (law, covariate, level) =
+                (word(&cause["law"]), word(&cause["covariate"]), word(&cause["target"]["level"]));
+            format!("{kind} {name}{} {law} {covariate} {level}", between.join("-"))
+        };
+        for cause in list(&self.answer, "causes") {
+            let _ = write!(text, "\n    cause: {} {:.3}", one(cause), cause["probability"].as_f64().unwrap());
+            if let Some(first) = list(cause, "parameters").first() {
+                let edge = |side: usize| first["interval90"][side].as_f64().unwrap();
+                let _ = write!(text, " in {:.4} … {:.4}", edge(0), edge(1));
+            }
+        }
+        for other in list(&self.answer, "alternatives").iter().take(6) {
+            let nats = other["log_evidence_difference"].as_f64().unwrap();
+            let _ = write!(text, "\n    instead of {}: {} {nats:+.1} nats", other["instead_of"], one(other));
+        }
+        if let Some(function) = self.answer["remainder"]["function"].as_str() {
+            let p = self.answer["remainder"]["p_value"].as_f64().unwrap();
+            let _ = write!(text, "\n    left: {function}, p = {p:.1e}");
+        }
+        text
+    }
+}
+
+/// Whether a cause that was not chosen is the effect, and as good as the one in whose place it stands.
+fn as_good(other: &Value, truth: &Truth) -> bool {
+    names(other, truth) && other["log_evidence_difference"].as_f64().unwrap() > -EQUIVALENT_NATS
+}
+
+/// The cause that names the one hidden effect: the first, or one of the few of an ambiguous answer.
+fn named<'a>(answer: &'a Value, truth: &Truth) -> Option<&'a Value> {
+    let causes = list(answer, "causes");
+    match answer["verdict"].as_str()? {
+        "cause" => causes.first().filter(|cause| names(cause, truth)),
+        "ambiguous" => {
+            assert!(causes.len() <= 3, "an answer of {} is none", causes.len());
+            let first = names(&causes[0], truth);
+            let equivalent = first || list(answer, "alternatives").iter().any(|other| as_good(other, truth));
+            causes.iter().find(|cause| names(cause, truth)).filter(|_| equivalent)
+        }
+        _ => None,
+    }
+}
+
+/// Whether two hidden effects are named by two of several causes, or by what these data cannot tell from them.
+fn both_named(answer: &Value, truths: &[Truth]) -> bool {
+    let places = |truth: &Truth| {
+        let causes = list(answer, "causes").iter().enumerate();
+        let chosen = causes.filter(|(_, cause)| names(cause, truth)).map(|(index, _)| index as u64 + 1);
+        let others = list(answer, "alternatives").iter().filter(|other| as_good(other, truth));
+        chosen.chain(others.map(|other| other["instead_of"].as_u64().unwrap())).collect::<BTreeSet<_>>()
+    };
+    let (first, second) = (places(&truths[0]), places(&truths[1]));
+    answer["verdict"] == "several" && first.iter().any(|a| second.iter().any(|b| a != b))
+}
+
+/// A cause that is nearly sure, of a target or a covariate that the hidden effect does not have, without a word that
+/// something is left.
+fn confident_wrong_name<'a>(answer: &'a Value, hidden: &Truth) -> Option<&'a Value> {
+    let columns = hidden.covariate.as_deref().unwrap().split(world::AND).collect::<Vec<_>>();
+    let wrong = |cause: &&Value| {
+        let covariate = cause["covariate"].as_str().unwrap_or_default();
+        target(cause) != (hidden.kind, hidden.name.as_str()) || !columns.contains(&covariate)
+    };
+    let sure = |cause: &&Value| cause["probability"].as_f64().unwrap() > 0.9;
+    list(answer, "causes").iter().filter(sure).find(wrong).filter(|_| answer["verdict"] != "none_of_these")
+}
+
+// ---- Counting ----
+
+/// Counts of a set of worlds.
+struct Tally<'a> {
+    all: Vec<&'a Judged>,
+}
+
+impl<'a> Tally<'a> {
+    fn new(judged: &'a [Judged], kind: Kind) -> Self {
+        Self { all: judged.iter().filter(|j| j.kind == kind).collect() }
+    }
+
+    fn worlds(&self) -> usize {
+        self.all.len()
+    }
+
+    fn count(&self, good: impl Fn(&Judged) -> bool) -> usize {
+        self.all.iter().filter(|j| good(j)).count()
+    }
+
+    fn share(&self, good: impl Fn(&Judged) -> bool) -> f64 {
+        self.count(good) as f64 / self.worlds() as f64
+    }
+
+    fn right(&self) -> usize {
+        self.count(|j| j.right)
+    }
+
+    /// Worlds whose size was compared, and those where it is inside.
+    fn sizes(&self) -> (usize, usize) {
+        (self.count(|j| j.size_inside.is_some()), self.count(|j| j.size_inside == Some(true)))
+    }
+
+    fn median_gain(&self) -> f64 {
+        let mut gains = self.all.iter().map(|j| j.gain).collect::<Vec<_>>();
+        gains.sort_by(f64::total_cmp);
+        gains[gains.len() / 2]
+    }
+}
+
+/// What was hidden against what was named first, the counts, and every miss.
+fn report(judged: &[Judged]) {
+    let mut table = BTreeMap::<String, BTreeMap<String, usize>>::new();
+    for j in judged.iter().filter(|j| j.kind != Kind::Two) {
+        let hidden = match j.kind {
+            Kind::Single => j.world.truths[0].kind,
+            Kind::Nothing => "(nothing)",
+            Kind::Two | Kind::Outside => "(outside)",
+        };
+        let named = match j.verdict() {
+            "nothing_found" | "none_of_these" => format!("({})", j.verdict()),
+            _ => target(&j.answer["causes"][0]).0.to_owned(),
+        };
+        *table.entry(hidden.to_owned()).or_default().entry(named).or_default() += 1;
+    }
+    let columns = table.values().flat_map(BTreeMap::keys).collect::<BTreeSet<_>>();
+    println!("hidden \\ named first");
+    let header = columns.iter().fold(String::new(), |text, column| format!("{text} {column:>17}"));
+    println!("{:17}{header}", "");
+    for (hidden, counts) in &table {
+        let cell = |column: &&String| counts.get(*column).map_or("·".to_owned(), ToString::to_string);
+        let cells = columns.iter().map(cell).fold(String::new(), |text, cell| format!("{text} {cell:>17}"));
+        println!("{hidden:17}{cells}");
+    }
+    for j in judged.iter().filter(|j| !j.right) {
+        println!("MISS {}", j.told());
+    }
+    for j in
+        judged.iter().filter(|j| j.right && (j.size_inside == Some(false) || (j.kind == Kind::Single && j.gain < GAIN)))
+    {
+        println!("FAR {}", j.told());
+    }
+    let single = Tally::new(judged, Kind::Single);
+    let (compared, inside) = single.sizes();
+    let gained = single.count(|j| j.gain >= GAIN);
+    println!(
+        "single: {} of {} right, size inside {inside} of {compared}, gain >= {GAIN} in {gained}, median gain {:.3}",
+        single.right(),
+        single.worlds(),
+        single.median_gain()
+    );
+    for (name, kind) in [("nothing", Kind::Nothing), ("two", Kind::Two), ("outside", Kind::Outside)] {
+        let tally = Tally::new(judged, kind);
+        println!("{name}: {} of {} right", tally.right(), tally.worlds());
+    }
+    let honest = Tally::new(judged, Kind::Outside).count(|j| j.verdict() == "none_of_these");
+    let extra = Tally::new(judged, Kind::Two).count(|j| list(&j.answer, "causes").len() > 2);
+    println!("outside: {honest} called none of these; two: {extra} with a third cause");
+}
+
+/// Of the worlds with hysteresis: how many there are, and how often it was taken for a lag of the right spring.
+fn hysteresis_taken_for_a_lag(judged: &[Judged]) -> (usize, usize) {
+    let worlds = judged.iter().filter(|j| j.world.outside.is_some_and(|o| o.starts_with("hysteresis")));
+    let lagged = |j: &&Judged| {
+        let hidden = j.world.outside_target.as_ref().unwrap();
+        list(&j.answer, "causes").iter().any(|cause| cause["law"] == "lagged" && names(cause, hidden))
+    };
+    (worlds.clone().count(), worlds.filter(lagged).count())
+}
+
+/// Worlds of a kind from consecutive seeds.
+fn orders(first_seed: u64, count: u64, kind: Kind) -> impl Iterator<Item = Order> {
+    (first_seed..first_seed + count).map(move |seed| Order::Kind(seed, kind))
+}
+
+// ---- Worlds ----
+
+#[test]
+fn hidden_effects_are_found_in_a_fixed_set_of_worlds() {
+    let families = world::SINGLE_FAMILIES.iter().zip(5000..);
+    let singles = families.map(|((target, law), seed)| Order::Family(seed, target, law));
+    let others = orders(5100, 6, Kind::Nothing).chain(orders(5200, 5, Kind::Two)).chain(orders(5300, 4, Kind::Outside));
+    let judged = judged(&singles.chain(others).collect::<Vec<_>>());
+    report(&judged);
+
+    // The rates asked of many worlds, with the slack that few worlds need.
+    let single = Tally::new(&judged, Kind::Single);
+    assert!(single.right() + 2 >= single.worlds(), "{} wrong places", single.worlds() - single.right());
+    let (compared, inside) = single.sizes();
+    assert!(inside >= 22, "{inside} of {compared} sizes inside");
+    assert!(single.count(|j| j.gain >= GAIN) >= 25, "gains");
+    assert!(Tally::new(&judged, Kind::Nothing).right() >= 5, "something in nothing");
+    assert!(Tally::new(&judged, Kind::Two).right() >= 4, "two effects");
+    assert!(Tally::new(&judged, Kind::Outside).right() >= 3, "confident wrong names");
+}
+
+#[test]
+#[ignore = "20 minutes"]
+fn hidden_effects_are_found_in_two_hundred_worlds() {
+    let singles = orders(10_000, 200, Kind::Single);
+    let others =
+        orders(20_000, 60, Kind::Nothing).chain(orders(30_000, 60, Kind::Two)).chain(orders(40_000, 60, Kind::Outside));
+    let judged = judged(&singles.chain(others).collect::<Vec<_>>());
+    report(&judged);
+    let (worlds, lagged) = hysteresis_taken_for_a_lag(&judged);
+    println!("hysteresis: taken for a lag of the right spring in {lagged} of {worlds}");
+
+    let single = Tally::new(&judged, Kind::Single);
+    assert!(single.share(|j| j.right) >= 0.95, "{} single effects in the right place", single.right());
+    let (compared, inside) = single.sizes();
+    let coverage = inside as f64 / compared as f64;
+    assert!((0.80..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
+    assert!(single.median_gain() >= GAIN, "median gain {}", single.median_gain());
+    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.85), (Kind::Outside, 0.90)] {
+        let tally = Tally::new(&judged, kind);
+        assert!(tally.share(|j| j.right) >= least, "{kind:?}: {} of {} right", tally.right(), tally.worlds());
+    }
+}
+
+#[test]
+fn a_softening_spring_is_found_in_simulated_time_histories() {
+    let world = spectrum::softening_world(1);
+    let answer = answer(&world.structure_toml, &world.csv, &[]);
+    let scatter = world.scatter.map(|s| format!("{:.3} %", 100.0 * s)).join(", ");
+    println!("seed {}: {}; scatter {scatter}: {}", world.seed, world.description, answer["summary"]);
+    let cause = named(&answer, &world.truth).expect("the softening spring, with amplitude");
+    let swing = cause["parameters"][0]["value"].as_f64().unwrap();
+    let size = world.truth.size;
+    assert!((swing / size - 1.0).abs() < 0.25, "swing {swing}, by equivalent linearisation {size}");
+}
