@@ -163,14 +163,21 @@ impl Scatter {
         let label = escaped(&format!("{title}: {y_label} over {x_label}"));
         let mut svg = String::new();
         self.plot.draw(&mut svg, &self.points, &self.x_names).expect("drawing into memory cannot fail");
-        let svg = svg.replacen("<svg ", &format!("<svg role=\"img\" aria-label=\"{label}\" "), 1);
+        // Ticks at 0 may lie a rounding error below it.
+        let svg = svg.replace("\n-0.0\n", "\n0.0\n").replacen(
+            "<svg ",
+            &format!("<svg role=\"img\" aria-label=\"{label}\" "),
+            1,
+        );
         let key = |p: &Points| {
             let RGBColor(r, g, b) = COLOURS[p.colour % COLOURS.len()];
             let dot = if p.hollow { '○' } else { '●' };
-            format!("<span style=\"color:rgb({r},{g},{b})\">{dot}</span>&nbsp;{} ", escaped(&p.name))
+            let name = escaped(&p.name);
+            format!("<span class=\"key\"><span style=\"color:rgb({r},{g},{b})\">{dot}</span> {name}</span> ")
         };
         let key: String = self.points.iter().filter(|p| !p.points.is_empty()).map(key).collect();
-        format!("<figure>{svg}<figcaption>{key}{}</figcaption></figure>", escaped(caption))
+        let caption = if caption.is_empty() { String::new() } else { format!("<br>{}", escaped(caption)) };
+        format!("<figure>{svg}<figcaption>{key}{caption}</figcaption></figure>")
     }
 }
 
@@ -183,14 +190,17 @@ const STYLE: &str =
      .scroll{overflow-x:auto;margin:1rem 0}table{border-collapse:collapse;font-variant-numeric:tabular-nums}\
      caption{text-align:left;padding:.25rem 0}td,th{padding:.25rem .7rem;text-align:right;vertical-align:top;\
      border-bottom:1px solid var(--rule)}th:first-child,td.words,th.words{text-align:left}td.words{min-width:13rem}\
+     td:not(.words){white-space:nowrap}\
      tbody th{font-weight:400;min-width:9rem}.plots{display:flex;flex-wrap:wrap;gap:1rem}\
      .plots svg{max-width:100%;height:auto;background:#fff;border-radius:6px}figure{margin:0;padding:.25rem;\
      background:#fff;color:#1a1a1a;border:1px solid var(--rule);border-radius:6px;flex:0 1 34.25rem}\
-     figcaption{font-size:.85rem;padding:0 .5rem .4rem}.lead{font-size:1.3rem;line-height:1.45}.facts{color:var(--text);\
+     .key{white-space:nowrap;margin-right:.6rem}figcaption{font-size:.85rem;padding:0 .5rem .4rem}\
+     .lead{font-size:1.3rem;line-height:1.45}.facts{color:var(--text);\
      opacity:.85;font-size:.9rem}.card{background:var(--soft);border-radius:6px;padding:.75rem 1rem;margin:1rem 0}\
      .card h3{margin:0 0 .4rem}.bar{display:block;width:8rem;height:.6rem;background:var(--soft);fill:var(--bar)}\
      dt{font-weight:600}dd{margin:0 0 .6rem}.bad{color:var(--bad);font-weight:600}\
-     @media print{body{margin:0;max-width:none;font-size:11pt}figure,tr,.card{break-inside:avoid}.scroll{overflow:visible}}";
+     @media print{body{margin:0;max-width:none;font-size:11pt}figure,tr,.card{break-inside:avoid}\
+     .scroll{overflow:visible}}";
 
 /// A self-contained HTML page: sections of title and content, which must already be HTML.
 pub fn page(title: &str, sections: &[(String, String)]) -> String {
@@ -199,7 +209,8 @@ pub fn page(title: &str, sections: &[(String, String)]) -> String {
     write!(
         html,
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
-         content=\"width=device-width,initial-scale=1\"><title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>"
+         content=\"width=device-width,initial-scale=1\"><title>{title}</title><style>{STYLE}</style></head><body>\
+         <h1>{title}</h1>"
     )
     .expect("writing to memory cannot fail");
     for (heading, content) in sections {
@@ -220,10 +231,8 @@ pub fn table(header: &[&str], rows: &[Vec<String>]) -> String {
 /// A table whose cells are HTML already; columns that hold words (`true`) are flush left. It scrolls in its own box.
 pub fn table_of_html(caption: &str, header: &[(&str, bool)], rows: &[Vec<String>]) -> String {
     let class = |words: bool| if words { " class=\"words\"" } else { "" };
-    let head: String = header
-        .iter()
-        .map(|(title, words)| format!("<th scope=\"col\"{}>{}</th>", class(*words), escaped(title)))
-        .collect();
+    let title = |(title, words): &(&str, bool)| format!("<th scope=\"col\"{}>{}</th>", class(*words), escaped(title));
+    let head: String = header.iter().map(title).collect();
     let cell = |(column, cell): (usize, &String)| match column {
         0 => format!("<th scope=\"row\">{cell}</th>"),
         _ => format!("<td{}>{cell}</td>", class(header.get(column).is_some_and(|h| h.1))),
@@ -232,7 +241,8 @@ pub fn table_of_html(caption: &str, header: &[(&str, bool)], rows: &[Vec<String>
     let body: String = rows.iter().map(line).collect();
     let caption = if caption.is_empty() { String::new() } else { format!("<caption>{}</caption>", escaped(caption)) };
     format!(
-        "<div class=\"scroll\" tabindex=\"0\"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+        "<div class=\"scroll\" tabindex=\"0\"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>\
+         </table></div>"
     )
 }
 

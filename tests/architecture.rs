@@ -36,6 +36,8 @@ const TABLE: [(&str, &[&str], bool); 23] = [
             "assessment",
             "baseline",
             "damage",
+            "discrepancy",
+            "flow",
             "hierarchy",
             "physics",
             "posterior",

@@ -6,8 +6,8 @@ use nalgebra::DMatrix;
 use super::calibration::{calibrate, CalibrationRecord};
 use super::identifiability::{identifiability, IdentifiabilityRecord};
 use super::manifest::{
-    Conditions, EffectRange, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord, Whitening,
-    FORMAT,
+    Conditions, EffectRange, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord,
+    Whitening, FORMAT,
 };
 use super::observation::{measure, Encoder, Observation};
 use super::{to_real_line, Baseline, InferenceError};

@@ -326,7 +326,10 @@ fn settle_time(row: &mut RawMeasurement, times: &mut BTreeSet<i64>) -> (bool, bo
         Err(_) => match Timestamp::parse(&format!("{}Z", text.replace(' ', "T"))) {
             Ok(time) => (time, true),
             // The check names the mistake with its line.
-            Err(_) => return (false, false),
+            Err(_) => {
+                row.measured_at = Some(text.trim().to_owned());
+                return (false, false);
+            }
         },
     };
     let mut micros = time.micros();

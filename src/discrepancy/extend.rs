@@ -81,7 +81,11 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
             let with_level = effect.law.with_level;
             effect = ranked.candidate.effect(&bare, data, &outcome.training, law, with_level, 0.0);
             values = effect.numbers.iter().map(|n| n.prior_mean).collect();
-            added.push(format!("{} (in its {} form without the lag: one batch does not say what came before)", cause.sentence, law.name()));
+            added.push(format!(
+                "{} (in its {} form without the lag: one batch does not say what came before)",
+                cause.sentence,
+                law.name()
+            ));
         } else {
             added.push(cause.sentence.clone());
         }

@@ -58,7 +58,8 @@ pub struct Gain {
     pub coverage90: Change<f64>,
     /// Standard deviation of each parameter over healthy batches of ten rows, per cent of its mean.
     pub spread_of_parameters_percent: Change<BTreeMap<String, f64>>,
-    /// Batches of ten healthy rows whose parameters lie beyond a limit set for 1 in 1000.
+    /// Batches of ten healthy rows, held out, that lie beyond the limit which the first quarter of the other rows, taken for
+    /// the undamaged state, sets for 1 in 1000.
     pub false_alarms_per_1000: Change<f64>,
     /// Loss of the parameter that is seen worst, detected with 90 % probability in one batch of ten rows at a limit that
     /// healthy batches really keep.
@@ -166,13 +167,21 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
     let shifts = shifts(study, &views);
     let healthy = study.view(training, fit)?;
     let own = self::shifts(study, &healthy);
-    let limit = -stats::normal_quantile(ALARM_RATE / study.free().len().max(1) as f64);
+    let level = ALARM_RATE / study.free().len().max(1) as f64;
+    let limit = -stats::normal_quantile(level);
+    let undamaged = reference(&own)?;
     let damaging = |k: usize, value: f64| match space[k].damage {
         DamageDirection::Decrease => -value,
         DamageDirection::Increase => value,
         DamageDirection::None => f64::NEG_INFINITY,
     };
-    let alarms = shifts.iter().filter(|s| s.iter().any(|(k, shift, std)| damaging(*k, shift / std) > limit)).count();
+    // Limit for one more batch, with the mean and the scatter known from that many batches.
+    let count = undamaged.count as f64;
+    let factor = -StudentsT::new(0.0, 1.0, count - 1.0).ok()?.inverse_cdf(level) * (1.0 + 1.0 / count).sqrt();
+    let beyond = |s: &Vec<(usize, f64, f64)>| {
+        s.iter().zip(&undamaged.moments).any(|((k, shift, _), (mean, std))| damaging(*k, (shift - mean) / std) > factor)
+    };
+    let alarms = shifts.iter().filter(|s| beyond(s)).count();
     let mut spread = BTreeMap::new();
     let mut detectable: f64 = 0.0;
     for (place, &k) in study.free().iter().enumerate() {
@@ -192,6 +201,27 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
         detectable,
         errors,
     })
+}
+
+/// What the first batches showed: mean and standard deviation of the shift of each free parameter.
+struct Reference {
+    moments: Vec<(f64, f64)>,
+    count: usize,
+}
+
+/// The first quarter of the training rows in batches of ten, as a service would have been told to take for undamaged; at
+/// least five batches, or all.
+fn reference(shifts: &[Vec<(usize, f64, f64)>]) -> Option<Reference> {
+    let apart: Vec<&Vec<(usize, f64, f64)>> = shifts.iter().step_by(BATCH).collect();
+    let count = (apart.len() / 4).max(5).min(apart.len());
+    if count < 2 {
+        return None;
+    }
+    let moment = |place: usize| {
+        let values: Vec<f64> = apart[..count].iter().map(|s| s[place].1).collect();
+        (stats::mean(&values), stats::sample_std(&values).unwrap_or(f64::INFINITY))
+    };
+    Some(Reference { moments: (0..apart[0].len()).map(moment).collect(), count })
 }
 
 /// For each run of ten rows and each free parameter: (parameter, shift of its mean, standard error of the shift).

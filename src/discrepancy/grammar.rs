@@ -282,7 +282,7 @@ impl Candidate {
         let free = (f64::NEG_INFINITY, f64::INFINITY);
         let number = |name: String| {
             let (prior_mean, prior_std, bounds) = match name.as_str() {
-                "level" => (0.0, 2.0 * size, free),
+                "level" => (0.0, size, free),
                 "slope_per_unit" => (0.0, size / (2.0 * width), free),
                 "slope_below_per_unit" | "slope_above_per_unit" => (0.0, size / width, free),
                 "curvature_per_unit2" => (0.0, size / (2.0 * width).powi(2), free),

@@ -41,6 +41,10 @@ const MOST_NAMED: usize = 3;
 /// Alternatives reported beside those that are named.
 const MOST_ALTERNATIVES: usize = 5;
 
+/// Beyond those, all that are nearly as probable, up to this many.
+const NEARLY_NATS: f64 = 5.0;
+const MOST_NEARLY: usize = 20;
+
 /// A remainder counts below these probabilities of chance, without and with causes found.
 const REMAINDER: f64 = 1e-3;
 const REMAINDER_WITH_CAUSES: f64 = 1e-4;
@@ -190,10 +194,14 @@ pub enum Holdout {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// Too few rows.
-    #[error("{rows} measurements to look for causes in: a verdict needs at least {FEWEST_ROWS}")]
+    #[error(
+        "{rows} measurements to look for causes in ({held_out} are held out): a verdict needs at least {FEWEST_ROWS}"
+    )]
     TooFew {
         /// Rows there are.
         rows: usize,
+        /// Rows held out beside them.
+        held_out: usize,
     },
     /// The hold-out cannot be made.
     #[error("the hold-out {0}")]
@@ -219,7 +227,7 @@ pub fn diagnose(
 ) -> Result<Outcome, Error> {
     let (training, held) = split(data, holdout)?;
     if training.len() < FEWEST_ROWS {
-        return Err(Error::TooFew { rows: training.len() });
+        return Err(Error::TooFew { rows: training.len(), held_out: held.len() });
     }
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
@@ -256,8 +264,11 @@ fn run(
         let best = &slot.ranked[0];
         let described = |r: &Ranked| {
             // The chosen one is described by the final fit, the others by their own.
-            let (fit, place) =
-                if std::ptr::eq(r, best) { (&selection.fit, known.len() + index) } else { (&r.fit, r.fit.effects.len() - 1) };
+            let (fit, place) = if std::ptr::eq(r, best) {
+                (&selection.fit, known.len() + index)
+            } else {
+                (&r.fit, r.fit.effects.len() - 1)
+            };
             describe::cause(simulator, data, r, fit, place, share)
         };
         let unsure = best.probability <= SURE;
@@ -268,7 +279,8 @@ fn run(
             causes.extend(named.iter().skip(1).map(|place| described(&slot.ranked[*place])));
         }
         for (place, other) in slot.ranked.iter().enumerate().skip(1) {
-            if named.contains(&place) || place <= MOST_ALTERNATIVES {
+            let near = place <= MOST_NEARLY && other.log_odds > best.log_odds - NEARLY_NATS;
+            if near || named.contains(&place) || place <= MOST_ALTERNATIVES {
                 alternatives.push(Alternative {
                     cause: described(other),
                     instead_of: index + 1,
@@ -291,7 +303,7 @@ fn run(
     } else {
         None
     };
-    let notes = notes(simulator, data, &training, share);
+    let notes = notes(simulator, data, &training, &selection.fit, share);
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
         verdict,
@@ -381,7 +393,7 @@ fn split(data: &Data, holdout: &Holdout) -> Result<(Vec<usize>, Vec<usize>), Err
 
 /// What the reader must know about the data: covariates that say nothing or the same, modes that are never there, settings
 /// outside the prior.
-fn notes(simulator: &Simulator, data: &Data, rows: &[usize], share: f64) -> Vec<String> {
+fn notes(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit, share: f64) -> Vec<String> {
     let mut notes = Vec::new();
     for mode in 0..simulator.modes() {
         let measured = rows.iter().filter(|r| data.log_frequencies[**r][mode].is_finite()).count();
@@ -450,6 +462,24 @@ fn notes(simulator: &Simulator, data: &Data, rows: &[usize], share: f64) -> Vec<
             notes.push(format!("{outside} settings of {} lie outside its prior, {} to {}", p.name, p.lower, p.upper));
         }
     }
+    for &k in &fit.free {
+        let p = &simulator.space().as_slice()[k];
+        if !p.prior().contains(&fit.mean[k]) {
+            notes.push(format!(
+                "{} comes out at {:.4} {}, beyond its prior ({} to {}): units, the nominal values or the simulation are far off",
+                p.name, fit.mean[k], p.unit, p.lower, p.upper
+            ));
+        }
+    }
+    for (mode, factor) in fit.noise_factor.iter().enumerate() {
+        if *factor > 2.0 {
+            notes.push(format!(
+                "mode {} scatters {factor:.1} times as much as its stated noise, beyond what the spread of the parameters \
+                 explains",
+                mode + 1
+            ));
+        }
+    }
     if share < 0.9 {
         notes.push(format!(
             "residuals follow one another in time: the rows count as {:.0} % of as many independent ones",
@@ -472,8 +502,11 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
 fn told_apart(simulator: &Simulator, data: &Data, a: &Ranked, b: &Ranked) -> String {
     let (ca, cb) = (&a.candidate, &b.candidate);
     if ca.covariate != cb.covariate {
-        let name = |c: &Option<String>| c.clone().unwrap_or_else(|| "nothing".to_owned());
-        return format!("measurements in which {} and {} do not go together", name(&ca.covariate), name(&cb.covariate));
+        return match (&ca.covariate, &cb.covariate) {
+            (Some(a), Some(b)) => format!("measurements in which {a} and {b} do not go together"),
+            (Some(one), None) | (None, Some(one)) => format!("measurements over a wider range of {one}"),
+            (None, None) => unreachable!("they differ"),
+        };
     }
     let count = simulator.structure().masses().len();
     if count > simulator.modes() && a.fit.effects.len() == b.fit.effects.len() {

@@ -1,12 +1,12 @@
 //! The page of a diagnosis: what was found, what it rests on, what it gains, and how to read it.
 
 use super::data::{Data, Values, TIME};
-use super::describe::{covariate_unit, rounded, Cause, NamedNumber};
+use super::describe::{rounded, Cause, NamedNumber};
 use super::gain::{Change, Gain};
 use super::grammar::Class;
 use super::misfit::{Misfit, Remainder};
 use super::model::{Fit, Study};
-use super::{Diagnosis, Outcome, Verdict};
+use super::{Diagnosis, Outcome, Verdict, SURE};
 use crate::plot::{escaped, page, table_of_html, Plot, Points, Scatter};
 use crate::quantity::Digest;
 use crate::simulator::law::LawKind;
@@ -59,8 +59,10 @@ fn in_short(d: &Diagnosis) -> String {
     };
     let short = |digest: &Digest| digest.as_str().chars().take(12).collect::<String>();
     format!(
-        "<p class=\"lead\">{}</p><p class=\"facts\"><strong>Verdict:</strong> {verdict}. <strong>Rows:</strong> {}, of which \
-         {} were searched for causes and {} held out. <strong>Data</strong> {}, <strong>structure</strong> {} (SHA-256, \
+        "<p class=\"lead\">{}</p><p class=\"facts\"><strong>Verdict:</strong> {verdict}. <strong>Rows:</strong> {}, \
+         of which \
+         {} were searched for causes and {} held out. <strong>Data</strong> {}, <strong>structure</strong> {} \
+         (SHA-256, \
          first 12 digits), <strong>seed</strong> {}.</p>",
         escaped(&d.summary),
         d.training_rows + d.holdout_rows,
@@ -77,6 +79,9 @@ fn causes(d: &Diagnosis) -> String {
         _ if d.causes.is_empty() => "No cause is named.",
         Verdict::NoneOfThese => "These explain a part only: do not rely on them before the rest is understood.",
         Verdict::Ambiguous => "One of these is the cause. The next section says what would tell them apart.",
+        _ if d.causes.iter().any(|c| c.probability <= SURE) => {
+            "Where a probability is low, the next section says what else it may be and what would tell them apart."
+        }
         _ => "",
     };
     format!("<p>{lead}</p>{}", d.causes.iter().map(cause).collect::<String>())
@@ -87,7 +92,7 @@ fn cause(cause: &Cause) -> String {
     // A difference between categories gives the first of them as its size as well.
     let repeated = usize::from(cause.law == LawKind::Category);
     let rows: Vec<Vec<String>> = cause.parameters.iter().skip(repeated).map(|n| number(cause, n)).collect();
-    let header = [("number", true), ("most probable", false), ("90 % interval", false), ("unit", true)];
+    let header = [("number", true), ("most probable", false), ("90 % interval", false)];
     let table = if rows.is_empty() { String::new() } else { table_of_html("", &header, &rows) };
     format!(
         "<article class=\"card\"><h3>{}</h3><p>Probability <strong>{}</strong>. Kind: <strong>{class}</strong>. \
@@ -114,7 +119,7 @@ fn class(class: Class) -> (&'static str, &'static str) {
     }
 }
 
-/// A row of a cause's numbers: name, value, interval, unit; shares in per cent.
+/// A row of a cause's numbers: name, value and interval with unit; shares in per cent.
 fn number(cause: &Cause, n: &NamedNumber) -> Vec<String> {
     let over = cause.covariate.as_deref().unwrap_or_default();
     let name = match n.name.as_str() {
@@ -138,13 +143,16 @@ fn number(cause: &Cause, n: &NamedNumber) -> Vec<String> {
     let [low, high] = n.interval90.map(|edge| factor * edge);
     let std = (high - low) / (2.0 * stats::normal_quantile(0.95));
     let shown = |value: f64| signed(&rounded(value, std).0);
-    let interval = if std > 0.0 { format!("{} to {}", shown(low), shown(high)) } else { "not estimated".to_owned() };
-    vec![escaped(&name), shown(factor * n.value), interval, escaped(&unit)]
+    let interval =
+        if std > 0.0 { format!("{} to {} {unit}", shown(low), shown(high)) } else { "not estimated".to_owned() };
+    let value = format!("{} {unit}", shown(factor * n.value));
+    vec![escaped(&name), escaped(&value), escaped(&interval)]
 }
 
 fn candidates(d: &Diagnosis) -> String {
     let intro = format!(
-        "<p>{} combinations of a target, a law and a covariate were compared. The difference is in nats: −3 means about 20 \
+        "<p>{} combinations of a target, a law and a covariate were compared. The difference is in nats: −3 means \
+         about 20 \
          times less probable than the cause that was chosen, priors included.</p>",
         d.candidates
     );
@@ -161,7 +169,8 @@ fn candidates(d: &Diagnosis) -> String {
 fn candidate_table(d: &Diagnosis, number: usize, cause: &Cause) -> String {
     let row = |text: &str, difference: String, p: f64, told_apart_by: &str| {
         let bar = format!(
-            "<svg class=\"bar\" viewBox=\"0 0 100 8\" preserveAspectRatio=\"none\" aria-hidden=\"true\"><rect width=\"{:.1}\" \
+            "<svg class=\"bar\" viewBox=\"0 0 100 8\" preserveAspectRatio=\"none\" aria-hidden=\"true\"><rect \
+             width=\"{:.1}\" \
              height=\"8\"/></svg>",
             100.0 * p.clamp(0.0, 1.0)
         );
@@ -179,7 +188,7 @@ fn candidate_table(d: &Diagnosis, number: usize, cause: &Cause) -> String {
         ("candidate", true),
         ("Δ log evidence, nats", false),
         ("probability", false),
-        ("", true),
+        ("", false),
         ("told apart from the chosen one by", true),
     ];
     table_of_html(&format!("Cause {number} and what else it may be"), &header, &rows)
@@ -209,7 +218,9 @@ impl<'a> Drawn<'a> {
         // Evenly, but at no fixed phase: a fixed one would show the same hour of every day.
         let place = |i: usize| if stride > 1.0 { (i as f64 * GOLDEN).fract() } else { 0.0 };
         let rows: Vec<usize> = (0..count).map(|i| ((i as f64 + place(i)) * stride) as usize).collect();
-        let study = Study::new(simulator, data);
+        // Both fits carry the effects of the structure themselves.
+        let bare = simulator.without_effects();
+        let study = Study::new(&bare, data);
         let residuals = |fit: &Fit| -> Option<Vec<Vec<f64>>> {
             let mut by_mode = vec![vec![f64::NAN; rows.len()]; simulator.modes()];
             for (row, view) in study.view(&rows, fit)?.iter().enumerate() {
@@ -220,7 +231,7 @@ impl<'a> Drawn<'a> {
             Some(by_mode)
         };
         let before = residuals(&outcome.before)?;
-        let after = if outcome.after.effects.is_empty() { None } else { Some(residuals(&outcome.after)?) };
+        let after = if outcome.diagnosis.causes.is_empty() { None } else { Some(residuals(&outcome.after)?) };
         let mut held = vec![false; data.rows()];
         outcome.holdout.iter().for_each(|row| held[*row] = true);
         Some(Self { data, held: rows.iter().map(|row| held[*row]).collect(), rows, before, after })
@@ -293,12 +304,12 @@ fn figure(title: String, axis: &Axis, mut clouds: Vec<Points>) -> String {
         beyond += usize::from((inside - *y).abs() > 0.0);
         *y = inside;
     }
-    let caption =
-        if beyond == 0 { String::new() } else { format!("{beyond} points beyond the scale are drawn at its edge.") };
+    let told = format!("Beyond the scale and drawn at its edge: {beyond} of {} points.", all.len());
+    let caption = if beyond == 0 { "" } else { &told };
     let y_label = RESIDUAL.to_owned();
     let marks = vec![(0.0, String::new())];
     let plot = Plot { title, x_label: axis.label.clone(), y_label, marks, ..Plot::default() };
-    Scatter { plot, points: clouds, x_names: axis.names.clone() }.figure(&caption)
+    Scatter { plot, points: clouds, x_names: axis.names.clone() }.figure(caption)
 }
 
 /// Plots of every mode over the covariate that matters most, and of the worst mode over time.
@@ -309,7 +320,8 @@ fn now(d: &Diagnosis, drawn: &Drawn<'_>) -> String {
     let axis = drawn.axis(covariate);
     let plots: String = (0..drawn.before.len()).map(|mode| drawn.before_and_after(mode, &axis)).collect();
     let colours = if drawn.after.is_some() {
-        "Orange: the simulation as it is. Blue: with the causes above. A good simulation leaves a level, narrow band about 0."
+        "Orange: the simulation as it is. Blue: with the causes above. A good simulation leaves a level, narrow band \
+         about 0."
     } else {
         "A good simulation leaves a level, narrow band about 0."
     };
@@ -318,19 +330,21 @@ fn now(d: &Diagnosis, drawn: &Drawn<'_>) -> String {
     } else {
         String::new()
     };
-    let mut html = format!(
-        "<p>Each point is one measured frequency less the predicted one, per cent, over {}. {colours} Open circles are rows \
-         held out.{few}</p><div class=\"plots\">{plots}</div>",
-        escaped(&axis.label)
-    );
-    if covariate != TIME {
+    let over_time = if covariate == TIME {
+        String::new()
+    } else {
         let size = |m: &&Misfit| m.size_percent.abs();
         let modes = d.misfit.iter().filter(|m| m.mode.is_some());
         let mode = modes.max_by(|a, b| size(a).total_cmp(&size(b))).and_then(|m| m.mode).unwrap_or(1) - 1;
         let plot = drawn.before_and_after(mode, &drawn.axis(TIME));
-        html += &format!("<p>The mode with the largest misfit, over time:</p><div class=\"plots\">{plot}</div>");
-    }
-    html
+        format!("<p>The mode with the largest misfit, over time:</p><div class=\"plots\">{plot}</div>")
+    };
+    format!(
+        "<p>Each point is one measured frequency less the predicted one, per cent, over {}. {colours} Open circles \
+         are rows \
+         held out.{few}</p><div class=\"plots\">{plots}</div>{over_time}",
+        escaped(&axis.label)
+    )
 }
 
 fn misfits(d: &Diagnosis) -> String {
@@ -346,8 +360,10 @@ fn misfits(d: &Diagnosis) -> String {
     let rows: Vec<Vec<String>> = d.misfit.iter().take(MISFITS).map(row).collect();
     let header = [("what deviates", true), ("goes with", true), ("size, %", false), ("p", false)];
     format!(
-        "<p>Deviations of the simulation as it is, before any cause is added; the clearest first. A parameter is listed when \
-         its best value drifts with a covariate, because it took up what the simulation lacks. p: probability of as much by \
+        "<p>Deviations of the simulation as it is, before any cause is added; the clearest first. A parameter is \
+         listed when \
+         its best value drifts with a covariate, because it took up what the simulation lacks. p: probability of as \
+         much by \
          chance, all looks counted.</p>{}",
         table_of_html(&format!("The {} clearest of {}", rows.len(), d.misfit.len()), &header, &rows)
     )
@@ -372,11 +388,11 @@ fn remainder(left: &Remainder, drawn: &Drawn<'_>) -> String {
         .size_percent
         .iter()
         .enumerate()
-        .map(|(m, s)| format!("mode {}: {} %", m + 1, signed(&digits(*s))))
+        .map(|(m, s)| format!("mode {} {} %", m + 1, signed(&digits(*s))))
         .collect();
     format!(
-        "<p>With all causes above in place, the residuals still go with <strong>{}</strong> (p {}). Along it they range over \
-         {}. No cause that this program knows has that shape: look for what else changes with it.</p>\
+        "<p>With all causes above in place, the residuals still go with <strong>{}</strong> (p {}). Their change along \
+         it: {}. No cause that this program knows has that shape: look for what else changes with it.</p>\
          <div class=\"plots\">{plots}</div>",
         escaped(&left.function),
         p_compared(left.p_value),
@@ -417,7 +433,8 @@ fn gain(g: &Gain) -> String {
         let (before, after) = (rms.before[mode], rms.after[mode]);
         let interval = format!("{} ({} to {})", plus(after - before), plus(*low), plus(*high));
         let meaning = if mode == 0 {
-            "Root mean square of measured against predicted frequency, and the 90 % interval of the change. Smaller is better."
+            "Root mean square of measured against predicted frequency, and the 90 % interval of the change. Smaller \
+             is better."
         } else {
             "As above."
         };
@@ -461,25 +478,35 @@ fn notes(d: &Diagnosis) -> String {
     if d.notes.is_empty() {
         return "<p>None.</p>".to_owned();
     }
-    let items: String = d.notes.iter().map(|note| format!("<li>{}</li>", escaped(note))).collect();
-    format!("<ul>{items}</ul>")
+    let items: Vec<String> = d.notes.iter().map(|note| format!("<li>{}</li>", escaped(note))).collect();
+    format!("<ul>{}</ul>", items.concat())
 }
 
-const GLOSSARY: &str = "<dl><dt>Probability of a cause</dt><dd>Among all candidates and no cause at all, given these data and \
-    that nothing outside the list acts. 0.97 leaves 3 in 100 for something else. When the section \u{201c}What no cause \
-    explains\u{201d} is there, something outside the list does act, and the probabilities only rank the candidates.</dd>\
+const GLOSSARY: &str = "<dl><dt>Probability of a cause</dt><dd>Among all candidates and no cause at all, given these \
+data and \
+    that nothing outside the list acts. 0.97 leaves 3 in 100 for something else. When the section \u{201c}What no \
+    cause \
+    explains\u{201d} is there, something outside the list does act, and the probabilities only rank the \
+    candidates.</dd>\
     <dt>90 % interval</dt><dd>The number lies inside with 90 % probability, if the cause is right.</dd>\
-    <dt>Nat, log density, log evidence</dt><dd>Logarithms, base e, of how probable the data are under a model. One nat more: \
+    <dt>Nat, log density, log evidence</dt><dd>Logarithms, base e, of how probable the data are under a model. One \
+    nat more: \
     2.7 times as probable. 3 nats: 20 times. Evidence also charges for every number that was fitted.</dd>\
     <dt>Hold-out</dt><dd>Rows kept aside until everything was chosen and fitted. Only on them is a gain a gain.</dd>\
-    <dt>Residual</dt><dd>Measured frequency less the predicted one. Noise leaves a level band about 0; a shape means that \
-    something is missing.</dd><dt>p</dt><dd>Probability that chance alone makes as large a deviation. Below 0.001 it is hardly \
-    chance.</dd><dt>Covariate</dt><dd>What was recorded beside the frequencies: temperature, load, operator, time.</dd></dl>";
+    <dt>Residual</dt><dd>Measured frequency less the predicted one. Noise leaves a level band about 0; a shape means \
+    that \
+    something is missing.</dd><dt>p</dt><dd>Probability that chance alone makes as large a deviation. Below 0.001 it \
+    is hardly \
+    chance.</dd><dt>Covariate</dt><dd>What was recorded beside the frequencies: temperature, load, operator, \
+    time.</dd></dl>";
 
 /// Three significant digits.
 fn digits(value: f64) -> String {
     if !value.is_finite() {
         return "–".to_owned();
+    }
+    if value == 0.0 {
+        return "0".to_owned();
     }
     let size = value.abs().max(1e-4).log10().floor();
     let digits = (2.0 - size).clamp(0.0, 5.0) as usize;
@@ -517,11 +544,8 @@ fn p_value(p: f64) -> String {
 /// A p-value after the letter p, as HTML.
 fn p_compared(p: f64) -> String {
     let text = p_value(p);
-    if text.starts_with('&') {
-        text
-    } else {
-        format!("= {text}")
-    }
+    let text = if text.starts_with('&') { text } else { format!("= {text}") };
+    text.replace('-', "\u{2011}")
 }
 
 /// Begins with a capital.

@@ -93,7 +93,8 @@ pub fn select(
         let total = log_sum(ranked.iter().map(|r| r.log_odds));
         let Some(best) = ranked.first().filter(|_| total > ACCEPTED_NATS) else { break };
         let cross_validation = cross_validate(study, rows, &fit, &best.fit)?;
-        if cross_validation.0 <= 0.0 {
+        // A cause that clearly predicts worse is none, whatever it explains.
+        if cross_validation.0 + 2.0 * cross_validation.1 <= 0.0 {
             break;
         }
         fit = best.fit.clone();
@@ -285,20 +286,22 @@ fn unscreened(
 /// the row before; 1 where ρ is no more than chance.
 fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64> {
     let views = study.view(rows, fit)?;
-    let modes = study.simulator.modes();
-    let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);
-    let mut before: Vec<Option<f64>> = vec![None; modes];
+    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.simulator.modes()];
     for view in &views {
         let factor = view.covariance.clone().cholesky()?.l();
         let white = factor.solve_lower_triangular(&view.residual)?;
         for (place, mode) in view.present.iter().enumerate() {
-            let value = white[place] * view.weight.sqrt();
-            squares += value * value;
-            if let Some(before) = before[*mode].replace(value) {
-                products += value * before;
-                pairs += 1.0;
-            }
+            series[*mode].push(white[place] * view.weight.sqrt());
         }
+    }
+    let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);
+    for values in &mut series {
+        // A constant deviation is no correlation in time.
+        let mean = crate::stats::mean(values);
+        values.iter_mut().for_each(|v| *v -= mean);
+        squares += values.iter().map(|v| v * v).sum::<f64>();
+        products += values.windows(2).map(|w| w[0] * w[1]).sum::<f64>();
+        pairs += values.len().saturating_sub(1) as f64;
     }
     let correlation: f64 = products / f64::max(squares, f64::MIN_POSITIVE);
     let chance = 3.0 / f64::max(pairs, 1.0).sqrt();

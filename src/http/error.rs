@@ -73,6 +73,9 @@ impl From<monitor::Error> for ApiError {
         match error {
             E::UnknownStructure(_) => Self::new(StatusCode::NOT_FOUND, "unknown_structure", detail),
             E::UnknownBatch { .. } => Self::new(StatusCode::NOT_FOUND, "unknown_batch", detail),
+            E::UnknownDiagnosis(_) => Self::new(StatusCode::NOT_FOUND, "unknown_diagnosis", detail),
+            E::NoExtension { .. } => Self::new(StatusCode::CONFLICT, "no_extension", detail),
+            E::NoStepBack(_) => Self::new(StatusCode::CONFLICT, "no_step_back", detail),
             E::NoModel { .. } => Self::new(StatusCode::CONFLICT, "no_model", detail),
             E::StructureInUse(_) => Self::new(StatusCode::CONFLICT, "structure_in_use", detail),
             E::KeyConflict { .. } => Self::invalid("idempotency_key_reused", detail, Vec::new()),

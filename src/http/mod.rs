@@ -3,6 +3,7 @@
 mod alarms;
 mod answer;
 mod batches;
+mod diagnoses;
 mod error;
 mod history;
 mod operations;
@@ -16,7 +17,7 @@ use std::time::Duration;
 use axum::extract::DefaultBodyLimit;
 use axum::http::StatusCode;
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::{get, post};
+use axum::routing::{delete, get, post};
 use axum::{middleware, Router};
 use metrics_exporter_prometheus::PrometheusHandle;
 use serde::{Deserialize, Serialize};
@@ -82,6 +83,11 @@ pub fn router(monitor: Monitor, metrics: PrometheusHandle, settings: &HttpSettin
         .route("/v1/structures/{id}/charts", get(alarms::charts))
         .route("/v1/structures/{id}/maintenance", get(alarms::maintenance).post(alarms::add_maintenance))
         .route("/v1/structures/{id}/identifiability", get(alarms::identifiability))
+        .route("/v1/structures/{id}/diagnoses", get(diagnoses::list).post(diagnoses::create))
+        .route("/v1/structures/{id}/extension", delete(diagnoses::step_back))
+        .route("/v1/diagnoses/{id}", get(diagnoses::read))
+        .route("/v1/diagnoses/{id}/report", get(diagnoses::report))
+        .route("/v1/diagnoses/{id}/extension", post(diagnoses::extend))
         .route("/healthz", get(operations::health))
         .route("/readyz", get(operations::ready))
         .route("/metrics", get(operations::metrics))

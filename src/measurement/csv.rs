@@ -66,12 +66,13 @@ pub fn offered(
     let unknown: Vec<usize> =
         (0..header.len()).filter(|i| column(&header[*i], covariates, options).is_none()).collect();
     let mut cells: Vec<std::collections::BTreeSet<String>> = vec![std::collections::BTreeSet::new(); unknown.len()];
-    let mut numeric = vec![true; unknown.len()];
+    let (mut numbers, mut others) = (vec![0; unknown.len()], vec![0; unknown.len()]);
     for record in records {
         let record = record.map_err(|e| problem(&e))?;
         for (place, index) in unknown.iter().enumerate() {
             let Some(cell) = record.get(*index).filter(|cell| !cell.is_empty()) else { continue };
-            numeric[place] &= number(cell, separator != b',').is_ok();
+            let counted = if number(cell, separator != b',').is_ok() { &mut numbers } else { &mut others };
+            counted[place] += 1;
             if cells[place].len() <= most_categories {
                 cells[place].insert(cell.to_owned());
             }
@@ -79,7 +80,8 @@ pub fn offered(
     }
     let offer = |(place, index): (usize, &usize)| {
         let (name, values) = (header[*index].to_owned(), cells[place].len());
-        if numeric[place] {
+        // A few cells that are no numbers do not make numbers text: reading names them with their line.
+        if numbers[place] >= 9 * others[place] {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Number })
         } else if values <= most_categories {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Category })

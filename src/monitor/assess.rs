@@ -525,7 +525,8 @@ fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Opt
     let theta: Vec<f64> = samples.posterior.theta().row_mean().iter().copied().collect();
     // Under the mean of the effects' sizes.
     let count = samples.observations.len() as f64;
-    let known: Vec<&Vec<f64>> = samples.observations.iter().map(|o| &o.effect_sizes).filter(|s| !s.is_empty()).collect();
+    let known: Vec<&Vec<f64>> =
+        samples.observations.iter().map(|o| &o.effect_sizes).filter(|s| !s.is_empty()).collect();
     let sizes: Vec<f64> =
         (0..known.first().map_or(0, |s| s.len())).map(|i| known.iter().map(|s| s[i]).sum::<f64>() / count).collect();
     let simulated = baseline.simulator().under(&sizes).frequencies_hz(&theta)?;

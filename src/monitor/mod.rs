@@ -3,6 +3,7 @@
 pub mod assess;
 pub mod charts;
 pub mod compute;
+mod diagnoses;
 mod silence;
 mod undamaged;
 mod watched;
@@ -27,6 +28,7 @@ use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store, StoredCh
 use assess::{Context, Draws};
 use charts::KnownLimits;
 use compute::{Compute, ComputeSettings, QueueFull};
+pub use diagnoses::{DiagnosisRequest, ExtensionTraining};
 pub use watched::Watched;
 
 /// How batches are taken and assessed.
@@ -128,6 +130,20 @@ pub enum Error {
         /// What was found in it.
         reason: String,
     },
+    /// No such diagnosis.
+    #[error("there is no diagnosis {0}")]
+    UnknownDiagnosis(String),
+    /// A diagnosis that no extension can be made of.
+    #[error("diagnosis {diagnosis} cannot be extended: {reason}")]
+    NoExtension {
+        /// The diagnosis.
+        diagnosis: String,
+        /// Why.
+        reason: String,
+    },
+    /// A structure whose present version extends none.
+    #[error("structure {0} extends no earlier version: there is no step back")]
+    NoStepBack(StructureId),
     /// A stored definition is not readable any more: the database was written by another version.
     #[error("the stored definition of a structure is refused: {0}")]
     StoredDefinition(#[from] DefinitionError),
@@ -169,6 +185,7 @@ pub struct Monitor {
     /// Alarms that this process has logged.
     reported: Arc<Mutex<BTreeSet<(StructureId, i64)>>>,
     compute: Compute,
+    jobs: diagnoses::Jobs,
     settings: MonitorSettings,
 }
 
@@ -188,6 +205,7 @@ impl Monitor {
             known_limits: Arc::default(),
             reported: Arc::default(),
             compute: Compute::new(settings.compute),
+            jobs: diagnoses::Jobs::default(),
             settings,
         };
         for (id, entry) in monitor.library.iter() {
@@ -197,10 +215,15 @@ impl Monitor {
                 warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches and the library's differs");
             }
         }
+        let interrupted = monitor.store.end_interrupted_jobs(Timestamp::now()).await?;
+        if interrupted > 0 {
+            warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
+        }
         for summary in monitor.store.structures().await? {
             if let Some(record) = monitor.store.structure(&summary.id).await? {
                 let simulator = Simulator::new(StructureDefinition::parse_json(&record.definition_json)?)?;
-                monitor.watch(simulator);
+                let baseline = monitor.baseline_for(&simulator).await?;
+                monitor.watch(simulator, baseline);
             }
         }
         Ok(monitor)

@@ -42,17 +42,30 @@ impl Monitor {
         let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
         match outcome {
             PutStructure::Refused => return Err(Error::StructureInUse(id)),
-            PutStructure::Created | PutStructure::Replaced => self.watch(simulator),
+            PutStructure::Created | PutStructure::Replaced => {
+                let baseline = self.baseline_for(&simulator).await?;
+                self.watch(simulator, baseline);
+            }
             PutStructure::Unchanged => {}
         }
         Ok(outcome)
     }
 
-    pub(super) fn watch(&self, simulator: Simulator) {
+    pub(super) fn watch(&self, simulator: Simulator, baseline: Result<Arc<Baseline>, String>) {
         let id = simulator.id().clone();
-        let baseline = self.find_baseline(&simulator);
         let watched = Arc::new(Watched { simulator, baseline });
         self.watched.write().expect("no holder of this lock panics").insert(id, watched);
+    }
+
+    /// The baseline of a version of a structure: one that the service trained for it, or that of the library.
+    pub(super) async fn baseline_for(&self, simulator: &Simulator) -> Result<Result<Arc<Baseline>, String>, Error> {
+        let Some(stored) = self.store.trained_baseline(simulator.id(), simulator.digest()).await? else {
+            return Ok(self.find_baseline(simulator));
+        };
+        let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);
+        let refused = |e: crate::baseline::LoadError| format!("the baseline that the service trained is refused: {e}");
+        let usable = |baseline: &Baseline| if stored.accepted { Ok(()) } else { self.usable(baseline) };
+        Ok(loaded.map_err(refused).and_then(|baseline| usable(&baseline).map(|()| Arc::new(baseline))))
     }
 
     fn find_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
@@ -69,10 +82,15 @@ impl Monitor {
             Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
             None => format!("no trained baseline: {train}"),
         })?;
+        self.usable(&baseline).map(|()| baseline)
+    }
+
+    /// Whether a baseline passed its calibration, or may be used all the same; why not.
+    pub(super) fn usable(&self, baseline: &Baseline) -> Result<(), String> {
         let failures = &baseline.manifest().calibration.failures;
         let digest = baseline.digest().as_str();
         if failures.is_empty() || self.settings.accept_uncalibrated.iter().any(|accepted| accepted == digest) {
-            return Ok(baseline);
+            return Ok(());
         }
         Err(format!(
             "the trained baseline failed its calibration ({}): train again with more samples or epochs; to use it all the \

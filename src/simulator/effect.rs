@@ -174,11 +174,7 @@ pub fn draw_covariates(effects: &[Effect], stream: &mut Stream) -> BTreeMap<Stri
 }
 
 /// Sizes under covariates with numbers drawn from what is known of them.
-pub fn draw_sizes(
-    effects: &[Effect],
-    covariates: &BTreeMap<String, CovariateValue>,
-    stream: &mut Stream,
-) -> Vec<f64> {
+pub fn draw_sizes(effects: &[Effect], covariates: &BTreeMap<String, CovariateValue>, stream: &mut Stream) -> Vec<f64> {
     effects.iter().flat_map(|effect| effect.draw_sizes(effect.input(covariates).0, stream)).collect()
 }
 
@@ -238,17 +234,20 @@ fn check_one(
             return Err(("covariate", format!("there is no [[covariate]] {name}")));
         }
         (false, Some(Some(declared))) => {
-            let wanted =
-                if effect.law == LawKind::Category { CovariateKind::Category } else { CovariateKind::Number };
+            let wanted = if effect.law == LawKind::Category { CovariateKind::Category } else { CovariateKind::Number };
             if declared.kind != wanted {
-                return Err(("covariate", format!("the law {} takes a covariate of the other kind", effect.law.name())));
+                return Err((
+                    "covariate",
+                    format!("the law {} takes a covariate of the other kind", effect.law.name()),
+                ));
             }
         }
     }
     let category = effect.law == LawKind::Category;
     let levels = if category { effect.numbers.keys().cloned().collect() } else { Vec::new() };
     let with_level = effect.numbers.contains_key("level") && effect.law.has_level();
-    let law = Law { kind: effect.law, covariate: effect.covariate.clone(), reference: effect.reference, with_level, levels };
+    let law =
+        Law { kind: effect.law, covariate: effect.covariate.clone(), reference: effect.reference, with_level, levels };
     let mut wanted = if matches!(target, Target::ModeOrder(_)) { Vec::new() } else { law.numbers() };
     if matches!(target, Target::Oscillator(_)) {
         wanted.push("frequency_hz".to_owned());
@@ -295,7 +294,12 @@ fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option
     if rows.is_empty() {
         return Ok(None);
     }
-    let wrong = || ("covariance", format!("{n} rows of {n} finite numbers, positive semidefinite, in the order of the names of the numbers"));
+    let wrong = || {
+        (
+            "covariance",
+            format!("{n} rows of {n} finite numbers, positive semidefinite, in the order of the names of the numbers"),
+        )
+    };
     if rows.len() != n || rows.iter().any(|row| row.len() != n || row.iter().any(|v| !v.is_finite())) {
         return Err(wrong());
     }

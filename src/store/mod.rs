@@ -6,6 +6,7 @@
 mod alarm;
 mod assessment;
 mod batch;
+mod diagnosis;
 mod history;
 mod structure;
 #[cfg(test)]
@@ -27,6 +28,7 @@ use sqlx::Connection as _;
 
 pub use alarm::{Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, FIT_SERIES};
 pub use batch::{BatchRecord, InsertBatch};
+pub use diagnosis::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
 pub use history::{Exceedance, HistoryEntry, HistoryQuery};
 pub use structure::{PutStructure, StructureRecord, StructureSummary};
 pub use undamaged::UndamagedRecord;

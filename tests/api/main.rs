@@ -4,6 +4,7 @@
 
 mod bad_input;
 mod batches;
+mod diagnosis;
 mod helpers;
 mod history;
 mod hostile;

@@ -171,6 +171,7 @@ struct Judged {
 
 impl Judged {
     fn new(kind: Kind, world: World, answer: Value) -> Self {
+        assert!(kind == Kind::Nothing || world.nats >= 20.0, "what is hidden cannot be seen");
         let right = match kind {
             Kind::Nothing => answer["verdict"] == "nothing_found",
             Kind::Single => named(&answer, &world.truths[0]).is_some(),
@@ -395,7 +396,7 @@ fn hidden_effects_are_found_in_a_fixed_set_of_worlds() {
 }
 
 #[test]
-#[ignore = "20 minutes"]
+#[ignore = "10 minutes"]
 fn hidden_effects_are_found_in_two_hundred_worlds() {
     let singles = orders(10_000, 200, Kind::Single);
     let others =
@@ -427,4 +428,116 @@ fn a_softening_spring_is_found_in_simulated_time_histories() {
     let swing = cause["parameters"][0]["value"].as_f64().unwrap();
     let size = world.truth.size;
     assert!((swing / size - 1.0).abs() < 0.25, "swing {swing}, by equivalent linearisation {size}");
+}
+
+// ---- Tables ----
+
+/// Masses, springs and the one free parameter of a chain of three.
+const CHAIN_KG: [f64; 3] = [1.0, 1.2, 0.8];
+const CHAIN_N_PER_M: [f64; 3] = [4000.0, 3000.0, 2000.0];
+const CHAIN_NOISE: f64 = 0.002;
+
+fn chain_toml() -> String {
+    let name = |kind: &str, index: usize| format!("{kind}{}", index + 1);
+    let masses = (0..3).map(|i| (name("m", i), CHAIN_KG[i])).collect::<Vec<_>>();
+    let from = |i: usize| if i == 0 { "ground".to_owned() } else { name("m", i - 1) };
+    let springs = (0..3).map(|i| (name("k", i), from(i), name("m", i), CHAIN_N_PER_M[i])).collect::<Vec<_>>();
+    world::structure_toml(3, CHAIN_NOISE, &masses, &springs, &[name("k", 0)])
+}
+
+/// Measurements of chains of the structure file, with further columns and their cells.
+fn chain_csv(rows: usize, columns: &str, cells: impl Fn(usize, &mut ChaCha8Rng) -> String) -> String {
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut text = format!("measured_at,f1_hz,f2_hz,f3_hz,{columns}\n");
+    for row in 0..rows {
+        let normals = [(); 4].map(|()| rng.sample::<f64, _>(StandardNormal));
+        let first_n_per_m = CHAIN_N_PER_M[0] * (1.0 + 0.01 * normals[3]);
+        let springs = [(None, 0, first_n_per_m), (Some(0), 1, CHAIN_N_PER_M[1]), (Some(1), 2, CHAIN_N_PER_M[2])];
+        let hz = world::frequencies_hz(&CHAIN_KG, &springs).unwrap();
+        text += &world::rfc3339(world::EPOCH_2024_S + 40_000 * row as i64);
+        for (f, normal) in hz.iter().zip(normals) {
+            let _ = write!(text, ",{}", world::number(f * (1.0 + CHAIN_NOISE * normal)));
+        }
+        let _ = writeln!(text, ",{}", cells(row, &mut rng));
+    }
+    text
+}
+
+/// The same table without the values of a column.
+fn emptied(csv: &str, column: &str) -> String {
+    let place = csv.lines().next().unwrap().split(',').position(|name| name == column).unwrap();
+    let without = |(line, text): (usize, &str)| {
+        let keep = |(cell, value)| if line > 0 && cell == place { "" } else { value };
+        text.split(',').enumerate().map(keep).collect::<Vec<_>>().join(",") + "\n"
+    };
+    csv.lines().enumerate().map(without).collect()
+}
+
+fn celsius(rng: &mut ChaCha8Rng) -> String {
+    world::number(rng.random_range(-5.0..25.0))
+}
+
+/// That nothing was found in a table and a note says so-and-so.
+fn noted(csv: &str, words: &[&str]) {
+    let answer = answer(&chain_toml(), csv, &[]);
+    assert_eq!(answer["verdict"], "nothing_found", "{}", answer["summary"]);
+    let notes = list(&answer, "notes").iter().map(|note| note.as_str().unwrap()).collect::<Vec<_>>();
+    assert!(notes.iter().any(|note| words.iter().all(|word| note.contains(word))), "{words:?} in {notes:?}");
+}
+
+/// That a table is refused with so-and-so.
+fn refused(csv: &str, options: &[&str], words: &[&str]) {
+    let text = refusal(&chain_toml(), csv, options);
+    assert!(words.iter().all(|word| text.contains(word)), "{words:?} in {text:?}");
+}
+
+#[test]
+fn bad_data_get_clear_answers() {
+    let weather = |rows| chain_csv(rows, "temperature_c", |_, rng| celsius(rng));
+    let operators = chain_csv(120, "operator", |row, _| ["A", "B", "C"][row % 3].to_owned());
+
+    // A quarter is held out: 36 rows leave 27.
+    refused(&weather(36), &[], &["27 measurements", "at least 30"]);
+    noted(&weather(40), &["30 rows are few"]);
+
+    noted(&chain_csv(120, "temperature_c", |_, _| "21.5".to_owned()), &["temperature_c", "21.5 in every row"]);
+    noted(&chain_csv(120, "operator", |_, _| "A".to_owned()), &["operator", "A in every row"]);
+    noted(&emptied(&weather(120), "f3_hz"), &["mode 3 was never measured"]);
+    let together = |_, rng: &mut ChaCha8Rng| {
+        let c = rng.random_range(-5.0..25.0);
+        format!("{c:.3},{:.3}", 70.0 - 1.5 * c + rng.random_range(-0.1..0.1))
+    };
+    let collinear = chain_csv(120, "temperature_c,humidity_percent", together);
+    noted(&collinear, &["temperature_c", "humidity_percent", "cannot tell which"]);
+
+    let set = |row: usize, _: &mut ChaCha8Rng| if row == 41 { "9000" } else { "4000" }.to_owned();
+    refused(&chain_csv(120, "set_k1", set), &[], &["line 43", "set_k1", "prior of k1", "2000 to 6400"]);
+    refused(&weather(120).replace("f1_hz", "first_hz"), &[], &["f1_hz", "3 modes"]);
+    refused(&operators, &["--holdout", "where:lab=B"], &["lab", "there are operator, time"]);
+    refused(&operators, &["--holdout", "where:operator=D"], &["operator = D", "A, B, C"]);
+    refused(&weather(120), &["--holdout", "where:temperature_c=3"], &["temperature_c", "numbers"]);
+    refused(&weather(120), &["--holdout", "first:0.2"], &["last:0.25"]);
+
+    let answer = answer(&chain_toml(), &operators, &["--holdout", "where:operator=B"]);
+    assert_eq!((&answer["training_rows"], &answer["holdout_rows"]), (&80.into(), &40.into()));
+}
+
+#[test]
+fn the_same_question_gets_the_same_answer_and_the_seed_moves_only_bootstrap_intervals() {
+    let world = world::draw_single(1, "spring", "linear");
+    let json = |options: &[&str]| {
+        let output = diagnose(&world.structure_toml, &world.csv, &[&["--json"], options].concat());
+        assert!(output.status.success());
+        output.stdout
+    };
+    let first = json(&[]);
+    assert!(first == json(&[]), "two runs differ");
+
+    let [mut one, mut other] = [first, json(&["--seed", "1001"])].map(|j| serde_json::from_slice::<Value>(&j).unwrap());
+    assert_ne!(one, other);
+    for answer in [&mut one, &mut other] {
+        answer["seed"] = Value::Null;
+        answer["gain"]["rms_difference_interval90"] = Value::Null;
+    }
+    assert_eq!(one, other);
 }

@@ -1,0 +1,328 @@
+//! Diagnoses as jobs: one at a time, away from the queue of assessments; and the switch to an extended structure.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+
+use serde::{Deserialize, Serialize};
+use tracing::{error, info, warn};
+
+use super::watched::Watched;
+use super::{Error, Monitor};
+use crate::baseline::observation::DEFAULT_NOISE_RANGE;
+use crate::baseline::train::{train, Trained};
+use crate::baseline::Baseline;
+use crate::discrepancy::data::Data;
+use crate::discrepancy::extend::extend;
+use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
+use crate::flow::train::TrainSettings;
+use crate::flow::FlowSettings;
+use crate::measurement::ModalMeasurement;
+use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::simulator::definition::StructureDefinition;
+use crate::simulator::Simulator;
+use crate::store::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
+
+/// Training of an extension of a structure that had no baseline.
+const SAMPLES: usize = 200_000;
+const EPOCHS: usize = 80;
+
+/// What is diagnosed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DiagnosisRequest {
+    /// Batches, by id.
+    pub batches: Vec<String>,
+    /// Share of the measurements, the last in time, kept for measuring the gain.
+    pub holdout_last: f64,
+    /// Instead of that, the measurements where a category has a value: (covariate, category).
+    pub holdout_where: Option<(String, String)>,
+    /// Seed of the bootstrap and, in an extension, of the training.
+    pub seed: u64,
+}
+
+/// How an extension is trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ExtensionTraining {
+    /// Simulated pairs; as the baseline before without.
+    pub samples: Option<usize>,
+    /// Passes over them; as the baseline before without.
+    pub epochs: Option<usize>,
+    /// Use the flow even if it fails its calibration; every answer says so then.
+    pub accept_uncalibrated: bool,
+}
+
+/// What an extension did.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct ExtensionResult {
+    added: Vec<String>,
+    left_out: Vec<String>,
+    structure_digest: String,
+    parent_digest: String,
+    model_digest: String,
+    undamaged_version: Option<u32>,
+}
+
+/// Where jobs are, by id.
+#[derive(Clone)]
+pub(super) struct Jobs {
+    one_at_a_time: Arc<tokio::sync::Semaphore>,
+    progress: Arc<Mutex<BTreeMap<String, String>>>,
+}
+
+impl Default for Jobs {
+    fn default() -> Self {
+        Self { one_at_a_time: Arc::new(tokio::sync::Semaphore::new(1)), progress: Arc::default() }
+    }
+}
+
+impl Jobs {
+    fn say(&self, id: &str, what: impl Into<String>) {
+        self.progress.lock().expect("no holder of this lock panics").insert(id.to_owned(), what.into());
+    }
+
+    fn end(&self, id: &str) {
+        self.progress.lock().expect("no holder of this lock panics").remove(id);
+    }
+
+    fn of(&self, id: &str) -> Option<String> {
+        self.progress.lock().expect("no holder of this lock panics").get(id).cloned()
+    }
+}
+
+impl Monitor {
+    /// Begins a diagnosis; `batches` empty stands for all.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::Store`].
+    pub async fn start_diagnosis(
+        &self,
+        structure: &StructureId,
+        mut request: DiagnosisRequest,
+    ) -> Result<DiagnosisRecord, Error> {
+        let watched = self.structure(structure)?;
+        if request.batches.is_empty() {
+            request.batches = self.store.batch_ids(structure).await?;
+        }
+        for id in &request.batches {
+            self.stored(structure, id).await?;
+        }
+        let id = uuid::Uuid::now_v7().to_string();
+        let json = serde_json::to_string(&request).expect("a request is plain data");
+        let digest = watched.simulator.digest();
+        self.store.insert_diagnosis(&id, structure, digest, &json, Timestamp::now()).await?;
+        self.jobs.say(&id, "waiting");
+        let (monitor, job, of) = (self.clone(), id.clone(), structure.clone());
+        tokio::spawn(async move {
+            let outcome = monitor.diagnose_here(&job, &of, &watched.simulator, &request).await;
+            let stored = outcome.map_err(|failure| {
+                warn!(diagnosis = %job, "Diagnosis {job} failed: {failure}");
+                failure
+            });
+            let stored = stored.map(|(outcome, html)| {
+                (serde_json::to_string(&outcome.diagnosis).expect("a diagnosis is plain data"), html)
+            });
+            if let Err(failure) = monitor.store.finish_diagnosis(&job, stored, Timestamp::now()).await {
+                error!(diagnosis = %job, "Could not store the end of diagnosis {job}: {failure}");
+            }
+            monitor.jobs.end(&job);
+        });
+        self.diagnosis(&id).await.map(|(record, _)| record)
+    }
+
+    async fn diagnose_here(
+        &self,
+        id: &str,
+        structure: &StructureId,
+        simulator: &Simulator,
+        request: &DiagnosisRequest,
+    ) -> Result<(Outcome, Option<String>), String> {
+        let _turn = self.jobs.one_at_a_time.acquire().await.expect("the semaphore is never closed");
+        let measurements = self.store.measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
+        let (jobs, id, simulator, request) = (self.jobs.clone(), id.to_owned(), simulator.clone(), request.clone());
+        let work = move || {
+            let (data, outcome) = study(&jobs, &id, &simulator, &measurements, &request)?;
+            let html = report::html(&simulator, &data, &outcome);
+            Ok((outcome, html))
+        };
+        tokio::task::spawn_blocking(work).await.map_err(|_| "the diagnosis panicked".to_owned())?
+    }
+
+    /// A diagnosis, and what its job does now.
+    ///
+    /// # Errors
+    /// [`Error::UnknownDiagnosis`], [`Error::Store`].
+    pub async fn diagnosis(&self, id: &str) -> Result<(DiagnosisRecord, Option<String>), Error> {
+        let record = self.store.diagnosis(id).await?;
+        let record = record.ok_or_else(|| Error::UnknownDiagnosis(crate::quantity::shown(id)))?;
+        Ok((record, self.jobs.of(id)))
+    }
+
+    /// Begins to extend the structure with the causes of a diagnosis: a new version of the structure, a baseline trained for
+    /// it, and all batches assessed again.
+    ///
+    /// # Errors
+    /// [`Error::UnknownDiagnosis`], [`Error::NoExtension`] when it is not done, when the structure has changed since, or when
+    /// an extension runs or is done already.
+    pub async fn start_extension(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, Error> {
+        let (record, _) = self.diagnosis(id).await?;
+        let watched = self.structure(&record.structure)?;
+        let refuse = |why: &str| Error::NoExtension { diagnosis: id.to_owned(), reason: why.to_owned() };
+        if record.state != JobState::Done {
+            return Err(refuse("it is not done"));
+        }
+        if record.structure_digest != *watched.simulator.digest() {
+            return Err(refuse("the structure is another version now: diagnose that one"));
+        }
+        if !self.store.begin_extension(id).await? {
+            return Err(refuse("it is being extended or was already"));
+        }
+        self.jobs.say(id, "waiting");
+        let (monitor, job) = (self.clone(), id.to_owned());
+        let begun = self.diagnosis(id).await?.0;
+        tokio::spawn(async move {
+            let outcome = monitor.extend_here(&record, &watched, training).await;
+            if let Err(failure) = &outcome {
+                warn!(diagnosis = %job, "Extension by diagnosis {job} failed: {failure}");
+            }
+            if let Err(failure) = monitor.store.finish_extension(&job, outcome, Timestamp::now()).await {
+                error!(diagnosis = %job, "Could not store the end of the extension by {job}: {failure}");
+            }
+            monitor.jobs.end(&job);
+        });
+        Ok(begun)
+    }
+
+    async fn extend_here(
+        &self,
+        record: &DiagnosisRecord,
+        watched: &Watched,
+        training: ExtensionTraining,
+    ) -> Result<String, String> {
+        let simulator = &watched.simulator;
+        // Trained as the baseline before it, for the same noise.
+        let before = watched.baseline.as_ref().ok().map(|baseline| baseline.manifest());
+        let noise_range = before.and_then(|m| m.conditions.noise_range).unwrap_or(DEFAULT_NOISE_RANGE);
+        let samples = training.samples.or(before.map(|m| m.training.samples)).unwrap_or(SAMPLES);
+        let epochs = training.epochs.or(before.map(|m| m.training.settings.epochs)).unwrap_or(EPOCHS);
+        let said = |e: &dyn std::fmt::Display| e.to_string();
+        let _turn = self.jobs.one_at_a_time.acquire().await.expect("the semaphore is never closed");
+        let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| said(&e))?;
+        let structure = &record.structure;
+        let measurements = self.store.measurements_of(structure, &request.batches).await.map_err(|e| said(&e))?;
+        let (jobs, id, old) = (self.jobs.clone(), record.id.clone(), simulator.clone());
+        let work = move || -> Result<_, String> {
+            // The fits are not stored: the same data and seed give them again.
+            let (data, outcome) = study(&jobs, &id, &old, &measurements, &request)?;
+            let extended = extend(&old, &data, &outcome).map_err(|e| e.to_string())?;
+            let simulator = Simulator::new(extended.definition.clone()).map_err(|e| e.to_string())?;
+            let settings = TrainSettings { epochs, seed: request.seed, ..TrainSettings::default() };
+            let flow = FlowSettings::default();
+            let trained = train(&simulator, samples, noise_range, &flow, &settings, |epoch| {
+                jobs.say(&id, format!("training: epoch {} of {epochs}", epoch.epoch));
+            });
+            jobs.say(&id, "switching");
+            Ok((extended, simulator, trained.map_err(|e| e.to_string())?))
+        };
+        let done = tokio::task::spawn_blocking(work).await.map_err(|_| "the extension panicked".to_owned())?;
+        let (extended, extended_simulator, trained) = done?;
+        let accepted = training.accept_uncalibrated && self.usable(&trained.baseline).is_err();
+        if !accepted {
+            self.usable(&trained.baseline)?;
+        }
+        let Trained { baseline, manifest_json, weights } = trained;
+        let version = NewVersion {
+            digest: extended_simulator.digest().clone(),
+            definition_json: extended_simulator.definition().canonical_json(),
+            parent: Some(simulator.digest().clone()),
+            diagnosis: Some(record.id.clone()),
+            baseline: Some(StoredBaseline {
+                model_digest: baseline.digest().to_string(),
+                manifest: manifest_json,
+                weights,
+                accepted,
+            }),
+        };
+        let model_digest = baseline.digest().to_string();
+        let undamaged_version =
+            self.switch(structure, version, extended_simulator.clone(), Ok(Arc::new(baseline))).await;
+        let result = ExtensionResult {
+            added: extended.added,
+            left_out: extended.left_out,
+            structure_digest: extended_simulator.digest().to_string(),
+            parent_digest: simulator.digest().to_string(),
+            model_digest,
+            undamaged_version: undamaged_version.map_err(|e| said(&e))?,
+        };
+        info!(structure.id = %structure, diagnosis = %record.id, "Extended {structure}: {}", result.added.join("; "));
+        Ok(serde_json::to_string(&result).expect("a result is plain data"))
+    }
+
+    /// One step back: the version that the present one extends, with its baseline; all batches are assessed again.
+    ///
+    /// # Errors
+    /// [`Error::NoStepBack`] when the present version extends none.
+    pub async fn step_back(&self, structure: &StructureId) -> Result<Digest, Error> {
+        let watched = self.structure(structure)?;
+        let none = || Error::NoStepBack(structure.clone());
+        let present = watched.simulator.digest().clone();
+        let (_, parent) = self.store.structure_version(structure, &present).await?.ok_or_else(none)?;
+        let parent = parent.ok_or_else(none)?;
+        let (definition, grandparent) = self.store.structure_version(structure, &parent).await?.ok_or_else(none)?;
+        let simulator = Simulator::new(StructureDefinition::parse_json(&definition)?)?;
+        let baseline = self.baseline_for(&simulator).await?;
+        let version = NewVersion {
+            digest: parent.clone(),
+            definition_json: definition,
+            parent: grandparent,
+            diagnosis: None,
+            baseline: None,
+        };
+        self.switch(structure, version, simulator, baseline).await?;
+        info!(structure.id = %structure, "Went back to version {parent} of {structure}");
+        Ok(parent)
+    }
+
+    /// Puts another version in use; the undamaged batches are taken as that under it too. Version of the undamaged state.
+    async fn switch(
+        &self,
+        structure: &StructureId,
+        version: NewVersion,
+        simulator: Simulator,
+        baseline: Result<Arc<Baseline>, String>,
+    ) -> Result<Option<u32>, Error> {
+        let undamaged = self.store.undamaged(structure).await?;
+        self.store.switch_version(structure, version, Timestamp::now()).await?;
+        let usable = baseline.is_ok();
+        let watched = Arc::new(Watched { simulator, baseline });
+        self.watched.write().expect("no holder of this lock panics").insert(structure.clone(), watched);
+        let mut taken = None;
+        if let Some(undamaged) = undamaged.filter(|_| usable) {
+            let threshold = undamaged.state.threshold_probability;
+            match self.declare_undamaged(structure, undamaged.batches, threshold).await {
+                Ok(record) => taken = Some(record.state.version),
+                Err(error) => {
+                    warn!(structure.id = %structure, %error, "The undamaged batches of {structure} make no undamaged state under its new version: {error}");
+                }
+            }
+        }
+        self.resume_later(structure.clone());
+        Ok(taken)
+    }
+}
+
+/// Data and outcome of a request.
+fn study(
+    jobs: &Jobs,
+    id: &str,
+    simulator: &Simulator,
+    measurements: &[ModalMeasurement],
+    request: &DiagnosisRequest,
+) -> Result<(Data, Outcome), String> {
+    let data = Data::new(simulator, measurements);
+    let holdout = match &request.holdout_where {
+        Some((covariate, level)) => Holdout::Where { covariate: covariate.clone(), level: level.clone() },
+        None => Holdout::Last(request.holdout_last),
+    };
+    let progress = |step: Step| jobs.say(id, step.to_string());
+    let outcome = diagnose(simulator, &data, &holdout, request.seed, &progress).map_err(|e| e.to_string())?;
+    Ok((data, outcome))
+}

@@ -1,0 +1,193 @@
+//! A season's false alarms, their cause, the structure extended by it, and a real loss afterwards: all through HTTP.
+
+use std::process::Command;
+use std::time::Duration;
+
+use rand::SeedableRng as _;
+use rand_distr::StandardNormal;
+use serde_json::{json, Value};
+
+use crate::helpers::{command, created, Service};
+
+#[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
+#[path = "../discrepancy/world.rs"]
+mod world;
+
+/// Two springs of a chain are unknown; the simulation knows nothing of temperature.
+const STRUCTURE: &str = r#"
+id = "soft"
+modes = 3
+measurement_noise = { relative = 0.002 }
+mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 0.8 }, { name = "m3", kg = 1.2 }]
+spring = [
+    { name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 },
+    { name = "k2", from = "m1", to = "m2", n_per_m = 1400.0 },
+    { name = "k3", from = "m2", to = "m3", n_per_m = 900.0 },
+    { name = "k4", from = "ground", to = "m3", n_per_m = 700.0 },
+]
+parameter = [
+    { name = "k1", prior = { uniform = [500.0, 1500.0] }, sets = { spring = "k1" } },
+    { name = "k2", prior = { uniform = [700.0, 2100.0] }, sets = { spring = "k2" } },
+]
+covariate = [{ name = "temperature_c" }]
+"#;
+
+/// Relative change of k2 per °C.
+const SOFTENING: f64 = -0.004;
+
+const PER_BATCH: i64 = 10;
+
+/// Air temperature of a day, °C: cold when the data begin.
+fn temperature_c(day: f64) -> f64 {
+    10.0 - 13.0 * (std::f64::consts::TAU * day / 365.0).cos()
+}
+
+/// A batch of one day; `k1_factor` is what is left of k1.
+fn batch(day: f64, k1_factor: f64, rng: &mut impl rand::Rng) -> Vec<Value> {
+    let mut one = |i: i64| {
+        let mut normal = || rng.sample::<f64, _>(StandardNormal);
+        let t = temperature_c(day) + 2.0 * normal();
+        let k1 = 1000.0 * k1_factor * (1.0 + 0.006 * normal());
+        let k2 = 1400.0 * (1.0 + SOFTENING * (t - 10.0)) * (1.0 + 0.006 * normal());
+        let springs = [(None, 0, k1), (Some(0), 1, k2), (Some(1), 2, 900.0), (None, 2, 700.0)];
+        let exact = world::frequencies_hz(&[1.0, 0.8, 1.2], &springs).unwrap();
+        let f: Vec<f64> = exact.iter().map(|f| f * (1.0 + 0.002 * normal())).collect();
+        let seconds = (day * 86_400.0) as i64 + 600 * i;
+        json!({ "measured_at": world::rfc3339(world::EPOCH_2024_S + seconds), "frequencies_hz": f, "covariates": { "temperature_c": t } })
+    };
+    (0..PER_BATCH).map(&mut one).collect()
+}
+
+/// Waits until a path of a diagnosis's answer is no longer "running".
+async fn finished(service: &Service, id: &str, pointer: &str) -> Value {
+    for _ in 0..3_000 {
+        let answer = service.read(&format!("/v1/diagnoses/{id}")).await;
+        match answer.pointer(pointer).and_then(Value::as_str) {
+            Some("running") | None => tokio::time::sleep(Duration::from_millis(200)).await,
+            Some("done") => return answer,
+            Some(other) => panic!("{pointer} is {other}: {answer}"),
+        }
+    }
+    panic!("{pointer} of diagnosis {id} is still running after ten minutes");
+}
+
+/// Damage alarms of a structure: (parameter, opened at).
+async fn damage_alarms(service: &Service) -> Vec<(String, String)> {
+    let alarms = service.read("/v1/structures/soft/alarms?limit=200").await;
+    let items = alarms["items"].as_array().unwrap().iter();
+    let damage = items.filter(|a| a["kind"] == "damage");
+    damage
+        .map(|a| (a["parameter"].as_str().unwrap_or_default().to_owned(), a["opened_at"].as_str().unwrap().to_owned()))
+        .collect()
+}
+
+/// Share of the assessed batches in `days` whose chart lies in alarm, and how many there were.
+async fn wait_until_assessed(service: &Service, batches: usize) {
+    for _ in 0..600 {
+        let history = service.read("/v1/structures/soft/history?limit=1000").await;
+        let assessed = history["items"].as_array().unwrap().iter().filter(|i| i["state"] == "assessed").count();
+        if assessed >= batches {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    panic!("{batches} batches were not assessed within two minutes");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_after_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let models = folder.path().join("models");
+    let own = models.join("soft");
+    std::fs::create_dir_all(&own).unwrap();
+    std::fs::write(own.join("structure.toml"), STRUCTURE).unwrap();
+    // A narrow range of noise: a small training passes its calibration.
+    let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", "0.5,2", "--structure"])
+        .arg(own.join("structure.toml"))
+        .arg("--out")
+        .arg(&own)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&trained.stdout).into_owned();
+    assert!(trained.status.success() && said.contains("calibration passed"), "{said}");
+
+    let data = folder.path().join("data");
+    let start = || Service::spawn(command(&data).arg("--models").arg(&models));
+    let mut service = start();
+    let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(7);
+    let path = "/v1/structures/soft/batches";
+
+    // A year without damage.
+    let mut ids = Vec::new();
+    for number in 0..122 {
+        let day = 3.0 * f64::from(number);
+        let answer = created(service.post(path, &json!({ "measurements": batch(day, 1.0, &mut rng) })).await).await;
+        ids.push(answer["batch"].as_str().unwrap().to_owned());
+    }
+    // Undamaged: the first winter, and two hot days, so that no batch is beyond the temperatures that were seen: such a one
+    // would raise no alarm anyway.
+    let undamaged: Vec<&String> = ids[..20].iter().chain(&ids[60..62]).collect();
+    created(service.post("/v1/structures/soft/baseline", &json!({ "batches": undamaged })).await).await;
+    wait_until_assessed(&service, ids.len()).await;
+    let before = damage_alarms(&service).await;
+    println!("damage alarms under the original model: {before:?}");
+    assert!(!before.is_empty(), "the season should have raised false alarms");
+
+    // The cause.
+    let asked = service.post("/v1/structures/soft/diagnoses", &json!({})).await;
+    assert_eq!(asked.status(), 202);
+    let id = asked.json::<Value>().await.unwrap()["diagnosis"].as_str().unwrap().to_owned();
+    let diagnosis = finished(&service, &id, "/state").await;
+    println!("{}", diagnosis["result"]["summary"].as_str().unwrap());
+    let cause = &diagnosis["result"]["causes"][0];
+    assert_eq!(diagnosis["result"]["verdict"], "cause", "{diagnosis}");
+    assert_eq!((&cause["target"]["name"], &cause["covariate"]), (&json!("k2"), &json!("temperature_c")));
+    let page = service.get(&format!("/v1/diagnoses/{id}/report")).send().await.unwrap().text().await.unwrap();
+    assert!(page.contains("<svg") && page.contains("k2"));
+
+    // The extension.
+    let asked = service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await;
+    assert_eq!(asked.status(), 202);
+    let extended = finished(&service, &id, "/extension/state").await;
+    println!("{}", extended["extension"]["result"]);
+    // A second one finds the structure changed.
+    assert_eq!(service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await.status(), 409);
+    wait_until_assessed(&service, ids.len()).await;
+    let since = extended["extension"]["result"]["undamaged_version"].as_i64().unwrap();
+    let alarms = |service: Value| -> Vec<String> {
+        let items = service["items"].as_array().unwrap().clone();
+        let of_now = items.into_iter().filter(|a| a["kind"] == "damage" && a["undamaged_version"] == since);
+        of_now.map(|a| a["parameter"].as_str().unwrap_or_default().to_owned()).collect()
+    };
+    let now = alarms(service.read("/v1/structures/soft/alarms?limit=200").await);
+    assert!(now.is_empty(), "alarms of the re-assessed year: {now:?}");
+
+    // The next spring: a tenth of k1 is lost. The service was restarted in between.
+    service.stop("TERM");
+    let service = start();
+    for number in 0..20 {
+        let day = 366.0 + 3.0 * f64::from(number);
+        let left = if number < 10 { 1.0 } else { 0.9 };
+        let answer = created(service.post(path, &json!({ "measurements": batch(day, left, &mut rng) })).await).await;
+        assert_eq!(answer["state"], "assessed", "{answer}");
+    }
+    let found = alarms(service.read("/v1/structures/soft/alarms?limit=200").await);
+    println!("alarms after the loss: {found:?}");
+    assert!(found.contains(&"k1".to_owned()), "the loss of k1 was not alarmed");
+    assert!(!found.contains(&"k2".to_owned()), "k2 was alarmed, which lost nothing");
+
+    // A batch without its temperature is taken at all temperatures, and says so.
+    let mut blind = batch(430.0, 0.9, &mut rng);
+    blind.iter_mut().for_each(|m| m["covariates"] = json!({}));
+    let answer = created(service.post(path, &json!({ "measurements": blind })).await).await;
+    let findings = answer.to_string();
+    assert!(findings.contains("covariate_missing"), "{findings}");
+
+    // One step back.
+    let back = service.request(reqwest::Method::DELETE, "/v1/structures/soft/extension").send().await.unwrap();
+    assert_eq!(back.status(), 200);
+    let structure = service.read("/v1/structures/soft").await;
+    assert_eq!(structure["digest"], diagnosis["structure_digest"]);
+    assert!(structure["definition"]["effect"].is_null());
+}
