@@ -127,6 +127,31 @@ pub struct Baseline {
     digest: Digest,
 }
 
+/// Measurements without a covariate that are drawn from at a time: each stands for as many as there are possible values.
+const BLIND_AT_A_TIME: usize = 64;
+
+/// One observation for each of the possible sizes.
+fn at_possible_sizes(observation: &Observation) -> Vec<Observation> {
+    let at = |sizes: &Vec<f64>| Observation {
+        effect_sizes: sizes.clone(),
+        possible_sizes: Vec::new(),
+        ..observation.clone()
+    };
+    observation.possible_sizes.iter().map(at).collect()
+}
+
+/// A step near 0.6 of `count` without a common divisor: walking by it visits all, and the first few lie far apart.
+fn spread_stride(count: usize) -> usize {
+    let divisor = |mut a: usize, mut b: usize| {
+        while b > 0 {
+            (a, b) = (b, a % b);
+        }
+        a
+    };
+    let wanted = (count * 3 / 5).max(1);
+    (wanted..count.max(2)).find(|stride| divisor(*stride, count) == 1).unwrap_or(1)
+}
+
 impl Baseline {
     /// Reads a stored baseline and runs its self-test.
     ///
@@ -195,28 +220,39 @@ impl Baseline {
         if observations.iter().all(|o| o.possible_sizes.is_empty()) {
             return self.infer_known(observations, draws, seed);
         }
-        let possible = |o: &Observation| o.possible_sizes.len().clamp(1, draws.max(1));
-        // Each possible value is an observation of its own; of its samples the first few are taken.
-        let expand = |o: &Observation| -> Vec<Observation> {
-            let count = possible(o);
-            // Fewer draws than values: the values at equal steps.
-            let pick = |i: usize| o.possible_sizes[i * o.possible_sizes.len() / count].clone();
-            match o.possible_sizes.len() {
-                0 => vec![o.clone()],
-                _ => (0..count).map(|i| Observation { effect_sizes: pick(i), ..o.clone() }).collect(),
-            }
-        };
-        let expanded: Vec<Observation> = observations.iter().flat_map(expand).collect();
-        let samples = self.infer_known(&expanded, draws, seed)?;
-        let mut theta = DMatrix::zeros(observations.len() * draws, self.space().len());
-        let mut first = 0;
+        let (mut known, mut blind): (Vec<usize>, Vec<usize>) = (Vec::new(), Vec::new());
         for (row, observation) in observations.iter().enumerate() {
-            let count = possible(observation);
-            for draw in 0..draws {
-                let source = (first + draw % count) * draws + draw / count;
-                theta.set_row(row * draws + draw, &samples.theta().row(source));
+            if observation.possible_sizes.is_empty() { &mut known } else { &mut blind }.push(row);
+        }
+        let mut theta = DMatrix::zeros(observations.len() * draws, self.space().len());
+        let of_known: Vec<Observation> = known.iter().map(|row| observations[*row].clone()).collect();
+        if !known.is_empty() {
+            let samples = self.infer_known(&of_known, draws, seed)?;
+            for (place, row) in known.iter().enumerate() {
+                for draw in 0..draws {
+                    theta.set_row(row * draws + draw, &samples.theta().row(place * draws + draw));
+                }
             }
-            first += count;
+        }
+        for (chunk, rows) in blind.chunks(BLIND_AT_A_TIME).enumerate() {
+            let seed = seed.wrapping_add(1 + chunk as u64);
+            let values = rows.iter().map(|row| observations[*row].possible_sizes.len()).max().unwrap_or(1);
+            // Each possible value is an observation of its own, and gives its share of the draws.
+            let each = draws.div_ceil(values.min(draws.max(1)));
+            let expanded: Vec<Observation> =
+                rows.iter().flat_map(|row| at_possible_sizes(&observations[*row])).collect();
+            let samples = self.infer_known(&expanded, each, seed)?;
+            let mut first = 0;
+            for row in rows {
+                let count = observations[*row].possible_sizes.len();
+                let stride = spread_stride(count);
+                for draw in 0..draws {
+                    // Any few draws in a row go through the whole range of values.
+                    let source = (first + draw * stride % count) * each + (draw / count) % each;
+                    theta.set_row(row * draws + draw, &samples.theta().row(source));
+                }
+                first += count;
+            }
         }
         Ok(PosteriorSamples::new(theta, draws))
     }
@@ -354,11 +390,44 @@ impl Baseline {
         theta: &DMatrix<f64>,
         observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
+        let draws = theta.nrows() / observations.len().max(1);
+        if observations.iter().any(|o| !o.possible_sizes.is_empty()) {
+            return self.log_density_of_blind_draws(theta, observations, draws);
+        }
         let context = self.flow.summarise(&self.condition(observations)?)?;
         let (rows, features) = context.dims2()?;
-        let draws = theta.nrows() / rows.max(1);
         let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
         self.log_density(theta, &repeated)
+    }
+
+    /// The same where covariates are missing: the mean of the densities at their possible values, one measurement at a time.
+    fn log_density_of_blind_draws(
+        &self,
+        theta: &DMatrix<f64>,
+        observations: &[Observation],
+        draws: usize,
+    ) -> Result<Vec<f64>, InferenceError> {
+        let mut all = Vec::with_capacity(theta.nrows());
+        for (row, observation) in observations.iter().enumerate() {
+            let own = theta.rows(row * draws, draws);
+            let possible = if observation.possible_sizes.is_empty() {
+                vec![observation.clone()]
+            } else {
+                at_possible_sizes(observation)
+            };
+            let count = possible.len();
+            let repeated = DMatrix::from_fn(count * draws, own.ncols(), |i, k| own[(i % draws, k)]);
+            let known: Vec<Observation> =
+                possible.into_iter().map(|o| Observation { possible_sizes: Vec::new(), ..o }).collect();
+            let densities = self.log_density_of_draws(&repeated, &known)?;
+            for draw in 0..draws {
+                let values = || (0..count).map(|value| densities[value * draws + draw]);
+                let largest = values().fold(f64::NEG_INFINITY, f64::max);
+                let sum: f64 = values().map(|v| (v - largest).exp()).sum();
+                all.push(largest + (sum / count as f64).ln());
+            }
+        }
+        Ok(all)
     }
 
     fn log_density(&self, theta: &DMatrix<f64>, context: &Tensor) -> Result<Vec<f64>, InferenceError> {

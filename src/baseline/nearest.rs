@@ -140,7 +140,7 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
     let (mut standardised_residuals, mut expanded) =
         (DVector::zeros(simulator.modes()), DMatrix::zeros(simulator.modes(), simulator.modes()));
     for (row, &mode) in present.iter().enumerate() {
-        standardised_residuals[mode] = error[row];
+        standardised_residuals[mode] = if known { error[row] } else { 0.0 };
         for (column, &other) in present.iter().enumerate() {
             expanded[(mode, other)] = projector[(row, column)];
         }

@@ -68,6 +68,8 @@ pub struct Tables {
     pub covariates: Vec<Covariate>,
     /// What was guessed, for people.
     pub notes: Vec<String>,
+    /// Whether the tables have times; without, the order of the rows stands for them.
+    pub timed: bool,
 }
 
 /// How tables are read.
@@ -113,6 +115,7 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     let how = TableArgs { time: args.time.as_deref(), settings: &args.settings, ignore: &args.ignore };
     let tables = read_tables(&simulator, &args.data, &how)?;
     let data = Data::new(&simulator, &tables.measurements);
+    let data = if tables.timed { data } else { data.by_order() };
     let bar = ProgressBar::new_spinner();
     let style = ProgressStyle::with_template("{spinner} {elapsed} {msg}");
     bar.set_style(style.context("the template of the progress bar")?);
@@ -243,8 +246,12 @@ fn holdout(text: &str) -> Result<Holdout, String> {
 /// # Errors
 /// A table that is refused, with line and column.
 pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>) -> anyhow::Result<Tables> {
-    let mut tables =
-        Tables { measurements: Vec::new(), covariates: simulator.covariates().to_vec(), notes: Vec::new() };
+    let mut tables = Tables {
+        measurements: Vec::new(),
+        covariates: simulator.covariates().to_vec(),
+        notes: Vec::new(),
+        timed: false,
+    };
     let mut texts: Vec<(&Path, Vec<u8>)> = Vec::new();
     for path in paths {
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
@@ -286,12 +293,23 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         max_measurements: usize::MAX,
     };
     let mut times = BTreeSet::new();
-    let (mut empty, mut local, mut moved) = (0, 0, 0);
+    let (mut empty, mut local, mut moved, mut earlier_rows) = (0, 0, 0, 0_i64);
     let mut all = Vec::new();
     for (path, bytes) in &texts {
         let mut raw =
             csv::read(bytes, simulator.modes(), &tables.covariates, &options).map_err(|p| refused(path, p))?;
         let rows = raw.len();
+        if let Some(column) = how.time.filter(|_| raw.iter().all(|r| r.measured_at.is_none() || untimed(r))) {
+            anyhow::bail!("{} has no column {column}, which --time names", path.display());
+        }
+        // Tables without times follow one another.
+        for row in raw.iter_mut().filter(|row| untimed(row)) {
+            let time = row.measured_at.as_deref().and_then(|text| Timestamp::parse(text).ok());
+            let later = time.and_then(|t| Timestamp::from_micros(t.micros() + earlier_rows * 1_000_000).ok());
+            row.measured_at = later.map(|t| t.to_string());
+        }
+        earlier_rows += rows as i64;
+        tables.timed |= raw.iter().any(|r| !untimed(r));
         raw.retain(|r| r.frequencies_hz.iter().any(Option::is_some));
         empty += rows - raw.len();
         for row in &mut raw {
@@ -316,6 +334,11 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
     }
     tables.measurements = all;
     Ok(tables)
+}
+
+/// Whether a row has the number of its row for its time.
+fn untimed(row: &RawMeasurement) -> bool {
+    row.measured_at.as_deref().is_some_and(|time| time.starts_with("1970-"))
 }
 
 /// A time without an offset is UTC; one that was there already moves on by microseconds.

@@ -7,7 +7,7 @@ use crate::quantity::{Digest, Hertz};
 use crate::simulator::law::{lagged, Input, Law, LawKind};
 use crate::simulator::Simulator;
 
-/// Name of time among the covariates; its unit is days since the first row.
+/// Name of time among the covariates; its unit is [`Data::time_unit`] since the first row.
 pub const TIME: &str = "time";
 
 /// Least relative standard deviation of a frequency: a structure without noise still has data of finite precision.
@@ -39,8 +39,10 @@ pub struct Column {
 /// Rows of measurements in the order of time.
 #[derive(Debug, Clone)]
 pub struct Data {
-    /// Days since the first row.
+    /// Days since the first row; where no time is known, the number of the row.
     pub times_days: Vec<f64>,
+    /// `day`, or `row` where no time is known.
+    pub time_unit: &'static str,
     /// ln f, `[n][m]`, f in Hz; NaN where a mode is missing.
     pub log_frequencies: Vec<Vec<f64>>,
     /// Relative standard deviation of each frequency as stated by the row or the structure, `[n][m]`.
@@ -89,10 +91,22 @@ impl Data {
             settings: sorted.iter().map(setting).collect(),
             digest: Digest::of(&[&content]),
             times_days,
+            time_unit: "day",
             log_frequencies,
             noise,
             columns,
         }
+    }
+
+    /// The same with the order of the rows for their time: for tables without one.
+    #[must_use]
+    pub fn by_order(mut self) -> Self {
+        self.times_days = (0..self.rows()).map(|row| row as f64).collect();
+        self.time_unit = "row";
+        if let Some(time) = self.columns.iter_mut().find(|c| c.name == TIME) {
+            time.values = Values::Numbers(self.times_days.clone());
+        }
+        self
     }
 
     /// Number of rows n.

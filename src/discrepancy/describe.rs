@@ -77,7 +77,10 @@ pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
         Target::Springs(indices) if indices.len() == 1 => ("spring", structure.springs()[indices[0]].name.clone()),
         Target::Springs(indices) if indices.len() == structure.springs().len() => ("spring_group", "all".to_owned()),
         Target::Springs(indices) => {
-            let group = simulator.spring_groups().into_iter().find(|(_, springs)| springs == indices);
+            let same = |springs: &Vec<usize>| {
+                springs.len() == indices.len() && springs.iter().all(|spring| indices.contains(spring))
+            };
+            let group = simulator.spring_groups().into_iter().find(|(_, springs)| same(springs));
             ("spring_group", group.map_or_else(|| "several".to_owned(), |(name, _)| name))
         }
         Target::Masses(indices) if indices.len() == 1 => ("mass", structure.masses()[indices[0]].name.clone()),
@@ -114,7 +117,7 @@ pub fn phrase(name: &TargetName) -> String {
         "spring_group" if name.name == "all" => "the stiffness of all springs together".to_owned(),
         "spring_group" => of("the stiffness of the springs"),
         "mass" => format!("the mass {}", name.name),
-        "mass_group" => "all masses together".to_owned(),
+        "mass_group" => "the mass of all bodies together".to_owned(),
         "frequency_scale" if name.name.is_empty() => "the scale of all measured frequencies".to_owned(),
         "frequency_scale" => of("the scale of the measured frequency"),
         "frequency_offset" if name.name.is_empty() => "an offset of all measured frequencies".to_owned(),
@@ -144,10 +147,10 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
 }
 
 /// Unit of a covariate, from the end of its name.
-pub fn covariate_unit(name: &str) -> String {
+pub fn covariate_unit(name: &str, unit_of_time: &str) -> String {
     let last = name.rsplit('_').next().unwrap_or_default();
     match last {
-        _ if name == TIME => "day",
+        _ if name == TIME => unit_of_time,
         "c" | "degc" => "°C",
         "percent" => "%",
         "um" => "µm",
@@ -203,7 +206,7 @@ pub fn cause(
         value,
         interval90: [value - Z90 * std, value + Z90 * std],
     };
-    let over = effect.law.covariate.as_deref().map(covariate_unit).unwrap_or_default();
+    let over = effect.law.covariate.as_deref().map(|name| covariate_unit(name, data.time_unit)).unwrap_or_default();
     let numeric = matches!(
         effect.law.covariate.as_deref().and_then(|c| data.column(c)).map(|c| &c.values),
         Some(Values::Numbers(_))
@@ -219,7 +222,7 @@ pub fn cause(
             "curvature_per_unit2" => format!("{unit} per {over}²"),
             "rate_per_unit" => format!("1/{over}"),
             "knee" => over.clone(),
-            "lag_days" => "day".to_owned(),
+            "lag_days" => data.time_unit.to_owned(),
             "frequency_hz" => "Hz".to_owned(),
             "size" => continue,
             _ => unit.clone(),
@@ -230,12 +233,12 @@ pub fn cause(
         let at = effect.law.reference;
         parameters.push(NamedNumber {
             name: "time_days".to_owned(),
-            unit: "days since the first row".to_owned(),
+            unit: format!("{}s since the first", data.time_unit),
             value: at,
             interval90: [at, at],
         });
     }
-    let sentence = sentence(&name, effect, psi, &covariance, (value, std), factor, &shown_unit);
+    let sentence = sentence(&name, effect, psi, &covariance, (value, std), factor, &shown_unit, data.time_unit);
     Cause {
         sentence,
         target: name,
@@ -255,6 +258,7 @@ fn sentence(
     (value, std): (f64, f64),
     factor: f64,
     unit: &str,
+    time_unit: &str,
 ) -> String {
     let what = phrase(name);
     let plus_minus = |value: f64, std: f64, unit: &str| {
@@ -267,7 +271,7 @@ fn sentence(
         (_, false) => "rises by",
     };
     let covariate = effect.law.covariate.clone().unwrap_or_default();
-    let over = covariate_unit(&covariate);
+    let over = covariate_unit(&covariate, time_unit);
     let slope = || effect.numbers.iter().position(|n| n.name == "slope_per_unit");
     match effect.law.kind {
         _ if name.kind == "mode_assignment" => format!("{what} is not the one the data have"),
@@ -282,7 +286,7 @@ fn sentence(
             format!("{what} is {} {more} than the simulation has", plus_minus(value, std, unit))
         }
         LawKind::Step => format!(
-            "{what} {} {} from day {:.1} of the data on",
+            "{what} {} {} from {time_unit} {:.0} of the data on",
             changes(value),
             plus_minus(value, std, unit),
             effect.law.reference
@@ -304,7 +308,7 @@ fn sentence(
             let place = slope().unwrap_or_default();
             let (slope, slope_std) = (psi[place], covariance[(place, place)].max(0.0).sqrt());
             let later = match effect.lag() {
-                Some(lag) => format!(", following it with a lag of {:.1} days", psi[lag]),
+                Some(lag) => format!(", following it with a lag of {:.1} {time_unit}s", psi[lag]),
                 None => String::new(),
             };
             let per = format!("{unit} per {over}");

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::data::{Data, Values};
 use super::grammar::Class;
 use super::model::{Effect, Fit, Start, Study};
-use super::Outcome;
+use super::{Outcome, Verdict};
 use crate::measurement::CovariateKind;
 use crate::physics::effect::Target;
 use crate::simulator::definition::{CovariateDefinition, DefinitionError, EffectDefinition, StructureDefinition};
@@ -33,6 +33,12 @@ pub enum Error {
     /// Nothing can be added.
     #[error("there is nothing to extend the structure with: {}", if .0.is_empty() { "the diagnosis found no cause".to_owned() } else { .0.join("; ") })]
     Nothing(Vec<String>),
+    /// What was found is not the whole of it.
+    #[error(
+        "what the diagnosis found does not explain the data: compensating a part of it would hide the rest; find out what is \
+         left first"
+    )]
+    Unexplained,
     /// The causes cannot be fitted in the form that a structure takes.
     #[error("the causes cannot be fitted in a form that an assessment can use")]
     NoFit,
@@ -49,6 +55,9 @@ pub enum Error {
 /// # Errors
 /// [`Error`].
 pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<Extended, Error> {
+    if outcome.diagnosis.verdict == Verdict::NoneOfThese {
+        return Err(Error::Unexplained);
+    }
     let bare = simulator.without_effects();
     let known = simulator.effects().len();
     let (mut added, mut left_out) = (Vec::new(), Vec::new());
@@ -63,6 +72,10 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
         let effect = &outcome.after.effects[known + place];
         if ranked.candidate.class == Class::PossibleDamage {
             leave("it may be damage, which is not compensated");
+            continue;
+        }
+        if outcome.maybe_damage[place] {
+            leave("these data cannot tell it from a stiffness that changes with time, which may be damage");
             continue;
         }
         if matches!(effect.target, Target::SettingOffset(_) | Target::SettingScale(_)) {

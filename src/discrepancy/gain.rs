@@ -56,12 +56,12 @@ pub struct Gain {
     pub log_density_per_row: DensityChange,
     /// Share of frequencies inside their 90 % interval.
     pub coverage90: Change<f64>,
-    /// Standard deviation of each parameter over healthy batches of ten rows, per cent of its mean.
+    /// Standard deviation of each parameter over healthy batches of ten rows, per cent of the stiffness it sets.
     pub spread_of_parameters_percent: Change<BTreeMap<String, f64>>,
     /// Batches of ten healthy rows, held out, that lie beyond the limit which the first quarter of the other rows, taken for
     /// the undamaged state, sets for 1 in 1000.
     pub false_alarms_per_1000: Change<f64>,
-    /// Loss of the parameter that is seen worst, detected with 90 % probability in one batch of ten rows at a limit that
+    /// Loss of the stiffness that is seen worst, detected with 90 % probability in one batch of ten rows at a limit that
     /// healthy batches really keep.
     pub smallest_detectable_loss_percent: Change<f64>,
 }
@@ -169,23 +169,29 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
     let own = self::shifts(study, &healthy);
     let level = ALARM_RATE / study.free().len().max(1) as f64;
     let limit = -stats::normal_quantile(level);
-    let undamaged = reference(&own)?;
+    let undamaged = reference(&own);
     let damaging = |k: usize, value: f64| match space[k].damage {
         DamageDirection::Decrease => -value,
         DamageDirection::Increase => value,
         DamageDirection::None => f64::NEG_INFINITY,
     };
-    // Limit for one more batch, with the mean and the scatter known from that many batches.
-    let count = undamaged.count as f64;
-    let factor = -StudentsT::new(0.0, 1.0, count - 1.0).ok()?.inverse_cdf(level) * (1.0 + 1.0 / count).sqrt();
-    let beyond = |s: &Vec<(usize, f64, f64)>| {
-        s.iter().zip(&undamaged.moments).any(|((k, shift, _), (mean, std))| damaging(*k, (shift - mean) / std) > factor)
-    };
-    let alarms = shifts.iter().filter(|s| beyond(s)).count();
+    let alarms = undamaged.map_or(0, |undamaged| {
+        // Limit for one more batch, with the mean and the scatter known from that many batches.
+        let count = undamaged.count as f64;
+        let t = StudentsT::new(0.0, 1.0, count - 1.0).map_or(limit, |t| -t.inverse_cdf(level));
+        let factor = t * (1.0 + 1.0 / count).sqrt();
+        let beyond = |s: &Vec<(usize, f64, f64)>| {
+            s.iter()
+                .zip(&undamaged.moments)
+                .any(|((k, shift, _), (mean, std))| damaging(*k, (shift - mean) / std) > factor)
+        };
+        shifts.iter().filter(|s| beyond(s)).count()
+    });
     let mut spread = BTreeMap::new();
     let mut detectable: f64 = 0.0;
     for (place, &k) in study.free().iter().enumerate() {
-        let share = |s: &Vec<(usize, f64, f64)>| s[place].1 / fit.mean[k];
+        let of_stiffness = study.simulator.stiffness_share(k, fit.mean[k]);
+        let share = |s: &Vec<(usize, f64, f64)>| s[place].1 * of_stiffness;
         let held: Vec<f64> = shifts.iter().map(share).collect();
         spread.insert(space[k].name.clone(), 100.0 * stats::sample_std(&held).unwrap_or(f64::NAN));
         let known: Vec<f64> = own.iter().map(share).map(|s| s * s).collect();
@@ -235,7 +241,12 @@ fn shifts(study: &Study<'_>, views: &[RowView]) -> Vec<Vec<(usize, f64, f64)>> {
     let parts: Vec<(DMatrix<f64>, DVector<f64>)> = views
         .iter()
         .map(|view| {
-            let slopes = view.by_parameter.select_columns(free);
+            let mut slopes = view.by_parameter.select_columns(free);
+            for (column, k) in free.iter().enumerate() {
+                if study.data.settings[view.row][*k].is_some() {
+                    slopes.column_mut(column).fill(0.0);
+                }
+            }
             let solved = view.covariance.clone().cholesky().expect("noise is never 0");
             let information = slopes.tr_mul(&solved.solve(&slopes)) * view.weight;
             (information, slopes.tr_mul(&solved.solve(&view.residual)) * view.weight)
@@ -248,7 +259,11 @@ fn shifts(study: &Study<'_>, views: &[RowView]) -> Vec<Vec<(usize, f64, f64)>> {
     parts
         .windows(size)
         .filter_map(|window| {
-            let (mut information, mut along) = (DMatrix::zeros(d, d), DVector::zeros(d));
+            // As much as the prior knows: without it, modes fewer than parameters would leave it singular.
+            let width =
+                |k: usize| study.simulator.space().as_slice()[k].upper - study.simulator.space().as_slice()[k].lower;
+            let mut information = DMatrix::from_fn(d, d, |i, j| if i == j { width(free[i]).powi(-2) } else { 0.0 });
+            let mut along = DVector::zeros(d);
             for (i, a) in window {
                 information += i;
                 along += a;

@@ -109,9 +109,13 @@ pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     let structure = simulator.structure();
     let (springs, masses, modes) = (structure.springs().len(), structure.masses().len(), simulator.modes());
     let mut targets: Vec<Target> = (0..springs).map(|s| Target::Springs(vec![s])).collect();
-    targets.extend(simulator.spring_groups().into_iter().map(|(_, group)| Target::Springs(group)));
-    if springs > 1 {
-        targets.push(Target::Springs((0..springs).collect()));
+    let all = (0..springs).collect::<Vec<usize>>();
+    for mut group in simulator.spring_groups().into_iter().map(|(_, group)| group).chain([all]) {
+        group.sort_unstable();
+        let target = Target::Springs(group);
+        if !targets.contains(&target) {
+            targets.push(target);
+        }
     }
     targets.extend((0..masses).map(|m| Target::Masses(vec![m])));
     if masses > 1 {
@@ -147,10 +151,14 @@ fn missing_springs(simulator: &Simulator) -> Vec<(Node, Node)> {
     let masses = structure.masses().len();
     let joined =
         |a: Node, b: Node| structure.springs().iter().any(|s| (s.from, s.to) == (a, b) || (s.from, s.to) == (b, a));
-    let near = |a: usize, b: usize| {
-        masses <= ALL_PAIRS_MASSES
-            || (0..masses).any(|c| joined(Node::Mass(a), Node::Mass(c)) && joined(Node::Mass(c), Node::Mass(b)))
-    };
+    let mut neighbours = vec![std::collections::BTreeSet::new(); masses];
+    for spring in structure.springs() {
+        if let (Node::Mass(a), Node::Mass(b)) = (spring.from, spring.to) {
+            neighbours[a].insert(b);
+            neighbours[b].insert(a);
+        }
+    }
+    let near = |a: usize, b: usize| masses <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
     let mut pairs = Vec::new();
     for a in 0..masses {
         if !joined(Node::Ground, Node::Mass(a)) {

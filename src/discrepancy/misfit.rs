@@ -23,7 +23,7 @@ pub struct Misfit {
     pub parameter: Option<String>,
     /// Covariate it goes with; `null` for a constant deviation.
     pub covariate: Option<String>,
-    /// Range of the fitted curve over the covariate, per cent of the frequency or parameter.
+    /// Range of the fitted curve over the covariate, per cent of the frequency or stiffness.
     pub size_percent: f64,
     /// Probability of as much by chance, times the number of looks, at most 1.
     pub p_value: f64,
@@ -53,7 +53,8 @@ pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfi
         series.push((Some(mode + 1), None, views.iter().map(value).collect()));
     }
     for &k in study.free() {
-        let values = views.iter().map(|v| v.deviation[k] / fit.mean[k]).collect();
+        let of_stiffness = study.simulator.stiffness_share(k, fit.mean[k]);
+        let values = views.iter().map(|v| v.deviation[k] * of_stiffness).collect();
         series.push((None, Some(space.as_slice()[k].name.clone()), values));
     }
     let mut found = Vec::new();
@@ -91,8 +92,12 @@ fn regressors(values: &Values, rows: &[usize]) -> Vec<Vec<f64>> {
             if unit.is_empty() {
                 return Vec::new();
             }
-            let square = unit.iter().map(|u| u * u).collect();
-            vec![unit, square]
+            let mut different: Vec<u64> = unit.iter().map(|u| u.to_bits()).collect();
+            different.sort_unstable();
+            different.dedup();
+            // Of two values only, the square says nothing new.
+            let square = (different.len() > 2).then(|| unit.iter().map(|u| u * u).collect());
+            [unit].into_iter().chain(square).collect()
         }
         Values::Categories(names, indices) => {
             let indicator =
@@ -181,7 +186,7 @@ pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share
         (0..targets.len()).map(|column| whitened.sums(|place| directions[place].column(column).into_owned())).collect();
     let functions = functions(study.data, rows);
     let looks = (functions.len() * (1 + targets.len())) as f64;
-    let mut best: Option<Remainder> = None;
+    let mut best: Option<(Remainder, f64)> = None;
     for (function, covariates, values) in functions {
         let range = stats::quantile(&values, 0.95) - stats::quantile(&values, 0.05);
         let free = whitened.free_score(&values, modes);
@@ -197,13 +202,19 @@ pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share
         for (nats, numbers, size_percent) in tests.into_iter().filter(|t| t.1 > 0) {
             let chi = ChiSquared::new(numbers as f64).ok()?;
             let p_value = (chi.sf(2.0 * nats * independent_share) * looks).min(1.0);
-            if best.as_ref().is_none_or(|b| p_value < b.p_value) {
+            // Probabilities below 1e-308 are all 0: the statistic goes on.
+            let strength = nats - 0.5 * numbers as f64 * nats.max(1.0).ln();
+            let clearer = |(b, other): &(Remainder, f64)| {
+                p_value < b.p_value
+                    || (p_value <= f64::MIN_POSITIVE && b.p_value <= f64::MIN_POSITIVE && strength > *other)
+            };
+            if best.as_ref().is_none_or(clearer) {
                 let (function, covariates) = (function.clone(), covariates.clone());
-                best = Some(Remainder { function, covariates, size_percent, p_value });
+                best = Some((Remainder { function, covariates, size_percent, p_value }, strength));
             }
         }
     }
-    Some(best)
+    Some(best.map(|(remainder, _)| remainder))
 }
 
 /// What follows a covariate with play: it stays until the covariate has moved by `width` from where it turned.

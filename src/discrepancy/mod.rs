@@ -133,6 +133,8 @@ pub struct Outcome {
     pub after: Fit,
     /// The chosen candidates.
     pub causes: Vec<Ranked>,
+    /// Whether a change of stiffness with time is among what each of them may be instead.
+    pub maybe_damage: Vec<bool>,
     /// Rows held out.
     pub holdout: Vec<usize>,
     /// Rows that causes were looked for in.
@@ -285,7 +287,7 @@ fn run(
                     cause: described(other),
                     instead_of: index + 1,
                     log_evidence_difference: other.log_odds - best.log_odds,
-                    told_apart_by: told_apart(simulator, data, best, other),
+                    told_apart_by: told_apart(&bare, data, best, other),
                 });
             }
         }
@@ -297,13 +299,32 @@ fn run(
         1 => Verdict::Cause,
         _ => Verdict::Several,
     };
+    let unsure: Vec<bool> = selection.slots.iter().map(|s| s.ranked[0].probability <= SURE).collect();
+    let maybe_damage: Vec<bool> = selection
+        .slots
+        .iter()
+        .zip(&unsure)
+        .map(|(slot, unsure)| {
+            let damage = |p: &usize| slot.ranked[*p].candidate.class == Class::PossibleDamage;
+            *unsure && named(&slot.ranked).iter().any(damage)
+        })
+        .collect();
     progress(Step::Measuring);
     let gain = if found && holdout.len() >= 2 {
-        Some(gain::gain(&study, &training, &holdout, &selection.base, &selection.fit, seed).ok_or(Error::NoFit)?)
+        gain::gain(&study, &training, &holdout, &selection.base, &selection.fit, seed)
     } else {
         None
     };
-    let notes = notes(simulator, data, &training, &selection.fit, share);
+    let mut notes = notes(simulator, data, &training, &selection.fit, share);
+    if found && gain.is_none() {
+        notes.push(if holdout.len() < 2 {
+            "no rows are held out: the gain is not measured".to_owned()
+        } else {
+            "the causes cannot be carried to the rows held out, whose covariates leave no stiffness or mass: the gain is not \
+             measured"
+                .to_owned()
+        });
+    }
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
         verdict,
@@ -329,6 +350,7 @@ fn run(
         before: selection.base,
         after: selection.fit,
         causes: chosen.unwrap_or_default(),
+        maybe_damage,
         holdout,
         training,
     })
@@ -419,7 +441,7 @@ fn notes(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit, share: f
                 if known.len() < rows.len() {
                     let missing = rows.len() - known.len();
                     notes.push(format!(
-                        "{name} is missing in {missing} of {} rows: its effects count as 0 there",
+                        "{name} is missing in {missing} of {} rows: its effects count as their level there",
                         rows.len()
                     ));
                 }
@@ -585,7 +607,8 @@ fn summary(d: &Diagnosis) -> String {
     }
     if let Some(gain) = &d.gain {
         let rms = &gain.rms_error_percent;
-        let most = (0..rms.before.len()).max_by(|a, b| {
+        let finite = |m: &usize| rms.before[*m].is_finite() && rms.after[*m].is_finite();
+        let most = (0..rms.before.len()).filter(finite).max_by(|a, b| {
             let gained = |m: usize| rms.before[m] - rms.after[m];
             gained(*a).total_cmp(&gained(*b))
         });

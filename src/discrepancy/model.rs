@@ -126,6 +126,8 @@ pub struct Fit {
 
 /// What one row says under a fit; `[present modes]` unless said otherwise.
 pub struct RowView {
+    /// The row.
+    pub row: usize,
     /// Modes present.
     pub present: Vec<usize>,
     /// ln y − M.
@@ -187,11 +189,30 @@ impl<'a> Study<'a> {
             problem.set_out(&mut eta, start);
             tails = start.fit.tails;
         }
-        let mut here = problem.point(&eta, tails)?;
+        let mut here = problem.point(&eta, tails);
+        if let (None, Some(start)) = (&here, start) {
+            // A first guess that leaves no stiffness somewhere is taken nearer to nothing.
+            for share in [0.5, 0.2, 0.05, 0.0] {
+                let shrunk = problem.towards_prior(&eta, start, share);
+                here = problem.point(&shrunk, tails);
+                if here.is_some() {
+                    break;
+                }
+            }
+        }
+        let mut here = here?;
         for _ in 0..MOST_STEPS {
-            let Some(factor) = here.information.clone().cholesky() else { break };
-            let step = factor.solve(&here.gradient);
-            let promised = 0.5 * step.dot(&here.gradient);
+            // What stands at a bound and wants beyond it stays there, and out of the step of the others.
+            let (mut information, mut gradient) = (here.information.clone(), here.gradient.clone());
+            for held in problem.held(&here) {
+                gradient[held] = 0.0;
+                information.row_mut(held).fill(0.0);
+                information.column_mut(held).fill(0.0);
+                information[(held, held)] = 1.0;
+            }
+            let Some(factor) = information.cholesky() else { break };
+            let step = factor.solve(&gradient);
+            let promised = 0.5 * step.dot(&gradient);
             let before = here.log_posterior;
             let mut moved = false;
             let mut scale = 1.0;
@@ -267,6 +288,16 @@ impl<'a> Study<'a> {
         Some(rows.iter().enumerate().map(by).collect())
     }
 
+    /// One over the variance of the prior of each free mean and all ψ.
+    pub fn prior_information(&self, fit: &Fit) -> Vec<f64> {
+        let mean = |k: &usize| {
+            let p = &self.simulator.space().as_slice()[*k];
+            (0.5 * (p.upper - p.lower)).powi(-2)
+        };
+        let numbers = fit.effects.iter().flat_map(|e| &e.numbers).map(|n| n.prior_std.powi(-2));
+        self.free.iter().map(mean).chain(numbers).collect()
+    }
+
     fn theta(&self, row: usize, mean: &[f64]) -> Vec<f64> {
         mean.iter().enumerate().map(|(k, mean)| self.data.settings[row][k].unwrap_or(*mean)).collect()
     }
@@ -296,6 +327,7 @@ impl<'a> Study<'a> {
         let half_log_det: f64 = factor.l_dirty().diagonal().iter().map(|l| l.ln()).sum();
         let deviation = (0..d).map(|k| spread(k).powi(2) * by_parameter.column(k).dot(&solved)).collect();
         RowView {
+            row,
             log_density: log_density(distance, present.len(), half_log_det, fit.tails),
             weight: weight(distance, present.len(), fit.tails),
             present,
@@ -377,6 +409,19 @@ impl Problem<'_> {
         self.bound(eta);
     }
 
+    /// The same with the numbers of the last effect, where it is a new one, moved towards the middle of their prior.
+    fn towards_prior(&self, eta: &DVector<f64>, start: &Start<'_>, share: f64) -> DVector<f64> {
+        let mut shrunk = eta.clone();
+        let new = start.psi.len() > start.fit.effects.len();
+        if let Some(effect) = self.effects.last().filter(|_| new) {
+            let first = self.means() - effect.numbers.len();
+            for column in first..self.means() {
+                shrunk[column] *= share;
+            }
+        }
+        shrunk
+    }
+
     /// Keeps means in a box a little wider than the prior, ψ in their bounds, and the logarithms finite.
     fn bound(&self, eta: &mut DVector<f64>) {
         let free = self.study.free.len();
@@ -390,6 +435,18 @@ impl Problem<'_> {
         for column in self.means()..self.unknowns() {
             eta[column] = eta[column].clamp(-6.0, 6.0);
         }
+    }
+
+    /// Unknowns at a bound whose gradient points beyond it.
+    fn held(&self, point: &Point) -> Vec<usize> {
+        let beyond = |column: &usize| {
+            let mut moved = point.eta.clone();
+            moved[*column] += 1e-6 * point.gradient[*column].signum();
+            let wanted = moved[*column];
+            self.bound(&mut moved);
+            (moved[*column] - wanted).abs() > 1e-9
+        };
+        (0..self.unknowns()).filter(beyond).collect()
     }
 
     /// Mean, spread, noise factor and ψ of a point.

@@ -2,7 +2,8 @@
 //!
 //! Rows differ in the sizes of effects and in settings, and in each smoothly. So the eigenproblem is solved at Chebyshev
 //! nodes of those numbers and interpolated between them; numbers with few different values (categories, steps) are met
-//! exactly. Where that would save nothing, every different row is solved.
+//! exactly. What moves all frequencies by one share, and what the instrument does to them, needs no eigenproblem and is
+//! applied afterwards. Where interpolation would save nothing, every different row is solved.
 
 use std::collections::HashMap;
 
@@ -52,6 +53,20 @@ impl Responses {
 
     /// The responses at each row of parameters and sizes; `None` where the structure has no frequencies.
     pub fn new(simulator: &Simulator, targets: &[Target], theta: &[Vec<f64>], sizes: &[Vec<f64>]) -> Option<Self> {
+        let after = Afterwards::new(simulator, targets);
+        if after.steps.is_empty() {
+            return Self::structural(simulator, targets, theta, sizes);
+        }
+        let left: Vec<Target> = after.structural.iter().map(|(target, _)| targets[*target].clone()).collect();
+        let pick = |row: &Vec<f64>| -> Vec<f64> {
+            let own = |(target, first): &(usize, usize)| row[*first..first + targets[*target].sizes()].to_vec();
+            after.structural.iter().flat_map(own).collect()
+        };
+        let inner = Self::structural(simulator, &left, theta, &sizes.iter().map(pick).collect::<Vec<_>>())?;
+        after.apply(&inner, targets, sizes)
+    }
+
+    fn structural(simulator: &Simulator, targets: &[Target], theta: &[Vec<f64>], sizes: &[Vec<f64>]) -> Option<Self> {
         let (modes, parameters) = (simulator.modes(), simulator.space().len());
         let count = sizes.first().map_or(0, Vec::len);
         let width = 1 + parameters + count;
@@ -138,6 +153,98 @@ impl Responses {
     }
 }
 
+/// Targets that act on frequencies which are known already.
+struct Afterwards {
+    /// (index of the target, column of its size).
+    steps: Vec<(usize, usize)>,
+    /// The others: (index of the target, column of its first size).
+    structural: Vec<(usize, usize)>,
+}
+
+impl Afterwards {
+    fn new(simulator: &Simulator, targets: &[Target]) -> Self {
+        let structure = simulator.structure();
+        // A share of all springs or masses passes through to the frequencies only where nothing is added beside them.
+        let added = |t: &Target| matches!(t, Target::AddedSpring(..) | Target::Oscillator(_));
+        let alone = !targets.iter().any(added);
+        let (mut steps, mut structural) = (Vec::new(), Vec::new());
+        let mut first = 0;
+        for (index, target) in targets.iter().enumerate() {
+            let later = match target {
+                Target::FrequencyScale(_) | Target::FrequencyOffset(_) => true,
+                Target::Springs(all) => alone && all.len() == structure.springs().len(),
+                Target::Masses(all) => alone && all.len() == structure.masses().len(),
+                _ => false,
+            };
+            if later { &mut steps } else { &mut structural }.push((index, first));
+            first += target.sizes();
+        }
+        Self { steps, structural }
+    }
+
+    /// ```text
+    ///  f' = f·Π s + Σ o;   s = 1 + g, √(1 + g) for all springs, 1/√(1 + g) for all masses
+    ///  ∂ln f'/∂· = (f·Π s/f') ∂ln f/∂·,   ∂ln f'/∂g = (f·Π s/f') ∂ln s/∂g,   ∂ln f'/∂o = 1/f'
+    /// ```
+    fn apply(&self, inner: &Responses, targets: &[Target], sizes: &[Vec<f64>]) -> Option<Responses> {
+        let (modes, parameters) = (inner.modes, inner.parameters);
+        let width = 1 + parameters + sizes.first().map_or(0, Vec::len);
+        let mut values = vec![0.0; sizes.len() * modes * width];
+        for (row, sizes) in sizes.iter().enumerate() {
+            for mode in 0..modes {
+                let line = &mut values[(row * modes + mode) * width..(row * modes + mode + 1) * width];
+                let mut scaled_hz = inner.log_frequency(row, mode).exp();
+                let mut offset_hz = 0.0;
+                for (target, column) in &self.steps {
+                    let size = sizes[*column];
+                    let here = |m: &Option<usize>| m.is_none_or(|m| m == mode);
+                    let factor = 1.0 + size;
+                    let (scale, slope) = match &targets[*target] {
+                        Target::Springs(_) => (factor.sqrt(), 0.5 / factor),
+                        Target::Masses(_) => (1.0 / factor.sqrt(), -0.5 / factor),
+                        Target::FrequencyScale(m) if here(m) => (factor, 1.0 / factor),
+                        Target::FrequencyOffset(m) if here(m) => {
+                            offset_hz += size;
+                            (1.0, 0.0)
+                        }
+                        _ => (1.0, 0.0),
+                    };
+                    if !(factor > 0.0 || matches!(targets[*target], Target::FrequencyOffset(_))) {
+                        return None;
+                    }
+                    scaled_hz *= scale;
+                    line[1 + parameters + column] = slope;
+                }
+                let f = scaled_hz + offset_hz;
+                if !(f.is_finite() && f > 0.0) {
+                    return None;
+                }
+                let share = scaled_hz / f;
+                line[0] = f.ln();
+                for (own, by) in line[1..].iter_mut().zip(inner.by_parameter(row, mode)) {
+                    *own = share * by;
+                }
+                for (target, column) in &self.steps {
+                    let own = &mut line[1 + parameters + column];
+                    *own = match &targets[*target] {
+                        Target::FrequencyOffset(m) => f64::from(u8::from(m.is_none_or(|m| m == mode))) / f,
+                        _ => share * *own,
+                    };
+                }
+                let mut place = 0;
+                for (target, first) in &self.structural {
+                    for which in 0..targets[*target].sizes() {
+                        line[1 + parameters + first + which] = share * inner.by_size(row, mode)[place];
+                        place += 1;
+                    }
+                }
+            }
+        }
+        let places = (0..sizes.len()).map(|row| row * modes * width).collect();
+        Some(Responses { modes, parameters, width, values, places })
+    }
+}
+
 /// A number that is interpolated over.
 struct Dimension {
     index: usize,
@@ -214,4 +321,50 @@ fn scale(size: usize, targets: &[Target]) -> f64 {
         first += target.sizes();
     }
     1.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::physics::Node;
+    use crate::simulator::definition::StructureDefinition;
+
+    /// Interpolated and afterwards-applied responses against one eigenproblem for each row.
+    #[test]
+    fn responses_of_many_rows_are_those_of_each_row() {
+        let text = include_str!("../../models/three-dof/structure.toml");
+        let simulator = Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap();
+        let all: Vec<usize> = (0..6).collect();
+        let sets: [Vec<Target>; 3] = [
+            vec![Target::Springs(vec![3]), Target::Springs(all), Target::FrequencyOffset(Some(1))],
+            vec![Target::Masses(vec![1]), Target::FrequencyScale(None), Target::FrequencyScale(Some(2))],
+            vec![
+                Target::AddedSpring(Node::Mass(0), Node::Mass(2)),
+                Target::Masses(vec![0, 1, 2]),
+                Target::FrequencyOffset(None),
+            ],
+        ];
+        for targets in sets {
+            let row = |i: usize| {
+                let (a, b, c) = ((0.37 * i as f64).sin(), (0.91 * i as f64).cos(), (1.7 * i as f64).sin());
+                vec![0.15 * a, 0.1 * b, 0.004 * c]
+            };
+            let rows: Vec<Vec<f64>> = (0..400).map(row).collect();
+            let theta = vec![vec![4.0, 5.0, 6.0]; 400];
+            let many = Responses::new(&simulator, &targets, &theta, &rows).unwrap();
+            for (place, sizes) in rows.iter().enumerate().step_by(7) {
+                let one = simulator.respond(&theta[place], 3, &targets, sizes).unwrap();
+                for (mode, f) in one.frequencies_hz.iter().enumerate() {
+                    // Noise is 1e-4 at the least: an error of 1e-6 says nothing about it.
+                    assert!((many.log_frequency(place, mode) - f.ln()).abs() < 1e-6, "{targets:?}");
+                    for k in 0..3 {
+                        let exact = one.by_parameter[(mode, k)] / f;
+                        assert!((many.by_parameter(place, mode)[k] - exact).abs() < 1e-5, "{targets:?}, parameter {k}");
+                        let exact = one.by_size[(mode, k)] / f;
+                        assert!((many.by_size(place, mode)[k] - exact).abs() < 1e-4, "{targets:?}, size {k}");
+                    }
+                }
+            }
+        }
+    }
 }

@@ -19,6 +19,9 @@ use crate::stats;
 /// Share of a direction that must be left when what is fitted already is taken out of it.
 const IDENTIFIABLE: f64 = 1e-5;
 
+/// Added to the unit diagonal of ⟨N, N⟩: directions without any information would make it singular.
+const RIDGE: f64 = 1e-10;
+
 /// What a candidate promises under one law.
 #[derive(Debug, Clone)]
 pub struct Promise {
@@ -44,7 +47,7 @@ pub struct Whitened {
     pub residual: Vec<DVector<f64>>,
     /// L⁻¹N √w, `[n]`.
     pub nuisance: Vec<DMatrix<f64>>,
-    /// ⟨N, N⟩ with a little of the prior, inverted.
+    /// ⟨N, N⟩ with what the priors know, inverted.
     inverse: DMatrix<f64>,
     factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
 }
@@ -85,13 +88,19 @@ impl Whitened {
         for n in &nuisance {
             square += n.transpose() * n;
         }
-        // Directions without any information would make it singular.
-        let ridge = 1e-10;
+        // What the priors know: an exact effect of the structure takes nothing out of a residual.
+        let known = study.prior_information(fit);
         for i in 0..size {
-            square[(i, i)] *= 1.0 + ridge;
-            square[(i, i)] += f64::MIN_POSITIVE.max(1e-12 * square.trace() / size as f64);
+            square[(i, i)] += known[i];
         }
-        let inverse = if size == 0 { square } else { square.try_inverse()? };
+        // Columns have different units: only their correlations say whether they are independent.
+        let scale: Vec<f64> =
+            (0..size).map(|i| if square[(i, i)] > 0.0 { 1.0 / square[(i, i)].sqrt() } else { 1.0 }).collect();
+        let shares = DMatrix::from_fn(size, size, |i, j| {
+            square[(i, j)] * scale[i] * scale[j] + if i == j { RIDGE } else { 0.0 }
+        });
+        let inverse = if size == 0 { shares } else { shares.try_inverse()? };
+        let inverse = DMatrix::from_fn(size, size, |i, j| inverse[(i, j)] * scale[i] * scale[j]);
         Some(Self { residual, nuisance, inverse, factors })
     }
 
@@ -165,12 +174,6 @@ impl Whitened {
 
     fn solve(&self, score: DVector<f64>, information: DMatrix<f64>, cross: &DMatrix<f64>) -> Score {
         let q = score.len();
-        // Each residual score is corrected too: at a maximum with priors ⟨N, e⟩ is not quite 0.
-        let mut along = DVector::zeros(self.inverse.nrows());
-        for (n, e) in self.nuisance.iter().zip(&self.residual) {
-            along += n.tr_mul(e);
-        }
-        let score = score - cross * &self.inverse * along;
         let left = &information - cross * &self.inverse * cross.transpose();
         // In units of what each direction had before: what is left of it is a share then.
         let scale: Vec<f64> = (0..q).map(|a| information[(a, a)].max(f64::MIN_POSITIVE).sqrt()).collect();

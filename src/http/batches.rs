@@ -13,10 +13,12 @@ use super::answer;
 use super::error::ApiError;
 use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery};
 use super::Shared;
-use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, Place, RawMeasurement};
+use crate::measurement::check::{
+    check_idempotency_key, check_measurements, check_source, Place, Problem, RawMeasurement,
+};
 use crate::measurement::csv::{self, CsvOptions, Times};
-use crate::measurement::{CovariateValue, MeasurementBatch};
-use crate::monitor::{Monitor, Watched};
+use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
+use crate::monitor::{MissingCovariate, Monitor, Watched};
 use crate::quantity::StructureId;
 
 /// The client's own key for a batch.
@@ -130,7 +132,24 @@ fn parse_batch(
     };
     let source = source.or(query.source).unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
     check_source(&source).map_err(|problem| ApiError::invalid_input(vec![problem]))?;
+    let places: Vec<Place> = raw.iter().map(|r| r.place).collect();
     let measurements = check_measurements(raw, &monitor.expectation(watched)).map_err(ApiError::invalid_input)?;
+    if monitor.settings().missing_covariate == MissingCovariate::Refuse {
+        let missing = |(m, place): (&ModalMeasurement, &Place)| {
+            let missing = watched.simulator.effect_sizes(&m.covariates).missing;
+            missing
+                .into_iter()
+                .map(|name| {
+                    let message = format!("{name} is missing: the simulation of this structure depends on it");
+                    Problem::new(place.of_covariate(&name), message)
+                })
+                .collect::<Vec<_>>()
+        };
+        let problems: Vec<Problem> = measurements.iter().zip(&places).flat_map(missing).take(20).collect();
+        if !problems.is_empty() {
+            return Err(ApiError::invalid_input(problems));
+        }
+    }
     Ok(MeasurementBatch { structure, source, idempotency_key, measurements })
 }
 

@@ -94,6 +94,11 @@ enum Field<'a> {
 }
 
 impl Place {
+    /// Where a covariate of this measurement stands, or should.
+    pub fn of_covariate(self, name: &str) -> String {
+        self.of(&Field::Covariate(name))
+    }
+
     fn of(self, field: &Field<'_>) -> String {
         match self {
             Self::Json { index } => {

@@ -304,7 +304,7 @@ fn admit(
     }
     for (name, rows) in beyond {
         let message = format!(
-            "{} measurements have a {name} beyond the range that its effect was learnt from: the effect is extrapolated",
+            "{} measurements have a {name} beyond the range that its effect was learnt from: they count as its end",
             rows.len()
         );
         findings.push(Finding::new(Code::Extrapolated, Effect::HoldAlarm, message).of(rows));

@@ -1,6 +1,6 @@
 //! Diagnoses as jobs: one at a time, away from the queue of assessments; and the switch to an extended structure.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 
 use serde::{Deserialize, Serialize};
@@ -25,6 +25,12 @@ use crate::store::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
 /// Training of an extension of a structure that had no baseline.
 const SAMPLES: usize = 200_000;
 const EPOCHS: usize = 80;
+
+/// Most measurements of one diagnosis.
+const MOST_MEASUREMENTS: usize = 200_000;
+
+/// Most jobs that run or wait.
+const MOST_JOBS: usize = 16;
 
 /// What is diagnosed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -83,6 +89,10 @@ impl Jobs {
         self.progress.lock().expect("no holder of this lock panics").remove(id);
     }
 
+    fn waiting(&self) -> usize {
+        self.progress.lock().expect("no holder of this lock panics").len()
+    }
+
     fn of(&self, id: &str) -> Option<String> {
         self.progress.lock().expect("no holder of this lock panics").get(id).cloned()
     }
@@ -96,14 +106,38 @@ impl Monitor {
     pub async fn start_diagnosis(
         &self,
         structure: &StructureId,
+        request: DiagnosisRequest,
+    ) -> Result<DiagnosisRecord, Error> {
+        let (monitor, structure) = (self.clone(), structure.clone());
+        let task = tokio::spawn(async move { monitor.start_diagnosis_here(&structure, request).await });
+        task.await.map_err(|_| Error::Panicked)?
+    }
+
+    async fn start_diagnosis_here(
+        &self,
+        structure: &StructureId,
         mut request: DiagnosisRequest,
     ) -> Result<DiagnosisRecord, Error> {
         let watched = self.structure(structure)?;
+        let stored = self.store.batch_sizes(structure).await?;
         if request.batches.is_empty() {
-            request.batches = self.store.batch_ids(structure).await?;
+            request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
         }
+        let sizes: BTreeMap<&String, usize> = stored.iter().map(|(id, count)| (id, *count)).collect();
+        let mut seen = BTreeSet::new();
+        let mut found = 0;
         for id in &request.batches {
-            self.stored(structure, id).await?;
+            if !seen.insert(id) {
+                return Err(Error::RepeatedBatch(id.clone()));
+            }
+            let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: crate::quantity::shown(id) };
+            found += sizes.get(id).ok_or_else(unknown)?;
+        }
+        if found > MOST_MEASUREMENTS {
+            return Err(Error::TooManyMeasurements { found, most: MOST_MEASUREMENTS });
+        }
+        if self.jobs.waiting() >= MOST_JOBS {
+            return Err(Error::QueueFull(super::compute::QueueFull));
         }
         let id = uuid::Uuid::now_v7().to_string();
         let json = serde_json::to_string(&request).expect("a request is plain data");
@@ -161,8 +195,14 @@ impl Monitor {
     ///
     /// # Errors
     /// [`Error::UnknownDiagnosis`], [`Error::NoExtension`] when it is not done, when the structure has changed since, or when
-    /// an extension runs or is done already.
+    /// an extension runs.
     pub async fn start_extension(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, Error> {
+        let (monitor, id) = (self.clone(), id.to_owned());
+        let task = tokio::spawn(async move { monitor.start_extension_here(&id, training).await });
+        task.await.map_err(|_| Error::Panicked)?
+    }
+
+    async fn start_extension_here(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, Error> {
         let (record, _) = self.diagnosis(id).await?;
         let watched = self.structure(&record.structure)?;
         let refuse = |why: &str| Error::NoExtension { diagnosis: id.to_owned(), reason: why.to_owned() };
@@ -173,7 +213,7 @@ impl Monitor {
             return Err(refuse("the structure is another version now: diagnose that one"));
         }
         if !self.store.begin_extension(id).await? {
-            return Err(refuse("it is being extended or was already"));
+            return Err(refuse("it is being extended"));
         }
         self.jobs.say(id, "waiting");
         let (monitor, job) = (self.clone(), id.to_owned());
@@ -205,9 +245,14 @@ impl Monitor {
         let epochs = training.epochs.or(before.map(|m| m.training.settings.epochs)).unwrap_or(EPOCHS);
         let said = |e: &dyn std::fmt::Display| e.to_string();
         let _turn = self.jobs.one_at_a_time.acquire().await.expect("the semaphore is never closed");
+        if self.structure(&record.structure).map_err(|e| said(&e))?.simulator.digest() != simulator.digest() {
+            return Err("the structure became another version while this waited: diagnose that one".to_owned());
+        }
         let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| said(&e))?;
         let structure = &record.structure;
         let measurements = self.store.measurements_of(structure, &request.batches).await.map_err(|e| said(&e))?;
+        let mut flow = FlowSettings::default();
+        flow.units = before.map_or(flow.units, |m| m.architecture.units);
         let (jobs, id, old) = (self.jobs.clone(), record.id.clone(), simulator.clone());
         let work = move || -> Result<_, String> {
             // The fits are not stored: the same data and seed give them again.
@@ -215,7 +260,6 @@ impl Monitor {
             let extended = extend(&old, &data, &outcome).map_err(|e| e.to_string())?;
             let simulator = Simulator::new(extended.definition.clone()).map_err(|e| e.to_string())?;
             let settings = TrainSettings { epochs, seed: request.seed, ..TrainSettings::default() };
-            let flow = FlowSettings::default();
             let trained = train(&simulator, samples, noise_range, &flow, &settings, |epoch| {
                 jobs.say(&id, format!("training: epoch {} of {epochs}", epoch.epoch));
             });
@@ -226,7 +270,15 @@ impl Monitor {
         let (extended, extended_simulator, trained) = done?;
         let accepted = training.accept_uncalibrated && self.usable(&trained.baseline).is_err();
         if !accepted {
-            self.usable(&trained.baseline)?;
+            let refused = |_| {
+                let failures = &trained.baseline.manifest().calibration.failures;
+                format!(
+                    "the new flow failed its calibration ({}): ask again with more samples or epochs, or with \
+                     \"accept_uncalibrated\": true to use it all the same, which every answer will say",
+                    failures.join("; ")
+                )
+            };
+            self.usable(&trained.baseline).map_err(refused)?;
         }
         let Trained { baseline, manifest_json, weights } = trained;
         let version = NewVersion {
@@ -243,7 +295,7 @@ impl Monitor {
         };
         let model_digest = baseline.digest().to_string();
         let undamaged_version =
-            self.switch(structure, version, extended_simulator.clone(), Ok(Arc::new(baseline))).await;
+            self.switch(structure, simulator.digest(), version, extended_simulator.clone(), Arc::new(baseline)).await;
         let result = ExtensionResult {
             added: extended.added,
             left_out: extended.left_out,
@@ -261,6 +313,13 @@ impl Monitor {
     /// # Errors
     /// [`Error::NoStepBack`] when the present version extends none.
     pub async fn step_back(&self, structure: &StructureId) -> Result<Digest, Error> {
+        let (monitor, structure) = (self.clone(), structure.clone());
+        // A task of its own: a client that goes away must not stop it half-way.
+        let task = tokio::spawn(async move { monitor.step_back_here(&structure).await });
+        task.await.map_err(|_| Error::Panicked)?
+    }
+
+    async fn step_back_here(&self, structure: &StructureId) -> Result<Digest, Error> {
         let watched = self.structure(structure)?;
         let none = || Error::NoStepBack(structure.clone());
         let present = watched.simulator.digest().clone();
@@ -268,7 +327,8 @@ impl Monitor {
         let parent = parent.ok_or_else(none)?;
         let (definition, grandparent) = self.store.structure_version(structure, &parent).await?.ok_or_else(none)?;
         let simulator = Simulator::new(StructureDefinition::parse_json(&definition)?)?;
-        let baseline = self.baseline_for(&simulator).await?;
+        let missing = |reason| Error::NoModel { structure: structure.clone(), reason };
+        let baseline = self.baseline_for(&simulator).await?.map_err(missing)?;
         let version = NewVersion {
             digest: parent.clone(),
             definition_json: definition,
@@ -276,34 +336,27 @@ impl Monitor {
             diagnosis: None,
             baseline: None,
         };
-        self.switch(structure, version, simulator, baseline).await?;
+        self.switch(structure, &present, version, simulator, baseline).await?;
         info!(structure.id = %structure, "Went back to version {parent} of {structure}");
         Ok(parent)
     }
 
-    /// Puts another version in use; the undamaged batches are taken as that under it too. Version of the undamaged state.
+    /// Puts another version in the place of `expected`; the undamaged batches are taken as that under it too. Version of the
+    /// undamaged state.
     async fn switch(
         &self,
         structure: &StructureId,
+        expected: &Digest,
         version: NewVersion,
         simulator: Simulator,
-        baseline: Result<Arc<Baseline>, String>,
+        baseline: Arc<Baseline>,
     ) -> Result<Option<u32>, Error> {
-        let undamaged = self.store.undamaged(structure).await?;
-        self.store.switch_version(structure, version, Timestamp::now()).await?;
-        let usable = baseline.is_ok();
-        let watched = Arc::new(Watched { simulator, baseline });
-        self.watched.write().expect("no holder of this lock panics").insert(structure.clone(), watched);
-        let mut taken = None;
-        if let Some(undamaged) = undamaged.filter(|_| usable) {
-            let threshold = undamaged.state.threshold_probability;
-            match self.declare_undamaged(structure, undamaged.batches, threshold).await {
-                Ok(record) => taken = Some(record.state.version),
-                Err(error) => {
-                    warn!(structure.id = %structure, %error, "The undamaged batches of {structure} make no undamaged state under its new version: {error}");
-                }
-            }
+        if !self.store.switch_version(structure, expected, version, Timestamp::now()).await? {
+            return Err(Error::VersionChanged(structure.clone()));
         }
+        let watched = Arc::new(Watched { simulator, baseline: Ok(baseline) });
+        self.watched.write().expect("no holder of this lock panics").insert(structure.clone(), watched);
+        let taken = self.retake_undamaged(structure).await;
         self.resume_later(structure.clone());
         Ok(taken)
     }

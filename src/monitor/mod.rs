@@ -43,10 +43,22 @@ pub struct MonitorSettings {
     pub max_measurements: usize,
     /// Digests of trained baselines that may be used although they did not pass their calibration; every answer says so.
     pub accept_uncalibrated: Vec<String>,
+    /// What becomes of measurements that lack a covariate which the simulation depends on.
+    pub missing_covariate: MissingCovariate,
     /// How alarms are raised.
     pub alarm: AlarmSettings,
     /// The queue in front of the processor.
     pub compute: ComputeSettings,
+}
+
+/// What becomes of measurements that lack a covariate which the simulation depends on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MissingCovariate {
+    /// They are taken at all values that the effect was learnt from, flagged, and raise no alarm.
+    Marginalise,
+    /// They are refused with 422.
+    Refuse,
 }
 
 impl Default for MonitorSettings {
@@ -56,6 +68,7 @@ impl Default for MonitorSettings {
             draws_for_population: 64,
             max_measurements: 5_000,
             accept_uncalibrated: Vec::new(),
+            missing_covariate: MissingCovariate::Marginalise,
             alarm: AlarmSettings::default(),
             compute: ComputeSettings::default(),
         }
@@ -130,6 +143,14 @@ pub enum Error {
         /// What was found in it.
         reason: String,
     },
+    /// More measurements than a diagnosis takes.
+    #[error("{found} measurements are more than the {most} that one diagnosis takes: name fewer batches")]
+    TooManyMeasurements {
+        /// Measurements asked for.
+        found: usize,
+        /// Most.
+        most: usize,
+    },
     /// No such diagnosis.
     #[error("there is no diagnosis {0}")]
     UnknownDiagnosis(String),
@@ -141,6 +162,9 @@ pub enum Error {
         /// Why.
         reason: String,
     },
+    /// Another version came in between.
+    #[error("structure {0} became another version in the meantime: nothing was changed")]
+    VersionChanged(StructureId),
     /// A structure whose present version extends none.
     #[error("structure {0} extends no earlier version: there is no step back")]
     NoStepBack(StructureId),
@@ -186,6 +210,8 @@ pub struct Monitor {
     reported: Arc<Mutex<BTreeSet<(StructureId, i64)>>>,
     compute: Compute,
     jobs: diagnoses::Jobs,
+    /// Held while unassessed batches of a structure are worked off.
+    resuming: Arc<Mutex<BTreeMap<StructureId, Arc<tokio::sync::Mutex<()>>>>>,
     settings: MonitorSettings,
 }
 
@@ -206,6 +232,7 @@ impl Monitor {
             reported: Arc::default(),
             compute: Compute::new(settings.compute),
             jobs: diagnoses::Jobs::default(),
+            resuming: Arc::default(),
             settings,
         };
         for (id, entry) in monitor.library.iter() {
@@ -347,6 +374,7 @@ impl Monitor {
     fn resume_later(&self, structure: StructureId) {
         let monitor = self.clone();
         tokio::spawn(async move {
+            monitor.retake_undamaged(&structure).await;
             if let Err(error) = monitor.resume_structure(&structure).await {
                 error!(structure.id = %structure, %error, "Could not go on with unassessed batches of {structure}: {error}");
             }
@@ -354,10 +382,11 @@ impl Monitor {
     }
 
     async fn resume_structure(&self, structure: &StructureId) -> Result<(), Error> {
-        let watched = self.structure(structure)?;
-        if watched.baseline.is_err() {
-            return Ok(());
-        }
+        // One at a time for each structure: two would assess the same batches.
+        let turn = Arc::clone(
+            self.resuming.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default(),
+        );
+        let _turn = turn.lock().await;
         loop {
             let pending = self.store.pending(structure, 100).await?;
             if pending.is_empty() {
@@ -365,8 +394,15 @@ impl Monitor {
             }
             for batch_id in pending {
                 let place = self.compute.wait().await;
+                // The version may change at any time: each batch is taken under the present one.
+                let watched = self.structure(structure)?;
+                if watched.baseline.is_err() {
+                    return Ok(());
+                }
                 let record = self.stored(structure, &batch_id).await?;
-                self.assess_stored(&watched, record, place).await?;
+                if record.state == BatchState::Received {
+                    self.assess_stored(&watched, record, place).await?;
+                }
             }
         }
     }
@@ -398,7 +434,11 @@ impl Monitor {
                     let seconds = started.elapsed().as_secs_f64();
                     metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                     report(&structure, &record.batch_id, &assessment, seconds);
-                    self.store.insert_assessment(&structure, &record.batch_id, &assessment, points).await?;
+                    if !self.store.insert_assessment(&structure, &record.batch_id, &assessment, points).await? {
+                        // The structure has another version by now: the batch waits for an assessment under that.
+                        self.resume_later(structure);
+                        return Ok(());
+                    }
                     self.report_episodes(&structure).await;
                     // A state declared while this was computed did not find the batch assessed, and so did not send it
                     // back: it is compared now.
@@ -414,7 +454,10 @@ impl Monitor {
             let id = &record.batch_id;
             metrics::counter!("modalwatch_assessments_failed_total").increment(1);
             warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
-            return Ok(self.store.mark_failed(&structure, id, &reason).await?);
+            if !self.store.mark_failed(&structure, id, watched.simulator.digest(), &reason).await? {
+                self.resume_later(structure);
+            }
+            return Ok(());
         }
     }
 

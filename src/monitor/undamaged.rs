@@ -1,8 +1,9 @@
 //! Declaring batches as the undamaged state.
 
-use tracing::{info, Instrument as _};
+use tracing::{info, warn, Instrument as _};
 
 use super::assess::{self, Draws, UndamagedError};
+use super::compute::Place;
 use super::{baseline_of, Error, Monitor};
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::UndamagedRecord;
@@ -22,8 +23,41 @@ impl Monitor {
         threshold_probability: f64,
     ) -> Result<UndamagedRecord, Error> {
         let (monitor, structure) = (self.clone(), structure.clone());
-        let declare = async move { monitor.declare_here(&structure, batch_ids, threshold_probability).await };
+        let place = self.compute.reserve()?;
+        let declare = async move { monitor.declare_here(&structure, batch_ids, threshold_probability, place).await };
         tokio::spawn(declare.in_current_span()).await.map_err(|_| Error::Panicked)?
+    }
+
+    /// Takes the batches of the newest undamaged state as undamaged under the baseline in use, where that state was taken with
+    /// another: after a switch of versions, also one that a stop of the service cut short. Batches that are unfit now are left
+    /// out. Version of the new state.
+    pub(super) async fn retake_undamaged(&self, structure: &StructureId) -> Option<u32> {
+        let failed = |error: &dyn std::fmt::Display| {
+            warn!(structure.id = %structure, "The undamaged batches of {structure} make no undamaged state under its present version: {error}");
+        };
+        let newest = self.store.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
+        let watched = self.structure(structure).ok()?;
+        let baseline = watched.baseline.as_ref().ok()?;
+        let version = self.store.structure_version(structure, watched.simulator.digest()).await.ok()?;
+        // A baseline that a person replaced is a person's business: only versions made here are followed.
+        if newest.model_digest == *baseline.digest() || version.is_none() {
+            return None;
+        }
+        let (mut batches, threshold) = (newest.batches, newest.state.threshold_probability);
+        loop {
+            let place = self.compute.wait().await;
+            match self.declare_here(structure, batches.clone(), threshold, place).await {
+                Ok(record) => return Some(record.state.version),
+                Err(Error::UnfitForUndamaged { batch, reason }) if batches.len() > 1 => {
+                    warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged state of {structure}: {reason}");
+                    batches.retain(|id| *id != batch);
+                }
+                Err(error) => {
+                    failed(&error);
+                    return None;
+                }
+            }
+        }
     }
 
     async fn declare_here(
@@ -31,6 +65,7 @@ impl Monitor {
         structure: &StructureId,
         batch_ids: Vec<String>,
         threshold_probability: f64,
+        place: Place,
     ) -> Result<UndamagedRecord, Error> {
         let watched = self.structure(structure)?;
         let baseline = baseline_of(structure, &watched)?;
@@ -43,7 +78,6 @@ impl Monitor {
         }
         let drawn: Vec<Draws> = records.iter().map(|record| self.draws(&baseline, record)).collect();
         let model_digest = baseline.digest().clone();
-        let place = self.compute.reserve()?;
         let taken = place
             .run(move || {
                 let batches: Vec<_> =

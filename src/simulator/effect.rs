@@ -90,7 +90,7 @@ impl Effect {
         self.sizes_at(input, psi.as_slice())
     }
 
-    /// The covariate of a measurement as the law takes it; whether it lies beyond what was learnt from.
+    /// The covariate of a measurement as the law takes it, within what it was learnt from; whether it lies beyond.
     fn input(&self, covariates: &BTreeMap<String, CovariateValue>) -> (Input, bool) {
         let Some(name) = &self.law.covariate else { return (Input::Number(0.0), false) };
         match covariates.get(name) {
@@ -101,7 +101,9 @@ impl Effect {
             Some(CovariateValue::Number(value)) => {
                 let (low, high) = (self.seen[0], self.seen[self.seen.len() - 1]);
                 let margin = BEYOND * (high - low);
-                (Input::Number(*value), !(low - margin..=high + margin).contains(value))
+                // A sensor that sends 9999 must not become a structure without stiffness.
+                let within = value.clamp(low - margin, high + margin);
+                (Input::Number(within), !(low - margin..=high + margin).contains(value))
             }
         }
     }

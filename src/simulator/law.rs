@@ -51,7 +51,7 @@ pub enum Input {
     Lagged(f64, f64),
     /// Index in the law's `levels`, or none of them.
     Level(Option<usize>),
-    /// Not known: the effect has no size then.
+    /// Not known: only the level acts then.
     Missing,
 }
 
@@ -106,6 +106,11 @@ impl Law {
     pub fn size(&self, input: Input, psi: &[f64], slopes: &mut [f64]) -> f64 {
         slopes.fill(0.0);
         let c = match input {
+            // The level needs no covariate.
+            Input::Missing if self.with_level && self.kind.has_level() => {
+                slopes[0] = 1.0;
+                return psi[0];
+            }
             Input::Missing => return 0.0,
             Input::Level(level) => {
                 let Some(level) = level else { return 0.0 };
@@ -153,7 +158,7 @@ impl Law {
                     let x = psi[1] * u;
                     // (eˣ − 1)/x and its derivative by x.
                     let (shape, slope) = if x.abs() < SERIES {
-                        (1.0 + x / 2.0, 0.5 + x / 3.0)
+                        (1.0 + x / 2.0 + x * x / 6.0, 0.5 + x / 3.0)
                     } else {
                         let shape = x.exp_m1() / x;
                         (shape, (x.exp() - shape) / x)

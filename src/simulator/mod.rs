@@ -344,6 +344,12 @@ impl Simulator {
         self.parts.checked.bindings.iter().filter_map(derived).collect()
     }
 
+    /// d ln k/dp of the first spring that a parameter sets: what a small change of the parameter is as a share of stiffness.
+    pub fn stiffness_share(&self, column: usize, p: f64) -> f64 {
+        let binding = self.parts.checked.bindings.iter().find(|b| b.parameter == column);
+        binding.map_or(1.0 / p, |b| b.slope(p) / b.stiffness(p))
+    }
+
     /// Springs that one parameter sets together, with the parameter's name.
     pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
         let group = |(column, parameter): (usize, &Parameter)| {

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use sqlx::FromRow;
 
 use super::alarm::{chart, NewChartPoint};
+use super::structure::is_present;
 use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
 use crate::assessment::Assessment;
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
@@ -64,7 +65,8 @@ pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version d
 
 impl Store {
     /// Stores an assessment with its points on the alarm charts and marks its batch as assessed; storing it again changes
-    /// nothing.
+    /// nothing. An assessment under a version of the structure that is no longer the present one is not stored: the batch
+    /// waits for one under that. Whether it was stored.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -74,10 +76,13 @@ impl Store {
         batch_id: &str,
         assessment: &Assessment,
         charted: Vec<NewChartPoint>,
-    ) -> Result<(), Error> {
+    ) -> Result<bool, Error> {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.write(move |connection| {
             Box::pin(async move {
+                if !is_present(connection, &structure, &a.structure_digest).await? {
+                    return Ok(false);
+                }
                 let version = a.undamaged_version.unwrap_or(0);
                 for table in ["quantity_assessment", "assessment"] {
                     let delete = format!(
@@ -158,7 +163,7 @@ impl Store {
                 .bind(&id)
                 .execute(&mut *connection)
                 .await?;
-                Ok(())
+                Ok(true)
             })
         })
         .await

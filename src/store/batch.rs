@@ -169,14 +169,24 @@ impl Store {
         Ok(rows.into_iter().map(|(id,)| id).collect())
     }
 
-    /// Marks a batch whose assessment failed.
+    /// Marks a batch whose assessment failed, unless the structure has another version by now. Whether it was marked.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn mark_failed(&self, structure: &StructureId, batch_id: &str, reason: &str) -> Result<(), Error> {
+    pub async fn mark_failed(
+        &self,
+        structure: &StructureId,
+        batch_id: &str,
+        version: &Digest,
+        reason: &str,
+    ) -> Result<bool, Error> {
         let (structure, id, reason) = (structure.to_string(), batch_id.to_owned(), reason.to_owned());
+        let version = version.clone();
         self.write(move |connection| {
             Box::pin(async move {
+                if !super::structure::is_present(connection, &structure, &version).await? {
+                    return Ok(false);
+                }
                 sqlx::query(
                     "update measurement_batch set state = 'failed', failure = ? where structure_id = ? and batch_id = ?",
                 )
@@ -185,7 +195,7 @@ impl Store {
                 .bind(id)
                 .execute(&mut *connection)
                 .await?;
-                Ok(())
+                Ok(true)
             })
         })
         .await

@@ -2,6 +2,7 @@
 
 use sqlx::FromRow;
 
+use super::structure::is_present;
 use super::{bad_row, timestamp, Error, Store};
 use crate::measurement::ModalMeasurement;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -189,7 +190,7 @@ impl Store {
         .await
     }
 
-    /// Marks the extension of a diagnosis as begun, unless one runs or is done; whether it was marked.
+    /// Marks the extension of a diagnosis as begun, unless one runs; whether it was marked.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -200,7 +201,7 @@ impl Store {
                 let updated = sqlx::query(
                     "update diagnosis set extension_state = 'running', extension_failure = null
                      where diagnosis_id = ? and state = 'done'
-                       and (extension_state is null or extension_state = 'failed')",
+                       and (extension_state is null or extension_state <> 'running')",
                 )
                 .bind(&id)
                 .execute(&mut *connection)
@@ -311,18 +312,19 @@ impl Store {
         Ok(row.and_then(|row| row.0))
     }
 
-    /// Ids of all batches of a structure, in the order of their measurements.
+    /// All batches of a structure with their numbers of measurements, in the order of their time.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn batch_ids(&self, structure: &StructureId) -> Result<Vec<String>, Error> {
-        let rows: Vec<(String,)> = sqlx::query_as(
-            "select batch_id from measurement_batch where structure_id = ? order by measured_from_us, batch_id",
+    pub async fn batch_sizes(&self, structure: &StructureId) -> Result<Vec<(String, usize)>, Error> {
+        let rows: Vec<(String, i64)> = sqlx::query_as(
+            "select batch_id, measurement_count from measurement_batch where structure_id = ?
+             order by measured_from_us, batch_id",
         )
         .bind(structure.as_str())
         .fetch_all(&self.reader)
         .await?;
-        Ok(rows.into_iter().map(|row| row.0).collect())
+        Ok(rows.into_iter().map(|(id, count)| (id, count.unsigned_abs() as usize)).collect())
     }
 
     /// Measurements of several batches.
@@ -342,21 +344,26 @@ impl Store {
         Ok(all)
     }
 
-    /// Puts another version of a structure in the place of the present one, which is kept; with it the baseline trained for
-    /// it. All batches go back to be assessed under it; what they were assessed as before stays beside it.
+    /// Puts another version of a structure in the place of the version `expected`, which is kept; with it the baseline trained
+    /// for it. All batches go back to be assessed under it; what they were assessed as before stays beside it. Nothing is done
+    /// where `expected` is not the present version; whether it was.
     ///
     /// # Errors
-    /// [`Error::UnknownStructure`], [`Error::Sqlite`].
+    /// [`Error::Sqlite`].
     pub async fn switch_version(
         &self,
         structure: &StructureId,
+        expected: &Digest,
         version: NewVersion,
         now: Timestamp,
-    ) -> Result<(), Error> {
-        let (structure, now) = (structure.to_string(), now.micros());
+    ) -> Result<bool, Error> {
+        let (structure, expected, now) = (structure.to_string(), expected.clone(), now.micros());
         self.write(move |connection| {
             Box::pin(async move {
-                let keep = sqlx::query(
+                if !is_present(connection, &structure, &expected).await? {
+                    return Ok(false);
+                }
+                sqlx::query(
                     "insert or ignore into structure_version
                      select structure_id, digest, definition, null, null, created_at_us from structure
                      where structure_id = ?",
@@ -364,13 +371,6 @@ impl Store {
                 .bind(&structure)
                 .execute(&mut *connection)
                 .await?;
-                let known: Option<(String,)> = sqlx::query_as("select digest from structure where structure_id = ?")
-                    .bind(&structure)
-                    .fetch_optional(&mut *connection)
-                    .await?;
-                if known.is_none() && keep.rows_affected() == 0 {
-                    return Err(Error::UnknownStructure(structure));
-                }
                 sqlx::query("insert or ignore into structure_version values (?, ?, ?, ?, ?, ?)")
                     .bind(&structure)
                     .bind(version.digest.as_str())
@@ -405,7 +405,7 @@ impl Store {
                     .bind(&structure)
                     .execute(&mut *connection)
                     .await?;
-                Ok(())
+                Ok(true)
             })
         })
         .await

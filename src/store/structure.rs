@@ -46,6 +46,21 @@ pub struct StructureSummary {
     pub last_measured_at: Option<Timestamp>,
 }
 
+/// Whether a definition is the present one of its structure.
+pub(super) async fn is_present(
+    connection: &mut sqlx::SqliteConnection,
+    structure: &str,
+    digest: &Digest,
+) -> Result<bool, Error> {
+    let (present,): (bool,) =
+        sqlx::query_as("select exists (select 1 from structure where structure_id = ? and digest = ?)")
+            .bind(structure)
+            .bind(digest.as_str())
+            .fetch_one(&mut *connection)
+            .await?;
+    Ok(present)
+}
+
 impl Store {
     /// Stores a definition, unless another definition of the same id has batches.
     ///

@@ -1,0 +1,201 @@
+//! Effects against structures that have them built in, their derivatives against finite differences, and their mistakes in
+//! a structure file.
+
+use std::collections::BTreeMap;
+
+use modalwatch::measurement::CovariateValue;
+use modalwatch::physics::effect::{respond, Target};
+use modalwatch::physics::{natural_frequencies_hz, Mass, Node, Spring, Structure};
+use modalwatch::simulator::definition::StructureDefinition;
+use modalwatch::simulator::Simulator;
+
+const SIZES: [f64; 4] = [0.07, -0.11, 0.03, 0.2];
+
+/// Each target once, for a structure of at least three masses.
+fn targets(structure: &Structure) -> Vec<(Target, Vec<f64>)> {
+    let all = (0..structure.springs().len()).collect();
+    vec![
+        (Target::Springs(vec![1]), vec![SIZES[0]]),
+        (Target::Springs(all), vec![SIZES[1]]),
+        (Target::Masses(vec![0]), vec![SIZES[0]]),
+        (Target::Masses(vec![0, 1, 2]), vec![SIZES[1]]),
+        (Target::FrequencyScale(None), vec![SIZES[2]]),
+        (Target::FrequencyScale(Some(1)), vec![SIZES[2]]),
+        (Target::FrequencyOffset(None), vec![SIZES[2]]),
+        (Target::FrequencyOffset(Some(0)), vec![-SIZES[2]]),
+        (Target::AddedSpring(Node::Mass(0), Node::Mass(2)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Ground, Node::Mass(1)), vec![SIZES[3]]),
+        (Target::Oscillator(1), vec![0.05, 0.2]),
+    ]
+}
+
+fn structure() -> Structure {
+    let mass = |i: usize, kg: f64| Mass { name: format!("m{i}"), kg };
+    let spring = |i: usize, from, to, n_per_m| Spring { name: format!("k{i}"), from, to, n_per_m };
+    let masses = vec![mass(0, 0.7), mass(1, 0.5), mass(2, 0.3)];
+    let springs = vec![
+        spring(0, Node::Ground, Node::Mass(0), 4.0),
+        spring(1, Node::Mass(0), Node::Mass(1), 5.0),
+        spring(2, Node::Mass(1), Node::Mass(2), 6.0),
+    ];
+    Structure::new(masses, springs).unwrap()
+}
+
+fn close(a: &[f64], b: &[f64]) -> bool {
+    a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a / b - 1.0).abs() < 1e-10)
+}
+
+#[test]
+fn an_effect_is_the_structure_with_it_built_in() {
+    let base = structure();
+    let built = |change: &dyn Fn(&mut Vec<Mass>, &mut Vec<Spring>)| {
+        let (mut masses, mut springs) = (base.masses().to_vec(), base.springs().to_vec());
+        change(&mut masses, &mut springs);
+        let count = 3;
+        natural_frequencies_hz(&Structure::new(masses, springs).unwrap(), count).unwrap()
+    };
+    let under = |target: Target, sizes: &[f64]| respond(&base, 3, &[target], sizes).unwrap().frequencies_hz;
+    assert!(close(&under(Target::Springs(vec![1]), &[0.1]), &built(&|_, s| s[1].n_per_m *= 1.1)));
+    assert!(close(
+        &under(Target::Masses(vec![0, 2]), &[-0.1]),
+        &built(&|m, _| {
+            m[0].kg *= 0.9;
+            m[2].kg *= 0.9;
+        })
+    ));
+    let tie = |from, to, n_per_m| Spring { name: "new".to_owned(), from, to, n_per_m };
+    assert!(close(
+        &under(Target::AddedSpring(Node::Mass(0), Node::Mass(2)), &[1.5]),
+        &built(&|_, s| s.push(tie(Node::Mass(0), Node::Mass(2), 1.5)))
+    ));
+    let (kg, hz) = (0.02, 0.4);
+    assert!(close(
+        &under(Target::Oscillator(1), &[kg, hz]),
+        &built(&|m, s| {
+            m.push(Mass { name: "body".to_owned(), kg });
+            s.push(tie(Node::Mass(1), Node::Mass(3), (std::f64::consts::TAU * hz).powi(2) * kg));
+        })
+    ));
+    let plain = natural_frequencies_hz(&base, 3).unwrap();
+    let scaled: Vec<f64> = plain.iter().map(|f| f * 1.01).collect();
+    assert!(close(&under(Target::FrequencyScale(None), &[0.01]), &scaled));
+    // All springs by 1 + g and all masses by 1/(1 + g) do the same.
+    let all = Target::Springs(vec![0, 1, 2]);
+    assert!(close(&under(all, &[0.2]), &under(Target::Masses(vec![0, 1, 2]), &[1.0 / 1.2 - 1.0])));
+    // A mode that was overlooked.
+    let order = respond(&base, 2, &[Target::ModeOrder(vec![0, 2])], &[]).unwrap().frequencies_hz;
+    assert!(close(&order, &[plain[0], plain[2]]));
+}
+
+#[test]
+fn slopes_of_effects_are_central_differences_alone_and_together() {
+    let base = structure();
+    let each = targets(&base);
+    let mut sets: Vec<Vec<(Target, Vec<f64>)>> = each.iter().cloned().map(|one| vec![one]).collect();
+    sets.push(each);
+    for set in sets {
+        let targets: Vec<Target> = set.iter().map(|t| t.0.clone()).collect();
+        let sizes: Vec<f64> = set.iter().flat_map(|t| t.1.clone()).collect();
+        let at = |sizes: &[f64]| respond(&base, 3, &targets, sizes).unwrap();
+        let here = at(&sizes);
+        for column in 0..sizes.len() {
+            let moved = |h: f64| {
+                let mut sizes = sizes.clone();
+                sizes[column] += h;
+                at(&sizes).frequencies_hz
+            };
+            let (up, down) = (moved(1e-6), moved(-1e-6));
+            for mode in 0..3 {
+                let difference = (up[mode] - down[mode]) / 2e-6;
+                let slope = here.by_size[(mode, column)];
+                assert!((slope - difference).abs() < 1e-8 * (1.0 + slope.abs()), "{targets:?}: {slope} {difference}");
+            }
+        }
+        for spring in 0..3 {
+            let moved = |h: f64| {
+                let stiffer = base.with_stiffness(&[(spring, base.springs()[spring].n_per_m + h)]).unwrap();
+                respond(&stiffer, 3, &targets, &sizes).unwrap().frequencies_hz
+            };
+            let (up, down) = (moved(1e-6), moved(-1e-6));
+            for mode in 0..3 {
+                let difference = (up[mode] - down[mode]) / 2e-6;
+                assert!((here.by_spring[(mode, spring)] - difference).abs() < 1e-8, "{targets:?}, spring {spring}");
+            }
+        }
+    }
+}
+
+const FILE: &str = r#"
+id = "small"
+modes = 2
+mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 2.0 }]
+spring = [
+    { name = "k1", from = "ground", to = "m1", n_per_m = 10.0 },
+    { name = "k2", from = "m1", to = "m2", n_per_m = 20.0 },
+]
+parameter = [{ name = "k1", prior = { uniform = [5.0, 15.0] }, sets = { spring = "k1" } }]
+covariate = [{ name = "temperature_c" }, { name = "operator", kind = "category" }]
+
+[[effect]]
+name = "warm"
+target = { springs = ["k2"] }
+law = "linear"
+covariate = "temperature_c"
+reference = 10.0
+numbers = { slope_per_unit = -0.01 }
+covariance = [[1e-8]]
+seen = [-10.0, 10.0, 30.0]
+"#;
+
+fn covariates(celsius: f64) -> BTreeMap<String, CovariateValue> {
+    BTreeMap::from([("temperature_c".to_owned(), CovariateValue::Number(celsius))])
+}
+
+#[test]
+fn an_effect_of_a_file_acts_by_the_measurements_covariate() {
+    let simulator = Simulator::new(StructureDefinition::parse_toml(FILE).unwrap()).unwrap();
+    let sizes = |celsius: f64| simulator.effect_sizes(&covariates(celsius));
+    assert!((sizes(20.0).values[0] + 0.1).abs() < 1e-12);
+    let softer = simulator.structure().with_stiffness(&[(1, 18.0)]).unwrap();
+    let warm = simulator.under(&sizes(20.0).values).frequencies_hz(&[10.0]).unwrap();
+    assert!(close(&warm, &natural_frequencies_hz(&softer, 2).unwrap()));
+    // A sensor that hangs at 9999 counts as the end of what was seen, a tenth beyond, and is told.
+    let broken = sizes(9999.0);
+    assert_eq!(broken.beyond, ["temperature_c"]);
+    assert!((broken.values[0] + 0.24).abs() < 1e-12);
+    // Without the covariate: the mean, and all values that were seen.
+    let blind = simulator.effect_sizes(&BTreeMap::new());
+    assert_eq!(blind.missing, ["temperature_c"]);
+    assert!(blind.values[0].abs() < 1e-12);
+    assert_eq!(simulator.possible_sizes(&BTreeMap::new()).len(), 3);
+    // The file comes back as it was.
+    let again = StructureDefinition::parse_json(&simulator.definition().canonical_json()).unwrap();
+    assert_eq!(again.digest(), *simulator.digest());
+}
+
+#[test]
+fn each_mistake_of_an_effect_is_named_with_its_place() {
+    let cases = [
+        ("springs = [\"k2\"]", "springs = [\"k9\"]", "/effect/0/target", "no spring \"k9\""),
+        ("springs = [\"k2\"]", "masses = []", "/effect/0/target", "at least one"),
+        ("springs = [\"k2\"]", "frequency_scale = 3", "/effect/0/target", "2 modes"),
+        ("springs = [\"k2\"]", "added_spring = [\"m1\", \"m1\"]", "/effect/0/target", "to itself"),
+        ("springs = [\"k2\"]", "mode_order = [1, 1]", "/effect/0/target", "2 different modes"),
+        ("covariate = \"temperature_c\"\n", "covariate = \"wind\"\n", "/effect/0/covariate", "no [[covariate]]"),
+        ("covariate = \"temperature_c\"\n", "covariate = \"operator\"\n", "/effect/0/covariate", "other kind"),
+        ("covariate = \"temperature_c\"\n", "", "/effect/0/covariate", "needs a covariate"),
+        ("law = \"linear\"", "law = \"lagged\"", "/effect/0/law", "history"),
+        ("law = \"linear\"", "law = \"constant\"", "/effect/0/covariate", "no covariate"),
+        ("{ slope_per_unit = -0.01 }", "{ slope = -0.01 }", "/effect/0/numbers", "slope_per_unit"),
+        ("{ slope_per_unit = -0.01 }", "{ slope_per_unit = nan }", "/effect/0/numbers", "finite"),
+        ("[[1e-8]]", "[[-1e-8]]", "/effect/0/covariance", "positive"),
+        ("[[1e-8]]", "[[1e-8, 0.0]]", "/effect/0/covariance", "1 rows of 1"),
+        ("seen = [-10.0, 10.0, 30.0]", "seen = [10.0]", "/effect/0/seen", "at least two"),
+        ("seen = [-10.0, 10.0, 30.0]", "", "/effect/0/seen", "at least two"),
+    ];
+    for (right, wrong, pointer, message) in cases {
+        let error = StructureDefinition::parse_toml(&FILE.replace(right, wrong)).unwrap_err();
+        let problem = &error.problems[0];
+        assert!(problem.pointer == pointer && problem.message.contains(message), "{wrong}: {error}");
+    }
+}
