@@ -16,6 +16,7 @@
 //!  store                                 the archive    the only room that speaks SQL
 //!  assessment                            the result of one batch
 //!  alarm                                 charts, limits, states: when to wake somebody
+//!  discrepancy                           the study: what the simulation gets wrong, and what would mend it
 //!  damage                                judgement on the population behind a batch
 //!  trust                                 whether an answer may be believed
 //!  hierarchy                             the population behind posterior samples
@@ -30,7 +31,7 @@
 //! # Reading order
 //!
 //! [`quantity`], [`parameter`], [`measurement`], then [`physics`] and [`simulator`], then [`flow`] and [`baseline`], then
-//! [`damage`], [`monitor`], [`store`], [`http`].
+//! [`damage`], [`monitor`], [`store`], [`http`]; [`discrepancy`] needs only the first five.
 //!
 //! # Words
 //!
@@ -48,6 +49,9 @@
 //! | probability of damage | P(x < δ) of the population behind a batch; of the pool, its share below δ |
 //! | exceedance | a probability of damage above that of the undamaged state, 5 % |
 //! | chart, episode | shift of a batch from the undamaged state in standard errors; an alarm from its first batch to its end |
+//! | effect | target × law × covariate: what acts on a structure beside its parameters |
+//! | cause, verdict | an effect that the simulation lacks; what a diagnosis says of the causes |
+//! | extension | a new version of a structure with the causes as effects, and its own baseline |
 //! | outside | a measurement that no parameters of the prior give |
 //!
 //! # References
@@ -66,6 +70,9 @@
 //! - S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
 //!   arXiv:1804.06788; P. Lemos et al. (2023), Sampling-based accuracy testing of posterior estimators for general
 //!   inference, ICML. Ranks and TARP.
+//! - C. R. Rao (1948), Large sample tests of statistical hypotheses, Proc. Cambridge Phil. Soc. 44, 50–57. Score tests.
+//!   R. E. Kass, A. E. Raftery (1995), Bayes factors, JASA 90, 773–795. Laplace's evidence. K. L. Lange, R. J. A. Little,
+//!   J. M. G. Taylor (1989), Robust statistical modeling using the t distribution, JASA 84, 881–896.
 //! - R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
 //!   doi:10.1080/00031305.1996.10473566.
 

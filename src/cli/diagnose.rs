@@ -344,17 +344,10 @@ fn untimed(row: &RawMeasurement) -> bool {
 /// A time without an offset is UTC; one that was there already moves on by microseconds.
 fn settle_time(row: &mut RawMeasurement, times: &mut BTreeSet<i64>) -> (bool, bool) {
     let Some(text) = &row.measured_at else { return (false, false) };
-    let (time, local) = match Timestamp::parse(text) {
-        Ok(time) => (time, false),
-        Err(_) => match Timestamp::parse(&format!("{}Z", text.replace(' ', "T"))) {
-            Ok(time) => (time, true),
-            // The check names the mistake with its line.
-            Err(_) => {
-                row.measured_at = Some(text.trim().to_owned());
-                return (false, false);
-            }
-        },
-    };
+    let exact = Timestamp::parse(text).map(|time| (time, false));
+    let local = |_| Timestamp::parse(&format!("{}Z", text.trim().replace(' ', "T"))).map(|time| (time, true));
+    // The check names a mistake with its line.
+    let Ok((time, local)) = exact.or_else(local) else { return (false, false) };
     let mut micros = time.micros();
     while !times.insert(micros) {
         micros += 1;

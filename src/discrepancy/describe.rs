@@ -238,7 +238,7 @@ pub fn cause(
             interval90: [at, at],
         });
     }
-    let sentence = sentence(&name, effect, psi, &covariance, (value, std), factor, &shown_unit, data.time_unit);
+    let sentence = sentence(&name, effect, psi, &covariance, (value, std), (factor, &shown_unit, data.time_unit));
     Cause {
         sentence,
         target: name,
@@ -256,9 +256,7 @@ fn sentence(
     psi: &[f64],
     covariance: &nalgebra::DMatrix<f64>,
     (value, std): (f64, f64),
-    factor: f64,
-    unit: &str,
-    time_unit: &str,
+    (factor, unit, time_unit): (f64, &str, &str),
 ) -> String {
     let what = phrase(name);
     let plus_minus = |value: f64, std: f64, unit: &str| {
@@ -291,19 +289,18 @@ fn sentence(
             plus_minus(value, std, unit),
             effect.law.reference
         ),
-        LawKind::Category => match &name.level {
-            Some(level) => {
-                format!("{what} {} {} where {covariate} is {level}", changes(value), plus_minus(value, std, unit))
+        LawKind::Category => {
+            if let Some(level) = &name.level {
+                let size = plus_minus(value, std, unit);
+                return format!("{what} {} {size} where {covariate} is {level}", changes(value));
             }
-            None => {
-                let each = |(i, level): (usize, &String)| {
-                    let std = covariance[(i, i)].max(0.0).sqrt();
-                    format!("{level}: {} {}", if psi[i] < 0.0 { "−" } else { "+" }, plus_minus(psi[i], std, unit))
-                };
-                let each: Vec<String> = effect.law.levels.iter().enumerate().map(each).collect();
-                format!("{what} differs with {covariate} ({})", each.join(", "))
-            }
-        },
+            let each = |(i, level): (usize, &String)| {
+                let std = covariance[(i, i)].max(0.0).sqrt();
+                format!("{level}: {} {}", if psi[i] < 0.0 { "−" } else { "+" }, plus_minus(psi[i], std, unit))
+            };
+            let each: Vec<String> = effect.law.levels.iter().enumerate().map(each).collect();
+            format!("{what} differs with {covariate} ({})", each.join(", "))
+        }
         LawKind::Linear | LawKind::Lagged => {
             let place = slope().unwrap_or_default();
             let (slope, slope_std) = (psi[place], covariance[(place, place)].max(0.0).sqrt());

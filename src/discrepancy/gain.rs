@@ -105,12 +105,10 @@ pub fn gain(
             let rms = |errors: &[Vec<f64>]| {
                 let (mut sum, mut count) = (0.0, 0.0);
                 for k in &chosen {
-                    for place in (k * n).div_ceil(BLOCKS)..((k + 1) * n).div_ceil(BLOCKS).min(n) {
-                        let error = errors[place][mode];
-                        if error.is_finite() {
-                            sum += error * error;
-                            count += 1.0;
-                        }
+                    let places = (k * n).div_ceil(BLOCKS)..((k + 1) * n).div_ceil(BLOCKS).min(n);
+                    for error in errors[places].iter().map(|e| e[mode]).filter(|e| e.is_finite()) {
+                        sum += error * error;
+                        count += 1.0;
                     }
                 }
                 100.0 * (sum / f64::max(count, 1.0)).sqrt()

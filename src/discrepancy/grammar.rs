@@ -235,8 +235,7 @@ impl Candidate {
         if name == TIME {
             return vec![LawKind::Step, LawKind::Linear];
         }
-        use LawKind::{Bilinear, Exponential, Lagged, Linear, Quadratic};
-        vec![Linear, Quadratic, Bilinear, Exponential, Lagged]
+        vec![LawKind::Linear, LawKind::Quadratic, LawKind::Bilinear, LawKind::Exponential, LawKind::Lagged]
     }
 
     /// Categories that get a number of their own; the most frequent one is what the others are compared with.
@@ -290,7 +289,6 @@ impl Candidate {
         let free = (f64::NEG_INFINITY, f64::INFINITY);
         let number = |name: String| {
             let (prior_mean, prior_std, bounds) = match name.as_str() {
-                "level" => (0.0, size, free),
                 "slope_per_unit" => (0.0, size / (2.0 * width), free),
                 "slope_below_per_unit" | "slope_above_per_unit" => (0.0, size / width, free),
                 "curvature_per_unit2" => (0.0, size / (2.0 * width).powi(2), free),
@@ -319,7 +317,7 @@ impl Candidate {
     pub fn typical_size(&self, simulator: &Simulator) -> f64 {
         let structure = simulator.structure();
         match &self.target {
-            Target::Springs(_) | Target::Masses(_) => 0.1,
+            Target::Springs(_) | Target::Masses(_) | Target::SettingScale(_) => 0.1,
             Target::FrequencyScale(_) => 0.01,
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
             Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],
@@ -327,7 +325,6 @@ impl Candidate {
                 let p = &simulator.space().as_slice()[*column];
                 0.1 * (p.upper - p.lower)
             }
-            Target::SettingScale(_) => 0.1,
             Target::AddedSpring(..) => {
                 let stiffness: Vec<f64> = structure.springs().iter().map(|s| s.n_per_m).collect();
                 0.15 * stats::mean(&stiffness)

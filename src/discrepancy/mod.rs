@@ -1,7 +1,7 @@
 //! What the simulation gets wrong: show it, name the cause, measure what naming it gains.
 //!
 //! [`data`] holds the rows, [`grammar`] what could be wrong, [`model`] the likelihood, [`screen`] quick tests of every
-//! candidate, [`select`] the choice among them, [`misfit`] what is odd before and after, [`gain`] what the extension is
+//! candidate, [`mod@select`] the choice among them, [`misfit`] what is odd before and after, [`gain`] what the extension is
 //! worth on rows that nothing has seen, [`describe`] the words, [`report`] the page, [`extend`] the structure with the causes.
 
 pub mod data;
@@ -26,7 +26,7 @@ use gain::Gain;
 use grammar::{candidates, spread, Class};
 use misfit::{misfits, remainder, Misfit, Remainder};
 use model::{Effect, Fit, Study};
-use select::{select, Ranked};
+use select::{select, Ranked, Selection};
 
 /// Fewest rows that a verdict can stand on.
 const FEWEST_ROWS: usize = 30;
@@ -259,39 +259,7 @@ fn run(
     let limit = if found { REMAINDER_WITH_CAUSES } else { REMAINDER };
     let left = left.filter(|r| r.p_value < limit);
 
-    let mut causes = Vec::new();
-    let mut alternatives = Vec::new();
-    let mut ambiguous = false;
-    for (index, slot) in selection.slots.iter().enumerate() {
-        let best = &slot.ranked[0];
-        let described = |r: &Ranked| {
-            // The chosen one is described by the final fit, the others by their own.
-            let (fit, place) = if std::ptr::eq(r, best) {
-                (&selection.fit, known.len() + index)
-            } else {
-                (&r.fit, r.fit.effects.len() - 1)
-            };
-            describe::cause(simulator, data, r, fit, place, share)
-        };
-        let unsure = best.probability <= SURE;
-        ambiguous |= unsure;
-        let named = if unsure { named(&slot.ranked) } else { vec![0] };
-        causes.push(described(best));
-        if selection.slots.len() == 1 {
-            causes.extend(named.iter().skip(1).map(|place| described(&slot.ranked[*place])));
-        }
-        for (place, other) in slot.ranked.iter().enumerate().skip(1) {
-            let near = place <= MOST_NEARLY && other.log_odds > best.log_odds - NEARLY_NATS;
-            if near || named.contains(&place) || place <= MOST_ALTERNATIVES {
-                alternatives.push(Alternative {
-                    cause: described(other),
-                    instead_of: index + 1,
-                    log_evidence_difference: other.log_odds - best.log_odds,
-                    told_apart_by: told_apart(&bare, data, best, other),
-                });
-            }
-        }
-    }
+    let Named { causes, alternatives, ambiguous, maybe_damage } = name(simulator, data, &selection, known.len());
     let verdict = match selection.slots.len() {
         _ if left.is_some() => Verdict::NoneOfThese,
         0 => Verdict::NothingFound,
@@ -299,16 +267,6 @@ fn run(
         1 => Verdict::Cause,
         _ => Verdict::Several,
     };
-    let unsure: Vec<bool> = selection.slots.iter().map(|s| s.ranked[0].probability <= SURE).collect();
-    let maybe_damage: Vec<bool> = selection
-        .slots
-        .iter()
-        .zip(&unsure)
-        .map(|(slot, unsure)| {
-            let damage = |p: &usize| slot.ranked[*p].candidate.class == Class::PossibleDamage;
-            *unsure && named(&slot.ranked).iter().any(damage)
-        })
-        .collect();
     progress(Step::Measuring);
     let gain = if found && holdout.len() >= 2 {
         gain::gain(&study, &training, &holdout, &selection.base, &selection.fit, seed)
@@ -354,6 +312,50 @@ fn run(
         holdout,
         training,
     })
+}
+
+/// The slots of a selection in words.
+struct Named {
+    causes: Vec<Cause>,
+    alternatives: Vec<Alternative>,
+    ambiguous: bool,
+    maybe_damage: Vec<bool>,
+}
+
+/// Names the causes and their alternatives; the structure has `known` effects already.
+fn name(simulator: &Simulator, data: &Data, selection: &Selection, known: usize) -> Named {
+    let bare = simulator.without_effects();
+    let mut all = Named { causes: Vec::new(), alternatives: Vec::new(), ambiguous: false, maybe_damage: Vec::new() };
+    for (index, slot) in selection.slots.iter().enumerate() {
+        let best = &slot.ranked[0];
+        let described = |r: &Ranked| {
+            // The chosen one is described by the final fit, the others by their own.
+            let (fit, place) =
+                if std::ptr::eq(r, best) { (&selection.fit, known + index) } else { (&r.fit, r.fit.effects.len() - 1) };
+            describe::cause(simulator, data, r, fit, place, selection.independent_share)
+        };
+        let unsure = best.probability <= SURE;
+        all.ambiguous |= unsure;
+        let named = if unsure { named(&slot.ranked) } else { vec![0] };
+        let damage = |place: &usize| slot.ranked[*place].candidate.class == Class::PossibleDamage;
+        all.maybe_damage.push(unsure && named.iter().any(damage));
+        all.causes.push(described(best));
+        if selection.slots.len() == 1 {
+            all.causes.extend(named.iter().skip(1).map(|place| described(&slot.ranked[*place])));
+        }
+        for (place, other) in slot.ranked.iter().enumerate().skip(1) {
+            let near = place <= MOST_NEARLY && other.log_odds > best.log_odds - NEARLY_NATS;
+            if near || named.contains(&place) || place <= MOST_ALTERNATIVES {
+                all.alternatives.push(Alternative {
+                    cause: described(other),
+                    instead_of: index + 1,
+                    log_evidence_difference: other.log_odds - best.log_odds,
+                    told_apart_by: told_apart(&bare, data, best, other),
+                });
+            }
+        }
+    }
+    all
 }
 
 /// Places of the candidates that an unsure answer names: the best of each set of exact equivalents first, until they cover
@@ -616,20 +618,21 @@ fn summary(d: &Diagnosis) -> String {
             let (before, after) = (rms.before[mode], rms.after[mode]);
             let moved = if after < before { "falls" } else { "rises" };
             let alarms = &gain.false_alarms_per_1000;
-            text.push_str(&format!(
+            let gained = format!(
                 " With it, the prediction error of mode {} on {} rows held out {moved} from {before:.2} % to {after:.2} %, and \
                  false alarms go from {:.0} to {:.0} per 1000 healthy batches.",
                 mode + 1,
                 gain.holdout_rows,
                 alarms.before,
                 alarms.after
-            ));
+            );
+            text.push_str(&gained);
         }
     }
     text
 }
 
 /// Whether a covariate is time.
-pub fn is_time(name: &str) -> bool {
+fn is_time(name: &str) -> bool {
     name == TIME
 }

@@ -237,7 +237,7 @@ impl<'a> Study<'a> {
                 break;
             }
         }
-        problem.fit_at(here, tails)
+        problem.fit_at(&here, tails)
     }
 
     /// Each row of `rows` under a fit.
@@ -254,7 +254,9 @@ impl<'a> Study<'a> {
         let (mut sizes, _) = problem.all_sizes(&fit.psi);
         let further: usize = targets.iter().map(Target::sizes).sum();
         let first = sizes.first().map_or(0, Vec::len);
-        sizes.iter_mut().for_each(|sizes| sizes.extend(std::iter::repeat_n(0.0, further)));
+        for sizes in &mut sizes {
+            sizes.extend(std::iter::repeat_n(0.0, further));
+        }
         let responses = problem.responses(&fit.mean, &sizes, targets)?;
         let slopes = |place: usize| {
             DMatrix::from_fn(responses.modes(), further, |mode, column| responses.by_size(place, mode)[first + column])
@@ -552,34 +554,8 @@ impl Problem<'_> {
                 }
                 line[1 + means + free.len() + mode] = noise[mode] * data.noise[row][mode];
             }
-            // V = G Gᵀ, and its factor.
-            factor.clear();
-            factor.resize(p * p, 0.0);
             let root = 1 + means;
-            let mut half_log_det = 0.0;
-            for i in 0..p {
-                for j in 0..=i {
-                    let (a, b) = (&work[i * width + root..(i + 1) * width], &work[j * width + root..(j + 1) * width]);
-                    let mut sum: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
-                    for k in 0..j {
-                        sum -= factor[i * p + k] * factor[j * p + k];
-                    }
-                    factor[i * p + j] = if i == j { sum.max(1e-300).sqrt() } else { sum / factor[j * p + j] };
-                }
-                half_log_det += factor[i * p + i].ln();
-            }
-            for i in 0..p {
-                let (done, rest) = work.split_at_mut(i * width);
-                let line = &mut rest[..width];
-                for j in 0..i {
-                    let l = factor[i * p + j];
-                    for (value, earlier) in line.iter_mut().zip(&done[j * width..(j + 1) * width]) {
-                        *value -= l * earlier;
-                    }
-                }
-                let inverse = 1.0 / factor[i * p + i];
-                line.iter_mut().for_each(|v| *v *= inverse);
-            }
+            let half_log_det = whiten(&mut work, &mut factor, p, width, root);
             let distance: f64 = (0..p).map(|i| work[i * width].powi(2)).sum();
             let weight = weight(distance, p, tails);
             let (flat, deep) = if tails.is_finite() {
@@ -590,40 +566,9 @@ impl Problem<'_> {
             };
             log_likelihood += log_density(distance, p, half_log_det, tails);
             distances.push((distance, p, half_log_det));
-            for i in 0..p {
-                let line = &work[i * width..(i + 1) * width];
-                for a in 0..means {
-                    let slope = line[1 + a];
-                    if slope != 0.0 {
-                        gradient[a] += weight * slope * line[0];
-                        for b in 0..=a {
-                            information[(a, b)] += flat * slope * line[1 + b];
-                        }
-                    }
-                }
-            }
-            products.fill(0.0);
-            for u in 0..variances {
-                let mut along = 0.0;
-                for i in 0..p {
-                    let line = &work[i * width..(i + 1) * width];
-                    let slope = line[root + u];
-                    if slope != 0.0 {
-                        along += slope * line[0];
-                        for v in 0..=u {
-                            products[u * variances + v] += slope * line[root + v];
-                        }
-                    }
-                }
-                gradient[means + u] += weight * along * along - products[u * variances + u];
-            }
-            for u in 0..variances {
-                for v in 0..=u {
-                    let shared = products[u * variances + v];
-                    let own = products[u * variances + u] * products[v * variances + v];
-                    information[(means + u, means + v)] += flat * 2.0 * shared * shared - deep * own;
-                }
-            }
+            let row = WhiteRow { values: &work, width, means, variances, weight, flat, deep };
+            row.add_means(&mut gradient, &mut information);
+            row.add_variances(&mut products, &mut gradient, &mut information);
         }
         // From derivatives by ln σ and ln s to prior units.
         for u in 0..variances {
@@ -652,7 +597,7 @@ impl Problem<'_> {
         })
     }
 
-    fn fit_at(&self, point: Point, tails: f64) -> Option<Fit> {
+    fn fit_at(&self, point: &Point, tails: f64) -> Option<Fit> {
         let (mean, spread, noise_factor, psi) = self.unpack(&point.eta);
         let factor = point.information.clone().cholesky()?;
         // Prior densities are standard normal in these units: their 2π cancels that of Laplace's integral.
@@ -685,6 +630,96 @@ impl Fit {
         let size = self.psi[index].len();
         self.covariance.view((first, first), (size, size)).into_owned()
     }
+}
+
+/// One whitened row: by lines of the modes present, residual, slopes of the mean, square root of V.
+struct WhiteRow<'a> {
+    values: &'a [f64],
+    width: usize,
+    means: usize,
+    variances: usize,
+    /// Of the residual, in the gradient.
+    weight: f64,
+    /// Of the information: (ν + p)/(ν + p + 2) and 2/(ν + p + 2), 1 and 0 for a normal distribution.
+    flat: f64,
+    deep: f64,
+}
+
+impl WhiteRow<'_> {
+    /// Adds w Dᵀ V⁻¹ e and Dᵀ V⁻¹ D.
+    fn add_means(&self, gradient: &mut DVector<f64>, information: &mut DMatrix<f64>) {
+        for line in self.values.chunks_exact(self.width) {
+            for a in 0..self.means {
+                let slope = line[1 + a];
+                if slope != 0.0 {
+                    gradient[a] += self.weight * slope * line[0];
+                    for b in 0..=a {
+                        information[(a, b)] += self.flat * slope * line[1 + b];
+                    }
+                }
+            }
+        }
+    }
+
+    /// Adds the score and information of the logarithms of the columns of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G,
+    /// w h_u² − B_uu and 2 B_uv², less what the tails take.
+    fn add_variances(&self, products: &mut [f64], gradient: &mut DVector<f64>, information: &mut DMatrix<f64>) {
+        let (root, count) = (1 + self.means, self.variances);
+        products.fill(0.0);
+        for u in 0..count {
+            let mut along = 0.0;
+            for line in self.values.chunks_exact(self.width) {
+                let slope = line[root + u];
+                if slope != 0.0 {
+                    along += slope * line[0];
+                    for v in 0..=u {
+                        products[u * count + v] += slope * line[root + v];
+                    }
+                }
+            }
+            gradient[self.means + u] += self.weight * along * along - products[u * count + u];
+        }
+        for u in 0..count {
+            for v in 0..=u {
+                let shared = products[u * count + v];
+                let own = products[u * count + u] * products[v * count + v];
+                information[(self.means + u, self.means + v)] += self.flat * 2.0 * shared * shared - self.deep * own;
+            }
+        }
+    }
+}
+
+/// Factors V = G Gᵀ = L Lᵀ, G the columns of `work` from `root` on, and multiplies every column by L⁻¹; ½ ln|V|.
+fn whiten(work: &mut [f64], factor: &mut Vec<f64>, p: usize, width: usize, root: usize) -> f64 {
+    factor.clear();
+    factor.resize(p * p, 0.0);
+    let mut half_log_det = 0.0;
+    for i in 0..p {
+        for j in 0..=i {
+            let (a, b) = (&work[i * width + root..(i + 1) * width], &work[j * width + root..(j + 1) * width]);
+            let mut sum: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
+            for k in 0..j {
+                sum -= factor[i * p + k] * factor[j * p + k];
+            }
+            factor[i * p + j] = if i == j { sum.max(1e-300).sqrt() } else { sum / factor[j * p + j] };
+        }
+        half_log_det += factor[i * p + i].ln();
+    }
+    for i in 0..p {
+        let (done, rest) = work.split_at_mut(i * width);
+        let line = &mut rest[..width];
+        for j in 0..i {
+            let l = factor[i * p + j];
+            for (value, earlier) in line.iter_mut().zip(&done[j * width..(j + 1) * width]) {
+                *value -= l * earlier;
+            }
+        }
+        let inverse = 1.0 / factor[i * p + i];
+        for value in line.iter_mut() {
+            *value *= inverse;
+        }
+    }
+    half_log_det
 }
 
 /// Share of a normal row's weight that a row at `distance` has.

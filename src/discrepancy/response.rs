@@ -285,7 +285,7 @@ impl Dimension {
         // Chebyshev nodes of the first kind, whose barycentric weights are known.
         let angle = |i: usize| std::f64::consts::PI * (2 * i + 1) as f64 / (2 * count) as f64;
         let nodes = (0..count).map(|i| f64::midpoint(low, high) - 0.5 * (high - low) * angle(i).cos()).collect();
-        let sign = |i: usize| if i % 2 == 0 { 1.0 } else { -1.0 };
+        let sign = |i: usize| if i.is_multiple_of(2) { 1.0 } else { -1.0 };
         let barycentric = (0..count).map(|i| sign(i) * angle(i).sin()).collect();
         Some(Self { index, nodes, barycentric })
     }
@@ -303,7 +303,9 @@ impl Dimension {
             sum += weight;
             weights.push(weight);
         }
-        weights.iter_mut().for_each(|w| *w /= sum);
+        for weight in &mut weights {
+            *weight /= sum;
+        }
         weights
     }
 }

@@ -123,13 +123,13 @@ impl Whitened {
         let mut score = DVector::zeros(q);
         let mut information = DMatrix::zeros(q, q);
         let mut cross = DMatrix::zeros(q, self.inverse.nrows());
-        for place in 0..sums.along.len() {
+        for (place, along) in sums.along.iter().enumerate() {
             for a in 0..q {
                 let value = basis[a][place];
                 if value == 0.0 {
                     continue;
                 }
-                score[a] += value * sums.along[place];
+                score[a] += value * along;
                 for b in 0..=a {
                     information[(a, b)] += value * basis[b][place] * sums.square[place];
                 }
@@ -143,7 +143,7 @@ impl Whitened {
                 information[(a, b)] = information[(b, a)];
             }
         }
-        self.solve(score, information, &cross)
+        self.solve(&score, &information, &cross)
     }
 
     /// The score of an arbitrary response of each mode to one function of the row, `[n]`.
@@ -169,12 +169,12 @@ impl Whitened {
                 }
             }
         }
-        self.solve(score, information, &cross)
+        self.solve(&score, &information, &cross)
     }
 
-    fn solve(&self, score: DVector<f64>, information: DMatrix<f64>, cross: &DMatrix<f64>) -> Score {
+    fn solve(&self, score: &DVector<f64>, information: &DMatrix<f64>, cross: &DMatrix<f64>) -> Score {
         let q = score.len();
-        let left = &information - cross * &self.inverse * cross.transpose();
+        let left = information - cross * &self.inverse * cross.transpose();
         // In units of what each direction had before: what is left of it is a share then.
         let scale: Vec<f64> = (0..q).map(|a| information[(a, a)].max(f64::MIN_POSITIVE).sqrt()).collect();
         let shares = DMatrix::from_fn(q, q, |a, b| left[(a, b)] / (scale[a] * scale[b]));

@@ -139,13 +139,13 @@ fn look_again(
         fit = best.fit.clone();
         slots.push(Slot { ranked, cross_validation: old.cross_validation });
     }
-    for index in 0..slots.len() {
+    for (index, slot) in slots.iter_mut().enumerate() {
         let (mut effects, mut psi) = (fit.effects.clone(), fit.psi.clone());
         effects.remove(known + index);
         psi.remove(known + index);
         let start = Start { fit: &fit, psi: psi.into_iter().map(Some).collect() };
         let without = study.fit(rows, &effects, Some(&start))?;
-        slots[index].cross_validation = cross_validate(study, rows, &without, &fit).unwrap_or((f64::NEG_INFINITY, 0.0));
+        slot.cross_validation = cross_validate(study, rows, &without, &fit).unwrap_or((f64::NEG_INFINITY, 0.0));
     }
     Some(fit)
 }
@@ -311,7 +311,9 @@ fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64
     for values in &mut series {
         // A constant deviation is no correlation in time.
         let mean = crate::stats::mean(values);
-        values.iter_mut().for_each(|v| *v -= mean);
+        for value in values.iter_mut() {
+            *value -= mean;
+        }
         squares += values.iter().map(|v| v * v).sum::<f64>();
         products += values.windows(2).map(|w| w[0] * w[1]).sum::<f64>();
         pairs += values.len().saturating_sub(1) as f64;

@@ -67,7 +67,7 @@ pub struct Response {
 /// ```
 ///
 /// # Errors
-/// [`Error::Effect`] for sizes that leave hardly any stiffness or mass; as [`modes`].
+/// [`Error::Effect`] for sizes that leave hardly any stiffness or mass; as [`modes()`].
 pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &[f64]) -> Result<Response, Error> {
     let places = places(targets);
     let total = places.last().map_or(0, |(first, target)| first + target.sizes());
@@ -90,11 +90,15 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
         match target {
             Target::Springs(indices) => {
                 let factor = factor(number)?;
-                indices.iter().for_each(|i| spring_factor[*i] *= factor);
+                for i in indices {
+                    spring_factor[*i] *= factor;
+                }
             }
             Target::Masses(indices) => {
                 let factor = factor(number)?;
-                indices.iter().for_each(|i| mass_factor[*i] *= factor);
+                for i in indices {
+                    mass_factor[*i] *= factor;
+                }
             }
             Target::AddedSpring(from, to) => {
                 added[number].0 = springs.len();
@@ -132,20 +136,7 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     let spring_slope = |row: usize, spring: usize| sensitivity.by_spring[(order[row], spring)];
     let mass_slope = |row: usize, mass: usize| sensitivity.by_mass[(order[row], mass)];
 
-    // The instrument: f = (structural + Σ structural g) + Σ offsets, scales after one another.
-    let mut scale = vec![1.0; rows];
-    let mut offset_hz = vec![0.0; rows];
-    for (first, target) in &places {
-        for row in 0..rows {
-            match target {
-                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
-                    scale[row] *= 1.0 + sizes[*first]
-                }
-                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => offset_hz[row] += sizes[*first],
-                _ => {}
-            }
-        }
-    }
+    let (scale, offset_hz) = instrument(&places, sizes, rows);
     let mut by_size = DMatrix::zeros(rows, total);
     for (number, (first, target)) in places.iter().enumerate() {
         for row in 0..rows {
@@ -180,6 +171,22 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     let by_spring = DMatrix::from_fn(rows, originals, |row, s| scale[row] * spring_slope(row, s) * spring_factor[s]);
     let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
     Ok(Response { frequencies_hz, by_spring, by_size })
+}
+
+/// Product of the scales and sum of the offsets, Hz, of each mode: f → scale·f + offset.
+fn instrument(places: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<f64>, Vec<f64>) {
+    let (mut scale, mut offset_hz) = (vec![1.0; rows], vec![0.0; rows]);
+    for (first, target) in places {
+        for row in 0..rows {
+            let here = |mode: &Option<usize>| mode.is_none_or(|mode| mode == row);
+            match target {
+                Target::FrequencyScale(mode) if here(mode) => scale[row] *= 1.0 + sizes[*first],
+                Target::FrequencyOffset(mode) if here(mode) => offset_hz[row] += sizes[*first],
+                _ => {}
+            }
+        }
+    }
+    (scale, offset_hz)
 }
 
 /// Column of the first size of each target.

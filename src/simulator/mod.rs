@@ -170,6 +170,7 @@ impl Simulator {
     ///
     /// # Panics
     /// When there are sizes, but not one for each.
+    #[must_use]
     pub fn under(&self, sizes: &[f64]) -> Self {
         if sizes.is_empty() {
             return Self { sizes: effect::typical_sizes(self.effects()).into(), ..self.clone() };

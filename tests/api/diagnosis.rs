@@ -81,7 +81,7 @@ async fn damage_alarms(service: &Service) -> Vec<(String, String)> {
         .collect()
 }
 
-/// Share of the assessed batches in `days` whose chart lies in alarm, and how many there were.
+/// Waits until so many batches are assessed under the present version.
 async fn wait_until_assessed(service: &Service, batches: usize) {
     for _ in 0..600 {
         let history = service.read("/v1/structures/soft/history?limit=1000").await;
@@ -179,7 +179,9 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
 
     // A batch without its temperature is taken at all temperatures, and says so.
     let mut blind = batch(430.0, 0.9, &mut rng);
-    blind.iter_mut().for_each(|m| m["covariates"] = json!({}));
+    for m in &mut blind {
+        m["covariates"] = json!({});
+    }
     let answer = created(service.post(path, &json!({ "measurements": blind })).await).await;
     let findings = answer.to_string();
     assert!(findings.contains("covariate_missing"), "{findings}");
