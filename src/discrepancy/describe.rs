@@ -260,7 +260,9 @@ fn sentence(
 ) -> String {
     let what = phrase(name);
     let plus_minus = |value: f64, std: f64, unit: &str| {
-        let (value, std) = rounded((factor * value).abs(), factor * std);
+        // "Falls by" has the sign already; an added spring has none to change.
+        let size = if name.kind == "added_spring" { value } else { value.abs() };
+        let (value, std) = rounded(factor * size, factor * std);
         format!("{value} ± {std} {unit}")
     };
     let changes = |value: f64| match (name.kind.as_str(), value < 0.0) {

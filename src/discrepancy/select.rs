@@ -91,7 +91,7 @@ pub fn select(
     let mut independent_share = 1.0;
     for number in 0..MOST_CAUSES {
         progress(Step::Searching { cause: number + 1, of: MOST_CAUSES });
-        let (ranked, share) = rank(study, rows, &fit, candidates)?;
+        let (ranked, share) = rank(study, rows, &fit, candidates, known.len())?;
         independent_share = share;
         let total = log_sum(ranked.iter().map(|r| r.log_odds));
         let Some(best) = ranked.first().filter(|_| total > ACCEPTED_NATS) else { break };
@@ -130,7 +130,7 @@ fn look_again(
         psi.remove(known);
         let start = Start { fit: &fit, psi: psi.into_iter().map(Some).collect() };
         let without = study.fit(rows, &effects, Some(&start))?;
-        let (ranked, _) = rank(study, rows, &without, candidates)?;
+        let (ranked, _) = rank(study, rows, &without, candidates, known)?;
         let needed = log_sum(ranked.iter().map(|r| r.log_odds)) > ACCEPTED_NATS;
         let Some(best) = ranked.first().filter(|_| needed) else {
             fit = without;
@@ -150,12 +150,19 @@ fn look_again(
     Some(fit)
 }
 
-/// All candidates beside a fit, by probability; and the share of rows that are worth independent ones under the best.
-fn rank(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Option<(Vec<Ranked>, f64)> {
+/// All candidates beside a fit, by probability; and the share of rows that are worth independent ones under the best. The first
+/// `known` effects of the fit are the structure's own: what they say may be wrong, and a further one of the same kind mend it.
+fn rank(
+    study: &Study<'_>,
+    rows: &[usize],
+    fit: &Fit,
+    candidates: &[Candidate],
+    known: usize,
+) -> Option<(Vec<Ranked>, f64)> {
     let views = study.view(rows, fit)?;
     let whitened = Whitened::new(study, rows, fit, &views)?;
     let taken = |c: &Candidate| {
-        fit.effects.iter().any(|e| e.target == c.target && e.law.covariate == c.covariate && c.level.is_none())
+        fit.effects[known..].iter().any(|e| e.target == c.target && e.law.covariate == c.covariate && c.level.is_none())
     };
     let mut promised = promises(study, rows, &whitened, fit, candidates)?;
     promised.retain(|p| !taken(&candidates[p.candidate]));

@@ -7,7 +7,7 @@ use rand::SeedableRng as _;
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, Service};
+use crate::helpers::{command, created, spawn, Service};
 
 #[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
 #[path = "../discrepancy/world.rs"]
@@ -192,4 +192,51 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     let structure = service.read("/v1/structures/soft").await;
     assert_eq!(structure["digest"], diagnosis["structure_digest"]);
     assert!(structure["definition"]["effect"].is_null());
+}
+
+#[tokio::test]
+async fn diagnoses_that_cannot_be_made_say_why() {
+    let (service, _folder) = spawn();
+    let path = "/v1/structures/three-dof/diagnoses";
+    let code = |response: reqwest::Response| async move {
+        let status = response.status().as_u16();
+        let body: Value = response.json().await.unwrap();
+        (status, body["code"].as_str().unwrap_or_default().to_owned())
+    };
+    let unknown = service.get("/v1/diagnoses/none").send().await.unwrap();
+    assert_eq!(code(unknown).await, (404, "unknown_diagnosis".to_owned()));
+    let unknown = service.post("/v1/diagnoses/none/extension", &json!({})).await;
+    assert_eq!(code(unknown).await, (404, "unknown_diagnosis".to_owned()));
+    for holdout in ["last:1.5", "first:0.2", "where:lab"] {
+        let answer = service.post(path, &json!({ "holdout": holdout })).await;
+        assert_eq!(code(answer).await, (422, "invalid".to_owned()), "{holdout}");
+    }
+    let unknown = service.post(path, &json!({ "batches": ["none"] })).await;
+    assert_eq!(code(unknown).await, (404, "unknown_batch".to_owned()));
+    let unknown = service.post("/v1/structures/bridge/diagnoses", &json!({})).await;
+    assert_eq!(code(unknown).await, (404, "unknown_structure".to_owned()));
+    let wrong = service.post("/v1/diagnoses/none/extension", &json!({ "epochs": 0 })).await;
+    assert_eq!(code(wrong).await, (422, "invalid".to_owned()));
+    let back = service.request(reqwest::Method::DELETE, "/v1/structures/three-dof/extension").send().await.unwrap();
+    assert_eq!(code(back).await, (409, "no_step_back".to_owned()));
+
+    // Too few measurements: the job ends and says how many are needed.
+    let asked: Value = service.post(path, &json!({})).await.json().await.unwrap();
+    let id = asked["diagnosis"].as_str().unwrap();
+    let mut answer = service.read(&format!("/v1/diagnoses/{id}")).await;
+    for _ in 0..100 {
+        if answer["state"] != "running" {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        answer = service.read(&format!("/v1/diagnoses/{id}")).await;
+    }
+    assert_eq!(answer["state"], "failed");
+    assert!(answer["failure"].as_str().unwrap().contains("at least 30"), "{answer}");
+    let none = service.get(&format!("/v1/diagnoses/{id}/report")).send().await.unwrap();
+    assert_eq!(code(none).await, (409, "no_report".to_owned()));
+    let none = service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await;
+    assert_eq!(code(none).await, (409, "no_extension".to_owned()));
+    let listed = service.read(path).await;
+    assert_eq!(listed["items"][0]["state"], "failed");
 }

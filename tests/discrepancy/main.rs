@@ -541,3 +541,71 @@ fn the_same_question_gets_the_same_answer_and_the_seed_moves_only_bootstrap_inte
     }
     assert_eq!(one, other);
 }
+
+#[test]
+fn two_laboratories_differ_by_something_common_and_not_by_three_storeys() {
+    let repository = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let data = repository.join("../shared/data/ruler-frame-4dof/ruler_frame_frequencies.csv");
+    if !data.exists() {
+        println!("skipped: ../shared/data/ruler-frame-4dof is not on this machine");
+        return;
+    }
+    let output = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .args(["diagnose", "--structure", "ruler-frame-4dof", "--holdout", "last:0", "--json"])
+        .args(["--ignore", "zeta1,zeta2,zeta3,zeta4,measurement", "--data"])
+        .arg(&data)
+        .output()
+        .unwrap();
+    let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+    println!("{}", answer["summary"].as_str().unwrap());
+    let first = &answer["causes"][0];
+    assert_eq!(first["covariate"], "lab");
+    let common = [("mass_group", "all"), ("spring_group", "all"), ("frequency_scale", "")];
+    let target = (first["target"]["kind"].as_str().unwrap(), first["target"]["name"].as_str().unwrap());
+    assert!(common.contains(&target), "{first}");
+    // Three ways to say the same: none may be called sure.
+    assert!(first["probability"].as_f64().unwrap() < 0.9);
+}
+
+#[test]
+fn an_extended_structure_explains_its_data_and_half_an_effect_is_found_wanting() {
+    let world = world::draw_single(5_008, "spring_group", "linear");
+    let folder = tempfile::tempdir().unwrap();
+    let (structure, data) = (folder.path().join("world.toml"), folder.path().join("world.csv"));
+    fs::write(&structure, &world.structure_toml).unwrap();
+    fs::write(&data, &world.csv).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .args(["extend", "--no-training", "--structure"])
+        .arg(&structure)
+        .arg("--data")
+        .arg(&data)
+        .arg("--out")
+        .arg(folder.path().join("extended"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let written = folder.path().join("extended/structure.json");
+    let verdict = |structure: &Path| -> Value {
+        let output = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+            .args(["diagnose", "--json", "--structure"])
+            .arg(structure)
+            .arg("--data")
+            .arg(&data)
+            .output()
+            .unwrap();
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let answer = verdict(&written);
+    assert_eq!(answer["verdict"], "nothing_found", "{}", answer["summary"]);
+    // Half of the slope is left to find: the structure's own effect does not stand in the way.
+    let mut half: Value = serde_json::from_str(&fs::read_to_string(&written).unwrap()).unwrap();
+    let slope = half["effect"][0]["numbers"]["slope_per_unit"].as_f64().unwrap();
+    half["effect"][0]["numbers"]["slope_per_unit"] = (0.5 * slope).into();
+    let halved = folder.path().join("half.json");
+    fs::write(&halved, half.to_string()).unwrap();
+    let answer = verdict(&halved);
+    let first = &answer["causes"][0];
+    let common = ["spring_group", "mass_group", "frequency_scale"];
+    assert!(common.contains(&first["target"]["kind"].as_str().unwrap()), "{}", answer["summary"]);
+    assert_eq!(first["covariate"], "temperature_c");
+}
