@@ -290,6 +290,14 @@ impl<'a> Study<'a> {
         Some(rows.iter().enumerate().map(by).collect())
     }
 
+    /// False for the effect on a setting in a row where nobody set it.
+    pub fn is_set(&self, row: usize, target: &Target) -> bool {
+        match target {
+            Target::SettingOffset(k) | Target::SettingScale(k) => self.data.settings[row][*k].is_some(),
+            _ => true,
+        }
+    }
+
     /// One over the variance of the prior of each free mean and all ψ.
     pub fn prior_information(&self, fit: &Fit) -> Vec<f64> {
         let mean = |k: &usize| {
@@ -493,7 +501,13 @@ impl Problem<'_> {
         let (mut sizes, mut slopes) = (Vec::new(), Vec::new());
         let mut column = 0;
         for ((effect, inputs), psi) in self.effects.iter().zip(inputs).zip(psi) {
-            let (own, by) = effect.sizes(inputs[place], psi);
+            let (mut own, mut by) = effect.sizes(inputs[place], psi);
+            if !self.study.is_set(self.rows[place], &effect.target) {
+                own.fill(0.0);
+                for slopes in &mut by {
+                    slopes.fill(0.0);
+                }
+            }
             sizes.extend(own);
             slopes.extend(by.into_iter().map(|by| by.into_iter().enumerate().map(|(i, s)| (column + i, s)).collect()));
             column += psi.len();

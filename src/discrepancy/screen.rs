@@ -214,7 +214,10 @@ pub fn promises(
     let directions = study.directions(rows, fit, &owned)?;
     let mut found = Vec::new();
     for (column, target) in targets.iter().enumerate() {
-        let sums = whitened.sums(|place| directions[place].column(column).into_owned());
+        let sums = whitened.sums(|place| {
+            let set = f64::from(u8::from(study.is_set(rows[place], target)));
+            directions[place].column(column) * set
+        });
         let ones = vec![vec![1.0; rows.len()]];
         let told = whitened.score(&sums, &ones).numbers == 1;
         for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.target == **target) {
