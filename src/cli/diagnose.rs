@@ -31,7 +31,7 @@ pub struct StudyArgs {
     #[arg(long, required = true)]
     data: Vec<PathBuf>,
     /// Rows kept for measuring the gain: last:SHARE, or where:COLUMN=CATEGORY
-    #[arg(long, default_value = "last:0.25", value_parser = holdout)]
+    #[arg(long, default_value = "last:0.25")]
     holdout: Holdout,
     /// Column of the time [default: measured_at, or the order of the rows]
     #[arg(long)]
@@ -226,18 +226,6 @@ fn print(d: &Diagnosis) {
     }
     for note in &d.notes {
         println!("note: {note}");
-    }
-}
-
-fn holdout(text: &str) -> Result<Holdout, String> {
-    let wrong = || format!("{text:?} should read last:0.25 or where:lab=de");
-    match text.split_once(':') {
-        Some(("last", share)) => share.parse().map(Holdout::Last).map_err(|_| wrong()),
-        Some(("where", rest)) => {
-            let (covariate, level) = rest.split_once('=').ok_or_else(wrong)?;
-            Ok(Holdout::Where { covariate: covariate.to_owned(), level: level.to_owned() })
-        }
-        _ => Err(wrong()),
     }
 }
 

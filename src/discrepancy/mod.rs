@@ -18,7 +18,7 @@ pub mod select;
 
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::Digest;
+use crate::quantity::{shown, Digest};
 use crate::simulator::Simulator;
 use data::{Data, Values, TIME};
 use describe::Cause;
@@ -178,8 +178,9 @@ impl std::fmt::Display for Step {
 /// Called at each step.
 pub type Progress<'a> = dyn Fn(Step) + Sync + 'a;
 
-/// Which rows are kept for measuring the gain.
-#[derive(Debug, Clone, PartialEq)]
+/// Which rows are kept for measuring the gain; written `last:0.25` or `where:lab=de`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Holdout {
     /// The last share of the rows in time.
     Last(f64),
@@ -190,6 +191,25 @@ pub enum Holdout {
         /// Category.
         level: String,
     },
+}
+
+impl std::str::FromStr for Holdout {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("{} must read last:0.25, a share below 1, or where:lab=de", shown(text));
+        match text.split_once(':') {
+            Some(("last", share)) => {
+                let share: f64 = share.parse().map_err(|_| wrong())?;
+                (0.0..1.0).contains(&share).then_some(Self::Last(share)).ok_or_else(wrong)
+            }
+            Some(("where", rest)) => {
+                let (covariate, level) = rest.split_once('=').ok_or_else(wrong)?;
+                Ok(Self::Where { covariate: covariate.to_owned(), level: level.to_owned() })
+            }
+            _ => Err(wrong()),
+        }
+    }
 }
 
 /// Why there is no diagnosis.

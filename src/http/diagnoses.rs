@@ -113,28 +113,12 @@ pub async fn create(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let body: DiagnosisBody = json_body(&headers, body, shared.limits).await?;
-    let (holdout_last, holdout_where) = holdout(body.holdout.as_deref().unwrap_or("last:0.25"))?;
-    let request = DiagnosisRequest { batches: body.batches, holdout_last, holdout_where, seed: body.seed.unwrap_or(1) };
+    let holdout = body.holdout.as_deref().unwrap_or("last:0.25").parse();
+    let holdout = holdout.map_err(|message: String| ApiError::invalid_field("/holdout", message))?;
+    let request = DiagnosisRequest { batches: body.batches, holdout, seed: body.seed.unwrap_or(1) };
     let record = shared.monitor.start_diagnosis(&id, request).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{}", record.id))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
-}
-
-type HoldoutParts = (f64, Option<(String, String)>);
-
-fn holdout(text: &str) -> Result<HoldoutParts, ApiError> {
-    let wrong = || ApiError::invalid_field("/holdout", "must read last:0.25, a share below 1, or where:lab=de");
-    match text.split_once(':') {
-        Some(("last", share)) => {
-            let share: f64 = share.parse().map_err(|_| wrong())?;
-            (0.0..1.0).contains(&share).then_some((share, None)).ok_or_else(wrong)
-        }
-        Some(("where", rest)) => {
-            let (covariate, level) = rest.split_once('=').ok_or_else(wrong)?;
-            Ok((0.0, Some((covariate.to_owned(), level.to_owned()))))
-        }
-        _ => Err(wrong()),
-    }
 }
 
 /// `GET /v1/structures/{id}/diagnoses`: the newest first.

@@ -37,10 +37,8 @@ const MOST_JOBS: usize = 16;
 pub struct DiagnosisRequest {
     /// Batches, by id.
     pub batches: Vec<String>,
-    /// Share of the measurements, the last in time, kept for measuring the gain.
-    pub holdout_last: f64,
-    /// Instead of that, the measurements where a category has a value: (covariate, category).
-    pub holdout_where: Option<(String, String)>,
+    /// Measurements kept for measuring the gain.
+    pub holdout: Holdout,
     /// Seed of the bootstrap and, in an extension, of the training.
     pub seed: u64,
 }
@@ -371,11 +369,7 @@ fn study(
     request: &DiagnosisRequest,
 ) -> Result<(Data, Outcome), String> {
     let data = Data::new(simulator, measurements);
-    let holdout = match &request.holdout_where {
-        Some((covariate, level)) => Holdout::Where { covariate: covariate.clone(), level: level.clone() },
-        None => Holdout::Last(request.holdout_last),
-    };
     let progress = |step: Step| jobs.say(id, step.to_string());
-    let outcome = diagnose(simulator, &data, &holdout, request.seed, &progress).map_err(|e| e.to_string())?;
+    let outcome = diagnose(simulator, &data, &request.holdout, request.seed, &progress).map_err(|e| e.to_string())?;
     Ok((data, outcome))
 }
