@@ -12,6 +12,7 @@
 //! ```text
 //!  cli · http                            the doors      words for people and programs
 //!  config · telemetry                    what the doors are set to, and what they log
+//!  reproduce                             the exam       the paper's cases by all methods, beside its figures
 //!  monitor                               the office     what happens to a batch
 //!  store                                 the archive    the only room that speaks SQL
 //!  assessment                            the result of one batch
@@ -22,8 +23,9 @@
 //!  hierarchy                             the population behind posterior samples
 //!  baseline                              a trained flow, its record, and where it is found
 //!  posterior                             samples of the parameters, whoever drew them
+//!  updating                              the same question without a flow: sensitivity, TMCMC, laws
 //!  simulator                             the bench      parameters in, natural frequencies out
-//!  physics | flow                        two workshops  structures without networks | networks without structures
+//!  physics | emulator | gsa | flow       workshops      structures | tables of runs | global sensitivity | networks
 //!  parameter · measurement               what is unknown · what arrives
 //!  quantity · stats · plot               the foundation
 //! ```
@@ -73,6 +75,13 @@
 //! - C. R. Rao (1948), Large sample tests of statistical hypotheses, Proc. Cambridge Phil. Soc. 44, 50–57. Score tests.
 //!   R. E. Kass, A. E. Raftery (1995), Bayes factors, JASA 90, 773–795. Laplace's evidence. K. L. Lange, R. J. A. Little,
 //!   J. M. G. Taylor (1989), Robust statistical modeling using the t distribution, JASA 84, 881–896.
+//! - J. Ching, Y.-C. Chen (2007), Transitional Markov chain Monte Carlo method for Bayesian model updating, Journal of
+//!   Engineering Mechanics 133, 816–832. A. Bhattacharyya (1943), On a measure of divergence between two statistical
+//!   populations, Bull. Calcutta Math. Soc. 35, 99–109. Stochastic updating.
+//! - M. J. W. Jansen (1999), Analysis of variance designs for model output, Computer Physics Communications 117, 35–43;
+//!   A. Saltelli et al. (2010), Variance based sensitivity analysis of model output, ibid. 181, 259–270. Sobol' indices.
+//! - G. Blatman, B. Sudret (2011), Adaptive sparse polynomial chaos expansion based on least angle regression, Journal of
+//!   Computational Physics 230, 2345–2367. Emulators.
 //! - R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
 //!   doi:10.1080/00031305.1996.10473566.
 
@@ -83,7 +92,9 @@ pub mod cli;
 pub mod config;
 pub mod damage;
 pub mod discrepancy;
+pub mod emulator;
 pub mod flow;
+pub mod gsa;
 pub mod hierarchy;
 pub mod http;
 pub mod measurement;
@@ -93,8 +104,10 @@ pub mod physics;
 pub mod plot;
 pub mod posterior;
 pub mod quantity;
+pub mod reproduce;
 pub mod simulator;
 pub mod stats;
 pub mod store;
 pub mod telemetry;
 pub mod trust;
+pub mod updating;

@@ -9,15 +9,18 @@ use std::path::{Path, PathBuf};
 const FOUNDATION: [&str; 4] = ["quantity", "stats", "parameter", "measurement"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
-const TABLE: [(&str, &[&str], bool); 23] = [
+const TABLE: [(&str, &[&str], bool); 27] = [
     ("quantity", &[], false),
     ("stats", &[], false),
     ("plot", &[], false),
     ("parameter", &["quantity", "stats"], false),
     ("measurement", &["quantity", "stats", "parameter"], false),
     ("physics", &["quantity", "stats"], false),
+    ("emulator", &["stats"], false),
+    ("gsa", &["stats"], false),
     ("flow", &["stats"], false),
-    ("simulator", &["physics"], true),
+    ("simulator", &["emulator", "physics"], true),
+    ("updating", &["physics", "simulator"], true),
     ("posterior", &[], true),
     // `physics` for the error of a simulation only.
     ("baseline", &["flow", "simulator", "posterior", "physics"], true),
@@ -29,6 +32,8 @@ const TABLE: [(&str, &[&str], bool); 23] = [
     ("assessment", &["damage", "trust"], true),
     ("store", &["alarm", "assessment", "damage", "trust"], true),
     ("telemetry", &[], false),
+    // A study of the whole program, the assessment of a batch included.
+    ("reproduce", &["baseline", "damage", "gsa", "monitor", "physics", "plot", "simulator", "updating"], true),
     (
         "monitor",
         &[
@@ -61,9 +66,11 @@ const TABLE: [(&str, &[&str], bool); 23] = [
             "http",
             "monitor",
             "plot",
+            "reproduce",
             "simulator",
             "store",
             "telemetry",
+            "updating",
         ],
         true,
     ),

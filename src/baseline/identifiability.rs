@@ -153,7 +153,7 @@ fn local_covariance(
     let parameters = simulator.space().as_slice();
     let scaled = DMatrix::from_fn(jacobian.nrows(), jacobian.ncols(), |mode, k| {
         // A structure without noise is looked at with that of a very good test.
-        let std_hz = simulator.noise().std_hz(exact_hz[mode]).max(1e-5 * exact_hz[mode]);
+        let std_hz = simulator.std_hz(mode, exact_hz[mode]).max(1e-5 * exact_hz[mode]);
         jacobian[(mode, k)] * (parameters[k].upper - parameters[k].lower) / std_hz
     });
     let d = parameters.len();

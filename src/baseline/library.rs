@@ -96,7 +96,7 @@ impl Library {
         let Some((name, text)) = files.iter().find(|(name, _)| is_definition(name)) else {
             return;
         };
-        let simulator = match read_definition(name, text) {
+        let simulator = match read_definition(name, text, |file| in_folder(files, file)) {
             Ok(simulator) => simulator,
             Err(error) => return self.refuse(format!("{origin}/{name}"), None, &error),
         };
@@ -156,7 +156,8 @@ pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError>
         StructureFileError::Read { path: path.to_owned(), source, shipped }
     })?;
     let name = path.to_string_lossy();
-    read_definition(&name, &bytes).map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
+    let beside = |file: &str| std::fs::read_to_string(path.parent().unwrap_or(Path::new("")).join(file));
+    read_definition(&name, &bytes, beside).map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
 }
 
 /// A shipped or stored structure for the command line: a file, or the id of a shipped structure.
@@ -166,7 +167,7 @@ pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError>
 pub fn find_structure(path_or_id: &str) -> Result<Simulator, StructureFileError> {
     let shipped = shipped_folders().into_values().find_map(|files| {
         let (name, text) = files.iter().find(|(name, _)| is_definition(name))?;
-        read_definition(name, text).ok().filter(|simulator| simulator.id().as_str() == path_or_id)
+        read_definition(name, text, |file| in_folder(&files, file)).ok().filter(|simulator| simulator.id().as_str() == path_or_id)
     });
     match shipped {
         Some(simulator) if !Path::new(path_or_id).exists() => Ok(simulator),
@@ -174,11 +175,24 @@ pub fn find_structure(path_or_id: &str) -> Result<Simulator, StructureFileError>
     }
 }
 
-fn read_definition(name: &str, bytes: &[u8]) -> Result<Simulator, DefinitionError> {
+/// A text file of a folder in memory.
+fn in_folder(files: &Folder, file: &str) -> std::io::Result<String> {
+    let bytes = files.get(file).ok_or_else(|| std::io::Error::from(std::io::ErrorKind::NotFound))?;
+    String::from_utf8(bytes.clone()).map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e))
+}
+
+fn read_definition(
+    name: &str,
+    bytes: &[u8],
+    beside: impl Fn(&str) -> std::io::Result<String>,
+) -> Result<Simulator, DefinitionError> {
     let text = String::from_utf8_lossy(bytes);
     let is_json = Path::new(name).extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
-    let definition =
-        if is_json { StructureDefinition::parse_json(&text) } else { StructureDefinition::parse_toml(&text) }?;
+    let definition = if is_json {
+        StructureDefinition::parse_json_beside(&text, beside)
+    } else {
+        StructureDefinition::parse_toml_beside(&text, beside)
+    }?;
     Simulator::new(definition)
 }
 
@@ -211,7 +225,7 @@ fn read_folders(path: &Path) -> std::io::Result<BTreeMap<String, Folder>> {
         for file in std::fs::read_dir(entry.path())? {
             let file = file?;
             let name = file.file_name().to_string_lossy().into_owned();
-            let ours = is_definition(&name) || has_extension(&name, "safetensors") || has_extension(&name, "json");
+            let ours = is_definition(&name) || ["safetensors", "json", "csv"].iter().any(|e| has_extension(&name, e));
             if ours && file.file_type()?.is_file() {
                 files.insert(name, std::fs::read(file.path())?);
             }

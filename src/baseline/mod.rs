@@ -318,7 +318,8 @@ impl Baseline {
             Some(range) => {
                 for (mode, frequency) in frequencies_hz.iter_mut().enumerate() {
                     let given = measurement.std_hz.as_ref().and_then(|stds| stds[mode]);
-                    let own = frequency.map(|f| self.simulator.noise().std_hz(f));
+                    let own = frequency.map(|f| self.simulator.std_hz(mode, f));
+                    let given = given.zip(*frequency).map(|(std, f)| self.simulator.with_emulator_error(mode, f, std));
                     let multiple = given.zip(own).map_or(1.0, |(given, own)| given / own);
                     // The ends of the range belong to it, whatever the last digit of a division.
                     below_range |= frequency.is_some() && multiple < range.lowest * (1.0 - 1e-6);

@@ -58,7 +58,7 @@ impl Observation {
 
     /// Standard deviation of mode `mode`, Hz; `None` where it is missing.
     pub fn std_hz(&self, simulator: &Simulator, mode: usize) -> Option<f64> {
-        Some(simulator.noise().std_hz(self.frequencies_hz[mode]?) * self.noise_multiple[mode])
+        Some(simulator.std_hz(mode, self.frequencies_hz[mode]?) * self.noise_multiple[mode])
     }
 }
 
@@ -124,15 +124,15 @@ pub fn measure(
     multiples: &[Option<f64>],
     stream: &mut Stream,
 ) -> Observation {
-    let one = |(exact, multiple): (&f64, &Option<f64>)| {
+    let one = |(mode, (exact, multiple)): (usize, (&f64, &Option<f64>))| {
         // Drawn for missing modes too: the stream then does not depend on the masks.
         let normal: f64 = stream.sample(StandardNormal);
-        let std_hz = simulator.noise().std_hz(*exact);
+        let std_hz = simulator.std_hz(mode, *exact);
         // The mirror image of the few draws that would be negative: noise is far smaller than a frequency.
         multiple.map(|multiple| (exact + multiple * std_hz * normal).abs().max(f64::MIN_POSITIVE))
     };
     Observation {
-        frequencies_hz: exact_hz.iter().zip(multiples).map(one).collect(),
+        frequencies_hz: exact_hz.iter().zip(multiples).enumerate().map(one).collect(),
         noise_multiple: multiples.iter().map(|m| m.unwrap_or(1.0)).collect(),
         effect_sizes: effect_sizes.to_vec(),
         possible_sizes: Vec::new(),

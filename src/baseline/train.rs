@@ -102,7 +102,7 @@ pub fn train(
 ) -> Result<Trained, Error> {
     check(samples, noise_range, flow_settings, settings)?;
     let space = simulator.training_space();
-    let noisy = simulator.noise().std_hz(1.0) > 0.0;
+    let noisy = simulator.is_noisy();
     let training_box = space.iter().map(|p| [p.lower, p.upper]).collect();
     let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
     let training = draw(samples, "training set")?;

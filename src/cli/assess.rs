@@ -6,13 +6,11 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::calibrate::load;
+use super::measurements::read_measurements;
 use crate::baseline::{assessment_seed, Baseline};
-use crate::measurement::check::{check_measurements, Expectation};
-use crate::measurement::csv::{self, CsvOptions, Times};
 use crate::measurement::MeasurementBatch;
 use crate::monitor::assess::{self, Draws};
 use crate::monitor::MonitorSettings;
-use crate::quantity::Timestamp;
 
 /// Assess measurements without a service.
 #[derive(Debug, Args)]
@@ -110,22 +108,7 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
 
 fn read_batch(args: &AssessArgs, path: &Path, baseline: &Baseline) -> anyhow::Result<MeasurementBatch> {
     let simulator = baseline.simulator();
-    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let options = CsvOptions { times: Times::RowNumber, ignore: args.ignore.clone(), time_column: None };
-    let expectation = Expectation {
-        modes: simulator.modes(),
-        frequency_limits_hz: simulator.frequency_limits_hz(),
-        covariates: simulator.covariates(),
-        space: simulator.space(),
-        now: Timestamp::now(),
-        max_measurements: usize::MAX,
-    };
-    let measurements = csv::read(&bytes, simulator.modes(), simulator.covariates(), &options)
-        .and_then(|raw| check_measurements(raw, &expectation))
-        .map_err(|problems| {
-            let lines: Vec<String> = problems.iter().map(|p| format!("  {}: {}", p.pointer, p.message)).collect();
-            anyhow::anyhow!("{} is refused:\n{}", path.display(), lines.join("\n"))
-        })?;
+    let measurements = read_measurements(simulator, path, &args.ignore)?;
     let structure = simulator.id().clone();
     Ok(MeasurementBatch { structure, source: args.source.clone(), idempotency_key: None, measurements })
 }

@@ -203,13 +203,13 @@ fn noise_std(simulator: &Simulator, moments: &[(f64, f64)], noise: f64) -> anyho
     let theta: Vec<f64> = moments.iter().map(|m| m.0).collect();
     let (jacobian, frequencies) = (simulator.jacobian(&theta)?, simulator.frequencies_hz(&theta)?);
     anyhow::ensure!(
-        simulator.noise().std_hz(1.0) > 0.0,
+        simulator.is_noisy(),
         "structure {} has no measurement noise: state it in measurement_noise",
         simulator.id()
     );
     let width = |k: usize| simulator.space().as_slice()[k].upper - simulator.space().as_slice()[k].lower;
     let scaled = DMatrix::from_fn(jacobian.nrows(), jacobian.ncols(), |mode, k| {
-        jacobian[(mode, k)] * width(k) / (noise * simulator.noise().std_hz(frequencies[mode]))
+        jacobian[(mode, k)] * width(k) / (noise * simulator.std_hz(mode, frequencies[mode]))
     });
     let d = moments.len();
     let precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * 12.0;

@@ -5,9 +5,12 @@ mod calibrate;
 mod demo;
 mod design_alarm;
 mod diagnose;
+mod measurements;
+mod reproduce;
 mod serve;
 mod simulate;
 mod train;
+mod update;
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -41,6 +44,10 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
     Assess(assess::AssessArgs),
+    /// Find mean and spread of the parameters behind measurements, by one of three methods.
+    Update(update::UpdateArgs),
+    /// Run both cases of the paper by all methods and write a report beside its figures.
+    Reproduce(reproduce::ReproduceArgs),
     /// Find what the simulation gets wrong, name the cause and measure what naming it gains.
     Diagnose(diagnose::DiagnoseArgs),
     /// Diagnose, write the causes into a new version of the structure, and train its baseline.
@@ -113,6 +120,8 @@ pub fn run() -> anyhow::Result<()> {
         Command::Train(args) => train::train(&args),
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),
+        Command::Update(args) => update::update(&args),
+        Command::Reproduce(args) => reproduce::reproduce(&args),
         Command::Diagnose(args) => diagnose::diagnose(&args),
         Command::Extend(args) => diagnose::extend(&args),
         Command::Calibrate(args) => calibrate::calibrate(&args),

@@ -114,7 +114,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
 /// Samples and epochs of a training, where they are not given.
 pub(super) fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize>) -> (usize, usize) {
-    let noisy = simulator.noise().std_hz(1.0) > 0.0;
+    let noisy = simulator.is_noisy();
     let (usual_samples, usual_epochs) = if noisy { (200_000, 80) } else { (10_000, 200) };
     (samples.unwrap_or(usual_samples), epochs.unwrap_or(usual_epochs))
 }

@@ -65,7 +65,7 @@ impl Data {
             sorted.iter().map(|m| (m.measured_at.micros() - start) as f64 / MICROS_A_DAY).collect();
         let noise_of = |m: &ModalMeasurement, mode: usize, f: f64| {
             let stated = m.std_hz.as_ref().and_then(|stds| stds[mode]).unwrap_or_else(|| simulator.noise().std_hz(f));
-            (stated / f).max(LEAST_NOISE)
+            (simulator.with_emulator_error(mode, f, stated) / f).max(LEAST_NOISE)
         };
         let row = |m: &&ModalMeasurement| -> (Vec<f64>, Vec<f64>) {
             let cell = |(mode, f): (usize, &Option<Hertz>)| {

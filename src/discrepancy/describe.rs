@@ -8,7 +8,7 @@ use super::grammar::{Candidate, Class};
 use super::model::{Effect, Fit};
 use super::select::Ranked;
 use crate::physics::effect::Target;
-use crate::physics::Node;
+use crate::physics::{Form, Node};
 use crate::simulator::law::{Input, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
@@ -20,9 +20,9 @@ const Z90: f64 = 1.644_853_626_951_472;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TargetName {
     /// `spring`, `spring_group`, `mass`, `mass_group`, `frequency_scale`, `frequency_offset`, `setting`, `added_spring`,
-    /// `oscillator` or `mode_assignment`.
+    /// `oscillator`, `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table.
     pub kind: String,
-    /// Spring, mass, parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes.
+    /// Spring, mass, beam, parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes.
     pub name: String,
     /// Nodes of an added spring.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -66,16 +66,17 @@ pub struct Cause {
 
 /// Name of a target.
 pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
-    let structure = simulator.structure();
-    let node = |node: &Node| match node {
-        Node::Ground => "ground".to_owned(),
-        Node::Mass(index) => structure.masses()[*index].name.clone(),
-    };
+    let structure = || simulator.structure().expect("only a structure has parts to name");
+    let spring = |index: usize| structure().springs()[index].name.clone();
+    let span = |index: usize| matches!(structure().springs()[index].form, Form::Bending(_));
+    let node = |node: Node| structure().node_name(node).to_owned();
+    let parameter = |column: usize| simulator.space().as_slice()[column].name.clone();
     let one_mode = |mode: &Option<usize>| mode.map_or_else(String::new, |m| format!("mode {}", m + 1));
     let mut between = None;
     let (kind, name) = match &candidate.target {
-        Target::Springs(indices) if indices.len() == 1 => ("spring", structure.springs()[indices[0]].name.clone()),
-        Target::Springs(indices) if indices.len() == structure.springs().len() => ("spring_group", "all".to_owned()),
+        Target::Springs(indices) if indices.len() == 1 && span(indices[0]) => ("beam", spring(indices[0])),
+        Target::Springs(indices) if indices.len() == 1 => ("spring", spring(indices[0])),
+        Target::Springs(indices) if indices.len() == structure().springs().len() => ("spring_group", "all".to_owned()),
         Target::Springs(indices) => {
             let same = |springs: &Vec<usize>| {
                 springs.len() == indices.len() && springs.iter().all(|spring| indices.contains(spring))
@@ -83,18 +84,17 @@ pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
             let group = simulator.spring_groups().into_iter().find(|(_, springs)| same(springs));
             ("spring_group", group.map_or_else(|| "several".to_owned(), |(name, _)| name))
         }
-        Target::Masses(indices) if indices.len() == 1 => ("mass", structure.masses()[indices[0]].name.clone()),
+        Target::Masses(indices) if indices.len() == 1 => ("mass", structure().masses()[indices[0]].name.clone()),
         Target::Masses(_) => ("mass_group", "all".to_owned()),
         Target::FrequencyScale(mode) => ("frequency_scale", one_mode(mode)),
         Target::FrequencyOffset(mode) => ("frequency_offset", one_mode(mode)),
-        Target::SettingOffset(k) | Target::SettingScale(k) => {
-            ("setting", simulator.space().as_slice()[*k].name.clone())
-        }
+        Target::SettingOffset(k) | Target::SettingScale(k) => ("setting", parameter(*k)),
+        Target::ParameterScale(k) => ("parameter", parameter(*k)),
         Target::AddedSpring(from, to) => {
-            between = Some([node(from), node(to)]);
+            between = Some([node(*from), node(*to)]);
             ("added_spring", String::new())
         }
-        Target::Oscillator(host) => ("oscillator", structure.masses()[*host].name.clone()),
+        Target::Oscillator(host) => ("oscillator", node(Node::Freedom(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
     };
     TargetName { kind: kind.to_owned(), name, between, level: candidate.level.clone() }
@@ -114,6 +114,8 @@ pub fn phrase(name: &TargetName) -> String {
     let of = |what: &str| format!("{what} of {}", name.name);
     match name.kind.as_str() {
         "spring" => of("the stiffness"),
+        "beam" => of("the bending stiffness"),
+        "parameter" => format!("the parameter {}", name.name),
         "spring_group" if name.name == "all" => "the stiffness of all springs together".to_owned(),
         "spring_group" => of("the stiffness of the springs"),
         "mass" => format!("the mass {}", name.name),

@@ -179,7 +179,7 @@ fn definition_of(
     Some(EffectDefinition {
         name,
         description,
-        target: target_definition(&effect.target, simulator.structure())?,
+        target: target_definition(&effect.target, simulator)?,
         law: effect.law.kind,
         covariate: effect.law.covariate.clone(),
         reference: effect.law.reference,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::data::{Column, Data, Values, TIME};
 use super::model::{Effect, Number};
 use crate::physics::effect::Target;
-use crate::physics::Node;
+use crate::physics::{Form, Node, Structure};
 use crate::simulator::law::{Law, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
@@ -59,8 +59,8 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             let (class, weight) = plausibility(&target, covariate, is_category(data, covariate));
             let (covariate, level) = (covariate.map(str::to_owned), level.map(str::to_owned));
             let of = match &target {
-                Target::Springs(_) => simulator.structure().springs().len(),
-                Target::Masses(_) => simulator.structure().masses().len(),
+                Target::Springs(_) => simulator.structure().map_or(0, |s| s.springs().len()),
+                Target::Masses(_) => simulator.structure().map_or(0, |s| s.masses().len()),
                 _ => 0,
             };
             all.push(Candidate { target: target.clone(), covariate, level, class, of, weight });
@@ -106,8 +106,41 @@ fn is_category(data: &Data, covariate: Option<&str>) -> bool {
 
 /// Everything that could change.
 pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
-    let structure = simulator.structure();
-    let (springs, masses, modes) = (structure.springs().len(), structure.masses().len(), simulator.modes());
+    let modes = simulator.modes();
+    let mut targets = simulator.structure().map_or_else(Vec::new, |structure| part_targets(simulator, structure));
+    if simulator.table().is_some() {
+        // An emulator has no springs: what acts on them acts on the parameters that stand for them.
+        targets.extend((0..simulator.space().len()).map(Target::ParameterScale));
+    }
+    targets.extend([Target::FrequencyScale(None), Target::FrequencyOffset(None)]);
+    if modes > 1 {
+        targets.extend((0..modes).flat_map(|m| [Target::FrequencyScale(Some(m)), Target::FrequencyOffset(Some(m))]));
+    }
+    for column in 0..simulator.space().len() {
+        if data.settings.iter().any(|row| row[column].is_some()) {
+            targets.extend([Target::SettingOffset(column), Target::SettingScale(column)]);
+        }
+    }
+    if let Some(structure) = simulator.structure() {
+        targets.extend(missing_springs(structure).into_iter().map(|(from, to)| Target::AddedSpring(from, to)));
+        targets.extend(structure.places().iter().map(|place| Target::Oscillator(place.freedom)));
+    }
+    // A mode that was overlooked, or two neighbours taken for each other.
+    if simulator.available_modes() > modes {
+        let skipping = |skipped: usize| (0..modes).map(|m| m + usize::from(m >= skipped)).collect();
+        targets.extend((0..modes).map(|skipped| Target::ModeOrder(skipping(skipped))));
+    }
+    for low in 0..modes.saturating_sub(1) {
+        let mut order: Vec<usize> = (0..modes).collect();
+        order.swap(low, low + 1);
+        targets.push(Target::ModeOrder(order));
+    }
+    targets
+}
+
+/// Springs and masses, each by itself and in groups.
+fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
+    let (springs, masses) = (structure.springs().len(), structure.masses().len());
     let mut targets: Vec<Target> = (0..springs).map(|s| Target::Springs(vec![s])).collect();
     let all = (0..springs).collect::<Vec<usize>>();
     for mut group in simulator.spring_groups().into_iter().map(|(_, group)| group).chain([all]) {
@@ -121,52 +154,32 @@ pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     if masses > 1 {
         targets.push(Target::Masses((0..masses).collect()));
     }
-    targets.extend([Target::FrequencyScale(None), Target::FrequencyOffset(None)]);
-    if modes > 1 {
-        targets.extend((0..modes).flat_map(|m| [Target::FrequencyScale(Some(m)), Target::FrequencyOffset(Some(m))]));
-    }
-    for column in 0..simulator.space().len() {
-        if data.settings.iter().any(|row| row[column].is_some()) {
-            targets.extend([Target::SettingOffset(column), Target::SettingScale(column)]);
-        }
-    }
-    targets.extend(missing_springs(simulator).into_iter().map(|(from, to)| Target::AddedSpring(from, to)));
-    targets.extend((0..masses).map(Target::Oscillator));
-    // A mode that was overlooked, or two neighbours taken for each other.
-    if masses > modes {
-        let skipping = |skipped: usize| (0..modes).map(|m| m + usize::from(m >= skipped)).collect();
-        targets.extend((0..modes).map(|skipped| Target::ModeOrder(skipping(skipped))));
-    }
-    for low in 0..modes.saturating_sub(1) {
-        let mut order: Vec<usize> = (0..modes).collect();
-        order.swap(low, low + 1);
-        targets.push(Target::ModeOrder(order));
-    }
     targets
 }
 
 /// Pairs of nodes that no spring joins.
-fn missing_springs(simulator: &Simulator) -> Vec<(Node, Node)> {
-    let structure = simulator.structure();
-    let masses = structure.masses().len();
-    let joined =
-        |a: Node, b: Node| structure.springs().iter().any(|s| (s.from, s.to) == (a, b) || (s.from, s.to) == (b, a));
-    let mut neighbours = vec![std::collections::BTreeSet::new(); masses];
+fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
+    let places: Vec<usize> = structure.places().iter().map(|place| place.freedom).collect();
+    let joined = |a: Node, b: Node| {
+        let ends = [Form::Spring(a, b), Form::Spring(b, a)];
+        structure.springs().iter().any(|s| ends.contains(&s.form))
+    };
+    let mut neighbours = vec![std::collections::BTreeSet::new(); structure.freedoms()];
     for spring in structure.springs() {
-        if let (Node::Mass(a), Node::Mass(b)) = (spring.from, spring.to) {
+        if let Form::Spring(Node::Freedom(a), Node::Freedom(b)) = spring.form {
             neighbours[a].insert(b);
             neighbours[b].insert(a);
         }
     }
-    let near = |a: usize, b: usize| masses <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
+    let near = |a: usize, b: usize| places.len() <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
     let mut pairs = Vec::new();
-    for a in 0..masses {
-        if !joined(Node::Ground, Node::Mass(a)) {
-            pairs.push((Node::Ground, Node::Mass(a)));
+    for (index, &a) in places.iter().enumerate() {
+        if !joined(Node::Ground, Node::Freedom(a)) {
+            pairs.push((Node::Ground, Node::Freedom(a)));
         }
-        for b in a + 1..masses {
-            if !joined(Node::Mass(a), Node::Mass(b)) && near(a, b) {
-                pairs.push((Node::Mass(a), Node::Mass(b)));
+        for &b in &places[index + 1..] {
+            if !joined(Node::Freedom(a), Node::Freedom(b)) && near(a, b) {
+                pairs.push((Node::Freedom(a), Node::Freedom(b)));
             }
         }
     }
@@ -179,10 +192,10 @@ fn missing_springs(simulator: &Simulator) -> Vec<(Node, Node)> {
 fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
     let time = covariate == Some(TIME);
     match target {
-        Target::Springs(_) | Target::AddedSpring(..) => match covariate {
+        Target::Springs(_) | Target::ParameterScale(_) | Target::AddedSpring(..) => match covariate {
             _ if time => (Class::PossibleDamage, 1.0),
             Some(_) if category => (Class::SetUp, 0.5),
-            Some(_) => (Class::Environment, if matches!(target, Target::Springs(_)) { 1.0 } else { 0.3 }),
+            Some(_) => (Class::Environment, if matches!(target, Target::AddedSpring(..)) { 0.3 } else { 1.0 }),
             None => (Class::Structure, 0.5),
         },
         Target::Masses(_) => match covariate {
@@ -315,9 +328,8 @@ impl Candidate {
 
     /// Size that such an effect typically has: the scale of its prior.
     pub fn typical_size(&self, simulator: &Simulator) -> f64 {
-        let structure = simulator.structure();
         match &self.target {
-            Target::Springs(_) | Target::Masses(_) | Target::SettingScale(_) => 0.1,
+            Target::Springs(_) | Target::Masses(_) | Target::ParameterScale(_) | Target::SettingScale(_) => 0.1,
             Target::FrequencyScale(_) => 0.01,
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
             Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],
@@ -326,10 +338,16 @@ impl Candidate {
                 0.1 * (p.upper - p.lower)
             }
             Target::AddedSpring(..) => {
-                let stiffness: Vec<f64> = structure.springs().iter().map(|s| s.n_per_m).collect();
-                0.15 * stats::mean(&stiffness)
+                let springs = simulator.structure().map_or(&[][..], Structure::springs);
+                let between = springs.iter().filter(|s| matches!(s.form, Form::Spring(..)));
+                let stiffness: Vec<f64> = between.map(|s| s.n_per_m).collect();
+                let structure = simulator.structure().filter(|_| stiffness.is_empty());
+                // A beam without springs: what its mass at its lowest frequency stands for.
+                let lowest = std::f64::consts::TAU * simulator.nominal_frequencies_hz()[0];
+                let of_beam = structure.map(|s| s.masses().iter().map(|m| m.kg).sum::<f64>() * lowest.powi(2));
+                0.15 * of_beam.unwrap_or_else(|| stats::mean(&stiffness))
             }
-            Target::Oscillator(host) => 0.05 * structure.masses()[*host].kg,
+            Target::Oscillator(host) => 0.05 * simulator.structure().map_or(1.0, |s| s.kg_at(*host)),
             Target::ModeOrder(_) => 1.0,
         }
     }

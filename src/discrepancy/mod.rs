@@ -542,6 +542,9 @@ fn correlation(a: &[f64], b: &[f64]) -> f64 {
     sum(a, ma, b, mb) / (sum(a, ma, a, ma) * sum(b, mb, b, mb)).sqrt()
 }
 
+/// Modes beyond those measured that may be worth measuring.
+const FURTHER_MODES: usize = 5;
+
 /// What would tell two causes apart.
 fn told_apart(simulator: &Simulator, data: &Data, a: &Ranked, b: &Ranked) -> String {
     let (ca, cb) = (&a.candidate, &b.candidate);
@@ -552,7 +555,7 @@ fn told_apart(simulator: &Simulator, data: &Data, a: &Ranked, b: &Ranked) -> Str
             (None, None) => unreachable!("they differ"),
         };
     }
-    let count = simulator.structure().masses().len();
+    let count = simulator.available_modes().min(simulator.modes() + FURTHER_MODES);
     if count > simulator.modes() && a.fit.effects.len() == b.fit.effects.len() {
         if let (Some(fa), Some(fb)) = (extreme(simulator, data, &a.fit, count), extreme(simulator, data, &b.fit, count))
         {

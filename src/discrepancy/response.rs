@@ -163,7 +163,8 @@ struct Afterwards {
 
 impl Afterwards {
     fn new(simulator: &Simulator, targets: &[Target]) -> Self {
-        let structure = simulator.structure();
+        let springs = simulator.structure().map_or(0, |s| s.springs().len());
+        let masses = simulator.structure().map_or(0, |s| s.masses().len());
         // A share of all springs or masses passes through to the frequencies only where nothing is added beside them.
         let added = |t: &Target| matches!(t, Target::AddedSpring(..) | Target::Oscillator(_));
         let alone = !targets.iter().any(added);
@@ -172,8 +173,8 @@ impl Afterwards {
         for (index, target) in targets.iter().enumerate() {
             let later = match target {
                 Target::FrequencyScale(_) | Target::FrequencyOffset(_) => true,
-                Target::Springs(all) => alone && all.len() == structure.springs().len(),
-                Target::Masses(all) => alone && all.len() == structure.masses().len(),
+                Target::Springs(all) => alone && all.len() == springs,
+                Target::Masses(all) => alone && all.len() == masses,
                 _ => false,
             };
             if later { &mut steps } else { &mut structural }.push((index, first));
@@ -341,7 +342,7 @@ mod tests {
             vec![Target::Springs(vec![3]), Target::Springs(all), Target::FrequencyOffset(Some(1))],
             vec![Target::Masses(vec![1]), Target::FrequencyScale(None), Target::FrequencyScale(Some(2))],
             vec![
-                Target::AddedSpring(Node::Mass(0), Node::Mass(2)),
+                Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)),
                 Target::Masses(vec![0, 1, 2]),
                 Target::FrequencyOffset(None),
             ],

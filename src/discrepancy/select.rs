@@ -269,13 +269,14 @@ fn unscreened(
     tunings.extend([1.1 * f[f.len() - 1], 1.5 * f[f.len() - 1]]);
     let ordered = fit.effects.iter().any(|e| matches!(e.target, Target::ModeOrder(_)));
     // Hundreds of hosts would take hours: some of them stand for their neighbours.
-    let hosts = study.simulator.structure().masses().len();
+    let hosts = study.simulator.structure().map_or(0, |s| s.places().len());
     let every = hosts.div_ceil(MOST_HOSTS);
     let mut jobs: Vec<(usize, Option<Vec<f64>>)> = Vec::new();
+    let mut oscillators = 0..;
     for (index, candidate) in candidates.iter().enumerate() {
         let present = fit.effects.iter().any(|e| e.target == candidate.target);
         match candidate.target {
-            Target::Oscillator(host) if !present && host % every == 0 => {
+            Target::Oscillator(_) if !present && oscillators.next().is_some_and(|place| place % every == 0) => {
                 let kg = 0.5 * candidate.typical_size(study.simulator);
                 jobs.extend(tunings.iter().map(|hz| (index, Some(vec![kg, *hz]))));
             }

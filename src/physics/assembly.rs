@@ -1,33 +1,27 @@
-//! Springs and masses to matrices.
+//! Stiffnesses and masses to matrices.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
-use super::{Node, Structure};
+use super::{Form, Structure};
 
-/// Stiffness matrix K, N/m, `[n, n]`, symmetric and positive definite.
+/// Stiffness matrix K, `[n, n]`, symmetric.
 ///
 /// ```text
-///  K = Σ k (e_a − e_b)(e_a − e_b)ᵀ      over springs between masses a and b;  e_b = 0 for the ground
+///  K = Σ k A(form),    a spring between nodes a and b:  A = (e_a − e_b)(e_a − e_b)ᵀ,  e_b = 0 for the ground
 /// ```
 pub fn stiffness_matrix(structure: &Structure) -> DMatrix<f64> {
-    let n = structure.masses().len();
-    let mut k = DMatrix::zeros(n, n);
-    for spring in structure.springs() {
-        match (spring.from, spring.to) {
-            (Node::Mass(a), Node::Mass(b)) => {
-                k[(a, a)] += spring.n_per_m;
-                k[(b, b)] += spring.n_per_m;
-                k[(a, b)] -= spring.n_per_m;
-                k[(b, a)] -= spring.n_per_m;
-            }
-            (Node::Mass(a), Node::Ground) | (Node::Ground, Node::Mass(a)) => k[(a, a)] += spring.n_per_m,
-            (Node::Ground, Node::Ground) => unreachable!("a structure has no spring from the ground to itself"),
-        }
-    }
-    k
+    assemble(structure.freedoms(), structure.springs().iter().map(|s| (&s.form, s.n_per_m)))
 }
 
-/// Diagonal of the mass matrix M, kg, `[n]`: the masses are lumped.
-pub fn mass_diagonal(structure: &Structure) -> DVector<f64> {
-    DVector::from_iterator(structure.masses().len(), structure.masses().iter().map(|m| m.kg))
+/// Mass matrix M, `[n, n]`, symmetric: diagonal for bodies, consistent for spans of beams.
+pub fn mass_matrix(structure: &Structure) -> DMatrix<f64> {
+    assemble(structure.freedoms(), structure.masses().iter().map(|m| (&m.form, m.kg)))
+}
+
+fn assemble<'a>(freedoms: usize, parts: impl Iterator<Item = (&'a Form, f64)>) -> DMatrix<f64> {
+    let mut matrix = DMatrix::zeros(freedoms, freedoms);
+    for (form, value) in parts {
+        form.entries(|row, column, entry| matrix[(row, column)] += value * entry);
+    }
+    matrix
 }

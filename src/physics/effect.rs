@@ -28,9 +28,11 @@ pub enum Target {
     SettingOffset(usize),
     /// A parameter that the experimenter set, p → p(1 + g).
     SettingScale(usize),
+    /// A parameter, p → p(1 + g), whoever set it: what an emulator has in place of springs.
+    ParameterScale(usize),
     /// A further spring of stiffness g, N/m, between two nodes.
     AddedSpring(Node, Node),
-    /// A further body of g₁ kg on a spring tuned to g₂ Hz, attached to a mass.
+    /// A further body of g₁ kg on a spring tuned to g₂ Hz, attached to a degree of freedom.
     Oscillator(usize),
     /// Mode i of the data is mode `order[i]` of the structure; has no size.
     ModeOrder(Vec<usize>),
@@ -80,6 +82,7 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     let mut masses: Vec<Mass> = structure.masses().to_vec();
     // Index of the spring, and of the mass of an oscillator, that an effect adds.
     let mut added: Vec<(usize, usize)> = vec![(0, 0); targets.len()];
+    let mut freedoms = structure.freedoms();
     let mut order: Vec<usize> = (0..count).collect();
     for (number, (first, target)) in places.iter().enumerate() {
         let size = sizes.get(*first).copied().unwrap_or(0.0);
@@ -102,21 +105,24 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
             }
             Target::AddedSpring(from, to) => {
                 added[number].0 = springs.len();
-                springs.push(Spring { name: String::new(), from: *from, to: *to, n_per_m: size });
+                springs.push(Spring::between("", *from, *to, size));
             }
             Target::Oscillator(host) => {
                 let (kg, frequency_hz) = (size.max(LEAST_OSCILLATOR_KG), sizes[first + 1]);
                 added[number] = (springs.len(), masses.len());
                 let n_per_m = angular(frequency_hz).powi(2) * kg;
-                let (from, to) = (Node::Mass(*host), Node::Mass(masses.len()));
-                springs.push(Spring { name: String::new(), from, to, n_per_m });
-                masses.push(Mass { name: String::new(), kg });
+                springs.push(Spring::between("", Node::Freedom(*host), Node::Freedom(freedoms), n_per_m));
+                masses.push(Mass::at("", freedoms, kg));
+                freedoms += 1;
             }
             Target::ModeOrder(modes) => order.clone_from(modes),
             Target::FrequencyScale(_) => {
                 factor(number)?;
             }
-            Target::FrequencyOffset(_) | Target::SettingOffset(_) | Target::SettingScale(_) => {}
+            Target::FrequencyOffset(_)
+            | Target::SettingOffset(_)
+            | Target::SettingScale(_)
+            | Target::ParameterScale(_) => {}
         }
     }
     for (spring, factor) in springs.iter_mut().zip(&spring_factor) {
@@ -126,7 +132,7 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
         mass.kg *= factor;
     }
     // The parts were checked before, and what effects did to them above; a stiffness below zero shows in the eigenvalues.
-    let changed = Structure { masses, springs };
+    let changed = Structure { freedoms, places: structure.places.clone(), masses, springs };
     let needed = order.iter().max().map_or(count, |highest| highest + 1);
     let modes = modes(&changed, needed)?;
     let sensitivity = frequency_sensitivity(&changed, &modes);
@@ -171,6 +177,59 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     let by_spring = DMatrix::from_fn(rows, originals, |row, s| scale[row] * spring_slope(row, s) * spring_factor[s]);
     let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
     Ok(Response { frequencies_hz, by_spring, by_size })
+}
+
+/// Frequencies that another simulation gives, all of its modes, as `count` modes of the data have them, with derivatives by
+/// parameters and by the sizes of effects. Only an instrument and an order of modes can act here; the slopes of parameters'
+/// own effects are left at 0.
+///
+/// # Errors
+/// [`Error::TooFewModes`]; [`Error::Effect`] for an effect on parts that such a simulation does not have.
+pub fn measured(
+    frequencies_hz: &[f64],
+    by_parameter: &DMatrix<f64>,
+    count: usize,
+    targets: &[Target],
+    sizes: &[f64],
+) -> Result<(Vec<f64>, DMatrix<f64>, DMatrix<f64>), Error> {
+    let places = places(targets);
+    let mut order: Vec<usize> = (0..count).collect();
+    for (number, (first, target)) in places.iter().enumerate() {
+        let size = sizes.get(*first).copied().unwrap_or(0.0);
+        match target {
+            Target::ModeOrder(modes) => order.clone_from(modes),
+            Target::FrequencyScale(_) | Target::ParameterScale(_) | Target::SettingScale(_) => {
+                // Not `<`: NaN must fail too.
+                if !(1.0 + size >= LEAST_FACTOR) {
+                    return Err(Error::Effect { number, size });
+                }
+            }
+            Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
+            _ => return Err(Error::Effect { number, size }),
+        }
+    }
+    let needed = order.iter().max().map_or(count, |highest| highest + 1);
+    if needed > frequencies_hz.len() {
+        return Err(Error::TooFewModes { asked: needed, available: frequencies_hz.len() });
+    }
+    let (scale, offset_hz) = instrument(&places, sizes, count);
+    let structural: Vec<f64> = order.iter().map(|mode| frequencies_hz[*mode]).collect();
+    let slopes = DMatrix::from_fn(count, by_parameter.ncols(), |row, k| scale[row] * by_parameter[(order[row], k)]);
+    let mut by_size = DMatrix::zeros(count, sizes.len());
+    for (first, target) in &places {
+        for row in 0..count {
+            let slope = match target {
+                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
+                    structural[row] * scale[row] / (1.0 + sizes[*first])
+                }
+                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => 1.0,
+                _ => continue,
+            };
+            by_size[(row, *first)] = slope;
+        }
+    }
+    let as_measured = (0..count).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
+    Ok((as_measured, slopes, by_size))
 }
 
 /// Product of the scales and sum of the offsets, Hz, of each mode: f → scale·f + offset.

@@ -1,49 +1,113 @@
-//! Structures without networks: masses and springs, and their natural frequencies.
+//! Structures without networks: masses, springs and beams, and their natural frequencies.
 
 pub mod assembly;
+pub mod beam;
 pub mod effect;
 pub mod modes;
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
-
+use beam::Span;
 pub use modes::{frequency_sensitivity, modes, natural_frequencies_hz, FrequencySensitivity, Modes};
 
-/// A rigid body with one degree of freedom.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// A mass: a body, or what a span of a beam weighs.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Mass {
     /// Unique name.
     pub name: String,
     /// Mass, kg.
     pub kg: f64,
+    /// Where it moves.
+    pub form: Form,
+}
+
+impl Mass {
+    /// A body that moves with one degree of freedom.
+    pub fn at(name: impl Into<String>, freedom: usize, kg: f64) -> Self {
+        Self { name: name.into(), kg, form: Form::Spring(Node::Ground, Node::Freedom(freedom)) }
+    }
 }
 
 /// An end of a spring.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Node {
     /// Fixed.
     Ground,
-    /// A mass by its index.
-    Mass(usize),
+    /// A degree of freedom by its index: in a structure of masses and springs, the mass of that index.
+    Freedom(usize),
 }
 
-/// A linear spring between two nodes.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// The matrix that a unit of stiffness or of mass adds.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Form {
+    /// (e_a − e_b)(e_a − e_b)ᵀ, e = 0 for the ground: a spring between two nodes, or a body at one.
+    Spring(Node, Node),
+    /// Bending of a span of beam elements.
+    Bending(Arc<Span>),
+    /// Inertia of such a span, spread evenly.
+    Inertia(Arc<Span>),
+}
+
+impl Form {
+    /// Calls `entry(row, column, value)` for every entry of the matrix; one place may come several times.
+    pub fn entries(&self, mut entry: impl FnMut(usize, usize, f64)) {
+        match self {
+            Self::Spring(a, b) => {
+                let ends = [(a, 1.0), (b, -1.0)].map(|(node, sign)| match node {
+                    Node::Ground => None,
+                    Node::Freedom(freedom) => Some((*freedom, sign)),
+                });
+                for (row, left) in ends.iter().flatten() {
+                    for (column, right) in ends.iter().flatten() {
+                        entry(*row, *column, left * right);
+                    }
+                }
+            }
+            Self::Bending(span) => span.bending(entry),
+            Self::Inertia(span) => span.inertia(entry),
+        }
+    }
+
+    fn freedoms(&self) -> BTreeSet<usize> {
+        let mut all = BTreeSet::new();
+        self.entries(|row, column, _| all.extend([row, column]));
+        all
+    }
+}
+
+/// A stiffness: a linear spring, or the bending stiffness of a span of a beam.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Spring {
     /// Unique name.
     pub name: String,
-    /// One end.
-    pub from: Node,
-    /// The other end.
-    pub to: Node,
-    /// Stiffness, N/m.
+    /// Where it acts.
+    pub form: Form,
+    /// Stiffness: N/m; N·m/rad where it holds a rotation; bending stiffness EI in N·m² for a span.
     pub n_per_m: f64,
 }
 
-/// Masses and springs that hold together: every mass is tied to the ground.
+impl Spring {
+    /// A spring between two nodes.
+    pub fn between(name: impl Into<String>, from: Node, to: Node, n_per_m: f64) -> Self {
+        Self { name: name.into(), form: Form::Spring(from, to), n_per_m }
+    }
+}
+
+/// A named place that moves sideways: springs and bodies can be attached to it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Place {
+    /// Unique name.
+    pub name: String,
+    /// Its degree of freedom.
+    pub freedom: usize,
+}
+
+/// Masses and stiffnesses that hold together.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
+    freedoms: usize,
+    places: Arc<[Place]>,
     masses: Vec<Mass>,
     springs: Vec<Spring>,
 }
@@ -105,6 +169,9 @@ pub enum Error {
         /// Its size.
         size: f64,
     },
+    /// A degree of freedom that nothing gives a mass.
+    #[error("a degree of freedom has no mass: it has no natural frequency")]
+    Massless,
     /// More modes than degrees of freedom.
     #[error("asked for {asked} modes of a structure with {available}")]
     TooFewModes {
@@ -124,12 +191,33 @@ pub enum Error {
 }
 
 impl Structure {
-    /// Checks masses and springs.
+    /// Checks a structure of bodies on springs: one degree of freedom for each mass, in their order.
     ///
     /// # Errors
     /// [`Error`], one variant for each way they can be wrong.
     pub fn new(masses: Vec<Mass>, springs: Vec<Spring>) -> Result<Self, Error> {
-        if masses.is_empty() {
+        let place = |(freedom, mass): (usize, &Mass)| Place { name: mass.name.clone(), freedom };
+        let places = masses.iter().enumerate().map(place).collect();
+        let structure = Self::with_freedoms(masses.len(), places, masses, springs)?;
+        let tied = structure.springs.iter().filter(|s| s.n_per_m > 0.0);
+        if let Some(index) = floating_mass(structure.freedoms, tied) {
+            return Err(Error::Mechanism { mass: structure.masses[index].name.clone() });
+        }
+        Ok(structure)
+    }
+
+    /// Checks a structure of any forms over `freedoms` degrees of freedom. Whether it is tied to the ground shows in its
+    /// eigenvalues.
+    ///
+    /// # Errors
+    /// As [`Self::new`], but for [`Error::Mechanism`].
+    pub fn with_freedoms(
+        freedoms: usize,
+        places: Vec<Place>,
+        masses: Vec<Mass>,
+        springs: Vec<Spring>,
+    ) -> Result<Self, Error> {
+        if freedoms == 0 || masses.is_empty() {
             return Err(Error::NoMass);
         }
         if let Some(mass) = masses.iter().find(|m| !(m.kg.is_finite() && m.kg > 0.0)) {
@@ -140,24 +228,53 @@ impl Structure {
         for spring in &springs {
             let name = || spring.name.clone();
             check_stiffness(spring, spring.n_per_m)?;
-            if spring.from == spring.to {
+            if matches!(&spring.form, Form::Spring(from, to) if from == to) {
                 return Err(Error::Loop { name: name() });
             }
-            for end in [spring.from, spring.to] {
-                if let Node::Mass(index) = end {
-                    if index >= masses.len() {
-                        return Err(Error::UnknownMass { name: name(), index, masses: masses.len() });
-                    }
-                }
+            if let Some(&index) = spring.form.freedoms().iter().find(|index| **index >= freedoms) {
+                return Err(Error::UnknownMass { name: name(), index, masses: freedoms });
             }
         }
-        if let Some(index) = floating_mass(masses.len(), springs.iter().filter(|s| s.n_per_m > 0.0)) {
-            return Err(Error::Mechanism { mass: masses[index].name.clone() });
+        for mass in &masses {
+            if let Some(&index) = mass.form.freedoms().iter().find(|index| **index >= freedoms) {
+                return Err(Error::UnknownMass { name: mass.name.clone(), index, masses: freedoms });
+            }
         }
-        Ok(Self { masses, springs })
+        Ok(Self { freedoms, places: places.into(), masses, springs })
     }
 
-    /// The masses, in the order of the degrees of freedom.
+    /// Number of degrees of freedom.
+    pub fn freedoms(&self) -> usize {
+        self.freedoms
+    }
+
+    /// Places that move sideways, to which something can be attached.
+    pub fn places(&self) -> &[Place] {
+        &self.places
+    }
+
+    /// Name of a node.
+    ///
+    /// # Panics
+    /// When it is no place of this structure: a bug.
+    pub fn node_name(&self, node: Node) -> &str {
+        match node {
+            Node::Ground => "ground",
+            Node::Freedom(freedom) => {
+                let place = self.places.iter().find(|place| place.freedom == freedom);
+                &place.expect("only places are named").name
+            }
+        }
+    }
+
+    /// Mean mass of a place, kg: of the body there, or of the whole structure over its places.
+    pub fn kg_at(&self, freedom: usize) -> f64 {
+        let here = Form::Spring(Node::Ground, Node::Freedom(freedom));
+        let body = self.masses.iter().find(|m| m.form == here).map(|m| m.kg);
+        body.unwrap_or_else(|| self.masses.iter().map(|m| m.kg).sum::<f64>() / self.places.len().max(1) as f64)
+    }
+
+    /// The masses; in a structure of bodies on springs, in the order of the degrees of freedom.
     pub fn masses(&self) -> &[Mass] {
         &self.masses
     }
@@ -202,10 +319,11 @@ pub fn floating_mass<'a>(masses: usize, springs: impl Iterator<Item = &'a Spring
     let mut neighbours = vec![Vec::new(); masses + 1];
     let index = |node: Node| match node {
         Node::Ground => ground,
-        Node::Mass(index) => index,
+        Node::Freedom(index) => index,
     };
     for spring in springs {
-        let (from, to) = (index(spring.from), index(spring.to));
+        let Form::Spring(from, to) = &spring.form else { continue };
+        let (from, to) = (index(*from), index(*to));
         neighbours[from].push(to);
         neighbours[to].push(from);
     }

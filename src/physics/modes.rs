@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
-use super::assembly::{mass_diagonal, stiffness_matrix};
-use super::{Error, Node, Structure};
+use super::assembly::{mass_matrix, stiffness_matrix};
+use super::{Error, Form, Structure};
 
 /// Below this share of the largest eigenvalue, the smallest is rounding: the structure is a mechanism.
 const SINGULAR: f64 = 1e-12;
@@ -34,7 +34,7 @@ impl Modes {
 /// ∂f/∂k and ∂f/∂m of each mode.
 #[derive(Debug, Clone)]
 pub struct FrequencySensitivity {
-    /// Hz per N/m, `[modes, springs]`.
+    /// Hz per N/m (or per unit of another stiffness), `[modes, springs]`.
     pub by_spring: DMatrix<f64>,
     /// Hz per kg, `[modes, masses]`.
     pub by_mass: DMatrix<f64>,
@@ -49,7 +49,8 @@ pub struct FrequencySensitivity {
 /// # Errors
 /// [`Error::TooFewModes`], [`Error::NearMechanism`].
 pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec<f64>, Error> {
-    let mut eigenvalues: Vec<f64> = scaled_stiffness(structure).0.symmetric_eigenvalues().iter().copied().collect();
+    let scaled = Scaled::new(structure)?;
+    let mut eigenvalues: Vec<f64> = scaled.stiffness.symmetric_eigenvalues().iter().copied().collect();
     // nalgebra gives them unsorted.
     eigenvalues.sort_by(f64::total_cmp);
     frequencies(&eigenvalues, count)
@@ -60,20 +61,20 @@ pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec
 /// # Errors
 /// [`Error::TooFewModes`], [`Error::NearMechanism`].
 pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
-    let (scaled, inverse_root_mass) = scaled_stiffness(structure);
-    let SymmetricEigen { eigenvalues, eigenvectors } = scaled.symmetric_eigen();
+    let Scaled { stiffness, mass_root } = Scaled::new(structure)?;
+    let SymmetricEigen { eigenvalues, eigenvectors } = stiffness.symmetric_eigen();
     let mut order: Vec<usize> = (0..eigenvalues.len()).collect();
     order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
     let sorted: Vec<f64> = order.iter().map(|i| eigenvalues[*i]).collect();
     let n = order.len();
-    let all_shapes = DMatrix::from_fn(n, n, |row, column| inverse_root_mass[row] * eigenvectors[(row, order[column])]);
+    let all_shapes = mass_root.shapes(&DMatrix::from_fn(n, n, |row, column| eigenvectors[(row, order[column])]));
     Ok(Modes { frequencies_hz: frequencies(&sorted, count)?, eigenvalues: sorted, all_shapes })
 }
 
 /// Derivatives of the frequencies with respect to every spring and every mass.
 ///
 /// ```text
-///  ∂λ_i/∂k = (φ_ai − φ_bi)²   (φ_ai² for a spring to the ground),    ∂λ_i/∂m_a = −λ_i φ_ai²
+///  ∂λ_i/∂k = φ_iᵀ A φ_i,    ∂λ_i/∂m = −λ_i φ_iᵀ B φ_i      A, B: the matrices of a unit of stiffness, of mass
 ///  ∂f_i = ∂λ_i / (8π² f_i)
 /// ```
 ///
@@ -107,34 +108,66 @@ pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencyS
         }
         result
     };
-    let elongation = |spring: usize, mode: usize| {
-        let displacement = |node| match node {
-            Node::Ground => 0.0,
-            Node::Mass(mass) => shapes[(mass, mode)],
-        };
-        let spring = &structure.springs()[spring];
-        displacement(spring.from) - displacement(spring.to)
+    let product = |form: &Form, i: usize, j: usize| {
+        let mut sum = 0.0;
+        form.entries(|row, column, value| sum += shapes[(row, i)] * value * shapes[(column, j)]);
+        sum
     };
+    let (springs, masses) = (structure.springs(), structure.masses());
     FrequencySensitivity {
-        by_spring: derivative(structure.springs().len(), &|spring, i, j, _| {
-            elongation(spring, i) * elongation(spring, j)
-        }),
-        by_mass: derivative(structure.masses().len(), &|mass, i, j, eigenvalue| {
-            -eigenvalue * shapes[(mass, i)] * shapes[(mass, j)]
-        }),
+        by_spring: derivative(springs.len(), &|spring, i, j, _| product(&springs[spring].form, i, j)),
+        by_mass: derivative(masses.len(), &|mass, i, j, eigenvalue| -eigenvalue * product(&masses[mass].form, i, j)),
     }
 }
 
-/// M^-½ K M^-½, whose eigenvalues are those of K φ = λ M φ, and the diagonal of M^-½.
-fn scaled_stiffness(structure: &Structure) -> (DMatrix<f64>, DVector<f64>) {
-    let mut scaled = stiffness_matrix(structure);
-    let inverse_root = mass_diagonal(structure).map(|kg| 1.0 / kg.sqrt());
-    for row in 0..scaled.nrows() {
-        for column in 0..scaled.ncols() {
-            scaled[(row, column)] *= inverse_root[row] * inverse_root[column];
+/// A = R⁻¹ K R⁻ᵀ with M = R Rᵀ, whose eigenvalues are those of K φ = λ M φ; φ = R⁻ᵀ v.
+struct Scaled {
+    stiffness: DMatrix<f64>,
+    mass_root: MassRoot,
+}
+
+/// R⁻¹: by its diagonal for bodies, by the Cholesky factor R where masses are coupled.
+enum MassRoot {
+    InverseDiagonal(DVector<f64>),
+    Lower(DMatrix<f64>),
+}
+
+impl Scaled {
+    fn new(structure: &Structure) -> Result<Self, Error> {
+        let mut stiffness = stiffness_matrix(structure);
+        let mass = mass_matrix(structure);
+        let n = mass.nrows();
+        let coupled = structure.masses().iter().any(|m| matches!(m.form, Form::Inertia(_) | Form::Bending(_)));
+        if !coupled {
+            let inverse_root = DVector::from_fn(n, |i, _| 1.0 / mass[(i, i)].sqrt());
+            for row in 0..n {
+                for column in 0..n {
+                    stiffness[(row, column)] *= inverse_root[row] * inverse_root[column];
+                }
+            }
+            return Ok(Self { stiffness, mass_root: MassRoot::InverseDiagonal(inverse_root) });
+        }
+        let lower = mass.cholesky().ok_or(Error::Massless)?.l();
+        let solvable = "a Cholesky factor has no zero on its diagonal";
+        let left = lower.solve_lower_triangular(&stiffness).expect(solvable);
+        let scaled = lower.solve_lower_triangular(&left.transpose()).expect(solvable);
+        // Rounding leaves it slightly asymmetric.
+        let symmetric = 0.5 * (&scaled + scaled.transpose());
+        Ok(Self { stiffness: symmetric, mass_root: MassRoot::Lower(lower) })
+    }
+}
+
+impl MassRoot {
+    fn shapes(&self, eigenvectors: &DMatrix<f64>) -> DMatrix<f64> {
+        match self {
+            Self::InverseDiagonal(inverse) => {
+                DMatrix::from_fn(eigenvectors.nrows(), eigenvectors.ncols(), |i, j| inverse[i] * eigenvectors[(i, j)])
+            }
+            Self::Lower(lower) => {
+                lower.tr_solve_lower_triangular(eigenvectors).expect("a Cholesky factor has no zero on its diagonal")
+            }
         }
     }
-    (scaled, inverse_root)
 }
 
 fn frequencies(sorted_eigenvalues: &[f64], count: usize) -> Result<Vec<f64>, Error> {

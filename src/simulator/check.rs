@@ -3,13 +3,13 @@
 use std::collections::BTreeMap;
 
 use super::definition::{
-    DefinitionProblem, Law, MeasurementNoise, ParameterDefinition, Prior, SpringDefinition, StructureDefinition,
+    DefinitionProblem, Law, MeasurementNoise, ParameterDefinition, Prior, Sets, SimulationKind, StructureDefinition,
 };
 use super::effect::{self, Effect};
-use super::Binding;
+use super::{beam, table, Binding, Model};
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::{floating_mass, natural_frequencies_hz, Mass, Node, Spring, Structure};
+use crate::physics::{floating_mass, natural_frequencies_hz, Form, Mass, Node, Place, Spring, Structure};
 use crate::quantity::{shown, StructureId};
 
 /// Most degrees of freedom: a dense eigenproblem of this size takes some three seconds.
@@ -19,15 +19,14 @@ const MOST_MASSES: usize = 2_000;
 #[derive(Debug, Clone)]
 pub(super) struct Checked {
     pub id: StructureId,
-    pub structure: Structure,
+    pub model: Model,
     pub nominal_frequencies_hz: Vec<f64>,
     pub space: ParameterSpace,
-    pub bindings: Vec<Binding>,
     pub covariates: Vec<Covariate>,
     pub effects: Vec<Effect>,
 }
 
-type Problems = Vec<DefinitionProblem>;
+pub(super) type Problems = Vec<DefinitionProblem>;
 
 /// Checks a definition; all mistakes of a stage are reported together, a later stage needs the earlier ones.
 pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problems> {
@@ -35,41 +34,136 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
     let id =
         StructureId::parse(&definition.id).map_err(|e| problems.push(DefinitionProblem::new("/id", e.to_string())));
     check_head(definition, &mut problems);
-    let masses = check_masses(definition, &mut problems);
-    let ends = check_springs(definition, &masses, &mut problems);
+    check_sections(definition, &mut problems);
     check_covariates(definition, &mut problems);
+    let layout = layout(definition, &mut problems);
     let bindings = check_parameters(definition, &mut problems);
     let (Ok(id), true) = (id, problems.is_empty()) else { return Err(problems) };
 
-    let space = ParameterSpace::new(definition.parameters.iter().map(parameter).collect());
-    let springs = springs(definition, &ends, &bindings, &mut problems);
-    check_priors(definition, &springs, &bindings, &mut problems);
-    if !problems.is_empty() {
-        return Err(problems);
-    }
-    let masses = definition.masses.iter().map(|m| Mass { name: m.name.clone(), kg: m.kg }).collect();
-    let structure =
-        Structure::new(masses, springs).map_err(|e| vec![DefinitionProblem::new("/spring", e.to_string())])?;
-    // Tied to the ground is not enough: values far apart can drown the lowest frequency in rounding.
-    let nominal_frequencies_hz = natural_frequencies_hz(&structure, definition.modes)
-        .map_err(|e| vec![DefinitionProblem::new("/spring", format!("at the nominal stiffnesses: {e}"))])?;
+    let space = ParameterSpace::new(definition.parameters.iter().map(|p| parameter(definition, p)).collect());
+    let (model, nominal_frequencies_hz) = match layout {
+        None => {
+            let emulated = table::emulate(definition, &space).map_err(|problem| vec![problem])?;
+            let nominal = emulated.nominal_frequencies_hz(&space, definition.modes);
+            (Model::Table(emulated), nominal)
+        }
+        Some(layout) => {
+            let structure = assemble(definition, layout, &bindings)?;
+            // Tied to the ground is not enough: values far apart can drown the lowest frequency in rounding.
+            let nominal = natural_frequencies_hz(&structure, definition.modes).map_err(|e| {
+                let message = format!("at the nominal stiffnesses: {e}");
+                vec![DefinitionProblem::new("/spring", message)]
+            })?;
+            (Model::Matrices { structure, bindings }, nominal)
+        }
+    };
     let covariates: Vec<Covariate> =
         definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
-    let effects = effect::check(definition, &structure, &covariates, &mut problems);
+    let effects = effect::check(definition, &model, &covariates, &mut problems);
     if !problems.is_empty() {
         return Err(problems);
     }
-    Ok(Checked { id, structure, nominal_frequencies_hz, space, bindings, covariates, effects })
+    Ok(Checked { id, model, nominal_frequencies_hz, space, covariates, effects })
+}
+
+/// Degrees of freedom, places and masses of a structure, and the forms of its stiffnesses: springs, then spans.
+pub(super) struct Layout {
+    pub freedoms: usize,
+    pub places: Vec<Place>,
+    pub masses: Vec<Mass>,
+    pub forms: Vec<Form>,
+}
+
+fn layout(definition: &StructureDefinition, problems: &mut Problems) -> Option<Layout> {
+    match definition.simulation {
+        SimulationKind::Table => None,
+        SimulationKind::Beam => beam::layout(definition, problems),
+        SimulationKind::SpringMass => {
+            let by_name = check_masses(definition, problems);
+            let forms = check_springs(definition, &by_name, problems);
+            let masses = definition.masses.iter().enumerate();
+            let place = |(freedom, m): (usize, &super::definition::MassDefinition)| Place { name: m.name.clone(), freedom };
+            Some(Layout {
+                freedoms: definition.masses.len(),
+                places: masses.clone().map(place).collect(),
+                masses: masses.map(|(freedom, m)| Mass::at(&m.name, freedom, m.kg)).collect(),
+                forms,
+            })
+        }
+    }
+}
+
+/// The structure at its nominal stiffnesses, which holds together over the whole prior.
+fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Binding]) -> Result<Structure, Problems> {
+    let mut problems = Problems::new();
+    let springs = springs(definition, layout.forms, bindings, &mut problems);
+    let weakest = check_priors(definition, &springs, bindings, &mut problems);
+    if definition.simulation == SimulationKind::SpringMass && problems.is_empty() {
+        check_tied(definition, &springs, &weakest, bindings, &mut problems);
+    }
+    if !problems.is_empty() {
+        return Err(problems);
+    }
+    let failed = |e: crate::physics::Error| vec![DefinitionProblem::new("/spring", e.to_string())];
+    let Layout { freedoms, places, masses, .. } = layout;
+    if definition.simulation == SimulationKind::SpringMass {
+        return Structure::new(masses, springs).map_err(failed);
+    }
+    let structure = Structure::with_freedoms(freedoms, places, masses, springs).map_err(failed)?;
+    let least: Vec<(usize, f64)> = weakest.iter().enumerate().map(|(i, s)| (i, s.n_per_m)).collect();
+    let at_weakest = structure.with_stiffness(&least).and_then(|weak| natural_frequencies_hz(&weak, 1));
+    at_weakest.map_err(|e| {
+        let message = format!("with every parameter at its softest: {e}; hold the beam with supports or springs");
+        vec![DefinitionProblem::new("/node", message)]
+    })?;
+    Ok(structure)
+}
+
+/// Sections of another kind of simulation.
+fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
+    let d = definition;
+    let (name, wrong): (_, &[(&str, bool)]) = match d.simulation {
+        SimulationKind::SpringMass => {
+            ("spring_mass", &[("node", !d.nodes.is_empty()), ("beam", !d.beams.is_empty()), ("table", d.table.is_some())])
+        }
+        SimulationKind::Beam => ("beam", &[("table", d.table.is_some())]),
+        SimulationKind::Table => (
+            "table",
+            &[
+                ("mass", !d.masses.is_empty()),
+                ("spring", !d.springs.is_empty()),
+                ("node", !d.nodes.is_empty()),
+                ("beam", !d.beams.is_empty()),
+            ],
+        ),
+    };
+    for (section, _) in wrong.iter().filter(|(_, present)| *present) {
+        let message = format!("a simulation \"{name}\" has no {section}: remove it, or say another simulation = \"…\"");
+        problems.push(DefinitionProblem::new(format!("/{section}"), message));
+    }
+    if d.simulation == SimulationKind::SpringMass {
+        for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at.is_some()) {
+            let message = "only in a simulation \"beam\" a mass sits at a node";
+            problems.push(DefinitionProblem::new(format!("/mass/{index}/at"), message));
+        }
+        for (index, _) in d.springs.iter().enumerate().filter(|(_, s)| s.n_m_per_rad.is_some()) {
+            let message = "only in a simulation \"beam\" a spring holds a rotation: give n_per_m";
+            problems.push(DefinitionProblem::new(format!("/spring/{index}/n_m_per_rad"), message));
+        }
+    }
 }
 
 fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
     let masses = definition.masses.len();
-    if masses == 0 || masses > MOST_MASSES {
+    let bodies = definition.simulation == SimulationKind::SpringMass;
+    if bodies && (masses == 0 || masses > MOST_MASSES) {
         let message = format!("{masses} masses: a structure has 1 to {MOST_MASSES} [[mass]]");
         problems.push(DefinitionProblem::new("/mass", message));
-    } else if definition.modes == 0 || definition.modes > masses {
-        let message = format!("{} modes: a structure of {masses} masses has 1 to {masses}", definition.modes);
+    } else if definition.modes == 0 || (bodies && definition.modes > masses) {
+        let most = if bodies { masses.to_string() } else { "as many as are measured".to_owned() };
+        let of = if bodies { format!("a structure of {masses} masses") } else { "a structure".to_owned() };
+        let message = format!("{} modes: {of} has 1 to {most}", definition.modes);
         problems.push(DefinitionProblem::new("/modes", message));
     }
     let (key, noise) = match definition.measurement_noise {
@@ -87,7 +181,7 @@ fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
 }
 
 /// Names must be unique and usable as a column of a table.
-fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a String>, problems: &mut Problems) {
+pub(super) fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a String>, problems: &mut Problems) {
     let mut seen = BTreeMap::new();
     for (index, name) in names.enumerate() {
         let place = format!("/{section}/{index}/name");
@@ -120,39 +214,44 @@ fn check_masses<'a>(definition: &'a StructureDefinition, problems: &mut Problems
     by_name
 }
 
+/// Forms of the springs between named places.
 fn check_springs(
     definition: &StructureDefinition,
-    masses: &BTreeMap<&str, usize>,
+    places: &BTreeMap<&str, usize>,
     problems: &mut Problems,
-) -> Vec<(Node, Node)> {
+) -> Vec<Form> {
     check_names("spring", definition.springs.iter().map(|s| &s.name), problems);
-    let mut ends = Vec::new();
+    let mut forms = Vec::new();
     for (index, spring) in definition.springs.iter().enumerate() {
-        let mut node = |key: &str, name: &str| match masses.get(name) {
+        let mut node = |key: &str, name: &str| match places.get(name) {
             _ if name == "ground" => Node::Ground,
-            Some(mass) => Node::Mass(*mass),
+            Some(freedom) => Node::Freedom(*freedom),
             None => {
-                let message = format!(
-                    "spring {} goes to {}, which is no mass and not \"ground\"",
-                    shown(&spring.name),
-                    shown(name)
-                );
+                let spring = shown(&spring.name);
+                let message = format!("spring {spring} goes to {}, which is no mass and not \"ground\"", shown(name));
                 problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
                 Node::Ground
             }
         };
-        ends.push((node("from", &spring.from), node("to", &spring.to)));
-        if spring.from == spring.to {
-            let message = format!("spring {} goes from {} to itself", shown(&spring.name), shown(&spring.from));
-            problems.push(DefinitionProblem::new(format!("/spring/{index}/to"), message));
-        }
-        if let Some(n_per_m) = spring.n_per_m.filter(|k| !(k.is_finite() && *k >= 0.0)) {
+        forms.push(Form::Spring(node("from", &spring.from), node("to", &spring.to)));
+        check_spring(spring, index, problems);
+    }
+    forms
+}
+
+/// Ends that differ and a stiffness that is one.
+pub(super) fn check_spring(spring: &super::definition::SpringDefinition, index: usize, problems: &mut Problems) {
+    if spring.from == spring.to {
+        let message = format!("spring {} goes from {} to itself", shown(&spring.name), shown(&spring.from));
+        problems.push(DefinitionProblem::new(format!("/spring/{index}/to"), message));
+    }
+    for (key, unit, value) in [("n_per_m", "N/m", spring.n_per_m), ("n_m_per_rad", "N·m/rad", spring.n_m_per_rad)] {
+        if let Some(value) = value.filter(|k| !(k.is_finite() && *k >= 0.0)) {
             let name = shown(&spring.name);
-            let message = format!("spring {name} has a stiffness of {n_per_m} N/m: it must be finite and not negative");
-            problems.push(DefinitionProblem::new(format!("/spring/{index}/n_per_m"), message));
+            let message = format!("spring {name} has a stiffness of {value} {unit}: it must be finite and not negative");
+            problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
         }
     }
-    ends
 }
 
 fn check_covariates(definition: &StructureDefinition, problems: &mut Problems) {
@@ -178,30 +277,40 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
             let message = format!("uniform = [{lower}, {upper}]: both must be finite, the first below the second");
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/prior/uniform"), message));
         }
-        if parameter.sets.is_empty() {
-            let message = format!("parameter {} sets nothing: name a spring", shown(&parameter.name));
+        let table = definition.simulation == SimulationKind::Table;
+        if parameter.sets.is_empty() && !table {
+            let what = if definition.simulation == SimulationKind::Beam { "a beam or a spring" } else { "a spring" };
+            let message = format!("parameter {} sets nothing: name {what}", shown(&parameter.name));
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/sets"), message));
         }
         for (place, sets) in parameter.sets.iter().enumerate() {
+            let key = if sets.beam.is_some() { "beam" } else { "spring" };
             // A single one may stand in the file as a table or as a list; a list of several has an index.
             let pointer = match parameter.sets.len() {
                 1 => format!("/parameter/{index}/sets"),
-                _ => format!("/parameter/{index}/sets/{place}/spring"),
+                _ => format!("/parameter/{index}/sets/{place}/{key}"),
             };
-            let Some(spring) = definition.springs.iter().position(|s| s.name == sets.spring) else {
-                let message = format!("there is no spring {}", shown(&sets.spring));
-                problems.push(DefinitionProblem::new(pointer, message));
+            let mut wrong = |message: String| problems.push(DefinitionProblem::new(&pointer, message));
+            if table {
+                wrong("parameters of a table are columns of its runs: they set nothing".to_owned());
                 continue;
+            }
+            let spring = match stiffness_index(definition, sets) {
+                Ok(spring) => spring,
+                Err(message) => {
+                    wrong(message);
+                    continue;
+                }
             };
             if let Some(other) = bindings.iter().find(|b| b.spring == spring) {
                 let other = shown(&definition.parameters[other.parameter].name);
-                let message = format!("spring {} is set by parameter {other} already", shown(&sets.spring));
-                problems.push(DefinitionProblem::new(pointer, message));
+                let name = sets.spring.as_ref().or(sets.beam.as_ref()).map_or("", String::as_str);
+                wrong(format!("{key} {} is set by parameter {other} already", shown(name)));
                 continue;
             }
             if let Some(Law::Exponential(e)) = sets.law {
                 if !(e.a.is_finite() && e.b.is_finite() && e.c.is_finite()) {
-                    problems.push(DefinitionProblem::new(pointer, "the constants of a law must be finite"));
+                    wrong("the constants of a law must be finite".to_owned());
                     continue;
                 }
             }
@@ -211,39 +320,76 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
     bindings
 }
 
-fn parameter(definition: &ParameterDefinition) -> Parameter {
+/// Index among the stiffnesses: springs first, then spans.
+fn stiffness_index(definition: &StructureDefinition, sets: &Sets) -> Result<usize, String> {
+    match (&sets.spring, &sets.beam) {
+        (Some(name), None) => {
+            let place = definition.springs.iter().position(|s| s.name == *name);
+            place.ok_or_else(|| format!("there is no spring {}", shown(name)))
+        }
+        (None, Some(name)) => {
+            let place = definition.beams.iter().position(|b| b.name == *name);
+            place.map(|p| definition.springs.len() + p).ok_or_else(|| format!("there is no beam {}", shown(name)))
+        }
+        _ => Err("name one spring or one beam".to_owned()),
+    }
+}
+
+fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) -> Parameter {
     let Prior::Uniform([lower, upper]) = definition.prior;
-    let plain = definition.sets.iter().all(|sets| sets.law.is_none());
-    let unit = definition.unit.clone().unwrap_or_else(|| if plain { "N/m" } else { "–" }.to_owned());
+    let plain = |sets: &Sets| sets.law.is_none();
+    let rotation = |sets: &Sets| {
+        structure.springs.iter().any(|s| Some(&s.name) == sets.spring.as_ref() && s.n_m_per_rad.is_some())
+    };
+    let unit = match definition.sets.first() {
+        Some(_) if !definition.sets.iter().all(plain) => "–",
+        None => "–",
+        Some(sets) if sets.beam.is_some() => "N·m²",
+        Some(sets) if rotation(sets) => "N·m/rad",
+        Some(_) => "N/m",
+    };
+    let unit = definition.unit.clone().unwrap_or_else(|| unit.to_owned());
     Parameter { name: definition.name.clone(), unit, lower, upper, damage: definition.damage }
 }
 
-/// The springs at their nominal stiffness.
+/// The stiffnesses at their nominal values.
 fn springs(
     definition: &StructureDefinition,
-    ends: &[(Node, Node)],
+    forms: Vec<Form>,
     bindings: &[Binding],
     problems: &mut Problems,
 ) -> Vec<Spring> {
-    let nominal = |(index, spring): (usize, &SpringDefinition)| {
+    let springs = definition.springs.iter().map(|s| (&s.name, s.n_per_m.or(s.n_m_per_rad)));
+    let spans = definition.beams.iter().map(|b| (&b.name, b.bending_stiffness_n_m2));
+    let nominal = |(index, ((name, value), form)): (usize, ((&String, Option<f64>), Form))| {
         let binding = bindings.iter().find(|b| b.spring == index);
         let middle = binding.map(|b| {
             let Prior::Uniform([lower, upper]) = definition.parameters[b.parameter].prior;
             b.stiffness(f64::midpoint(lower, upper))
         });
-        let n_per_m = spring.n_per_m.or(middle).unwrap_or_else(|| {
-            let message = format!("spring {} has no n_per_m and no parameter sets it", shown(&spring.name));
-            problems.push(DefinitionProblem::new(format!("/spring/{index}"), message));
+        let n_per_m = value.or(middle).unwrap_or_else(|| {
+            let of_springs = definition.springs.len();
+            let (pointer, message) = if index < of_springs {
+                (format!("/spring/{index}"), format!("spring {} has no n_per_m and no parameter sets it", shown(name)))
+            } else {
+                let message = format!("beam {} has no bending_stiffness_n_m2 and no parameter sets it", shown(name));
+                (format!("/beam/{}", index - of_springs), message)
+            };
+            problems.push(DefinitionProblem::new(pointer, message));
             0.0
         });
-        let (from, to) = ends[index];
-        Spring { name: spring.name.clone(), from, to, n_per_m }
+        Spring { name: name.clone(), form, n_per_m }
     };
-    definition.springs.iter().enumerate().map(nominal).collect()
+    springs.chain(spans).zip(forms).enumerate().map(nominal).collect()
 }
 
-/// No value of the prior may give a negative stiffness or cut a mass off from the ground.
-fn check_priors(definition: &StructureDefinition, springs: &[Spring], bindings: &[Binding], problems: &mut Problems) {
+/// No value of the prior may give a negative stiffness; the stiffnesses at their least.
+fn check_priors(
+    definition: &StructureDefinition,
+    springs: &[Spring],
+    bindings: &[Binding],
+    problems: &mut Problems,
+) -> Vec<Spring> {
     let mut weakest: Vec<Spring> = springs.to_vec();
     for binding in bindings {
         let Prior::Uniform([lower, upper]) = definition.parameters[binding.parameter].prior;
@@ -252,16 +398,26 @@ fn check_priors(definition: &StructureDefinition, springs: &[Spring], bindings: 
         let least = at_lower.min(at_upper);
         let pointer = format!("/parameter/{}/prior/uniform", binding.parameter);
         let name = shown(&springs[binding.spring].name);
+        let kind = if binding.spring < definition.springs.len() { "spring" } else { "beam" };
         // Each end by itself: `min` and `max` pass over NaN, which 0·exp(large) gives.
         if !(least >= 0.0 && at_lower.is_finite() && at_upper.is_finite()) {
-            let message = format!("the prior [{lower}, {upper}] lets spring {name} have a stiffness of {at_lower} to {at_upper} N/m: it must be finite and not negative");
+            let unit = if kind == "beam" { "N·m²" } else { "N/m" };
+            let message = format!("the prior [{lower}, {upper}] lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must be finite and not negative");
             problems.push(DefinitionProblem::new(pointer, message));
         }
         weakest[binding.spring].n_per_m = least;
     }
-    if !problems.is_empty() {
-        return;
-    }
+    weakest
+}
+
+/// No value of the prior may cut a mass off from the ground.
+fn check_tied(
+    definition: &StructureDefinition,
+    springs: &[Spring],
+    weakest: &[Spring],
+    bindings: &[Binding],
+    problems: &mut Problems,
+) {
     let masses = definition.masses.len();
     if let Some(mass) = floating_mass(masses, springs.iter().filter(|s| s.n_per_m > 0.0)) {
         let name = shown(&definition.masses[mass].name);

@@ -13,7 +13,7 @@ use super::check;
 use super::law::LawKind;
 use crate::measurement::CovariateKind;
 use crate::parameter::DamageDirection;
-use crate::quantity::{json_pointer, Digest};
+use crate::quantity::{json_pointer, shown, Digest};
 
 /// A structure as a file describes it; `simulator::Simulator` is the checked form.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,6 +29,18 @@ pub struct StructureDefinition {
     /// Standard deviation of one measured frequency.
     #[serde(default)]
     pub measurement_noise: MeasurementNoise,
+    /// What kind of simulation it is.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub simulation: SimulationKind,
+    /// Places along a beam; only of a simulation `beam`.
+    #[serde(rename = "node", default, skip_serializing_if = "Vec::is_empty")]
+    pub nodes: Vec<NodeDefinition>,
+    /// Spans between nodes; only of a simulation `beam`.
+    #[serde(rename = "beam", default, skip_serializing_if = "Vec::is_empty")]
+    pub beams: Vec<BeamDefinition>,
+    /// Runs of a finite-element model; only of a simulation `table`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub table: Option<TableDefinition>,
     /// Masses.
     #[serde(rename = "mass", default)]
     pub masses: Vec<MassDefinition>,
@@ -88,6 +100,8 @@ pub enum TargetDefinition {
     Springs(Vec<String>),
     /// Mass of these bodies, m(1 + g).
     Masses(Vec<String>),
+    /// This parameter, p(1 + g).
+    Parameter(String),
     /// Scale of the measured frequency of this mode, from 1; of all modes for 0: f(1 + g).
     FrequencyScale(usize),
     /// Offset of the measured frequency of this mode, from 1; of all modes for 0: f + g, Hz.
@@ -98,6 +112,87 @@ pub enum TargetDefinition {
     Oscillator(String),
     /// Mode i of the data is this mode of the structure, from 1.
     ModeOrder(Vec<usize>),
+}
+
+/// What computes the frequencies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SimulationKind {
+    /// Bodies on springs.
+    #[default]
+    SpringMass,
+    /// Euler–Bernoulli beams with bodies and springs.
+    Beam,
+    /// An emulator of the user's own finite-element runs.
+    Table,
+}
+
+/// A place along a beam.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NodeDefinition {
+    /// Unique name; `ground` is taken.
+    pub name: String,
+    /// Position along the beam, m.
+    pub x_m: f64,
+    /// What holds it.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub support: Support,
+}
+
+/// What holds a node of a beam.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Support {
+    /// Nothing.
+    #[default]
+    Free,
+    /// Its deflection.
+    Pinned,
+    /// Its rotation.
+    Guided,
+    /// Both.
+    Clamped,
+}
+
+/// A span of constant cross-section between two nodes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BeamDefinition {
+    /// Unique name.
+    pub name: String,
+    /// Name of the node at one end.
+    pub from: String,
+    /// Name of the node at the other end.
+    pub to: String,
+    /// Nominal bending stiffness EI, N·m²; may be left out where a parameter sets it, whose middle then counts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bending_stiffness_n_m2: Option<f64>,
+    /// Mass per length, kg/m.
+    pub mass_kg_per_m: f64,
+    /// Finite elements of equal length; frequencies converge with the fourth power of their number.
+    #[serde(default = "usual_elements")]
+    pub elements: usize,
+}
+
+fn usual_elements() -> usize {
+    10
+}
+
+/// Runs of a finite-element model, one line each: a column for every parameter by its name, and `f1_hz`, `f2_hz`, ….
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TableDefinition {
+    /// A CSV file, relative to the structure file; its text takes its place as soon as the file is read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+    /// The text of the CSV.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub csv: Option<String>,
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 /// Standard deviation of one measured frequency.
@@ -134,21 +229,27 @@ pub struct MassDefinition {
     pub name: String,
     /// Mass, kg.
     pub kg: f64,
+    /// Node of a beam that it sits on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub at: Option<String>,
 }
 
-/// A spring between two masses, or a mass and the ground.
+/// A spring between two masses or nodes, or one of them and the ground.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpringDefinition {
     /// Unique name.
     pub name: String,
-    /// `ground` or the name of a mass.
+    /// `ground` or the name of a mass, of a node in a simulation `beam`.
     pub from: String,
-    /// `ground` or the name of a mass.
+    /// `ground` or the name of a mass, of a node in a simulation `beam`.
     pub to: String,
     /// Nominal stiffness, N/m; may be left out where a parameter sets it, whose middle then counts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub n_per_m: Option<f64>,
+    /// Nominal stiffness of a spring that holds the rotation of nodes of a beam, N·m/rad.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub n_m_per_rad: Option<f64>,
 }
 
 /// An unknown parameter.
@@ -162,8 +263,8 @@ pub struct ParameterDefinition {
     pub unit: Option<String>,
     /// What is known before measuring.
     pub prior: Prior,
-    /// The springs it sets: one table or a list of them.
-    #[serde(deserialize_with = "one_or_many")]
+    /// The stiffnesses it sets: one table or a list of them; none in a simulation `table`.
+    #[serde(default, deserialize_with = "one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub sets: Vec<Sets>,
     /// Which change is damage.
     #[serde(default)]
@@ -178,12 +279,16 @@ pub enum Prior {
     Uniform([f64; 2]),
 }
 
-/// A spring that a parameter sets.
+/// A stiffness that a parameter sets: a spring or a span.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Sets {
     /// Name of the spring.
-    pub spring: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub spring: Option<String>,
+    /// Or name of the span of a beam, whose bending stiffness it sets.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub beam: Option<String>,
     /// How; without a law the parameter is the stiffness itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub law: Option<Law>,
@@ -285,19 +390,26 @@ impl StructureDefinition {
     /// # Errors
     /// [`DefinitionError`] with line and pointer of each mistake.
     pub fn parse_toml(text: &str) -> Result<Self, DefinitionError> {
+        Self::from_toml(text)?.check(Some(text))
+    }
+
+    fn from_toml(text: &str) -> Result<Self, DefinitionError> {
         let syntax = |error: &toml::de::Error, pointer: String| {
             let line = error.span().map(|span| line_at(text, span.start));
             DefinitionError { problems: vec![DefinitionProblem { pointer, line, message: one_line(error.message()) }] }
         };
         let document = toml::Deserializer::parse(text).map_err(|e| syntax(&e, String::new()))?;
-        let definition: Self =
-            serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), json_pointer(e.path())))?;
-        definition.check().map_err(|mut error| {
-            for problem in &mut error.problems {
-                problem.line = toml_line(text, &problem.pointer);
-            }
-            error
-        })
+        serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), json_pointer(e.path())))
+    }
+
+    /// Reads and checks a TOML file whose table of runs is a file of its own, which `read` reads by its name.
+    ///
+    /// # Errors
+    /// [`DefinitionError`], as [`Self::parse_toml`].
+    pub fn parse_toml_beside(text: &str, read: impl Fn(&str) -> std::io::Result<String>) -> Result<Self, DefinitionError> {
+        let mut definition = Self::from_toml(text)?;
+        definition.take_table(read)?;
+        definition.check(Some(text))
     }
 
     /// Reads and checks JSON.
@@ -305,8 +417,28 @@ impl StructureDefinition {
     /// # Errors
     /// [`DefinitionError`] with the pointer of each mistake.
     pub fn parse_json(text: &str) -> Result<Self, DefinitionError> {
-        let definition: Self = from_json(text)?;
-        definition.check()
+        from_json::<Self>(text)?.check(None)
+    }
+
+    /// Reads and checks JSON whose table of runs is a file of its own, which `read` reads by its name.
+    ///
+    /// # Errors
+    /// [`DefinitionError`], as [`Self::parse_json`].
+    pub fn parse_json_beside(text: &str, read: impl Fn(&str) -> std::io::Result<String>) -> Result<Self, DefinitionError> {
+        let mut definition: Self = from_json(text)?;
+        definition.take_table(read)?;
+        definition.check(None)
+    }
+
+    fn take_table(&mut self, read: impl Fn(&str) -> std::io::Result<String>) -> Result<(), DefinitionError> {
+        let Some(table) = &mut self.table else { return Ok(()) };
+        if let Some(file) = table.file.take_if(|_| table.csv.is_none()) {
+            let failed = |error: std::io::Error| DefinitionError {
+                problems: vec![DefinitionProblem::new("/table/file", format!("{} cannot be read: {error}", shown(&file)))],
+            };
+            table.csv = Some(read(&file).map_err(failed)?);
+        }
+        Ok(())
     }
 
     /// The definition as JSON with its keys in a fixed order: equal definitions give equal text.
@@ -319,8 +451,17 @@ impl StructureDefinition {
         Digest::of(&[self.canonical_json().as_bytes()])
     }
 
-    fn check(self) -> Result<Self, DefinitionError> {
-        check::check(&self).map(|_| self).map_err(|problems| DefinitionError { problems })
+    /// With the line of each mistake where the text is TOML.
+    fn check(self, toml: Option<&str>) -> Result<Self, DefinitionError> {
+        match check::check(&self) {
+            Ok(_) => Ok(self),
+            Err(mut problems) => {
+                for problem in &mut problems {
+                    problem.line = toml.and_then(|text| toml_line(text, &problem.pointer));
+                }
+                Err(DefinitionError { problems })
+            }
+        }
     }
 }
 

@@ -8,6 +8,7 @@ use rand_distr::StandardNormal;
 
 use super::definition::{DefinitionProblem, EffectDefinition, StructureDefinition, TargetDefinition};
 use super::law::{Input, Law, LawKind};
+use super::{Model, Simulator};
 use crate::measurement::{Covariate, CovariateKind, CovariateValue};
 use crate::physics::effect::Target;
 use crate::physics::{Node, Structure};
@@ -193,12 +194,12 @@ fn mean_sizes(effect: &Effect) -> Vec<f64> {
 /// Checks the effects of a definition whose other parts are right.
 pub(super) fn check(
     definition: &StructureDefinition,
-    structure: &Structure,
+    model: &Model,
     covariates: &[Covariate],
     problems: &mut Vec<DefinitionProblem>,
 ) -> Vec<Effect> {
     let one = |(index, effect): (usize, &EffectDefinition)| {
-        check_one(definition, effect, structure, covariates)
+        check_one(definition, effect, model, covariates)
             .map_err(|(key, message)| problems.push(DefinitionProblem::new(format!("/effect/{index}/{key}"), message)))
             .ok()
     };
@@ -210,10 +211,10 @@ type Mistake = (&'static str, String);
 fn check_one(
     definition: &StructureDefinition,
     effect: &EffectDefinition,
-    structure: &Structure,
+    model: &Model,
     covariates: &[Covariate],
 ) -> Result<Effect, Mistake> {
-    let target = check_target(&effect.target, structure, definition.modes)?;
+    let target = check_target(&effect.target, model, definition)?;
     let constant = matches!(effect.law, LawKind::Constant);
     if matches!(effect.law, LawKind::Step | LawKind::Lagged) {
         let message = format!(
@@ -319,23 +320,63 @@ fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option
     Ok(Some(DMatrix::from_fn(n, n, |i, j| scale[i] * factor[(i, j)])))
 }
 
-fn check_target(target: &TargetDefinition, structure: &Structure, modes: usize) -> Result<Target, Mistake> {
+fn check_target(
+    target: &TargetDefinition,
+    model: &Model,
+    definition: &StructureDefinition,
+) -> Result<Target, Mistake> {
+    let modes = definition.modes;
     let wrong = |message: String| ("target", message);
-    let mass = |name: &String| {
-        let place = structure.masses().iter().position(|m| m.name == *name);
-        place.ok_or_else(|| wrong(format!("there is no mass {}", shown(name))))
-    };
-    let spring = |name: &String| {
-        let place = structure.springs().iter().position(|s| s.name == *name);
-        place.ok_or_else(|| wrong(format!("there is no spring {}", shown(name))))
-    };
-    let node = |name: &String| if name == "ground" { Ok(Node::Ground) } else { mass(name).map(Node::Mass) };
-    let some = |count: usize| if count > 0 { Ok(()) } else { Err(wrong("name at least one".to_owned())) };
     let one_mode = |mode: usize| match mode {
         0 => Ok(None),
         mode if mode <= modes => Ok(Some(mode - 1)),
         _ => Err(wrong(format!("mode {mode}: the structure has {modes} modes; 0 stands for all"))),
     };
+    let available = match model {
+        Model::Matrices { structure, .. } => structure.freedoms(),
+        Model::Table(table) => table.emulator().modes(),
+    };
+    match target {
+        TargetDefinition::FrequencyScale(mode) => Ok(Target::FrequencyScale(one_mode(*mode)?)),
+        TargetDefinition::FrequencyOffset(mode) => Ok(Target::FrequencyOffset(one_mode(*mode)?)),
+        TargetDefinition::Parameter(name) => {
+            let place = definition.parameters.iter().position(|p| p.name == *name);
+            place.map(Target::ParameterScale).ok_or_else(|| wrong(format!("there is no parameter {}", shown(name))))
+        }
+        TargetDefinition::ModeOrder(order) => {
+            let mut sorted = order.clone();
+            sorted.sort_unstable();
+            sorted.dedup();
+            let valid =
+                sorted.len() == modes && order.len() == modes && order.iter().all(|m| (1..=available).contains(m));
+            if !valid {
+                return Err(wrong(format!("{modes} different modes from 1 to {available}")));
+            }
+            Ok(Target::ModeOrder(order.iter().map(|m| m - 1).collect()))
+        }
+        _ => match model {
+            Model::Matrices { structure, .. } => check_part(target, structure).map_err(wrong),
+            Model::Table(_) => Err(wrong("a table has no springs and masses: name a parameter".to_owned())),
+        },
+    }
+}
+
+/// A target among the parts of a structure.
+fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target, String> {
+    let mass = |name: &String| {
+        let place = structure.masses().iter().position(|m| m.name == *name);
+        place.ok_or_else(|| format!("there is no mass {}", shown(name)))
+    };
+    let spring = |name: &String| {
+        let place = structure.springs().iter().position(|s| s.name == *name);
+        place.ok_or_else(|| format!("there is no spring {}", shown(name)))
+    };
+    let freedom = |name: &String| {
+        let place = structure.places().iter().find(|place| place.name == *name);
+        place.map(|place| place.freedom).ok_or_else(|| format!("there is nothing {} to attach to", shown(name)))
+    };
+    let node = |name: &String| if name == "ground" { Ok(Node::Ground) } else { freedom(name).map(Node::Freedom) };
+    let some = |count: usize| if count > 0 { Ok(()) } else { Err("name at least one".to_owned()) };
     match target {
         TargetDefinition::Springs(names) => {
             some(names.len())?;
@@ -345,43 +386,34 @@ fn check_target(target: &TargetDefinition, structure: &Structure, modes: usize) 
             some(names.len())?;
             Ok(Target::Masses(names.iter().map(mass).collect::<Result<_, _>>()?))
         }
-        TargetDefinition::FrequencyScale(mode) => Ok(Target::FrequencyScale(one_mode(*mode)?)),
-        TargetDefinition::FrequencyOffset(mode) => Ok(Target::FrequencyOffset(one_mode(*mode)?)),
-        TargetDefinition::AddedSpring([a, b]) if a == b => Err(wrong("a spring from a node to itself".to_owned())),
+        TargetDefinition::AddedSpring([a, b]) if a == b => Err("a spring from a node to itself".to_owned()),
         TargetDefinition::AddedSpring([a, b]) => Ok(Target::AddedSpring(node(a)?, node(b)?)),
-        TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(mass(host)?)),
-        TargetDefinition::ModeOrder(order) => {
-            let masses = structure.masses().len();
-            let mut sorted = order.clone();
-            sorted.sort_unstable();
-            sorted.dedup();
-            let valid = sorted.len() == modes && order.len() == modes && order.iter().all(|m| (1..=masses).contains(m));
-            if !valid {
-                return Err(wrong(format!("{modes} different modes from 1 to {masses}")));
-            }
-            Ok(Target::ModeOrder(order.iter().map(|m| m - 1).collect()))
-        }
+        TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(freedom(host)?)),
+        TargetDefinition::FrequencyScale(_)
+        | TargetDefinition::FrequencyOffset(_)
+        | TargetDefinition::Parameter(_)
+        | TargetDefinition::ModeOrder(_) => unreachable!("no part of a structure"),
     }
 }
 
 /// A target as a structure file writes it; `None` for a setting, which acts on what the experimenter says, not on the
 /// structure.
-pub fn target_definition(target: &Target, structure: &Structure) -> Option<TargetDefinition> {
-    let springs = |indices: &[usize]| indices.iter().map(|i| structure.springs()[*i].name.clone()).collect();
-    let masses = |indices: &[usize]| indices.iter().map(|i| structure.masses()[*i].name.clone()).collect();
-    let node = |node: &Node| match node {
-        Node::Ground => "ground".to_owned(),
-        Node::Mass(index) => structure.masses()[*index].name.clone(),
-    };
+pub fn target_definition(target: &Target, simulator: &Simulator) -> Option<TargetDefinition> {
+    let structure = || simulator.structure().expect("only a structure has parts to name");
+    let springs = |indices: &[usize]| indices.iter().map(|i| structure().springs()[*i].name.clone()).collect();
+    let masses = |indices: &[usize]| indices.iter().map(|i| structure().masses()[*i].name.clone()).collect();
+    let node = |node: Node| structure().node_name(node).to_owned();
+    let parameter = |column: usize| simulator.space().as_slice()[column].name.clone();
     let mode = |mode: &Option<usize>| mode.map_or(0, |m| m + 1);
     match target {
         Target::Springs(indices) => Some(TargetDefinition::Springs(springs(indices))),
         Target::Masses(indices) => Some(TargetDefinition::Masses(masses(indices))),
         Target::FrequencyScale(m) => Some(TargetDefinition::FrequencyScale(mode(m))),
         Target::FrequencyOffset(m) => Some(TargetDefinition::FrequencyOffset(mode(m))),
-        Target::AddedSpring(a, b) => Some(TargetDefinition::AddedSpring([node(a), node(b)])),
-        Target::Oscillator(host) => Some(TargetDefinition::Oscillator(structure.masses()[*host].name.clone())),
+        Target::AddedSpring(a, b) => Some(TargetDefinition::AddedSpring([node(*a), node(*b)])),
+        Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Freedom(*host)))),
         Target::ModeOrder(order) => Some(TargetDefinition::ModeOrder(order.iter().map(|m| m + 1).collect())),
+        Target::ParameterScale(column) => Some(TargetDefinition::Parameter(parameter(*column))),
         Target::SettingOffset(_) | Target::SettingScale(_) => None,
     }
 }

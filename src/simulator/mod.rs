@@ -1,10 +1,15 @@
 //! The bench: parameters in, natural frequencies out.
+//!
+//! Three kinds of simulation stand behind one face, [`Simulator`]: bodies on springs and beams, both as matrices K and M,
+//! and a table of the user's own finite-element runs, as an emulator.
 
+mod beam;
 mod check;
 pub mod definition;
 pub mod effect;
 pub mod law;
 pub mod population;
+pub mod table;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,12 +21,13 @@ use rayon::prelude::*;
 
 use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::effect::{respond, Target};
+use crate::physics::effect::{measured, respond, Target};
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_hz, Structure};
 use crate::quantity::{Digest, StructureId};
 use crate::stats;
 use definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
 use effect::Effect;
+use table::Table;
 
 /// How far outside its simulated range a frequency may lie before it is taken for a mistake of unit or place.
 const FREQUENCY_MARGIN: f64 = 100.0;
@@ -32,12 +38,26 @@ const MARGIN: f64 = 0.1;
 /// Tries to draw a noisy frequency that is positive before giving up.
 const NOISE_TRIES: usize = 100;
 
-/// A parameter that sets a spring.
+/// What computes the frequencies.
+#[derive(Debug, Clone)]
+pub enum Model {
+    /// Matrices K and M, with parameters that set stiffnesses.
+    Matrices {
+        /// The structure at its nominal stiffnesses.
+        structure: Structure,
+        /// Which parameter sets which stiffness.
+        bindings: Vec<Binding>,
+    },
+    /// An emulator of finite-element runs.
+    Table(Table),
+}
+
+/// A parameter that sets a stiffness.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Binding {
     /// Column of the parameter.
     pub parameter: usize,
-    /// Index of the spring.
+    /// Index of the spring or span.
     pub spring: usize,
     /// How; plainly without a law.
     pub law: Option<Law>,
@@ -199,9 +219,50 @@ impl Simulator {
         &self.parts.digest
     }
 
-    /// The structure at its nominal stiffnesses.
-    pub fn structure(&self) -> &Structure {
-        &self.parts.checked.structure
+    /// What computes the frequencies.
+    pub fn model(&self) -> &Model {
+        &self.parts.checked.model
+    }
+
+    /// The structure at its nominal stiffnesses; a table has none.
+    pub fn structure(&self) -> Option<&Structure> {
+        match self.model() {
+            Model::Matrices { structure, .. } => Some(structure),
+            Model::Table(_) => None,
+        }
+    }
+
+    /// The emulated runs, where the simulation is a table.
+    pub fn table(&self) -> Option<&Table> {
+        match self.model() {
+            Model::Table(table) => Some(table),
+            Model::Matrices { .. } => None,
+        }
+    }
+
+    /// Modes that the simulation has, of which the first [`Self::modes`] are measured.
+    pub fn available_modes(&self) -> usize {
+        match self.model() {
+            Model::Matrices { structure, .. } => structure.freedoms(),
+            Model::Table(table) => table.emulator().modes(),
+        }
+    }
+
+    /// What a user should know of the simulation before relying on it.
+    pub fn warnings(&self) -> Vec<String> {
+        self.table().map_or_else(Vec::new, |table| table.warnings(self.modes()))
+    }
+
+    /// Whether `theta` lies where an emulator has no runs.
+    pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
+        self.table().is_some_and(|table| table.emulator().is_outside(theta))
+    }
+
+    fn bindings(&self) -> &[Binding] {
+        match self.model() {
+            Model::Matrices { bindings, .. } => bindings,
+            Model::Table(_) => &[],
+        }
     }
 
     /// The parameters.
@@ -219,9 +280,34 @@ impl Simulator {
         &self.parts.checked.covariates
     }
 
-    /// Standard deviation of one measured frequency.
+    /// Standard deviation of one measured frequency, as the structure file states it.
     pub fn noise(&self) -> MeasurementNoise {
         self.parts.definition.measurement_noise
+    }
+
+    /// Standard deviation of a measured frequency about the simulated one, Hz: the noise that the structure file states,
+    /// and the error of an emulator.
+    pub fn std_hz(&self, mode: usize, frequency_hz: f64) -> f64 {
+        self.with_emulator_error(mode, frequency_hz, self.noise().std_hz(frequency_hz))
+    }
+
+    /// A measurement's own standard deviation with the error of an emulator, Hz.
+    ///
+    /// ```text
+    ///  √(s² + (ε f)²),    ε: the relative error of the mode on runs left out, 0 without an emulator
+    /// ```
+    pub fn with_emulator_error(&self, mode: usize, frequency_hz: f64, measured_std_hz: f64) -> f64 {
+        let relative = self.table().map_or(0.0, |table| table.emulator().relative_error(mode));
+        if relative > 0.0 {
+            measured_std_hz.hypot(relative * frequency_hz)
+        } else {
+            measured_std_hz
+        }
+    }
+
+    /// Whether measured frequencies scatter about the simulated ones at all.
+    pub fn is_noisy(&self) -> bool {
+        (0..self.modes()).any(|mode| self.std_hz(mode, 1.0) > 0.0)
     }
 
     /// Natural frequencies, Hz, ascending, at parameters `theta` (`[d]`, parameter units), without noise.
@@ -229,10 +315,19 @@ impl Simulator {
     /// # Errors
     /// [`physics::Error`] for parameters that give a negative stiffness or a mechanism.
     pub fn frequencies_hz(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
-        if self.effects().is_empty() {
-            return natural_frequencies_hz(&self.structure_at(theta)?, self.modes());
+        if !self.effects().is_empty() {
+            return self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz);
         }
-        self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz)
+        match self.model() {
+            Model::Matrices { structure, bindings } => {
+                natural_frequencies_hz(&structure_at(structure, bindings, theta)?, self.modes())
+            }
+            Model::Table(table) => {
+                let mut frequencies = table.emulator().frequencies_hz(theta);
+                frequencies.truncate(self.modes());
+                Ok(frequencies)
+            }
+        }
     }
 
     /// Derivatives of the frequencies at `theta`, Hz per parameter unit, `[m, d]`.
@@ -249,17 +344,32 @@ impl Simulator {
         if !self.effects().is_empty() {
             return self.respond(theta, self.modes(), &[], &[]).map(|response| response.by_parameter);
         }
-        let structure = self.structure_at(theta)?;
-        let modes = modes(&structure, self.modes())?;
-        let sensitivity = frequency_sensitivity(&structure, &modes);
-        let mut jacobian = DMatrix::zeros(self.modes(), self.space().len());
-        for binding in &self.parts.checked.bindings {
-            let slope = binding.slope(theta[binding.parameter]);
-            for mode in 0..self.modes() {
-                jacobian[(mode, binding.parameter)] += sensitivity.by_spring[(mode, binding.spring)] * slope;
+        self.frequencies_and_jacobian(theta).map(|(_, jacobian)| jacobian)
+    }
+
+    /// [`Self::frequencies_hz`] and [`Self::jacobian`] by one eigenproblem.
+    ///
+    /// # Errors
+    /// As [`Self::frequencies_hz`].
+    pub fn frequencies_and_jacobian(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
+        if !self.effects().is_empty() {
+            let response = self.respond(theta, self.modes(), &[], &[])?;
+            return Ok((response.frequencies_hz, response.by_parameter));
+        }
+        match self.model() {
+            Model::Matrices { structure, bindings } => {
+                let structure = structure_at(structure, bindings, theta)?;
+                let modes = modes(&structure, self.modes())?;
+                let sensitivity = frequency_sensitivity(&structure, &modes);
+                let jacobian = chained(&sensitivity.by_spring, bindings, theta);
+                Ok((modes.frequencies_hz, jacobian))
+            }
+            Model::Table(table) => {
+                let (mut frequencies, jacobian) = table.emulator().frequencies_and_jacobian(theta);
+                frequencies.truncate(self.modes());
+                Ok((frequencies, jacobian.rows(0, self.modes()).into_owned()))
             }
         }
-        Ok(jacobian)
     }
 
     /// The lowest `modes` frequencies at `theta` under the structure's effects and further ones, and their derivatives; `sizes` as in [`respond`].
@@ -283,7 +393,7 @@ impl Simulator {
         for target in targets {
             match target {
                 Target::SettingOffset(column) => theta[*column] += sizes[first],
-                Target::SettingScale(column) => {
+                Target::SettingScale(column) | Target::ParameterScale(column) => {
                     theta[*column] *= 1.0 + sizes[first];
                     set_scale[*column] *= 1.0 + sizes[first];
                 }
@@ -291,21 +401,24 @@ impl Simulator {
             }
             first += target.sizes();
         }
-        let mut response = respond(&self.structure_at(&theta)?, modes, targets, sizes)?;
-        let mut by_parameter = DMatrix::zeros(modes, theta.len());
-        for binding in &self.parts.checked.bindings {
-            let slope = binding.slope(theta[binding.parameter]);
-            for mode in 0..modes {
-                by_parameter[(mode, binding.parameter)] += response.by_spring[(mode, binding.spring)] * slope;
+        let (frequencies_hz, mut by_parameter, mut by_size) = match self.model() {
+            Model::Matrices { structure, bindings } => {
+                let response = respond(&structure_at(structure, bindings, &theta)?, modes, targets, sizes)?;
+                let by_parameter = chained(&response.by_spring, bindings, &theta);
+                (response.frequencies_hz, by_parameter, response.by_size)
             }
-        }
+            Model::Table(table) => {
+                let (frequencies, jacobian) = table.emulator().frequencies_and_jacobian(&theta);
+                measured(&frequencies, &jacobian, modes, targets, sizes)?
+            }
+        };
         first = 0;
         for target in targets {
             for mode in 0..modes {
                 match target {
-                    Target::SettingOffset(column) => response.by_size[(mode, first)] = by_parameter[(mode, *column)],
-                    Target::SettingScale(column) => {
-                        response.by_size[(mode, first)] =
+                    Target::SettingOffset(column) => by_size[(mode, first)] = by_parameter[(mode, *column)],
+                    Target::SettingScale(column) | Target::ParameterScale(column) => {
+                        by_size[(mode, first)] =
                             by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
                     }
                     _ => {}
@@ -316,8 +429,8 @@ impl Simulator {
         for (column, scale) in set_scale.iter().enumerate() {
             by_parameter.column_mut(column).scale_mut(*scale);
         }
-        let by_size = response.by_size.columns(own, sizes.len() - own).into_owned();
-        Ok(Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size })
+        let by_size = by_size.columns(own, sizes.len() - own).into_owned();
+        Ok(Response { frequencies_hz, by_parameter, by_size })
     }
 
     /// Natural frequencies at the nominal stiffnesses, Hz.
@@ -339,22 +452,22 @@ impl Simulator {
     /// The springs set through a law, whose stiffness is monitored beside the parameter.
     pub fn derived_stiffnesses(&self) -> Vec<DerivedStiffness> {
         let derived = |binding: &Binding| {
-            let name = format!("spring:{}", self.structure().springs()[binding.spring].name);
+            let name = format!("spring:{}", self.structure()?.springs()[binding.spring].name);
             Some(DerivedStiffness { name, parameter: binding.parameter, law: binding.law? })
         };
-        self.parts.checked.bindings.iter().filter_map(derived).collect()
+        self.bindings().iter().filter_map(derived).collect()
     }
 
     /// d ln k/dp of the first spring that a parameter sets: what a small change of the parameter is as a share of stiffness.
     pub fn stiffness_share(&self, column: usize, p: f64) -> f64 {
-        let binding = self.parts.checked.bindings.iter().find(|b| b.parameter == column);
+        let binding = self.bindings().iter().find(|b| b.parameter == column);
         binding.map_or(1.0 / p, |b| b.slope(p) / b.stiffness(p))
     }
 
     /// Springs that one parameter sets together, with the parameter's name.
     pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
         let group = |(column, parameter): (usize, &Parameter)| {
-            let bindings = self.parts.checked.bindings.iter().filter(|b| b.parameter == column);
+            let bindings = self.bindings().iter().filter(|b| b.parameter == column);
             let springs: Vec<usize> = bindings.map(|b| b.spring).collect();
             (springs.len() > 1).then(|| (parameter.name.clone(), springs))
         };
@@ -364,11 +477,15 @@ impl Simulator {
     /// The prior box with a margin on each side, which a flow is trained in: a density is hardest to learn at an edge, and
     /// with a margin the edges of the prior are no edges of what was learnt.
     ///
-    /// A tenth of the prior's width, less where a stiffness would fall below half the least of the prior.
+    /// A tenth of the prior's width, less where a stiffness would fall below half the least of the prior; none for a table,
+    /// which ends where its runs do.
     pub fn training_space(&self) -> ParameterSpace {
+        if self.table().is_some() {
+            return self.space().clone();
+        }
         let padded = |(column, parameter): (usize, &Parameter)| {
             let width = parameter.upper - parameter.lower;
-            let bindings = || self.parts.checked.bindings.iter().filter(move |b| b.parameter == column);
+            let bindings = || self.bindings().iter().filter(move |b| b.parameter == column);
             let margin = |edge: f64, outwards: f64| {
                 let stiff = |value: f64, b: &Binding| {
                     let least = b.stiffness(parameter.lower).min(b.stiffness(parameter.upper));
@@ -432,6 +549,14 @@ impl Simulator {
         rows.par_iter().map(simulate).collect()
     }
 
+    /// Frequencies at each row of parameters, with the structure's measurement noise, `[n, m]`, Hz.
+    ///
+    /// # Errors
+    /// [`Error`] for a negative stiffness or a mechanism.
+    pub fn measured(&self, rows: &[Vec<f64>], seed: u64) -> Result<DMatrix<f64>, Error> {
+        self.measure(rows, 1.0, seed)
+    }
+
     /// Frequencies of each row of parameters with measurement noise, `[n, m]`, Hz.
     fn measure(&self, rows: &[Vec<f64>], noise_multiple: f64, seed: u64) -> Result<DMatrix<f64>, Error> {
         let exact = self.exact(rows)?;
@@ -439,7 +564,7 @@ impl Simulator {
         let mut noisy = DMatrix::zeros(rows.len(), self.modes());
         for (row, frequencies) in exact.iter().enumerate() {
             for (mode, &frequency_hz) in frequencies.iter().enumerate() {
-                let std_hz = noise_multiple * self.noise().std_hz(frequency_hz);
+                let std_hz = noise_multiple * self.std_hz(mode, frequency_hz);
                 let mut draw = || frequency_hz + std_hz * stream.sample::<f64, _>(StandardNormal);
                 let value = (0..NOISE_TRIES).map(|_| draw()).find(|f| *f > 0.0);
                 noisy[(row, mode)] = value.ok_or(Error::Noise { frequency_hz, std_hz })?;
@@ -447,10 +572,21 @@ impl Simulator {
         }
         Ok(noisy)
     }
+}
 
-    fn structure_at(&self, theta: &[f64]) -> Result<Structure, physics::Error> {
-        let changes: Vec<(usize, f64)> =
-            self.parts.checked.bindings.iter().map(|b| (b.spring, b.stiffness(theta[b.parameter]))).collect();
-        self.structure().with_stiffness(&changes)
+fn structure_at(structure: &Structure, bindings: &[Binding], theta: &[f64]) -> Result<Structure, physics::Error> {
+    let changes: Vec<(usize, f64)> = bindings.iter().map(|b| (b.spring, b.stiffness(theta[b.parameter]))).collect();
+    structure.with_stiffness(&changes)
+}
+
+/// Derivatives by parameters from those by stiffnesses, `[m, d]`.
+fn chained(by_spring: &DMatrix<f64>, bindings: &[Binding], theta: &[f64]) -> DMatrix<f64> {
+    let mut by_parameter = DMatrix::zeros(by_spring.nrows(), theta.len());
+    for binding in bindings {
+        let slope = binding.slope(theta[binding.parameter]);
+        for mode in 0..by_spring.nrows() {
+            by_parameter[(mode, binding.parameter)] += by_spring[(mode, binding.spring)] * slope;
+        }
     }
+    by_parameter
 }

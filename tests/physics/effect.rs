@@ -23,20 +23,20 @@ fn targets(structure: &Structure) -> Vec<(Target, Vec<f64>)> {
         (Target::FrequencyScale(Some(1)), vec![SIZES[2]]),
         (Target::FrequencyOffset(None), vec![SIZES[2]]),
         (Target::FrequencyOffset(Some(0)), vec![-SIZES[2]]),
-        (Target::AddedSpring(Node::Mass(0), Node::Mass(2)), vec![SIZES[3]]),
-        (Target::AddedSpring(Node::Ground, Node::Mass(1)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Ground, Node::Freedom(1)), vec![SIZES[3]]),
         (Target::Oscillator(1), vec![0.05, 0.2]),
     ]
 }
 
 fn structure() -> Structure {
-    let mass = |i: usize, kg: f64| Mass { name: format!("m{i}"), kg };
-    let spring = |i: usize, from, to, n_per_m| Spring { name: format!("k{i}"), from, to, n_per_m };
+    let mass = |i: usize, kg: f64| Mass::at(format!("m{i}"), i, kg);
+    let spring = |i: usize, from, to, n_per_m| Spring::between(format!("k{i}"), from, to, n_per_m);
     let masses = vec![mass(0, 0.7), mass(1, 0.5), mass(2, 0.3)];
     let springs = vec![
-        spring(0, Node::Ground, Node::Mass(0), 4.0),
-        spring(1, Node::Mass(0), Node::Mass(1), 5.0),
-        spring(2, Node::Mass(1), Node::Mass(2), 6.0),
+        spring(0, Node::Ground, Node::Freedom(0), 4.0),
+        spring(1, Node::Freedom(0), Node::Freedom(1), 5.0),
+        spring(2, Node::Freedom(1), Node::Freedom(2), 6.0),
     ];
     Structure::new(masses, springs).unwrap()
 }
@@ -63,17 +63,17 @@ fn an_effect_is_the_structure_with_it_built_in() {
             m[2].kg *= 0.9;
         })
     ));
-    let tie = |from, to, n_per_m| Spring { name: "new".to_owned(), from, to, n_per_m };
+    let tie = |from, to, n_per_m| Spring::between("new", from, to, n_per_m);
     assert!(close(
-        &under(Target::AddedSpring(Node::Mass(0), Node::Mass(2)), &[1.5]),
-        &built(&|_, s| s.push(tie(Node::Mass(0), Node::Mass(2), 1.5)))
+        &under(Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)), &[1.5]),
+        &built(&|_, s| s.push(tie(Node::Freedom(0), Node::Freedom(2), 1.5)))
     ));
     let (kg, hz) = (0.02, 0.4);
     assert!(close(
         &under(Target::Oscillator(1), &[kg, hz]),
         &built(&|m, s| {
-            m.push(Mass { name: "body".to_owned(), kg });
-            s.push(tie(Node::Mass(1), Node::Mass(3), (std::f64::consts::TAU * hz).powi(2) * kg));
+            m.push(Mass::at("body", 3, kg));
+            s.push(tie(Node::Freedom(1), Node::Freedom(3), (std::f64::consts::TAU * hz).powi(2) * kg));
         })
     ));
     let plain = natural_frequencies_hz(&base, 3).unwrap();
@@ -156,7 +156,7 @@ fn an_effect_of_a_file_acts_by_the_measurements_covariate() {
     let simulator = Simulator::new(StructureDefinition::parse_toml(FILE).unwrap()).unwrap();
     let sizes = |celsius: f64| simulator.effect_sizes(&covariates(celsius));
     assert!((sizes(20.0).values[0] + 0.1).abs() < 1e-12);
-    let softer = simulator.structure().with_stiffness(&[(1, 18.0)]).unwrap();
+    let softer = simulator.structure().unwrap().with_stiffness(&[(1, 18.0)]).unwrap();
     let warm = simulator.under(&sizes(20.0).values).frequencies_hz(&[10.0]).unwrap();
     assert!(close(&warm, &natural_frequencies_hz(&softer, 2).unwrap()));
     // A sensor that hangs at 9999 counts as the end of what was seen, a tenth beyond, and is told.

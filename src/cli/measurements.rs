@@ -1,0 +1,38 @@
+//! Measurements from a CSV file.
+
+use std::path::Path;
+
+use anyhow::Context as _;
+
+use crate::measurement::check::{check_measurements, Expectation};
+use crate::measurement::csv::{self, CsvOptions, Times};
+use crate::measurement::ModalMeasurement;
+use crate::quantity::Timestamp;
+use crate::simulator::Simulator;
+
+/// Reads and checks the measurements of a structure; columns in `ignore` are not read.
+///
+/// # Errors
+/// A file that cannot be read, and every mistake in it with line and column.
+pub fn read_measurements(
+    simulator: &Simulator,
+    path: &Path,
+    ignore: &[String],
+) -> anyhow::Result<Vec<ModalMeasurement>> {
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let options = CsvOptions { times: Times::RowNumber, ignore: ignore.to_vec(), time_column: None };
+    let expectation = Expectation {
+        modes: simulator.modes(),
+        frequency_limits_hz: simulator.frequency_limits_hz(),
+        covariates: simulator.covariates(),
+        space: simulator.space(),
+        now: Timestamp::now(),
+        max_measurements: usize::MAX,
+    };
+    csv::read(&bytes, simulator.modes(), simulator.covariates(), &options)
+        .and_then(|raw| check_measurements(raw, &expectation))
+        .map_err(|problems| {
+            let lines: Vec<String> = problems.iter().map(|p| format!("  {}: {}", p.pointer, p.message)).collect();
+            anyhow::anyhow!("{} is refused:\n{}", path.display(), lines.join("\n"))
+        })
+}

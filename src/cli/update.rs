@@ -1,0 +1,272 @@
+//! `modalwatch update`: the population behind measurements, by sensitivity, by TMCMC or by the trained flow.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use clap::{Args, ValueEnum};
+use indicatif::{ProgressBar, ProgressStyle};
+use nalgebra::DMatrix;
+use serde::Serialize;
+
+use super::calibrate::load;
+use super::measurements::read_measurements;
+use crate::baseline::library::find_structure;
+use crate::damage::Hyperparameters;
+use crate::measurement::ModalMeasurement;
+use crate::monitor::assess::{self, Draws};
+use crate::monitor::MonitorSettings;
+use crate::quantity::Hertz;
+use crate::simulator::Simulator;
+use crate::stats;
+use crate::updating::sensitivity::{prior_lattice, update_all, Update};
+use crate::updating::stochastic::{Estimate, Population, SIMULATED};
+use crate::updating::tmcmc;
+
+/// Update the parameters of a structure by measurements.
+#[derive(Debug, Args)]
+pub struct UpdateArgs {
+    /// How: a deterministic inverse of each measurement; Markov chains over mean and spread; the trained flow
+    #[arg(long, value_enum)]
+    method: Method,
+    /// Structure file (TOML or JSON), or the id of a shipped structure
+    #[arg(long)]
+    structure: String,
+    /// CSV of the measurements
+    #[arg(long)]
+    data: PathBuf,
+    /// Columns that are not read, separated by commas
+    #[arg(long, value_delimiter = ',')]
+    ignore: Vec<String>,
+    /// cinn: the trained baseline's .safetensors, with its .json beside it; the shipped one without it
+    #[arg(long)]
+    model: Option<PathBuf>,
+    /// tmcmc: samples of the chains
+    #[arg(long, default_value_t = 1_000)]
+    samples: usize,
+    /// tmcmc: simulated measurements at each of them
+    #[arg(long, default_value_t = SIMULATED)]
+    simulated: usize,
+    /// tmcmc: noise of the measurements as a multiple of the structure's
+    #[arg(long, default_value_t = 1.0)]
+    noise: f64,
+    /// Seed of everything random
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print the result as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Method {
+    Sensitivity,
+    Tmcmc,
+    Cinn,
+}
+
+/// What is printed; intervals are 90 %.
+#[derive(Debug, Serialize)]
+struct Answer {
+    method: &'static str,
+    measurements_used: usize,
+    measurements_left_out: usize,
+    parameters: Vec<Line>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    evidence: Option<Estimate>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    updates: Vec<SingleUpdate>,
+    notes: Vec<String>,
+    seconds: f64,
+}
+
+#[derive(Debug, Serialize)]
+struct Line {
+    name: String,
+    unit: String,
+    mean: f64,
+    mean_interval: Option<[f64; 2]>,
+    std: Option<f64>,
+    std_interval: Option<[f64; 2]>,
+}
+
+#[derive(Debug, Serialize)]
+struct SingleUpdate {
+    parameters: Vec<f64>,
+    residual_percent: f64,
+    iterations: usize,
+    converged: bool,
+}
+
+/// Reads, updates and prints.
+///
+/// # Errors
+/// A file that is refused, data that the method cannot use.
+pub fn update(args: &UpdateArgs) -> anyhow::Result<()> {
+    let simulator = find_structure(&args.structure)?;
+    let measurements = read_measurements(&simulator, &args.data, &args.ignore)?;
+    anyhow::ensure!(
+        simulator.effects().is_empty() || matches!(args.method, Method::Cinn),
+        "{} has effects that differ from measurement to measurement: only --method cinn knows of them",
+        simulator.id()
+    );
+    let started = Instant::now();
+    let mut answer = match args.method {
+        Method::Sensitivity => by_sensitivity(&simulator, &measurements)?,
+        Method::Tmcmc => by_tmcmc(&simulator, &measurements, args)?,
+        Method::Cinn => by_flow(&measurements, args)?,
+    };
+    answer.seconds = started.elapsed().as_secs_f64();
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&answer)?);
+    } else {
+        print(&answer);
+    }
+    Ok(())
+}
+
+fn by_sensitivity(simulator: &Simulator, measurements: &[ModalMeasurement]) -> anyhow::Result<Answer> {
+    let rows: Vec<Vec<Option<f64>>> =
+        measurements.iter().map(|m| m.frequencies_hz.iter().map(|f| f.map(Hertz::get)).collect()).collect();
+    let updates = update_all(simulator, &rows, &prior_lattice(simulator))?;
+    let mut notes = Vec::new();
+    let stuck = updates.iter().filter(|u| !u.converged).count();
+    if stuck > 0 {
+        notes.push(format!("{stuck} of {} searches did not come to rest", updates.len()));
+    }
+    let missed = updates.iter().filter(|u| !u.is_met()).count();
+    let worst = updates.iter().map(|u| 100.0 * u.residual).fold(0.0, f64::max);
+    if missed > 0 {
+        let message = "measurements are not met exactly by any parameters in the prior; misfit at most";
+        notes.push(format!("{missed} of {} {message} {worst:.3} %", updates.len()));
+    }
+    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| {
+        let values: Vec<f64> = updates.iter().map(|u| u.theta[k]).collect();
+        Line {
+            name: parameter.name.clone(),
+            unit: parameter.unit.clone(),
+            mean: stats::mean(&values),
+            mean_interval: None,
+            std: stats::sample_std(&values),
+            std_interval: None,
+        }
+    };
+    let single = |u: &Update| SingleUpdate {
+        parameters: u.theta.clone(),
+        residual_percent: 100.0 * u.residual,
+        iterations: u.iterations,
+        converged: u.converged,
+    };
+    Ok(Answer {
+        method: "sensitivity",
+        measurements_used: updates.len(),
+        measurements_left_out: 0,
+        parameters: simulator.space().iter().enumerate().map(line).collect(),
+        evidence: None,
+        updates: updates.iter().map(single).collect(),
+        notes,
+        seconds: 0.0,
+    })
+}
+
+fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Result<Answer> {
+    anyhow::ensure!(args.noise >= 0.0 && args.noise.is_finite(), "--noise is {}: it must be 0 or above", args.noise);
+    let complete: Vec<Vec<f64>> = measurements.iter().filter_map(ModalMeasurement::complete_hz).collect();
+    let m = simulator.modes();
+    let measured = DMatrix::from_fn(complete.len(), m, |row, mode| complete[row][mode]);
+    let modes: Vec<usize> = (0..m).collect();
+    let population = Population::new(simulator, &measured, &modes, args.noise, args.simulated, args.seed)?;
+    let settings = tmcmc::Settings { samples: args.samples, ..tmcmc::Settings::default() };
+    let bar = ProgressBar::new(100);
+    let style = "{elapsed} {wide_bar} {msg}";
+    bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
+    let (_, estimate) = population.sample(&settings, args.seed, &|stage| {
+        bar.set_message(format!("exponent {:.2e}, {:.0} % accepted", stage.exponent, 100.0 * stage.acceptance));
+        bar.set_position((100.0 * stage.exponent) as u64);
+    })?;
+    bar.finish_and_clear();
+    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| Line {
+        name: parameter.name.clone(),
+        unit: parameter.unit.clone(),
+        mean: estimate.mean[k],
+        mean_interval: Some(estimate.mean_interval[k]),
+        std: Some(estimate.std[k]),
+        std_interval: Some(estimate.std_interval[k]),
+    };
+    let left_out = measurements.len() - complete.len();
+    let mut notes = Vec::new();
+    if left_out > 0 {
+        notes.push(format!("{left_out} measurements lack a mode: a distance between distributions needs all of them"));
+    }
+    Ok(Answer {
+        method: "tmcmc",
+        measurements_used: complete.len(),
+        measurements_left_out: left_out,
+        parameters: simulator.space().iter().enumerate().map(line).collect(),
+        evidence: Some(estimate),
+        updates: Vec::new(),
+        notes,
+        seconds: 0.0,
+    })
+}
+
+fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Result<Answer> {
+    let baseline = load(&args.structure, args.model.as_deref())?;
+    let settings = MonitorSettings::default();
+    let draws = Draws {
+        per_measurement: settings.draws_per_measurement,
+        for_population: settings.draws_for_population,
+        seed: args.seed,
+    };
+    let batch = assess::draw(&baseline, measurements, None, draws)?;
+    let population = &batch.populations.parameters;
+    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| Line {
+        name: parameter.name.clone(),
+        unit: parameter.unit.clone(),
+        mean: stats::mean(&population[k].mean_draws),
+        mean_interval: Some(population[k].mean_interval()),
+        std: population[k].std_interval().map(|_| stats::mean(&population[k].std_draws)),
+        std_interval: population[k].std_interval(),
+    };
+    let mut notes: Vec<String> = batch.findings.iter().map(|f| f.message.clone()).collect();
+    let pool = batch.posterior.first(settings.draws_per_measurement);
+    for (k, parameter) in baseline.space().iter().enumerate() {
+        let pooled = Hyperparameters::from_pool(&pool.column(k), settings.draws_per_measurement);
+        let std = pooled.std.map_or("-".to_owned(), |std| format!("{std:.4}"));
+        notes.push(format!("pooled samples of {}: mean {:.4}, std {std} (noise included)", parameter.name, pooled.mean));
+    }
+    Ok(Answer {
+        method: "cinn",
+        measurements_used: measurements.len() - batch.left_out,
+        measurements_left_out: batch.left_out,
+        parameters: baseline.space().iter().enumerate().map(line).collect(),
+        evidence: None,
+        updates: Vec::new(),
+        notes,
+        seconds: 0.0,
+    })
+}
+
+fn print(answer: &Answer) {
+    println!(
+        "{} measurements used, {} left out, {:.2} s by {}",
+        answer.measurements_used, answer.measurements_left_out, answer.seconds, answer.method
+    );
+    for note in &answer.notes {
+        println!("note: {note}");
+    }
+    let with = |value: Option<f64>, interval: Option<[f64; 2]>| match (value, interval) {
+        (Some(v), Some([low, high])) => format!("{v:.4} ({low:.4} … {high:.4})"),
+        (Some(v), None) => format!("{v:.4}"),
+        _ => "-".to_owned(),
+    };
+    println!("{:>16} {:>30} {:>30} {:>8}", "parameter", "mean (90 %)", "std (90 %)", "unit");
+    for p in &answer.parameters {
+        let (mean, std) = (with(Some(p.mean), p.mean_interval), with(p.std, p.std_interval));
+        println!("{:>16} {mean:>30} {std:>30} {:>8}", p.name, p.unit);
+    }
+    if let Some(e) = &answer.evidence {
+        let [log_evidence, error] = e.log_evidence;
+        println!("log-evidence {log_evidence:.2} ± {error:.2} nats; {} runs of the model", e.model_runs);
+    }
+}
