@@ -157,7 +157,8 @@ pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError>
     })?;
     let name = path.to_string_lossy();
     let beside = |file: &str| std::fs::read_to_string(path.parent().unwrap_or(Path::new("")).join(file));
-    read_definition(&name, &bytes, beside).map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
+    read_definition(&name, &bytes, beside)
+        .map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
 }
 
 /// A shipped or stored structure for the command line: a file, or the id of a shipped structure.
@@ -167,7 +168,9 @@ pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError>
 pub fn find_structure(path_or_id: &str) -> Result<Simulator, StructureFileError> {
     let shipped = shipped_folders().into_values().find_map(|files| {
         let (name, text) = files.iter().find(|(name, _)| is_definition(name))?;
-        read_definition(name, text, |file| in_folder(&files, file)).ok().filter(|simulator| simulator.id().as_str() == path_or_id)
+        read_definition(name, text, |file| in_folder(&files, file))
+            .ok()
+            .filter(|simulator| simulator.id().as_str() == path_or_id)
     });
     match shipped {
         Some(simulator) if !Path::new(path_or_id).exists() => Ok(simulator),

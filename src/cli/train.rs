@@ -67,6 +67,18 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         );
     }
 
+    if let Some(table) = simulator.table() {
+        let error = |mode: usize| format!("{:.2e}", table.emulator().relative_error(mode));
+        let errors: Vec<String> = (0..simulator.modes()).map(error).collect();
+        eprintln!(
+            "emulator of {} runs: relative error of the modes on runs left out {}",
+            table.runs(),
+            errors.join(", ")
+        );
+    }
+    for warning in simulator.warnings() {
+        eprintln!("note: {warning}");
+    }
     let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
     let settings = TrainSettings { epochs, seed: args.seed, ..TrainSettings::default() };
     let mut flow = FlowSettings::default();

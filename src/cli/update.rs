@@ -20,8 +20,7 @@ use crate::quantity::Hertz;
 use crate::simulator::Simulator;
 use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all, Update};
-use crate::updating::stochastic::{Estimate, Population, SIMULATED};
-use crate::updating::tmcmc;
+use crate::updating::stochastic::{settings, Estimate, Population, SIMULATED};
 
 /// Update the parameters of a structure by measurements.
 #[derive(Debug, Args)]
@@ -176,11 +175,10 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
     let measured = DMatrix::from_fn(complete.len(), m, |row, mode| complete[row][mode]);
     let modes: Vec<usize> = (0..m).collect();
     let population = Population::new(simulator, &measured, &modes, args.noise, args.simulated, args.seed)?;
-    let settings = tmcmc::Settings { samples: args.samples, ..tmcmc::Settings::default() };
     let bar = ProgressBar::new(100);
     let style = "{elapsed} {wide_bar} {msg}";
     bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
-    let (_, estimate) = population.sample(&settings, args.seed, &|stage| {
+    let (_, estimate) = population.sample(&settings(args.samples), args.seed, &|stage| {
         bar.set_message(format!("exponent {:.2e}, {:.0} % accepted", stage.exponent, 100.0 * stage.acceptance));
         bar.set_position((100.0 * stage.exponent) as u64);
     })?;
@@ -233,7 +231,8 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
     for (k, parameter) in baseline.space().iter().enumerate() {
         let pooled = Hyperparameters::from_pool(&pool.column(k), settings.draws_per_measurement);
         let std = pooled.std.map_or("-".to_owned(), |std| format!("{std:.4}"));
-        notes.push(format!("pooled samples of {}: mean {:.4}, std {std} (noise included)", parameter.name, pooled.mean));
+        notes
+            .push(format!("pooled samples of {}: mean {:.4}, std {std} (noise included)", parameter.name, pooled.mean));
     }
     Ok(Answer {
         method: "cinn",

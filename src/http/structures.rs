@@ -24,10 +24,22 @@ struct StructureBody {
     digest: String,
     definition: Value,
     nominal_frequencies_hz: Vec<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    emulator: Option<EmulatorBody>,
     model: Option<ModelBody>,
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
     undamaged: Option<super::answer::Undamaged>,
+}
+
+/// How well the emulator of a table follows its runs; one entry a measured mode.
+#[derive(Debug, Serialize)]
+struct EmulatorBody {
+    runs: usize,
+    /// Root mean square error on runs left out, % of the frequency; added to the noise.
+    error_percent: Vec<f64>,
+    r_squared: Vec<f64>,
+    warnings: Vec<String>,
 }
 
 /// The trained baseline in use.
@@ -140,12 +152,22 @@ fn body(id: &StructureId, watched: &Watched, undamaged: Option<super::answer::Un
         conditions: baseline.manifest().conditions.clone(),
         calibration: baseline.manifest().calibration.clone(),
     });
+    let emulator = watched.simulator.table().map(|table| {
+        let modes = 0..watched.simulator.modes();
+        EmulatorBody {
+            runs: table.runs(),
+            error_percent: modes.clone().map(|mode| 100.0 * table.emulator().relative_error(mode)).collect(),
+            r_squared: modes.map(|mode| table.emulator().r_squared(mode)).collect(),
+            warnings: watched.simulator.warnings(),
+        }
+    });
     let definition = serde_json::from_str(&watched.simulator.definition().canonical_json());
     StructureBody {
         id: id.clone(),
         digest: watched.simulator.digest().to_string(),
         definition: definition.expect("canonical JSON is JSON"),
         nominal_frequencies_hz: watched.simulator.nominal_frequencies_hz(),
+        emulator,
         model,
         model_missing: watched.baseline.as_ref().err().cloned(),
         undamaged,

@@ -422,6 +422,7 @@ pub fn assess(
         );
         findings.push(Finding::new(Code::PriorEdge, Effect::Note, message));
     }
+    findings.extend(beyond_runs(baseline, &samples.posterior));
     let trust = Trust::new(&samples.fit, findings);
     // Nothing is said of damage where the simulation does not hold.
     let compared = context.undamaged.filter(|_| trust.accepted());
@@ -439,6 +440,22 @@ pub fn assess(
         trust,
         assessed_at: Timestamp::now(),
         quantities: damage::assess(&sampled, compared),
+    })
+}
+
+/// Whether much of the posterior lies where the table behind an emulator has no runs.
+fn beyond_runs(baseline: &Baseline, posterior: &PosteriorSamples) -> Option<Finding> {
+    let simulator = baseline.simulator();
+    simulator.table()?;
+    let theta = posterior.theta();
+    let outside = |row: &usize| simulator.is_extrapolated(&theta.row(*row).iter().copied().collect::<Vec<_>>());
+    let share = (0..theta.nrows()).filter(outside).count() as f64 / theta.nrows() as f64;
+    (share > MUCH_EDGE_MASS).then(|| {
+        let message = format!(
+            "{:.0} % of the samples lie where the table of runs has none: the emulator extrapolates; add runs there",
+            100.0 * share
+        );
+        Finding::new(Code::BeyondRuns, Effect::Note, message)
     })
 }
 

@@ -82,8 +82,7 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     let mut masses: Vec<Mass> = structure.masses().to_vec();
     // Index of the spring, and of the mass of an oscillator, that an effect adds.
     let mut added: Vec<(usize, usize)> = vec![(0, 0); targets.len()];
-    let mut freedoms = structure.freedoms();
-    let mut order: Vec<usize> = (0..count).collect();
+    let (mut freedoms, mut order) = (structure.freedoms(), (0..count).collect::<Vec<usize>>());
     for (number, (first, target)) in places.iter().enumerate() {
         let size = sizes.get(*first).copied().unwrap_or(0.0);
         let factor = |index: usize| {
@@ -179,6 +178,17 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     Ok(Response { frequencies_hz, by_spring, by_size })
 }
 
+/// Frequencies of another simulation under effects, and their derivatives.
+#[derive(Debug, Clone)]
+pub struct Measured {
+    /// As the data would have them, Hz, `[m]`.
+    pub frequencies_hz: Vec<f64>,
+    /// Hz per parameter unit, `[m, d]`.
+    pub by_parameter: DMatrix<f64>,
+    /// By the size of each effect, Hz per unit of the size, `[m, sizes]`.
+    pub by_size: DMatrix<f64>,
+}
+
 /// Frequencies that another simulation gives, all of its modes, as `count` modes of the data have them, with derivatives by
 /// parameters and by the sizes of effects. Only an instrument and an order of modes can act here; the slopes of parameters'
 /// own effects are left at 0.
@@ -191,7 +201,7 @@ pub fn measured(
     count: usize,
     targets: &[Target],
     sizes: &[f64],
-) -> Result<(Vec<f64>, DMatrix<f64>, DMatrix<f64>), Error> {
+) -> Result<Measured, Error> {
     let places = places(targets);
     let mut order: Vec<usize> = (0..count).collect();
     for (number, (first, target)) in places.iter().enumerate() {
@@ -199,8 +209,9 @@ pub fn measured(
         match target {
             Target::ModeOrder(modes) => order.clone_from(modes),
             Target::FrequencyScale(_) | Target::ParameterScale(_) | Target::SettingScale(_) => {
-                // Not `<`: NaN must fail too.
-                if !(1.0 + size >= LEAST_FACTOR) {
+                // Compared by what holds: NaN must fail too.
+                let enough = 1.0 + size >= LEAST_FACTOR;
+                if !enough {
                     return Err(Error::Effect { number, size });
                 }
             }
@@ -214,7 +225,8 @@ pub fn measured(
     }
     let (scale, offset_hz) = instrument(&places, sizes, count);
     let structural: Vec<f64> = order.iter().map(|mode| frequencies_hz[*mode]).collect();
-    let slopes = DMatrix::from_fn(count, by_parameter.ncols(), |row, k| scale[row] * by_parameter[(order[row], k)]);
+    let by_parameter =
+        DMatrix::from_fn(count, by_parameter.ncols(), |row, k| scale[row] * by_parameter[(order[row], k)]);
     let mut by_size = DMatrix::zeros(count, sizes.len());
     for (first, target) in &places {
         for row in 0..count {
@@ -228,8 +240,8 @@ pub fn measured(
             by_size[(row, *first)] = slope;
         }
     }
-    let as_measured = (0..count).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
-    Ok((as_measured, slopes, by_size))
+    let frequencies_hz = (0..count).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
+    Ok(Measured { frequencies_hz, by_parameter, by_size })
 }
 
 /// Product of the scales and sum of the offsets, Hz, of each mode: f → scale·f + offset.

@@ -3,7 +3,9 @@
 use nalgebra::DMatrix;
 
 use super::paper::{ALL_61, CASE_2, LAWS, SECONDS};
-use super::trial::{accuracy, add, realised, share_below, state, thresholds, times, Bench, Data, Entry, Series, METHODS};
+use super::trial::{
+    accuracy, add, realised, share_below, state, thresholds, times, Bench, Data, Entry, Series, METHODS,
+};
 use super::{Case, Configuration, LawFit, Method, MethodSamples, Rig, Settings};
 use crate::baseline::Baseline;
 use crate::gsa::{self, sobol_indices, Input, Sensitivity};
@@ -53,7 +55,9 @@ pub fn case2(
     let (mut states, mut methods) = (Vec::new(), Vec::new());
     for repetition in 0..settings.repetitions {
         let seed = settings.seed.wrapping_add(repetition as u64);
-        let of = |name: &str, wanted: &dyn Fn(&Configuration) -> bool| measured(simulator, &configurations, name, wanted, seed);
+        let of = |name: &str, wanted: &dyn Fn(&Configuration) -> bool| {
+            measured(simulator, &configurations, name, wanted, seed)
+        };
         let undamaged = of("undamaged", &|c| !c.damaged)?;
         let damaged = of("damaged", &|c| c.damaged)?;
         let all = of(ALL_61, &|_| true)?;
@@ -68,7 +72,11 @@ pub fn case2(
                 add(&mut series, simulator, &entry);
             }
             let found = bench.find(method, &all, seed)?;
-            add(&mut series, simulator, &Entry { data: &all, method, found: &found, undamaged: None, target_pod: None });
+            add(
+                &mut series,
+                simulator,
+                &Entry { data: &all, method, found: &found, undamaged: None, target_pod: None },
+            );
             seconds[place].push((found.seconds, found.model_runs));
             if repetition == 0 {
                 methods.push(MethodSamples { method, samples: found.samples });
@@ -135,8 +143,7 @@ fn measured(
     wanted: &dyn Fn(&Configuration) -> bool,
     seed: u64,
 ) -> anyhow::Result<Data> {
-    let set: Vec<Vec<f64>> =
-        configurations.iter().filter(|c| wanted(c)).map(|c| vec![c.p12_m, c.p23_m]).collect();
+    let set: Vec<Vec<f64>> = configurations.iter().filter(|c| wanted(c)).map(|c| vec![c.p12_m, c.p23_m]).collect();
     let own = rand::RngCore::next_u64(&mut stats::stream(seed, &format!("case 2, {name}")));
     let frequencies_hz = simulator.measured(&set, own)?;
     let theta = DMatrix::from_fn(set.len(), 2, |row, k| set[row][k]);
@@ -169,9 +176,8 @@ fn sensitivity(settings: &Settings) -> anyhow::Result<Sensitivity> {
         let mut springs: Vec<Spring> = (0..3)
             .map(|i| Spring::between(format!("kg{}", i + 1), Node::Ground, Node::Freedom(i), 2.0 * x[5 + i]))
             .collect();
-        springs.extend(
-            (0..2).map(|k| Spring::between(format!("k{k}"), Node::Freedom(k), Node::Freedom(k + 1), law(k))),
-        );
+        springs
+            .extend((0..2).map(|k| Spring::between(format!("k{k}"), Node::Freedom(k), Node::Freedom(k + 1), law(k))));
         natural_frequencies_hz(&Structure::new(masses, springs)?, 3)
     };
     let samples = if settings.quick { 512 } else { 4096 };

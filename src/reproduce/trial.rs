@@ -18,17 +18,13 @@ use crate::quantity::{Hertz, Timestamp};
 use crate::simulator::Simulator;
 use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all};
-use crate::updating::stochastic::Population;
-use crate::updating::tmcmc;
+use crate::updating::stochastic::{settings, Population, SIMULATED};
 
 /// Posterior samples of each measurement (paper §5.2).
 pub const DRAWS: usize = 10;
 
 /// Factor of Eq. 21.
 const DELTA: f64 = 1.645;
-
-/// Simulated measurements at each point of TMCMC. From a Sobol' sequence: their moments move ln L by less than 0.1.
-const SIMULATED: usize = 128;
 
 /// Held-out points of the prior in the figures of accuracy.
 const HELD_OUT: usize = 1_000;
@@ -108,9 +104,8 @@ impl Bench<'_> {
     fn tmcmc(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
         let modes: Vec<usize> = (0..self.simulator().modes()).collect();
         let population = Population::new(self.simulator(), &data.frequencies_hz, &modes, 1.0, SIMULATED, seed)?;
-        let settings =
-            tmcmc::Settings { samples: self.settings.tmcmc_samples, correlation: 0.5, ..tmcmc::Settings::default() };
-        let (posterior, estimate) = population.sample(&settings, seed, &|_| {})?;
+        let chains = settings(self.settings.tmcmc_samples);
+        let (posterior, estimate) = population.sample(&chains, seed, &|_| {})?;
         let d = estimate.mean.len();
         let mut stream = stats::stream(seed, "population of a posterior");
         let mut draw = |k: usize| -> Vec<f64> {

@@ -89,7 +89,8 @@ pub(super) fn layout(definition: &StructureDefinition, problems: &mut Problems) 
     forms.extend(spans.into_iter().map(Form::Bending));
     let modes = definition.modes;
     if modes > freedoms {
-        let message = format!("{modes} modes of a beam with {freedoms} degrees of freedom: give its spans more elements");
+        let message =
+            format!("{modes} modes of a beam with {freedoms} degrees of freedom: give its spans more elements");
         problems.push(DefinitionProblem::new("/modes", message));
     }
     (problems.len() == before).then_some(Layout { freedoms, places, masses, forms })
@@ -125,8 +126,9 @@ fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: us
         }
     }
     if let (Some(from), Some(to)) = (x_m(&beam.from), x_m(&beam.to)) {
-        // Not `==`: NaN must fail too.
-        if !((to - from).abs() > 0.0) {
+        // Compared by what holds: NaN must fail too.
+        let long = (to - from).abs() > 0.0;
+        if !long {
             wrong("to", format!("beam {name} has no length: both ends are at {from} m"));
         }
     }

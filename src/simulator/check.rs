@@ -83,7 +83,8 @@ fn layout(definition: &StructureDefinition, problems: &mut Problems) -> Option<L
             let by_name = check_masses(definition, problems);
             let forms = check_springs(definition, &by_name, problems);
             let masses = definition.masses.iter().enumerate();
-            let place = |(freedom, m): (usize, &super::definition::MassDefinition)| Place { name: m.name.clone(), freedom };
+            let place =
+                |(freedom, m): (usize, &super::definition::MassDefinition)| Place { name: m.name.clone(), freedom };
             Some(Layout {
                 freedoms: definition.masses.len(),
                 places: masses.clone().map(place).collect(),
@@ -124,9 +125,10 @@ fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Bindin
 fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
     let d = definition;
     let (name, wrong): (_, &[(&str, bool)]) = match d.simulation {
-        SimulationKind::SpringMass => {
-            ("spring_mass", &[("node", !d.nodes.is_empty()), ("beam", !d.beams.is_empty()), ("table", d.table.is_some())])
-        }
+        SimulationKind::SpringMass => (
+            "spring_mass",
+            &[("node", !d.nodes.is_empty()), ("beam", !d.beams.is_empty()), ("table", d.table.is_some())],
+        ),
         SimulationKind::Beam => ("beam", &[("table", d.table.is_some())]),
         SimulationKind::Table => (
             "table",
@@ -248,7 +250,8 @@ pub(super) fn check_spring(spring: &super::definition::SpringDefinition, index: 
     for (key, unit, value) in [("n_per_m", "N/m", spring.n_per_m), ("n_m_per_rad", "N·m/rad", spring.n_m_per_rad)] {
         if let Some(value) = value.filter(|k| !(k.is_finite() && *k >= 0.0)) {
             let name = shown(&spring.name);
-            let message = format!("spring {name} has a stiffness of {value} {unit}: it must be finite and not negative");
+            let message =
+                format!("spring {name} has a stiffness of {value} {unit}: it must be finite and not negative");
             problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
         }
     }

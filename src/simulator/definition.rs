@@ -406,7 +406,10 @@ impl StructureDefinition {
     ///
     /// # Errors
     /// [`DefinitionError`], as [`Self::parse_toml`].
-    pub fn parse_toml_beside(text: &str, read: impl Fn(&str) -> std::io::Result<String>) -> Result<Self, DefinitionError> {
+    pub fn parse_toml_beside(
+        text: &str,
+        read: impl Fn(&str) -> std::io::Result<String>,
+    ) -> Result<Self, DefinitionError> {
         let mut definition = Self::from_toml(text)?;
         definition.take_table(read)?;
         definition.check(Some(text))
@@ -424,7 +427,10 @@ impl StructureDefinition {
     ///
     /// # Errors
     /// [`DefinitionError`], as [`Self::parse_json`].
-    pub fn parse_json_beside(text: &str, read: impl Fn(&str) -> std::io::Result<String>) -> Result<Self, DefinitionError> {
+    pub fn parse_json_beside(
+        text: &str,
+        read: impl Fn(&str) -> std::io::Result<String>,
+    ) -> Result<Self, DefinitionError> {
         let mut definition: Self = from_json(text)?;
         definition.take_table(read)?;
         definition.check(None)
@@ -434,7 +440,10 @@ impl StructureDefinition {
         let Some(table) = &mut self.table else { return Ok(()) };
         if let Some(file) = table.file.take_if(|_| table.csv.is_none()) {
             let failed = |error: std::io::Error| DefinitionError {
-                problems: vec![DefinitionProblem::new("/table/file", format!("{} cannot be read: {error}", shown(&file)))],
+                problems: vec![DefinitionProblem::new(
+                    "/table/file",
+                    format!("{} cannot be read: {error}", shown(&file)),
+                )],
             };
             table.csv = Some(read(&file).map_err(failed)?);
         }

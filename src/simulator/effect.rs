@@ -320,11 +320,7 @@ fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option
     Ok(Some(DMatrix::from_fn(n, n, |i, j| scale[i] * factor[(i, j)])))
 }
 
-fn check_target(
-    target: &TargetDefinition,
-    model: &Model,
-    definition: &StructureDefinition,
-) -> Result<Target, Mistake> {
+fn check_target(target: &TargetDefinition, model: &Model, definition: &StructureDefinition) -> Result<Target, Mistake> {
     let modes = definition.modes;
     let wrong = |message: String| ("target", message);
     let one_mode = |mode: usize| match mode {

@@ -409,7 +409,8 @@ impl Simulator {
             }
             Model::Table(table) => {
                 let (frequencies, jacobian) = table.emulator().frequencies_and_jacobian(&theta);
-                measured(&frequencies, &jacobian, modes, targets, sizes)?
+                let measured = measured(&frequencies, &jacobian, modes, targets, sizes)?;
+                (measured.frequencies_hz, measured.by_parameter, measured.by_size)
             }
         };
         first = 0;
@@ -418,8 +419,7 @@ impl Simulator {
                 match target {
                     Target::SettingOffset(column) => by_size[(mode, first)] = by_parameter[(mode, *column)],
                     Target::SettingScale(column) | Target::ParameterScale(column) => {
-                        by_size[(mode, first)] =
-                            by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
+                        by_size[(mode, first)] = by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
                     }
                     _ => {}
                 }

@@ -127,9 +127,10 @@ fn read_runs(csv: &str, space: &ParameterSpace, modes: usize) -> Result<Runs, St
     let headers: Vec<String> = reader.headers().map_err(|e| e.to_string())?.iter().map(str::to_owned).collect();
     let place = |name: &str| headers.iter().position(|h| h == name);
     let mut wanted = Vec::new();
-    for parameter in space.iter() {
+    for parameter in space {
         let name = shown(&parameter.name);
-        wanted.push(place(&parameter.name).ok_or_else(|| format!("there is no column {name} for the parameter {name}"))?);
+        wanted
+            .push(place(&parameter.name).ok_or_else(|| format!("there is no column {name} for the parameter {name}"))?);
     }
     let mode_columns: Vec<usize> = (1..).map_while(|mode| place(&format!("f{mode}_hz"))).collect();
     if mode_columns.len() < modes {
@@ -138,7 +139,9 @@ fn read_runs(csv: &str, space: &ParameterSpace, modes: usize) -> Result<Runs, St
     wanted.extend(&mode_columns);
     if let Some(unknown) = (0..headers.len()).find(|c| !wanted.contains(c) && headers[*c] != RUN_COLUMN) {
         let name = shown(&headers[unknown]);
-        return Err(format!("the column {name} is no parameter, no frequency (f1_hz, f2_hz, …) and not \"{RUN_COLUMN}\""));
+        return Err(format!(
+            "the column {name} is no parameter, no frequency (f1_hz, f2_hz, …) and not \"{RUN_COLUMN}\""
+        ));
     }
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for record in reader.records() {

@@ -67,6 +67,8 @@ pub enum Code {
     NoiseAboveRange,
     /// Covariates outside what the undamaged state saw.
     Extrapolated,
+    /// Parameters where the table behind an emulator has no runs.
+    BeyondRuns,
     /// The undamaged state has a covariate that this batch lacks.
     CovariateMissing,
     /// Too few effective samples for the hyperparameters.
@@ -75,6 +77,8 @@ pub enum Code {
     Uncalibrated,
     /// Parameters that these modes cannot tell apart.
     NotIdentifiable,
+    /// Modes that the emulator of a table follows badly.
+    EmulatorDoubtful,
 }
 
 /// One thing a reader must know before believing the figures.
@@ -151,9 +155,9 @@ impl Trust {
         self.findings.iter().all(|finding| finding.effect == Effect::Note)
     }
 
-    /// True when it was taken under conditions that the undamaged state did not see.
+    /// True when it was taken under conditions that the undamaged state did not see, or lies where an emulator has no runs.
     pub fn extrapolated(&self) -> bool {
-        self.findings.iter().any(|finding| finding.code == Code::Extrapolated)
+        self.findings.iter().any(|finding| matches!(finding.code, Code::Extrapolated | Code::BeyondRuns))
     }
 }
 
@@ -189,5 +193,7 @@ pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
         let message = format!("these modes hardly tell {} from {other}: damage of one may show in the other", p.name);
         Finding::new(Code::NotIdentifiable, Effect::Note, message)
     });
-    uncalibrated.into_iter().chain(grouped).chain(confused).collect()
+    let simulation = baseline.simulator().warnings().into_iter();
+    let doubtful = simulation.map(|message| Finding::new(Code::EmulatorDoubtful, Effect::Note, message));
+    uncalibrated.into_iter().chain(grouped).chain(confused).chain(doubtful).collect()
 }

@@ -50,11 +50,7 @@ impl Update {
 ///
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
-pub fn update(
-    simulator: &Simulator,
-    frequencies_hz: &[Option<f64>],
-    start: &[f64],
-) -> Result<Update, physics::Error> {
+pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f64]) -> Result<Update, physics::Error> {
     let parameters = simulator.space().as_slice();
     let present: Vec<(usize, f64)> = frequencies_hz.iter().enumerate().filter_map(|(i, f)| Some((i, (*f)?))).collect();
     let d = parameters.len();

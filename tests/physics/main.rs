@@ -191,7 +191,8 @@ fn a_cluster_cut_by_the_number_of_modes_asked_for_has_the_same_derivatives() {
 #[test]
 fn what_is_no_structure_is_named() {
     let two = || vec![mass(0, 1.0), mass(1, 1.0)];
-    let tied = || vec![spring(0, Node::Ground, Node::Freedom(0), 1.0), spring(1, Node::Freedom(0), Node::Freedom(1), 1.0)];
+    let tied =
+        || vec![spring(0, Node::Ground, Node::Freedom(0), 1.0), spring(1, Node::Freedom(0), Node::Freedom(1), 1.0)];
     let with = |change: &dyn Fn(&mut Vec<Mass>, &mut Vec<Spring>)| {
         let (mut masses, mut springs) = (two(), tied());
         change(&mut masses, &mut springs);
@@ -203,7 +204,10 @@ fn what_is_no_structure_is_named() {
     assert!(matches!(with(&|_, s| s[0].n_per_m = -2.0), Error::Stiffness { .. }));
     assert!(matches!(with(&|m, _| m[1].name = "m0".to_owned()), Error::DuplicateName(_)));
     assert!(matches!(with(&|_, s| s[1].form = Form::Spring(Node::Freedom(0), Node::Freedom(0))), Error::Loop { .. }));
-    assert!(matches!(with(&|_, s| s[1].form = Form::Spring(Node::Freedom(0), Node::Freedom(7))), Error::UnknownMass { .. }));
+    assert!(matches!(
+        with(&|_, s| s[1].form = Form::Spring(Node::Freedom(0), Node::Freedom(7))),
+        Error::UnknownMass { .. }
+    ));
     assert_eq!(with(&|_, s| s[0].n_per_m = 0.0), Error::Mechanism { mass: "m0".to_owned() });
     assert_eq!(with(&|_, s| s.truncate(1)), Error::Mechanism { mass: "m1".to_owned() });
     let asked = natural_frequencies_hz(&chain(2, 1.0, 1.0), 3).unwrap_err();

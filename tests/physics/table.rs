@@ -13,7 +13,7 @@ use rand::Rng as _;
 fn runs(simulator: &Simulator, count: usize, seed: u64) -> String {
     let mut stream = stats::stream(seed, "latin hypercube");
     let mut columns: Vec<Vec<f64>> = Vec::new();
-    for parameter in simulator.space().iter() {
+    for parameter in simulator.space() {
         let mut strata: Vec<usize> = (0..count).collect();
         strata.shuffle(&mut stream);
         let mut within = |stratum: &usize| (*stratum as f64 + stream.random::<f64>()) / count as f64;

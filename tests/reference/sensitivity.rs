@@ -1,5 +1,7 @@
 //! Sensitivity-based updating recovers what made the frequencies, from anywhere in the prior.
 
+use std::fmt::Write as _;
+
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 use modalwatch::stats;
@@ -39,7 +41,9 @@ fn updating_ends_at_the_truth_from_two_hundred_starts_or_says_that_it_does_not()
             };
             at_truth += usize::from(simulator.space().iter().zip(found.theta.iter().zip(&truth)).all(near));
         }
-        println!("{name}: {rested} of 200 at rest, {met} meet the frequencies, {at_truth} at the truth; {iterations} steps");
+        println!(
+            "{name}: {rested} of 200 at rest, {met} meet the frequencies, {at_truth} at the truth; {iterations} steps"
+        );
         assert_eq!(rested, 200, "{name}");
         // Of the rig, a second point of the box comes close to the same frequencies: where a start leads there, the search
         // rests at a misfit, and says so.
@@ -83,5 +87,48 @@ fn a_missing_mode_is_left_out_of_the_misfit() {
         frequencies[missing] = None;
         let found = update(&simulator, &frequencies, &[0.05, 0.055]).unwrap();
         assert!(found.is_met(), "without mode {missing}: {found:?}");
+    }
+}
+
+/// Latin-hypercube runs of the rig as the CSV of a table.
+fn rig_runs(rig: &Simulator, count: usize) -> String {
+    use rand::seq::SliceRandom as _;
+    let mut stream = stats::stream(5, "latin hypercube");
+    let mut partner: Vec<usize> = (0..count).collect();
+    partner.shuffle(&mut stream);
+    let mut csv = "p12,p23,f1_hz,f2_hz,f3_hz\n".to_owned();
+    for (run, other) in partner.into_iter().enumerate() {
+        let mut within = |stratum: usize| 0.12 * (stratum as f64 + stream.random::<f64>()) / count as f64;
+        let theta = [within(run), within(other)];
+        let f = rig.frequencies_hz(&theta).unwrap();
+        writeln!(csv, "{},{},{},{},{}", theta[0], theta[1], f[0], f[1], f[2]).unwrap();
+    }
+    csv
+}
+
+#[test]
+fn a_table_of_two_hundred_runs_gives_the_hyperparameters_of_the_simulation_itself() {
+    let rig = simulator(CASES[1].1);
+    let parameter = |p: &str| format!("[[parameter]]\nname = \"{p}\"\nprior = {{ uniform = [0.0, 0.12] }}\n");
+    let head = "id = \"rig-table\"\nsimulation = \"table\"\nmodes = 3\nmeasurement_noise = { relative = 0.001 }\n";
+    let text =
+        format!("{head}{}{}[table]\ncsv = '''\n{}'''\n", parameter("p12"), parameter("p23"), rig_runs(&rig, 200));
+    let table = simulator(&text);
+    for (seed, mean) in [(1, [0.0475, 0.0475]), (2, [0.03, 0.06]), (3, [0.07, 0.04])] {
+        let moments = [("p12", mean[0]), ("p23", mean[1])].map(|(name, mean)| (name.to_owned(), mean, 0.008)).to_vec();
+        let population = modalwatch::simulator::population::Population::new(rig.space(), &moments).unwrap();
+        let drawn = population.draw(&rig, 100, 0.2, seed).unwrap();
+        let rows: Vec<Vec<Option<f64>>> =
+            drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().map(Some).collect()).collect();
+        let hyperparameters = |simulator: &Simulator| -> Vec<f64> {
+            let found = update_all(simulator, &rows, &prior_lattice(simulator)).unwrap();
+            let columns = (0..2).map(|k| found.iter().map(|u| u.theta[k]).collect::<Vec<f64>>());
+            columns.flat_map(|values| [stats::mean(&values), stats::sample_std(&values).unwrap()]).collect()
+        };
+        let (direct, emulated) = (hyperparameters(&rig), hyperparameters(&table));
+        println!("direct {direct:?}, table {emulated:?}");
+        for (a, b) in direct.iter().zip(&emulated) {
+            assert!((a / b - 1.0).abs() < 0.02, "{direct:?} {emulated:?}");
+        }
     }
 }

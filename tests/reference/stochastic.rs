@@ -4,8 +4,7 @@ use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::population::Population as Drawn;
 use modalwatch::simulator::Simulator;
 use modalwatch::stats;
-use modalwatch::updating::stochastic::{Error, Population};
-use modalwatch::updating::tmcmc::Settings;
+use modalwatch::updating::stochastic::{settings, Error, Population};
 use nalgebra::DMatrix;
 
 const MODES: [usize; 3] = [0, 1, 2];
@@ -25,8 +24,7 @@ fn the_posterior_of_mean_and_spread_is_as_wide_as_sampling_theory_says_and_where
     let count = 200;
     let drawn = Drawn::new(simulator.space(), &moments()).unwrap().draw(&simulator, count, 0.0, 3).unwrap();
     let population = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, 128, 1).unwrap();
-    let settings = Settings { correlation: 0.5, ..Settings::default() };
-    let (samples, estimate) = population.sample(&settings, 1, &|_| {}).unwrap();
+    let (samples, estimate) = population.sample(&settings(1_000), 1, &|_| {}).unwrap();
     let root = (count as f64).sqrt();
     for k in 0..3 {
         let realised: Vec<f64> = drawn.theta.column(k).iter().copied().collect();
@@ -50,10 +48,9 @@ fn the_posterior_of_mean_and_spread_is_as_wide_as_sampling_theory_says_and_where
 fn noise_of_the_measurements_is_not_taken_for_spread() {
     let simulator = three_dof();
     let drawn = Drawn::new(simulator.space(), &moments()).unwrap().draw(&simulator, 200, 1.0, 4).unwrap();
-    let settings = Settings { samples: 500, correlation: 0.5, ..Settings::default() };
     let std_of_k2 = |noise: f64| {
         let population = Population::new(&simulator, &drawn.frequencies_hz, &MODES, noise, 128, 1).unwrap();
-        population.sample(&settings, 1, &|_| {}).unwrap().1.std[1]
+        population.sample(&settings(500), 1, &|_| {}).unwrap().1.std[1]
     };
     let (told, untold) = (std_of_k2(1.0), std_of_k2(0.0));
     let exact = stats::sample_std(&drawn.theta.column(1).iter().copied().collect::<Vec<f64>>()).unwrap();
@@ -73,4 +70,22 @@ fn data_without_a_distribution_are_refused() {
     let drawn = Drawn::new(simulator.space(), &moments()).unwrap().draw(&simulator, 20, 0.0, 3).unwrap();
     let many = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, 1 << 17, 1);
     assert!(matches!(many, Err(Error::Points { .. })));
+}
+
+#[test]
+fn the_points_of_the_simulation_have_the_moments_of_thousands() {
+    let simulator = three_dof();
+    let count = 500;
+    let drawn = Drawn::new(simulator.space(), &moments()).unwrap().draw(&simulator, count, 0.0, 5).unwrap();
+    let log_likelihood = |simulated: usize, seed: u64| {
+        let population = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, simulated, seed).unwrap();
+        modalwatch::updating::tmcmc::Target::log_likelihood(&population, &[4.0, 5.0, 6.0, 0.3, 0.1, 0.2])
+    };
+    let exact = log_likelihood(1 << 14, 1);
+    for seed in 0..10 {
+        let few = log_likelihood(modalwatch::updating::stochastic::SIMULATED, seed);
+        println!("ln L {few:.3} of few points, {exact:.3} of many");
+        // A nat is what matters between two points of the posterior.
+        assert!((few - exact).abs() < 0.5, "{few} {exact}");
+    }
 }
