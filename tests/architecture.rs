@@ -12,7 +12,7 @@ const FOUNDATION: [&str; 4] = ["quantity", "stats", "parameter", "measurement"];
 const TABLE: [(&str, &[&str], bool); 27] = [
     ("quantity", &[], false),
     ("stats", &[], false),
-    ("plot", &[], false),
+    ("plot", &["stats"], false),
     ("parameter", &["quantity", "stats"], false),
     ("measurement", &["quantity", "stats", "parameter"], false),
     ("physics", &["quantity", "stats"], false),

@@ -69,7 +69,7 @@ pub fn case1(
         table3: rows(&|s| s.state == "undamaged"),
         table4: rows(&|s| s.state.starts_with("scenario")),
         table5: rows(&|s| s.state == FIVE_HUNDRED),
-        table6: times(training_seconds, &seconds, SECONDS[0], &note),
+        table6: times((training_seconds, settings.training_samples), &seconds, SECONDS[0], &note),
         table8: Vec::new(),
         table9: Vec::new(),
         table10: Vec::new(),

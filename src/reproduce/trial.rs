@@ -295,8 +295,9 @@ fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
     Compared { ours: spread(values), target, paper, paper_percentile: paper.map(percentile) }
 }
 
-/// Times of the methods beside the paper's: `seconds` of training, then what each method found, in the order of [`METHODS`].
-pub fn times(training: f64, found: &[Vec<(f64, Option<usize>)>; 3], paper: [f64; 4], note: &str) -> Vec<Time> {
+/// Times of the methods beside the paper's: seconds and simulated pairs of the training, and what each method took, in the
+/// order of [`METHODS`].
+pub fn times(training: (f64, usize), found: &[Vec<(f64, Option<usize>)>; 3], paper: [f64; 4], note: &str) -> Vec<Time> {
     let median = |method: usize| stats::quantile(&found[method].iter().map(|f| f.0).collect::<Vec<_>>(), 0.5);
     let runs = |method: usize| found[method].first().and_then(|f| f.1);
     let reference = median(1);
@@ -312,7 +313,10 @@ pub fn times(training: f64, found: &[Vec<(f64, Option<usize>)>; 3], paper: [f64;
     vec![
         one(Method::Sensitivity, "updating", median(0), paper[0], runs(0)),
         one(Method::Tmcmc, "updating", reference, paper[1], runs(1)),
-        one(Method::Cinn, "training", training, paper[2], None),
+        Time {
+            note: format!("{} simulated pairs", training.1),
+            ..one(Method::Cinn, "training", training.0, paper[2], None)
+        },
         one(Method::Cinn, "inference", median(2), paper[3], None),
     ]
 }

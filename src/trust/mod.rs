@@ -169,11 +169,18 @@ pub fn too_many(bad: usize, all: usize) -> bool {
     bad > 0 && (bad == all || bad as f64 > (MOST_BAD * all as f64).max(1.0))
 }
 
+/// Failures of a calibration that a finding quotes.
+const SHOWN_FAILURES: usize = 3;
+
 /// What every answer of a baseline must say: that it did not pass its calibration, or cannot tell parameters apart.
 pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
     let record = &baseline.manifest().calibration;
     let uncalibrated = (!record.passed()).then(|| {
-        let message = format!("the trained baseline in use failed its calibration: {}", record.failures.join("; "));
+        // A flow that was trained far too short fails in dozens of places, and some of them say it as well as all.
+        let some = record.failures.iter().take(SHOWN_FAILURES).cloned().collect::<Vec<_>>().join("; ");
+        let more = record.failures.len().saturating_sub(SHOWN_FAILURES);
+        let more = if more > 0 { format!("; and {more} more, see its manifest") } else { String::new() };
+        let message = format!("the trained baseline in use failed its calibration: {some}{more}");
         Finding::new(Code::Uncalibrated, Effect::Note, message)
     });
     let grouped = baseline.groups().into_iter().map(|group| {

@@ -3,8 +3,9 @@
 //! - [`sensitivity`]: a deterministic inverse for each measurement;
 //! - [`stochastic`]: the population behind a batch, sampled by [`tmcmc`] under a likelihood by the Bhattacharyya
 //!   [`distance`];
-//! - [`law`]: how the stiffness of a coupling follows its setting.
+//! - [`chain`] and [`law`]: stiffnesses of couplings out of frequencies, and how they follow their settings.
 
+pub mod chain;
 pub mod distance;
 pub mod law;
 

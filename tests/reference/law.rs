@@ -3,9 +3,8 @@
 use std::f64::consts::PI;
 
 use modalwatch::stats;
-use modalwatch::updating::law::{
-    coupling_stiffness, fit_exponential, ChainError, CouplingStiffness, Estimate, ExponentialFit, FitError, Weighting,
-};
+use modalwatch::updating::chain::{coupling_stiffness, ChainError, CouplingStiffness};
+use modalwatch::updating::law::{fit_exponential, Estimate, ExponentialFit, FitError, Weighting};
 use nalgebra::Matrix3;
 use rand_distr::{Distribution as _, StandardNormal};
 

@@ -1,9 +1,23 @@
 //! Plots as SVG, and the self-contained page they stand in.
+//!
+//! - [`Plot`] and [`Scatter`]: one large plot on a light card;
+//! - [`Panel`] and [`Heat`]: small ones that stand side by side and follow the scheme of the page;
+//! - [`density`]: what a panel draws of samples.
+
+pub mod density;
+mod heat;
+mod panel;
+mod strip;
+mod ticks;
 
 use std::fmt::Write as _;
 
 use plotters::prelude::*;
 use plotters::style::FontFamily;
+
+pub use heat::Heat;
+pub use panel::{figure, key, Bars, Cloud, Curve, Panel, Swatch};
+pub use strip::{strip, strip_keys};
 
 const WIDTH: u32 = 560;
 const HEIGHT: u32 = 320;
@@ -199,8 +213,14 @@ const STYLE: &str =
      opacity:.85;font-size:.9rem}.card{background:var(--soft);border-radius:6px;padding:.75rem 1rem;margin:1rem 0}\
      .card h3{margin:0 0 .4rem}.bar{display:block;width:8rem;height:.6rem;background:var(--soft);fill:var(--bar)}\
      dt{font-weight:600}dd{margin:0 0 .6rem}.bad{color:var(--bad);font-weight:600}\
-     @media print{body{margin:0;max-width:none;font-size:11pt}figure,tr,.card{break-inside:avoid}\
-     .scroll{overflow:visible}}";
+     .dense th{white-space:nowrap}.dense tbody th{min-width:0}.dense td,.dense th{padding:.2rem .5rem}\
+     th.group{font-weight:600;text-align:left;padding-top:.8rem}\
+     .dense tbody tr.first>*{border-top:1px solid var(--rule)}.dense tbody td,.dense tbody th{border-bottom:0}\
+     .dense{border-bottom:1px solid var(--rule)}caption span{display:inline-block;position:sticky;left:0;\
+     max-width:min(52rem,calc(100vw - 2.5rem))}svg.strip{display:block;width:8.75rem;height:1.1rem;margin-top:.2rem}\
+     nav ul{padding-left:1.1rem}nav a{white-space:nowrap}a{color:var(--bar)}.quiet{opacity:.75;font-size:.85em}\
+     details>summary{cursor:pointer}@media(max-width:40rem){.dense{font-size:.88rem}}@media print{body{margin:0;\
+     max-width:none;font-size:11pt}figure,tr,.card{break-inside:avoid}.scroll{overflow:visible}}";
 
 /// A self-contained HTML page: sections of title and content, which must already be HTML.
 pub fn page(title: &str, sections: &[(String, String)]) -> String {
@@ -209,16 +229,23 @@ pub fn page(title: &str, sections: &[(String, String)]) -> String {
     write!(
         html,
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" \
-         content=\"width=device-width,initial-scale=1\"><title>{title}</title><style>{STYLE}</style></head><body>\
-         <h1>{title}</h1>"
+         content=\"width=device-width,initial-scale=1\"><title>{title}</title><style>{STYLE}{}</style></head><body>\
+         <h1>{title}</h1>",
+        panel::STYLE
     )
     .expect("writing to memory cannot fail");
     for (heading, content) in sections {
-        write!(html, "<section><h2>{}</h2>{content}</section>", escaped(heading))
+        write!(html, "<section id=\"{}\"><h2>{}</h2>{content}</section>", anchor(heading), escaped(heading))
             .expect("writing to memory cannot fail");
     }
     html.push_str("</body></html>\n");
     html
+}
+
+/// The id of the section under a heading: its letters and digits, small, with hyphens between.
+pub fn anchor(heading: &str) -> String {
+    let words = heading.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty());
+    words.map(str::to_lowercase).collect::<Vec<_>>().join("-")
 }
 
 /// A table as HTML; the first cell of a row names it.

@@ -1,0 +1,116 @@
+//! Tables 3 to 6 and Figures 8 to 14.
+
+use super::figure::{
+    accuracy, damage, damage_told, frequencies, frequency_keys, method_keys, methods, posterior_keys, posteriors,
+    CHANGED, OURS, TEXT,
+};
+use super::table;
+use super::words::capital;
+use crate::plot::{figure, key, Swatch};
+use crate::reproduce::{Case, State};
+
+/// The case, in the order of the paper.
+pub fn html(case: &Case) -> String {
+    let undamaged = case.states.first();
+    let scenarios = case.states.get(1..).unwrap_or_default();
+    [
+        "<h3>Training</h3>".to_owned(),
+        accuracy("fig8", 8, &case.accuracy),
+        "<h3>Undamaged state</h3>".to_owned(),
+        measured(undamaged),
+        found(undamaged),
+        table::states(
+            "table3",
+            "Table 3. Undamaged state: mean and standard deviation of each stiffness from 50 measurements, by the cINN",
+            &case.table3,
+        ),
+        "<h3>Damage scenarios</h3>".to_owned(),
+        measured_damaged(scenarios),
+        found_damaged(scenarios),
+        compared(undamaged, scenarios),
+        table::states(
+            "table4",
+            "Table 4. Damage scenarios: mean, standard deviation and probability of damage of each stiffness, by the \
+             cINN",
+            &case.table4,
+        ),
+        "<h3>Three methods</h3>".to_owned(),
+        by_method(case),
+        table::methods("table5", "Table 5. The three methods on the same 500 measurements", &case.table5),
+        table::time(
+            "table6",
+            "Table 6. Wall clock of the methods, here and on the paper's laptop; compare the ratios, not the seconds",
+            &case.table6,
+        ),
+    ]
+    .concat()
+}
+
+fn measured(undamaged: Option<&State>) -> String {
+    let panels = undamaged.map_or_else(Vec::new, |state| frequencies(state, ""));
+    let caption =
+        "Figure 9. The natural frequencies measured in the undamaged state, with their mean and standard deviation: \
+         nearly normal, since the stiffnesses are and the frequencies follow them almost linearly.";
+    figure("fig9", &panels, &frequency_keys(), caption)
+}
+
+fn found(undamaged: Option<&State>) -> String {
+    let panels = undamaged.map_or_else(Vec::new, |state| posteriors(state, ""));
+    let prior = undamaged.and_then(|state| state.quantities.first()).and_then(|q| Some((q.prior?, &q.unit)));
+    let prior = prior.map_or_else(String::new, |([low, high], unit)| {
+        format!(" The prior is level from {low} to {high} {unit}; the panels show what of it is in view.")
+    });
+    let caption = format!(
+        "Figure 10. What the measurements tell of the stiffnesses in the undamaged state: the posterior should lie on \
+         the target; 50 draws leave some difference.{prior}"
+    );
+    figure("fig10", &panels, &posterior_keys(), &caption)
+}
+
+fn title(state: &State) -> String {
+    format!("{}, ", capital(&state.name))
+}
+
+fn measured_damaged(scenarios: &[State]) -> String {
+    let panels: Vec<String> = scenarios.iter().flat_map(|state| frequencies(state, &title(state))).collect();
+    let caption =
+        "Figure 11. The natural frequencies measured in the damage scenarios, a row each: against Figure 9 they \
+         are lower, the more stiffness is lost.";
+    figure("fig11", &panels, &frequency_keys(), caption)
+}
+
+fn found_damaged(scenarios: &[State]) -> String {
+    let panels: Vec<String> = scenarios.iter().flat_map(|state| posteriors(state, &title(state))).collect();
+    let caption = "Figure 12. Posterior of each stiffness in the damage scenarios: it should follow the target to its \
+                   new place, and stay where nothing has changed. Where the target reaches below the prior, the \
+                   posterior cannot follow.";
+    figure("fig12", &panels, &posterior_keys(), caption)
+}
+
+fn compared(undamaged: Option<&State>, scenarios: &[State]) -> String {
+    let panels = |state: &State| -> Vec<String> {
+        let before = undamaged.map_or(&[][..], |state| &state.quantities);
+        before.iter().zip(&state.quantities).map(|(before, now)| damage(before, now, &title(state), false)).collect()
+    };
+    let told: Vec<String> = scenarios.iter().map(|state| damage_told(state, |_| true)).collect();
+    let caption = format!(
+        "Figure 13. Each stiffness in the damage scenarios against the undamaged state: the tinted area below δ shows \
+         the probability of damage (PoD), near 5 % where nothing has changed. {}.",
+        told.join(". ")
+    );
+    let keys = key(Swatch::Line, OURS, "undamaged")
+        + &key(Swatch::Line, CHANGED, "damage scenario")
+        + &key(Swatch::Upright, TEXT, "threshold δ");
+    figure("fig13", &scenarios.iter().flat_map(panels).collect::<Vec<_>>(), &keys, &caption)
+}
+
+fn by_method(case: &Case) -> String {
+    let quantities = case.states.first().map_or(&[][..], |state| &state.quantities);
+    let panel =
+        |(k, q): (usize, &crate::reproduce::Quantity)| methods(&case.methods, k, [&q.name, &q.unit], q.target, &[]);
+    let panels: Vec<String> = quantities.iter().enumerate().map(panel).collect();
+    let caption =
+        "Figure 14. The population of each stiffness as each method finds it from the same 500 measurements: the \
+                   curves should lie on the target and on one another.";
+    figure("fig14", &panels, &(method_keys() + &key(Swatch::Dashed, TEXT, "target")), caption)
+}
