@@ -6,6 +6,7 @@ pub mod library;
 pub mod manifest;
 pub mod nearest;
 pub mod observation;
+mod resample;
 pub mod train;
 
 use candle_core::{DType, Device, Tensor};
@@ -22,6 +23,7 @@ use crate::stats;
 use identifiability::Group;
 use manifest::{Manifest, SelfTest, Whitening};
 use observation::{Admitted, Encoder, Observation};
+use resample::Proposals;
 
 /// Largest difference of a self-test draw, as a share of the prior's width: f32 kernels differ between processors by
 /// some 1e-5, a wrong weight by far more.
@@ -29,6 +31,9 @@ const SELF_TEST_TOLERANCE: f64 = 1e-3;
 
 /// Times that draws beyond the prior are drawn again.
 const ROUNDS: usize = 12;
+
+/// Draws of the flow for each sample that is kept, where the simulation weighs them.
+const PROPOSALS: usize = 2;
 
 /// Draws that estimate which share of a posterior lies inside the prior.
 const SHARE_DRAWS: usize = 200;
@@ -257,17 +262,34 @@ impl Baseline {
         Ok(PosteriorSamples::new(theta, draws))
     }
 
+    /// Samples where all covariates are known: the flow's draws, set right by the simulation where there is noise to weigh
+    /// them by.
     fn infer_known(
         &self,
         observations: &[Observation],
         draws: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
+        if self.manifest.conditions.noise_range.is_none() {
+            return Ok(PosteriorSamples::new(self.propose(observations, draws, seed)?.theta, draws));
+        }
+        let proposals = self.propose(observations, PROPOSALS * draws, seed)?;
+        let theta = resample::resample(&self.simulator, observations, &proposals, draws, seed);
+        Ok(PosteriorSamples::new(theta, draws))
+    }
+
+    /// The flow's own draws, `draws` for each observation.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes or a draw that is not finite.
+    fn propose(&self, observations: &[Observation], draws: usize, seed: u64) -> Result<Proposals, InferenceError> {
         let d = self.space().len();
         let context = self.flow.summarise(&self.condition(observations)?)?;
         let mut stream = stats::stream(seed, "latent");
         let mut theta = DMatrix::from_element(observations.len() * draws, d, f64::NAN);
+        let mut log_density = vec![0.0; observations.len() * draws];
         let mut filled = vec![0; observations.len()];
+        let mut moved = vec![false; observations.len()];
         // Draws beyond the prior, in the margin of the training box, are drawn again. Where hardly any falls inside, the
         // measurement lies outside, and the nearest point of the box has to do.
         for round in 1..=ROUNDS {
@@ -277,32 +299,38 @@ impl Baseline {
                 break;
             }
             let rows = Tensor::from_slice(&pending, pending.len(), &Device::Cpu)?;
-            let x = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
+            let (x, log_q) = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
             let real = x.to_dtype(DType::F64)?.to_vec2::<f64>()?;
+            let log_q = log_q.to_dtype(DType::F64)?.to_vec1::<f64>()?;
             for (place, values) in real.iter().enumerate() {
                 let row = pending[place / draws] as usize;
                 if filled[row] == draws {
                     continue;
                 }
                 let mut draw = Vec::with_capacity(d);
+                let mut log_q = log_q[place];
                 for (value, (wide, parameter)) in values.iter().zip(self.training_space.iter().zip(self.space())) {
-                    let value = wide.from_unit(logistic(*value));
+                    let unit = logistic(*value);
+                    let value = wide.from_unit(unit);
                     if !value.is_finite() {
                         return Err(InferenceError::NotFinite { row: place, parameter: parameter.name.clone() });
                     }
-                    let inside = value.clamp(parameter.lower, parameter.upper);
-                    if parameter.prior().contains(&value) || round == ROUNDS {
-                        draw.push(inside);
+                    log_q -= (unit * (1.0 - unit)).max(f64::MIN_POSITIVE).ln();
+                    let inside = parameter.prior().contains(&value);
+                    if inside || round == ROUNDS {
+                        draw.push(value.clamp(parameter.lower, parameter.upper));
+                        moved[row] |= !inside;
                     }
                 }
                 if draw.len() == d {
                     let target = row * draws + filled[row];
                     draw.iter().enumerate().for_each(|(column, value)| theta[(target, column)] = *value);
+                    log_density[target] = log_q;
                     filled[row] += 1;
                 }
             }
         }
-        Ok(PosteriorSamples::new(theta, draws))
+        Ok(Proposals { theta, log_density, moved })
     }
 
     /// A measurement as this baseline takes it, with the structure's noise where none is given.
@@ -367,7 +395,7 @@ impl Baseline {
         observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
         let context = self.flow.summarise(&self.condition(observations)?)?;
-        let drawn = self.flow.sample(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
+        let (drawn, _) = self.flow.sample(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
         let drawn = drawn.to_dtype(DType::F64)?.to_vec2::<f64>()?;
         let inside = |values: &&Vec<f64>| {
             let pairs = values.iter().zip(self.training_space.iter().zip(self.space()));
@@ -480,7 +508,7 @@ impl Baseline {
     fn self_test(&self) -> Result<(), LoadError> {
         let SelfTest { frequencies_hz, seed, expected } = &self.manifest.self_test;
         let observation = Observation::complete(frequencies_hz);
-        let samples = self.infer(&[observation], expected.len().max(1), *seed)?;
+        let samples = self.propose(&[observation], expected.len().max(1), *seed)?;
         let width = |column: usize| self.space().as_slice()[column].upper - self.space().as_slice()[column].lower;
         let mut difference = 0.0_f64;
         for (row, values) in expected.iter().enumerate() {
@@ -489,7 +517,7 @@ impl Baseline {
                 return Err(LoadError::Shape { what: "self_test.expected", found, expected });
             }
             for (column, value) in values.iter().enumerate() {
-                difference = difference.max((samples.theta()[(row, column)] - value).abs() / width(column));
+                difference = difference.max((samples.theta[(row, column)] - value).abs() / width(column));
             }
         }
         // Not `>`: a NaN must fail too.

@@ -60,21 +60,22 @@ impl CouplingUnit {
         Ok((Tensor::cat(&[&z1, &z2], 1)?, log_det))
     }
 
-    /// z to x, the inverse of [`Self::forward`].
+    /// z to x, the inverse of [`Self::forward`], and the log|det ∂z/∂x| that goes with it, `[n]`.
     ///
     /// # Errors
     /// A candle error when shapes do not fit.
-    pub fn inverse(&self, z: &Tensor, context: &Tensor) -> Result<Tensor> {
+    pub fn inverse(&self, z: &Tensor, context: &Tensor) -> Result<(Tensor, Tensor)> {
         let Some(on_first) = &self.on_first else {
             let (s, t) = self.on_second.scale_and_shift(context)?;
-            return (z - t)? * s.neg()?.exp()?;
+            return Ok((((z - t)? * s.neg()?.exp()?)?, s.sum(D::Minus1)?));
         };
         let (z1, z2) = self.halves(z)?;
         let (s2, t2) = on_first.scale_and_shift(&Tensor::cat(&[&z2, context], 1)?)?;
         let x1 = ((z1 - t2)? * s2.neg()?.exp()?)?;
         let (s1, t1) = self.on_second.scale_and_shift(&Tensor::cat(&[&x1, context], 1)?)?;
         let x2 = ((z2 - t1)? * s1.neg()?.exp()?)?;
-        Tensor::cat(&[&x1, &x2], 1)
+        let log_det = (s1.sum(D::Minus1)? + s2.sum(D::Minus1)?)?;
+        Ok((Tensor::cat(&[&x1, &x2], 1)?, log_det))
     }
 
     fn halves(&self, x: &Tensor) -> Result<(Tensor, Tensor)> {

@@ -149,16 +149,19 @@ impl Flow {
         Ok((z, log_det))
     }
 
-    /// z to x, the inverse of [`Self::forward`] for the same context.
+    /// z to x, the inverse of [`Self::forward`] for the same context; with log|det ∂z/∂x| `[n]`.
     ///
     /// # Errors
     /// A candle error when shapes do not fit.
-    pub fn inverse(&self, z: &Tensor, context: &Tensor) -> Result<Tensor> {
+    pub fn inverse(&self, z: &Tensor, context: &Tensor) -> Result<(Tensor, Tensor)> {
         let mut x = z.clone();
+        let mut log_det = Tensor::zeros(z.dim(0)?, self.dtype, z.device())?;
         for (permutation, unit) in self.units.iter().rev() {
-            x = permutation.inverse(&unit.inverse(&x, context)?)?;
+            let (next, unit_log_det) = unit.inverse(&x, context)?;
+            x = permutation.inverse(&next)?;
+            log_det = (log_det + unit_log_det)?;
         }
-        Ok(x)
+        Ok((x, log_det))
     }
 
     /// Log-density log q(x | y) of each row, nats. `x`: `[n, d]`, `context`: S(y) `[n, context]`; returns `[n]`.
@@ -167,20 +170,29 @@ impl Flow {
     /// A candle error when shapes do not fit.
     pub fn log_prob(&self, x: &Tensor, context: &Tensor) -> Result<Tensor> {
         let (z, log_det) = self.forward(x, context)?;
-        let normaliser = 0.5 * x.dim(1)? as f64 * (2.0 * std::f64::consts::PI).ln();
-        (log_det - (z.sqr()?.sum(D::Minus1)? * 0.5)?)? - normaliser
+        log_density(&z, &log_det)
     }
 
-    /// `draws` samples of x for each row of `context`, S(y) `[n, context]`, in the order of the rows: `[n·draws, d]`.
+    /// `draws` samples of x for each row of `context`, S(y) `[n, context]`, in the order of the rows: `[n·draws, d]`; and the
+    /// log-density of each, nats, `[n·draws]`.
     ///
     /// # Errors
     /// A candle error when the shape of `context` is another.
-    pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<Tensor> {
+    pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<(Tensor, Tensor)> {
         let (rows, features) = context.dims2()?;
         let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
         let z = standard_normal(rows * draws, self.architecture.parameters, stream).to_dtype(self.dtype)?;
-        self.inverse(&z, &repeated)
+        let (x, log_det) = self.inverse(&z, &repeated)?;
+        Ok((x, log_density(&z, &log_det)?))
     }
+}
+
+/// ```text
+///  log q = log|det ∂z/∂x| − ½|z|² − (d/2) log 2π
+/// ```
+fn log_density(z: &Tensor, log_det: &Tensor) -> Result<Tensor> {
+    let normaliser = 0.5 * z.dim(1)? as f64 * (2.0 * std::f64::consts::PI).ln();
+    (log_det - (z.sqr()?.sum(D::Minus1)? * 0.5)?)? - normaliser
 }
 
 /// Standard normal draws `[rows, columns]` from our own stream, f64 (candle's generator cannot be seeded).

@@ -61,8 +61,10 @@ fn inverse_undoes_forward_for_one_to_six_parameters() {
             let x = tensor(&normals(20 * parameters, seed, "x"), (20, parameters));
             let y = tensor(&normals(20 * 4, seed, "y"), (20, 1, 4));
             let context = flow.summarise(&y).unwrap();
-            let (z, _) = flow.forward(&x, &context).unwrap();
-            let back = flow.inverse(&z, &context).unwrap();
+            let (z, log_det) = flow.forward(&x, &context).unwrap();
+            let (back, log_det_back) = flow.inverse(&z, &context).unwrap();
+            let apart = (log_det - log_det_back).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f64>().unwrap();
+            assert!(apart < 1e-10, "{parameters} parameters, seed {seed}: the determinants are {apart} apart");
             let error = (back - &x).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f64>().unwrap();
             let moved = (z - x).unwrap().abs().unwrap().max_all().unwrap().to_scalar::<f64>().unwrap();
             assert!(error < 1e-10 && moved > 0.1, "{parameters} parameters, seed {seed}: {error}, moved {moved}");
@@ -100,7 +102,7 @@ fn the_density_integrates_to_one() {
     let (flow, _) = random_flow(&small(2, 3, 5), 5);
     let y = tensor(&normals(3, 5, "y"), (1, 1, 3));
     // Where the flow has its mass is seen from its own draws; the grid reaches a tenth beyond the outermost of 20,000.
-    let draws = flow.sample(&flow.summarise(&y).unwrap(), 20_000, &mut stats::stream(5, "latent")).unwrap();
+    let draws = flow.sample(&flow.summarise(&y).unwrap(), 20_000, &mut stats::stream(5, "latent")).unwrap().0;
     let side = |column: usize| {
         let values = draws.narrow(1, column, 1).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
         let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
@@ -126,7 +128,12 @@ fn the_condition_changes_the_draws_and_the_seed_repeats_them() {
     let (flow, _) = random_flow(&small(3, 3, 2), 2);
     let draw = |y: &[f64], seed| {
         let context = flow.summarise(&tensor(y, (1, 1, 3))).unwrap();
-        let x = flow.sample(&context, 2, &mut stats::stream(seed, "latent")).unwrap();
+        let (x, log_density) = flow.sample(&context, 2, &mut stats::stream(seed, "latent")).unwrap();
+        let both = context.expand((2, context.dim(1).unwrap())).unwrap().contiguous().unwrap();
+        let again = flow.log_prob(&x, &both).unwrap().to_vec1::<f64>().unwrap();
+        for (a, b) in log_density.to_vec1::<f64>().unwrap().iter().zip(again) {
+            assert!((a - b).abs() < 1e-9, "the density of a draw is {a} and {b}");
+        }
         x.flatten_all().unwrap().to_vec1::<f64>().unwrap()
     };
     assert_eq!(draw(&[0.1, 0.2, 0.3], 1), draw(&[0.1, 0.2, 0.3], 1));
@@ -176,7 +183,7 @@ fn a_trained_flow_finds_the_posterior_of_a_linear_gaussian_model() {
         let condition = tensor(&y, (1, 1, 3)).to_dtype(DType::F32).unwrap();
         let draws = 4_000;
         let context = flow.summarise(&condition).unwrap();
-        let samples = flow.sample(&context, draws, &mut stats::stream(3, "latent")).unwrap();
+        let samples = flow.sample(&context, draws, &mut stats::stream(3, "latent")).unwrap().0;
         let samples = samples.to_dtype(DType::F64).unwrap().to_vec2::<f64>().unwrap();
         for k in 0..2 {
             let values: Vec<f64> = samples.iter().map(|row| row[k]).collect();
@@ -223,7 +230,7 @@ fn a_training_that_diverges_stops_and_keeps_the_best_weights() {
     // Epoch 4 was kept before its weights were poisoned.
     assert!(outcome.best_epoch <= 4 && validation_losses.len() == 4, "{outcome:?}");
     let context = flow.summarise(&validation.y).unwrap();
-    let x = flow.sample(&context, 1, &mut stats::stream(1, "z")).unwrap().to_vec2::<f32>().unwrap();
+    let x = flow.sample(&context, 1, &mut stats::stream(1, "z")).unwrap().0.to_vec2::<f32>().unwrap();
     assert!(x.iter().flatten().all(|v| v.is_finite()));
 }
 
@@ -249,7 +256,7 @@ fn a_checkpoint_gives_back_the_same_flow_and_foreign_bytes_are_refused() {
     let y = tensor(&normals(4, 1, "y"), (1, 1, 4)).to_dtype(DType::F32).unwrap();
     let draws = |flow: &Flow| {
         let context = flow.summarise(&y).unwrap();
-        flow.sample(&context, 5, &mut stats::stream(1, "z")).unwrap().to_vec2::<f32>().unwrap()
+        flow.sample(&context, 5, &mut stats::stream(1, "z")).unwrap().0.to_vec2::<f32>().unwrap()
     };
     let loaded = checkpoint::from_bytes(&bytes, &architecture, DType::F32).unwrap();
     assert_eq!(draws(&flow), draws(&loaded));

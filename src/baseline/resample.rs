@@ -1,0 +1,138 @@
+//! Draws of a flow set right by the simulation: sampling, importance, resampling.
+
+use nalgebra::DMatrix;
+use rand::seq::SliceRandom as _;
+use rand::Rng as _;
+use rayon::prelude::*;
+
+use super::observation::Observation;
+use crate::simulator::Simulator;
+use crate::stats;
+
+/// Weights count up to this many times their median. A flow is close to the posterior nearly everywhere; where it is not, a
+/// few draws must not stand for all.
+const LARGEST: f64 = 10.0;
+
+/// Least median, as a share of the mean: where most draws are far off, their weights say nothing of the others'.
+const LEAST_MEDIAN: f64 = 1e-3;
+
+/// Draws of a flow, and what they are weighed by.
+pub(super) struct Proposals {
+    /// The same number for each observation, `[n·draws, d]`, parameter units.
+    pub theta: DMatrix<f64>,
+    /// Log-density of each under the flow, in parameter units, up to a constant; nats.
+    pub log_density: Vec<f64>,
+    /// Observations some of whose draws were moved to an edge of the prior: their densities mean nothing.
+    pub moved: Vec<bool>,
+}
+
+/// Draws `draws` of the proposals of each observation, by their weights.
+///
+/// ```text
+///  w_s = p(y | x_s)/q(x_s | y),    ln p(y | x) = −Σ_i ½((y_i − f_i(x))/s_i)² + ln s_i,   s_i the noise at f_i(x)
+/// ```
+///
+/// under the uniform prior, over the modes present; systematic resampling, then a shuffle, so that any first few are a
+/// sample too. A flow that bridges two humps leaves draws between them and in humps that are none: here they go.
+///
+/// Source: D. B. Rubin (1988), Using the SIR algorithm to simulate posterior distributions, Bayesian Statistics 3, 395–402;
+/// E. L. Ionides (2008), Truncated importance sampling, J. Comp. Graph. Stat. 17, 295–311.
+pub(super) fn resample(
+    simulator: &Simulator,
+    observations: &[Observation],
+    proposals: &Proposals,
+    draws: usize,
+    seed: u64,
+) -> DMatrix<f64> {
+    let d = proposals.theta.ncols();
+    let many = proposals.theta.nrows() / observations.len().max(1);
+    let chosen: Vec<Vec<usize>> = observations
+        .par_iter()
+        .enumerate()
+        .map(|(row, observation)| {
+            let rows = row * many..(row + 1) * many;
+            if proposals.moved[row] {
+                return rows.take(draws).collect();
+            }
+            let simulator = observation.simulator(simulator);
+            let log_weight = |place: usize| {
+                let theta: Vec<f64> = proposals.theta.row(place).iter().copied().collect();
+                log_likelihood(&simulator, observation, &theta) - proposals.log_density[place]
+            };
+            let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
+            let mut stream = stats::stream(seed, &format!("resampling {row}"));
+            match weights(&log_weights) {
+                Some(weights) => systematic(&weights, draws, &mut stream).into_iter().map(|i| rows.start + i).collect(),
+                None => rows.take(draws).collect(),
+            }
+        })
+        .collect();
+    let places: Vec<usize> = chosen.into_iter().flatten().collect();
+    DMatrix::from_fn(places.len(), d, |row, column| proposals.theta[(places[row], column)])
+}
+
+fn log_likelihood(simulator: &Simulator, observation: &Observation, theta: &[f64]) -> f64 {
+    let Ok(frequencies) = simulator.frequencies_hz(theta) else { return f64::NEG_INFINITY };
+    let one = |(mode, measured): (usize, &Option<f64>)| {
+        let f = frequencies[mode];
+        let std_hz = simulator.std_hz(mode, f) * observation.noise_multiple[mode];
+        measured.map_or(0.0, |y| -0.5 * ((y - f) / std_hz).powi(2) - std_hz.ln())
+    };
+    observation.frequencies_hz.iter().enumerate().map(one).sum()
+}
+
+/// Truncated weights; `None` where none of the draws has one.
+fn weights(log_weights: &[f64]) -> Option<Vec<f64>> {
+    let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    if !largest.is_finite() {
+        return None;
+    }
+    let weights: Vec<f64> = log_weights.iter().map(|w| (w - largest).exp()).collect();
+    let cap = LARGEST * stats::quantile(&weights, 0.5).max(LEAST_MEDIAN * stats::mean(&weights));
+    Some(weights.into_iter().map(|w| w.min(cap)).collect())
+}
+
+/// `draws` indices, each as often as its weight says to within one, in random order.
+fn systematic(weights: &[f64], draws: usize, stream: &mut stats::Stream) -> Vec<usize> {
+    let step = weights.iter().sum::<f64>() / draws as f64;
+    let offset: f64 = stream.random();
+    let (mut index, mut passed) = (0, 0.0);
+    let mut chosen: Vec<usize> = (0..draws)
+        .map(|draw| {
+            let target = (draw as f64 + offset) * step;
+            while index + 1 < weights.len() && passed + weights[index] <= target {
+                passed += weights[index];
+                index += 1;
+            }
+            index
+        })
+        .collect();
+    chosen.shuffle(stream);
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn systematic_draws_come_as_often_as_their_weights_say() {
+        let weights = [0.5, 0.0, 2.0, 1.0, 0.5];
+        for seed in 0..20 {
+            let chosen = systematic(&weights, 400, &mut stats::stream(seed, "test"));
+            for (index, weight) in weights.iter().enumerate() {
+                let count = chosen.iter().filter(|i| **i == index).count() as f64;
+                assert!((count - 100.0 * weight).abs() <= 1.0, "{index}: {count}");
+            }
+        }
+    }
+
+    #[test]
+    fn weights_are_cut_at_a_multiple_of_their_median_and_none_are_no_weights() {
+        let cut = weights(&[0.0, 0.0, 0.0, 5.0]).unwrap();
+        assert!((cut[3] / cut[0] - LARGEST).abs() < 1e-9, "{cut:?}");
+        let usual = weights(&[0.0, 0.1, -0.1]).unwrap();
+        assert!((usual[1] / usual[2] - 0.2_f64.exp()).abs() < 1e-12);
+        assert!(weights(&[f64::NEG_INFINITY; 3]).is_none());
+    }
+}
