@@ -10,7 +10,14 @@ use super::{Form, Structure};
 ///  K = Σ k A(form),    a spring between nodes a and b:  A = (e_a − e_b)(e_a − e_b)ᵀ,  e_b = 0 for the ground
 /// ```
 pub fn stiffness_matrix(structure: &Structure) -> DMatrix<f64> {
-    assemble(structure.freedoms(), structure.springs().iter().map(|s| (&s.form, s.n_per_m)))
+    stiffness_matrix_with(structure, &[])
+}
+
+/// The same with other stiffnesses, given as (index of the spring, N/m).
+pub fn stiffness_matrix_with(structure: &Structure, changes: &[(usize, f64)]) -> DMatrix<f64> {
+    let changed = |index: usize| changes.iter().rev().find(|(spring, _)| *spring == index).map(|(_, value)| *value);
+    let springs = structure.springs().iter().enumerate();
+    assemble(structure.freedoms(), springs.map(|(i, s)| (&s.form, changed(i).unwrap_or(s.n_per_m))))
 }
 
 /// Mass matrix M, `[n, n]`, symmetric: diagonal for bodies, consistent for spans of beams.

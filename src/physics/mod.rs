@@ -9,7 +9,9 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use beam::Span;
-pub use modes::{frequency_sensitivity, modes, natural_frequencies_hz, FrequencySensitivity, Modes};
+pub use modes::{
+    frequency_sensitivity, modes, natural_frequencies_hz, natural_frequencies_with, FrequencySensitivity, Modes,
+};
 
 /// A mass: a body, or what a span of a beam weighs.
 #[derive(Debug, Clone, PartialEq)]
@@ -291,12 +293,16 @@ impl Structure {
     /// # Errors
     /// [`Error::Stiffness`].
     pub fn with_stiffness(&self, changes: &[(usize, f64)]) -> Result<Self, Error> {
+        self.check_changes(changes)?;
         let mut changed = self.clone();
         for &(index, n_per_m) in changes {
-            check_stiffness(&changed.springs[index], n_per_m)?;
             changed.springs[index].n_per_m = n_per_m;
         }
         Ok(changed)
+    }
+
+    fn check_changes(&self, changes: &[(usize, f64)]) -> Result<(), Error> {
+        changes.iter().try_for_each(|(index, n_per_m)| check_stiffness(&self.springs[*index], *n_per_m))
     }
 }
 

@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
-use super::assembly::{mass_matrix, stiffness_matrix};
+use super::assembly::{mass_matrix, stiffness_matrix_with};
 use super::{Error, Form, Structure};
 
 /// Below this share of the largest eigenvalue, the smallest is rounding: the structure is a mechanism.
@@ -49,7 +49,21 @@ pub struct FrequencySensitivity {
 /// # Errors
 /// [`Error::TooFewModes`], [`Error::NearMechanism`].
 pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec<f64>, Error> {
-    let scaled = Scaled::new(structure)?;
+    natural_frequencies_with(structure, &[], count)
+}
+
+/// The same with other stiffnesses, given as (index of the spring, N/m), without a copy of the structure: for the many
+/// millions of runs of a stochastic updating.
+///
+/// # Errors
+/// As [`natural_frequencies_hz`], and [`Error::Stiffness`].
+pub fn natural_frequencies_with(
+    structure: &Structure,
+    changes: &[(usize, f64)],
+    count: usize,
+) -> Result<Vec<f64>, Error> {
+    structure.check_changes(changes)?;
+    let scaled = Scaled::new(structure, changes)?;
     let mut eigenvalues: Vec<f64> = scaled.stiffness.symmetric_eigenvalues().iter().copied().collect();
     // nalgebra gives them unsorted.
     eigenvalues.sort_by(f64::total_cmp);
@@ -61,7 +75,7 @@ pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec
 /// # Errors
 /// [`Error::TooFewModes`], [`Error::NearMechanism`].
 pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
-    let Scaled { stiffness, mass_root } = Scaled::new(structure)?;
+    let Scaled { stiffness, mass_root } = Scaled::new(structure, &[])?;
     let SymmetricEigen { eigenvalues, eigenvectors } = stiffness.symmetric_eigen();
     let mut order: Vec<usize> = (0..eigenvalues.len()).collect();
     order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
@@ -133,8 +147,8 @@ enum MassRoot {
 }
 
 impl Scaled {
-    fn new(structure: &Structure) -> Result<Self, Error> {
-        let mut stiffness = stiffness_matrix(structure);
+    fn new(structure: &Structure, changes: &[(usize, f64)]) -> Result<Self, Error> {
+        let mut stiffness = stiffness_matrix_with(structure, changes);
         let mass = mass_matrix(structure);
         let n = mass.nrows();
         let coupled = structure.masses().iter().any(|m| matches!(m.form, Form::Inertia(_) | Form::Bending(_)));

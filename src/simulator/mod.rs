@@ -22,7 +22,7 @@ use rayon::prelude::*;
 use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::physics::effect::{measured, respond, Target};
-use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_hz, Structure};
+use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_with, Structure};
 use crate::quantity::{Digest, StructureId};
 use crate::stats;
 use definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
@@ -320,7 +320,7 @@ impl Simulator {
         }
         match self.model() {
             Model::Matrices { structure, bindings } => {
-                natural_frequencies_hz(&structure_at(structure, bindings, theta)?, self.modes())
+                natural_frequencies_with(structure, &changes(bindings, theta), self.modes())
             }
             Model::Table(table) => {
                 let mut frequencies = table.emulator().frequencies_hz(theta);
@@ -575,8 +575,12 @@ impl Simulator {
 }
 
 fn structure_at(structure: &Structure, bindings: &[Binding], theta: &[f64]) -> Result<Structure, physics::Error> {
-    let changes: Vec<(usize, f64)> = bindings.iter().map(|b| (b.spring, b.stiffness(theta[b.parameter]))).collect();
-    structure.with_stiffness(&changes)
+    structure.with_stiffness(&changes(bindings, theta))
+}
+
+/// Stiffness of each spring that a parameter sets.
+fn changes(bindings: &[Binding], theta: &[f64]) -> Vec<(usize, f64)> {
+    bindings.iter().map(|b| (b.spring, b.stiffness(theta[b.parameter]))).collect()
 }
 
 /// Derivatives by parameters from those by stiffnesses, `[m, d]`.

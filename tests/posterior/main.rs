@@ -70,22 +70,18 @@ fn disagreement(baseline: &Baseline, relative_std: f64, starts: usize) -> Vec<(f
 
 #[test]
 fn posteriors_agree_with_the_exact_ones() {
-    // Structure, starts of the search on each axis, (noise, tolerances of mean and standard deviation, in exact standard
-    // deviations). Asked of the rig at 0.5 and 2 % are 0.05 for both: a measurement there often has a second point of the box
-    // near it, and a flow that bridges two humps leaves up to 1 % of its draws in one that the exact posterior does not have,
-    // which moves a standard deviation by a factor. These bounds hold what is reached; README says what is not.
-    let cases = [
-        ("three-dof", 3, [(0.0001, 0.15, 0.15), (0.001, 0.05, 0.05), (0.005, 0.05, 0.05)]),
-        ("rig", 8, [(0.0005, 0.15, 0.15), (0.005, 0.06, 0.22), (0.02, 0.09, 0.10)]),
-    ];
+    // Structure, starts of the search on each axis, noises. A measurement of the rig often has a second point of the box near
+    // it, and the flow alone leaves up to 1 % of its draws in humps that the exact posterior does not have: the simulation
+    // must have taken them out.
+    let cases = [("three-dof", 3, [0.0001, 0.001, 0.005]), ("rig", 8, [0.0005, 0.005, 0.02])];
     for (id, starts, levels) in cases {
         let baseline = shipped(id);
-        for (relative_std, mean_tolerance, std_tolerance) in levels {
+        for relative_std in levels {
             let sums = disagreement(&baseline, relative_std, starts);
             let mean = |part: fn(&(f64, f64)) -> f64| sums.iter().map(part).sum::<f64>() / sums.len() as f64;
             let (means, stds) = (mean(|s| s.0), mean(|s| s.1));
             println!("{id} at {} %: mean off by {means:.3}, std by {stds:.3} exact standard deviations; by parameter {sums:.3?}", 100.0 * relative_std);
-            assert!(means <= mean_tolerance && stds <= std_tolerance, "{id} at {relative_std}: {means}, {stds}");
+            assert!(means <= 0.05 && stds <= 0.05, "{id} at {relative_std}: {means}, {stds}");
         }
     }
 }
