@@ -38,6 +38,11 @@ impl Parameter {
         self.lower..self.upper
     }
 
+    /// Whether a share of its value means anything: the prior keeps clear of 0.
+    pub fn has_share(&self) -> bool {
+        self.lower > 0.0 || self.upper < 0.0
+    }
+
     /// Position of a value in the prior interval, 0 at `lower` and 1 at `upper`.
     pub fn to_unit(&self, value: f64) -> f64 {
         (value - self.lower) / (self.upper - self.lower)

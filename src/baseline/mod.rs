@@ -35,6 +35,9 @@ const ROUNDS: usize = 12;
 /// Draws of the flow for each sample that is kept, where the simulation weighs them.
 const PROPOSALS: usize = 2;
 
+/// Most degrees of freedom of a structure whose eigenproblem is solved for every draw: a millisecond each beyond.
+const MOST_FREEDOMS_WEIGHED: usize = 80;
+
 /// Draws that estimate which share of a posterior lies inside the prior.
 const SHARE_DRAWS: usize = 200;
 
@@ -270,12 +273,36 @@ impl Baseline {
         draws: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
-        if self.manifest.conditions.noise_range.is_none() {
+        if !self.is_weighed() {
             return Ok(PosteriorSamples::new(self.propose(observations, draws, seed)?.theta, draws));
         }
         let proposals = self.propose(observations, PROPOSALS * draws, seed)?;
         let theta = resample::resample(&self.simulator, observations, &proposals, draws, seed);
         Ok(PosteriorSamples::new(theta, draws))
+    }
+
+    /// Whether the simulation weighs the flow's draws: not without noise; not where it depends on numbers of effects that are
+    /// themselves uncertain, over which the flow has learnt to average; not where it would take longer than anybody waits.
+    fn is_weighed(&self) -> bool {
+        let certain = self.simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));
+        let quick = self.simulator.structure().is_none_or(|structure| structure.freedoms() <= MOST_FREEDOMS_WEIGHED);
+        self.manifest.conditions.noise_range.is_some() && certain && quick
+    }
+
+    /// Logarithm of the posterior density of `draws` rows of `theta` for each observation, in the unit box of the prior and up
+    /// to a constant for each observation, nats: of the simulation where it weighs the draws too, else of the flow.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes.
+    pub fn log_posterior_of_draws(
+        &self,
+        theta: &DMatrix<f64>,
+        observations: &[Observation],
+    ) -> Result<Vec<f64>, InferenceError> {
+        if self.is_weighed() && observations.iter().all(|o| o.possible_sizes.is_empty()) {
+            return Ok(resample::log_likelihoods(&self.simulator, observations, theta));
+        }
+        self.log_density_of_draws(theta, observations)
     }
 
     /// The flow's own draws, `draws` for each observation.

@@ -57,7 +57,13 @@ pub(super) fn resample(
             let simulator = observation.simulator(simulator);
             let log_weight = |place: usize| {
                 let theta: Vec<f64> = proposals.theta.row(place).iter().copied().collect();
-                log_likelihood(&simulator, observation, &theta) - proposals.log_density[place]
+                let weight = log_likelihood(&simulator, observation, &theta) - proposals.log_density[place];
+                // What has no number has no weight.
+                if weight.is_finite() {
+                    weight
+                } else {
+                    f64::NEG_INFINITY
+                }
             };
             let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
             let mut stream = stats::stream(seed, &format!("resampling {row}"));
@@ -69,6 +75,20 @@ pub(super) fn resample(
         .collect();
     let places: Vec<usize> = chosen.into_iter().flatten().collect();
     DMatrix::from_fn(places.len(), d, |row, column| proposals.theta[(places[row], column)])
+}
+
+/// ln p(y | x) of each row of `theta`, the same number of rows for each observation.
+pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation], theta: &DMatrix<f64>) -> Vec<f64> {
+    let each = theta.nrows() / observations.len().max(1);
+    let of = |(row, observation): (usize, &Observation)| {
+        let simulator = observation.simulator(simulator);
+        let one = |place: usize| {
+            let theta: Vec<f64> = theta.row(row * each + place).iter().copied().collect();
+            log_likelihood(&simulator, observation, &theta)
+        };
+        (0..each).map(one).collect::<Vec<f64>>()
+    };
+    observations.par_iter().enumerate().flat_map_iter(of).collect()
 }
 
 fn log_likelihood(simulator: &Simulator, observation: &Observation, theta: &[f64]) -> f64 {

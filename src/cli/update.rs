@@ -20,7 +20,7 @@ use crate::quantity::Hertz;
 use crate::simulator::Simulator;
 use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all, Update};
-use crate::updating::stochastic::{settings, Estimate, Population, SIMULATED};
+use crate::updating::stochastic::{settings, simulated_for, Estimate, Population};
 
 /// Update the parameters of a structure by measurements.
 #[derive(Debug, Args)]
@@ -43,9 +43,9 @@ pub struct UpdateArgs {
     /// tmcmc: samples of the chains
     #[arg(long, default_value_t = 1_000)]
     samples: usize,
-    /// tmcmc: simulated measurements at each of them
-    #[arg(long, default_value_t = SIMULATED)]
-    simulated: usize,
+    /// tmcmc: simulated measurements at each of them [default: 128; more for more than 500 measurements]
+    #[arg(long)]
+    simulated: Option<usize>,
     /// tmcmc: noise of the measurements as a multiple of the structure's
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
@@ -56,6 +56,9 @@ pub struct UpdateArgs {
     #[arg(long)]
     json: bool,
 }
+
+/// Multiple of what chance makes of a distance between distributions, beyond which something is wrong.
+const FAR: f64 = 5.0;
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Method {
@@ -125,10 +128,24 @@ pub fn update(args: &UpdateArgs) -> anyhow::Result<()> {
 }
 
 fn by_sensitivity(simulator: &Simulator, measurements: &[ModalMeasurement]) -> anyhow::Result<Answer> {
-    let rows: Vec<Vec<Option<f64>>> =
-        measurements.iter().map(|m| m.frequencies_hz.iter().map(|f| f.map(Hertz::get)).collect()).collect();
+    // With fewer modes than parameters the answer would be that of the starting point.
+    let needed = simulator.space().len();
+    let enough = |m: &&ModalMeasurement| m.frequencies_hz.iter().flatten().count() >= needed;
+    let rows: Vec<Vec<Option<f64>>> = measurements
+        .iter()
+        .filter(enough)
+        .map(|m| m.frequencies_hz.iter().map(|f| f.map(Hertz::get)).collect())
+        .collect();
+    anyhow::ensure!(
+        !rows.is_empty(),
+        "no measurement has the {needed} modes that {needed} parameters need: sensitivity updating finds one point for each"
+    );
+    let left_out = measurements.len() - rows.len();
     let updates = update_all(simulator, &rows, &prior_lattice(simulator))?;
-    let mut notes = Vec::new();
+    let mut notes = stated_noise_ignored(measurements);
+    if left_out > 0 {
+        notes.push(format!("{left_out} measurements have fewer modes than there are parameters: left out"));
+    }
     let stuck = updates.iter().filter(|u| !u.converged).count();
     if stuck > 0 {
         notes.push(format!("{stuck} of {} searches did not come to rest", updates.len()));
@@ -159,7 +176,7 @@ fn by_sensitivity(simulator: &Simulator, measurements: &[ModalMeasurement]) -> a
     Ok(Answer {
         method: "sensitivity",
         measurements_used: updates.len(),
-        measurements_left_out: 0,
+        measurements_left_out: left_out,
         parameters: simulator.space().iter().enumerate().map(line).collect(),
         evidence: None,
         updates: updates.iter().map(single).collect(),
@@ -174,7 +191,8 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
     let m = simulator.modes();
     let measured = DMatrix::from_fn(complete.len(), m, |row, mode| complete[row][mode]);
     let modes: Vec<usize> = (0..m).collect();
-    let population = Population::new(simulator, &measured, &modes, args.noise, args.simulated, args.seed)?;
+    let simulated = args.simulated.unwrap_or_else(|| simulated_for(complete.len()));
+    let population = Population::new(simulator, &measured, &modes, args.noise, simulated, args.seed)?;
     let bar = ProgressBar::new(100);
     let style = "{elapsed} {wide_bar} {msg}";
     bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
@@ -192,7 +210,16 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
         std_interval: Some(estimate.std_interval[k]),
     };
     let left_out = measurements.len() - complete.len();
-    let mut notes = Vec::new();
+    let mut notes = stated_noise_ignored(measurements);
+    // What normal samples of the fitted distribution differ by, on average: one for each moment, over 4n.
+    let by_chance = (m + m * (m + 1) / 2) as f64 / (4.0 * complete.len() as f64);
+    if estimate.least_distance > FAR * by_chance {
+        notes.push(format!(
+            "the nearest simulated population is {:.2} away from the measured one (Bhattacharyya; chance {by_chance:.2}): \
+             it lies beyond the prior, or the simulation does not fit",
+            estimate.least_distance
+        ));
+    }
     if left_out > 0 {
         notes.push(format!("{left_out} measurements lack a mode: a distance between distributions needs all of them"));
     }
@@ -206,6 +233,13 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
         notes,
         seconds: 0.0,
     })
+}
+
+/// Two of the methods take every measurement as equally good.
+fn stated_noise_ignored(measurements: &[ModalMeasurement]) -> Vec<String> {
+    let stated = measurements.iter().any(|m| m.std_hz.is_some());
+    let note = "the standard deviations stated in the file are not used by this method; --method cinn does";
+    stated.then(|| note.to_owned()).into_iter().collect()
 }
 
 fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Result<Answer> {
@@ -246,6 +280,12 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
     })
 }
 
+/// Decimals that show a difference of this size with two digits.
+fn decimals(difference: f64) -> usize {
+    let magnitude = difference.abs().max(1e-300).log10().floor();
+    (1.0 - magnitude).clamp(0.0, 15.0) as usize
+}
+
 fn print(answer: &Answer) {
     println!(
         "{} measurements used, {} left out, {:.2} s by {}",
@@ -255,8 +295,12 @@ fn print(answer: &Answer) {
         println!("note: {note}");
     }
     let with = |value: Option<f64>, interval: Option<[f64; 2]>| match (value, interval) {
-        (Some(v), Some([low, high])) => format!("{v:.4} ({low:.4} … {high:.4})"),
-        (Some(v), None) => format!("{v:.4}"),
+        (Some(v), Some([low, high])) => {
+            // Digits that the interval makes sense of.
+            let digits = decimals(high - low);
+            format!("{v:.digits$} ({low:.digits$} … {high:.digits$})")
+        }
+        (Some(v), None) => format!("{v:.0$}", decimals(0.03 * v)),
         _ => "-".to_owned(),
     };
     println!("{:>16} {:>30} {:>30} {:>8}", "parameter", "mean (90 %)", "std (90 %)", "unit");

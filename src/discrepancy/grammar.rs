@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::data::{Column, Data, Values, TIME};
 use super::model::{Effect, Number};
 use crate::physics::effect::Target;
-use crate::physics::{Form, Node, Structure};
+use crate::physics::{Form, Node, Spring, Structure};
 use crate::simulator::law::{Law, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
@@ -110,7 +110,8 @@ pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     let mut targets = simulator.structure().map_or_else(Vec::new, |structure| part_targets(simulator, structure));
     if simulator.table().is_some() {
         // An emulator has no springs: what acts on them acts on the parameters that stand for them.
-        targets.extend((0..simulator.space().len()).map(Target::ParameterScale));
+        let shares = simulator.space().iter().enumerate().filter(|(_, parameter)| parameter.has_share());
+        targets.extend(shares.map(|(column, _)| Target::ParameterScale(column)));
     }
     targets.extend([Target::FrequencyScale(None), Target::FrequencyOffset(None)]);
     if modes > 1 {
@@ -155,6 +156,16 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
         targets.push(Target::Masses((0..masses).collect()));
     }
     targets
+}
+
+/// Stiffness of each spring between places or a place and the ground, N/m: not of those that hold rotations.
+fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
+    let sideways = |node: &Node| match node {
+        Node::Ground => true,
+        Node::Freedom(freedom) => structure.places().iter().any(|place| place.freedom == *freedom),
+    };
+    let between = |s: &&Spring| matches!(&s.form, Form::Spring(a, b) if sideways(a) && sideways(b));
+    structure.springs().iter().filter(between).map(|s| s.n_per_m).collect()
 }
 
 /// Pairs of nodes that no spring joins.
@@ -338,14 +349,13 @@ impl Candidate {
                 0.1 * (p.upper - p.lower)
             }
             Target::AddedSpring(..) => {
-                let springs = simulator.structure().map_or(&[][..], Structure::springs);
-                let between = springs.iter().filter(|s| matches!(s.form, Form::Spring(..)));
-                let stiffness: Vec<f64> = between.map(|s| s.n_per_m).collect();
-                let structure = simulator.structure().filter(|_| stiffness.is_empty());
+                let structure = simulator.structure();
+                let sideways: Vec<f64> = structure.map_or_else(Vec::new, translational_n_per_m);
+                let mean = if sideways.is_empty() { 0.0 } else { stats::mean(&sideways) };
                 // A beam without springs: what its mass at its lowest frequency stands for.
                 let lowest = std::f64::consts::TAU * simulator.nominal_frequencies_hz()[0];
-                let of_beam = structure.map(|s| s.masses().iter().map(|m| m.kg).sum::<f64>() * lowest.powi(2));
-                0.15 * of_beam.unwrap_or_else(|| stats::mean(&stiffness))
+                let kg: f64 = structure.map_or(0.0, |s| s.masses().iter().map(|m| m.kg).sum());
+                0.15 * if mean > 0.0 { mean } else { kg * lowest.powi(2) }
             }
             Target::Oscillator(host) => 0.05 * simulator.structure().map_or(1.0, |s| s.kg_at(*host)),
             Target::ModeOrder(_) => 1.0,

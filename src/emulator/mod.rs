@@ -140,6 +140,11 @@ impl Emulator {
         (frequencies, jacobian)
     }
 
+    /// Least and greatest value of each parameter in the runs, `[d]`.
+    pub fn ranges(&self) -> impl Iterator<Item = [f64; 2]> + '_ {
+        self.lower.iter().zip(&self.upper).map(|(lower, upper)| [*lower, *upper])
+    }
+
     /// Number of modes, m.
     pub fn modes(&self) -> usize {
         self.relative_error.len()

@@ -107,11 +107,15 @@ pub async fn put(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let bytes = read_body(body, &headers, shared.limits).await?;
-    let definition = match media_type(&headers).as_deref() {
-        Some("application/json") => parse_definition_json(&bytes)?,
-        Some("application/toml") => StructureDefinition::parse_toml(utf8(&bytes)?).map_err(refused)?,
+    let kind = media_type(&headers);
+    let parse: fn(&[u8]) -> Result<StructureDefinition, ApiError> = match kind.as_deref() {
+        Some("application/json") => parse_definition_json,
+        Some("application/toml") => |bytes| StructureDefinition::parse_toml(utf8(bytes)?).map_err(refused),
         other => return Err(unsupported_media_type(other, "application/json or application/toml")),
     };
+    // Large structures are solved, and tables of runs fitted, while they are checked.
+    let parsed = tokio::task::spawn_blocking(move || parse(&bytes)).await.map_err(|e| ApiError::internal(&e))?;
+    let definition = parsed?;
     if definition.id != id.as_str() {
         let message = format!("the id in the body is {}, in the path {id}", crate::quantity::shown(&definition.id));
         return Err(ApiError::invalid_field("/id", message));

@@ -173,7 +173,7 @@ fn population_behind(
         return Ok(populations(posterior, None, space, seed));
     }
     let (samples, log_density) = proposals(posterior, &found, space, NEAR_DRAWS, seed);
-    let log_posterior = baseline.log_density_of_draws(samples.theta(), observations)?;
+    let log_posterior = baseline.log_posterior_of_draws(samples.theta(), observations)?;
     let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
     Ok(populations(&samples, Some(&log_weights), space, seed))
 }
@@ -422,7 +422,7 @@ pub fn assess(
         );
         findings.push(Finding::new(Code::PriorEdge, Effect::Note, message));
     }
-    findings.extend(beyond_runs(baseline, &samples.posterior));
+    findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
     let trust = Trust::new(&samples.fit, findings);
     // Nothing is said of damage where the simulation does not hold.
     let compared = context.undamaged.filter(|_| trust.accepted());
@@ -444,11 +444,14 @@ pub fn assess(
 }
 
 /// Whether much of the posterior lies where the table behind an emulator has no runs.
-fn beyond_runs(baseline: &Baseline, posterior: &PosteriorSamples) -> Option<Finding> {
+fn beyond_runs(baseline: &Baseline, posterior: &PosteriorSamples, asked: &[Observation]) -> Option<Finding> {
     let simulator = baseline.simulator();
     simulator.table()?;
     let theta = posterior.theta();
-    let outside = |row: &usize| simulator.is_extrapolated(&theta.row(*row).iter().copied().collect::<Vec<_>>());
+    let outside = |row: &usize| {
+        let simulator = asked[row / posterior.draws()].simulator(simulator);
+        simulator.is_extrapolated(&theta.row(*row).iter().copied().collect::<Vec<_>>())
+    };
     let share = (0..theta.nrows()).filter(outside).count() as f64 / theta.nrows() as f64;
     (share > MUCH_EDGE_MASS).then(|| {
         let message = format!(

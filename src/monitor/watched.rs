@@ -37,7 +37,8 @@ impl Monitor {
     /// # Errors
     /// [`Error::StructureInUse`] when it has batches under another definition.
     pub async fn put_structure(&self, definition: StructureDefinition) -> Result<PutStructure, Error> {
-        let simulator = Simulator::new(definition)?;
+        let built = tokio::task::spawn_blocking(move || Simulator::new(definition)).await;
+        let simulator = built.unwrap_or_else(|e| std::panic::resume_unwind(e.into_panic()))?;
         let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
         let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
         match outcome {

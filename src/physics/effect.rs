@@ -115,13 +115,10 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
                 freedoms += 1;
             }
             Target::ModeOrder(modes) => order.clone_from(modes),
-            Target::FrequencyScale(_) => {
+            Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                 factor(number)?;
             }
-            Target::FrequencyOffset(_)
-            | Target::SettingOffset(_)
-            | Target::SettingScale(_)
-            | Target::ParameterScale(_) => {}
+            Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
         }
     }
     for (spring, factor) in springs.iter_mut().zip(&spring_factor) {
@@ -223,13 +220,14 @@ pub fn measured(
     if needed > frequencies_hz.len() {
         return Err(Error::TooFewModes { asked: needed, available: frequencies_hz.len() });
     }
-    let (scale, offset_hz) = instrument(&places, sizes, count);
+    let rows = order.len();
+    let (scale, offset_hz) = instrument(&places, sizes, rows);
     let structural: Vec<f64> = order.iter().map(|mode| frequencies_hz[*mode]).collect();
     let by_parameter =
-        DMatrix::from_fn(count, by_parameter.ncols(), |row, k| scale[row] * by_parameter[(order[row], k)]);
-    let mut by_size = DMatrix::zeros(count, sizes.len());
+        DMatrix::from_fn(rows, by_parameter.ncols(), |row, k| scale[row] * by_parameter[(order[row], k)]);
+    let mut by_size = DMatrix::zeros(rows, sizes.len());
     for (first, target) in &places {
-        for row in 0..count {
+        for row in 0..rows {
             let slope = match target {
                 Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
                     structural[row] * scale[row] / (1.0 + sizes[*first])
@@ -240,7 +238,7 @@ pub fn measured(
             by_size[(row, *first)] = slope;
         }
     }
-    let frequencies_hz = (0..count).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
+    let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
     Ok(Measured { frequencies_hz, by_parameter, by_size })
 }
 

@@ -88,11 +88,10 @@ pub enum Method {
     Cinn,
 }
 
-/// One of the two cases. Tables and figures carry the paper's numbers in their names: `hyperparameters` is Table 3 and 4 of
-/// case 1, Table 8 of case 2; `comparison` is Table 5 or 9; `times` Table 6 or 10.
+/// One of the two cases. Tables carry the paper's numbers in their names; those of the other case are empty.
 #[derive(Debug, Clone, Serialize)]
 pub struct Case {
-    /// Case 1: Table 3, the undamaged state. Case 2: Table 8, both states.
+    /// Case 1: Table 3, the undamaged state.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub table3: Vec<Row>,
     /// Case 1: Table 4, the damaged states.
@@ -146,7 +145,7 @@ pub struct Compared {
     pub target: f64,
     /// What the paper found in its single run; none where it shows none for this method and state.
     pub paper: Option<f64>,
-    /// Share of our repetitions below the paper's value, %.
+    /// Share of our repetitions below the paper's value, %; one that meets it counts half.
     pub paper_percentile: Option<f64>,
 }
 

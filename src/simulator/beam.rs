@@ -25,7 +25,7 @@ pub(super) fn layout(definition: &StructureDefinition, problems: &mut Problems) 
     if definition.beams.is_empty() {
         problems.push(DefinitionProblem::new("/beam", "no [[beam]]: a simulation \"beam\" has at least one span"));
     }
-    let elements: usize = definition.beams.iter().map(|b| b.elements).sum();
+    let elements = definition.beams.iter().fold(0, |sum: usize, b| sum.saturating_add(b.elements));
     if elements > MOST_ELEMENTS {
         let message = format!("{elements} elements: at most {MOST_ELEMENTS}, some three for each half-wave are plenty");
         problems.push(DefinitionProblem::new("/beam", message));
@@ -139,8 +139,8 @@ fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: us
         let message = format!("beam {name} has a bending stiffness of {stiffness} N·m²: it must be finite and above 0");
         wrong("bending_stiffness_n_m2", message);
     }
-    if beam.elements == 0 {
-        wrong("elements", format!("beam {name} needs at least one element"));
+    if beam.elements == 0 || beam.elements > MOST_ELEMENTS {
+        wrong("elements", format!("beam {name} has {} elements: at least one, at most {MOST_ELEMENTS}", beam.elements));
     }
 }
 

@@ -115,7 +115,7 @@ fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Bindin
     let least: Vec<(usize, f64)> = weakest.iter().enumerate().map(|(i, s)| (i, s.n_per_m)).collect();
     let at_weakest = structure.with_stiffness(&least).and_then(|weak| natural_frequencies_hz(&weak, 1));
     at_weakest.map_err(|e| {
-        let message = format!("with every parameter at its softest: {e}; hold the beam with supports or springs");
+        let message = format!("with every parameter at its softest: {e}; hold the beam with supports or springs, or, if it is held, give a short span fewer elements");
         vec![DefinitionProblem::new("/node", message)]
     })?;
     Ok(structure)

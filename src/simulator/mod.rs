@@ -253,9 +253,18 @@ impl Simulator {
         self.table().map_or_else(Vec::new, |table| table.warnings(self.modes()))
     }
 
-    /// Whether `theta` lies where an emulator has no runs.
+    /// Whether `theta`, as effects on parameters move it, lies where an emulator has no runs.
     pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
-        self.table().is_some_and(|table| table.emulator().is_outside(theta))
+        let Some(table) = self.table() else { return false };
+        let mut moved = theta.to_vec();
+        let mut first = 0;
+        for effect in self.effects() {
+            if let Target::ParameterScale(column) = effect.target {
+                moved[column] *= 1.0 + self.sizes[first];
+            }
+            first += effect.target.sizes();
+        }
+        table.is_outside(&moved)
     }
 
     fn bindings(&self) -> &[Binding] {
@@ -323,7 +332,7 @@ impl Simulator {
                 natural_frequencies_with(structure, &changes(bindings, theta), self.modes())
             }
             Model::Table(table) => {
-                let mut frequencies = table.emulator().frequencies_hz(theta);
+                let mut frequencies = table.frequencies_hz(theta);
                 frequencies.truncate(self.modes());
                 Ok(frequencies)
             }
@@ -365,7 +374,7 @@ impl Simulator {
                 Ok((modes.frequencies_hz, jacobian))
             }
             Model::Table(table) => {
-                let (mut frequencies, jacobian) = table.emulator().frequencies_and_jacobian(theta);
+                let (mut frequencies, jacobian) = table.frequencies_and_jacobian(theta);
                 frequencies.truncate(self.modes());
                 Ok((frequencies, jacobian.rows(0, self.modes()).into_owned()))
             }
@@ -408,7 +417,7 @@ impl Simulator {
                 (response.frequencies_hz, by_parameter, response.by_size)
             }
             Model::Table(table) => {
-                let (frequencies, jacobian) = table.emulator().frequencies_and_jacobian(&theta);
+                let (frequencies, jacobian) = table.frequencies_and_jacobian(&theta);
                 let measured = measured(&frequencies, &jacobian, modes, targets, sizes)?;
                 (measured.frequencies_hz, measured.by_parameter, measured.by_size)
             }
@@ -461,7 +470,10 @@ impl Simulator {
     /// d ln k/dp of the first spring that a parameter sets: what a small change of the parameter is as a share of stiffness.
     pub fn stiffness_share(&self, column: usize, p: f64) -> f64 {
         let binding = self.bindings().iter().find(|b| b.parameter == column);
-        binding.map_or(1.0 / p, |b| b.slope(p) / b.stiffness(p))
+        let parameter = &self.space().as_slice()[column];
+        // A parameter of a table need be no stiffness: one that passes 0 has no share, and counts by the width of its prior.
+        let of_itself = if parameter.has_share() { 1.0 / p } else { 1.0 / (parameter.upper - parameter.lower) };
+        binding.map_or(of_itself, |b| b.slope(p) / b.stiffness(p))
     }
 
     /// Springs that one parameter sets together, with the parameter's name.

@@ -14,6 +14,10 @@ use crate::quantity::{shown, Digest};
 /// empty.
 const BEYOND: f64 = 0.02;
 
+/// Most runs, and most parameters and modes: fitting grows with the products.
+const MOST_RUNS: usize = 5_000;
+const MOST_COLUMNS: usize = 50;
+
 /// Column that may stand beside parameters and frequencies, to number the runs.
 const RUN_COLUMN: &str = "run";
 
@@ -40,10 +44,52 @@ impl Table {
         self.runs
     }
 
+    /// All frequencies of the table at `theta`, Hz.
+    ///
+    /// Polynomials run wild beyond the points they were fitted to: beyond the runs' range ln f goes on as a straight line.
+    pub fn frequencies_hz(&self, theta: &[f64]) -> Vec<f64> {
+        if self.within(theta) {
+            return self.emulator.frequencies_hz(theta);
+        }
+        self.frequencies_and_jacobian(theta).0
+    }
+
+    /// The same with derivatives, Hz per parameter unit, `[m, d]`.
+    pub fn frequencies_and_jacobian(&self, theta: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
+        if self.within(theta) {
+            return self.emulator.frequencies_and_jacobian(theta);
+        }
+        let edge: Vec<f64> =
+            theta.iter().zip(self.emulator.ranges()).map(|(x, [low, high])| x.clamp(low, high)).collect();
+        let (mut frequencies, mut jacobian) = self.emulator.frequencies_and_jacobian(&edge);
+        for (mode, f) in frequencies.iter_mut().enumerate() {
+            let slope: f64 = (0..edge.len()).map(|k| jacobian[(mode, k)] / *f * (theta[k] - edge[k])).sum();
+            jacobian.row_mut(mode).scale_mut(slope.exp());
+            *f *= slope.exp();
+        }
+        (frequencies, jacobian)
+    }
+
+    /// Whether there are no runs at `theta`: beyond their range by more than a Latin hypercube leaves empty, or in a corner
+    /// without any.
+    pub fn is_outside(&self, theta: &[f64]) -> bool {
+        let ranges = || theta.iter().zip(self.emulator.ranges());
+        let beyond = |(x, [low, high]): (&f64, [f64; 2])| {
+            let margin = BEYOND * (high - low);
+            !(low - margin..=high + margin).contains(x)
+        };
+        let edge: Vec<f64> = ranges().map(|(x, [low, high])| x.clamp(low, high)).collect();
+        ranges().any(beyond) || self.emulator.is_outside(&edge)
+    }
+
+    fn within(&self, theta: &[f64]) -> bool {
+        theta.iter().zip(self.emulator.ranges()).all(|(x, [low, high])| (low..=high).contains(x))
+    }
+
     /// Frequencies in the middle of the prior, Hz.
     pub(super) fn nominal_frequencies_hz(&self, space: &ParameterSpace, modes: usize) -> Vec<f64> {
         let middle: Vec<f64> = space.iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
-        let mut frequencies = self.emulator.frequencies_hz(&middle);
+        let mut frequencies = self.frequencies_hz(&middle);
         frequencies.truncate(modes);
         frequencies
     }
@@ -143,9 +189,16 @@ fn read_runs(csv: &str, space: &ParameterSpace, modes: usize) -> Result<Runs, St
             "the column {name} is no parameter, no frequency (f1_hz, f2_hz, …) and not \"{RUN_COLUMN}\""
         ));
     }
+    if space.len() > MOST_COLUMNS || mode_columns.len() > MOST_COLUMNS {
+        let (parameters, modes) = (space.len(), mode_columns.len());
+        return Err(format!("{parameters} parameters and {modes} modes: at most {MOST_COLUMNS} of each"));
+    }
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for record in reader.records() {
         let record = record.map_err(|e| e.to_string())?;
+        if rows.len() == MOST_RUNS {
+            return Err(format!("more than {MOST_RUNS} runs: choose among them, a few hundred usually do"));
+        }
         let line = record.position().map_or(0, csv::Position::line);
         let cell = |column: &usize| {
             let text = record.get(*column).unwrap_or_default();

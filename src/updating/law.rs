@@ -235,7 +235,7 @@ impl Data<'_> {
 /// rather than too narrow. By Levenberg–Marquardt from the best of a grid over B of both signs, A and C being linear
 /// for each.
 ///
-/// Stiffnesses from [`coupling_stiffness`] deserve `Std`: on the rig of the paper their errors differ by a factor of
+/// Stiffnesses from [`super::chain::coupling_stiffness`] deserve `Std`: on the rig of the paper their errors differ by a factor of
 /// 25, and the constants come out with a quarter to almost a half less error.
 ///
 /// Source: Wang et al. (2025), Eq. 25, which gives no intervals; MacKinnon & White (1985) for HC3.

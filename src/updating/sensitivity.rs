@@ -22,8 +22,10 @@ pub struct Update {
     pub theta: Vec<f64>,
     /// Root mean square of ln f/f(θ) over the modes measured.
     pub residual: f64,
-    /// Steps taken.
+    /// Steps taken, over all starts.
     pub iterations: usize,
+    /// Starts tried; the best ending counts.
+    pub starts: usize,
     /// The search came to rest: at frequencies that are met, at a least misfit, or at an edge of the box.
     pub converged: bool,
 }
@@ -99,7 +101,7 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
         let met = root_mean_square(&residual) <= MET;
         converged = met || moved <= AT_REST || damping > 1e10;
     }
-    Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, converged })
+    Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, starts: 1, converged })
 }
 
 /// [`update`] of many measurements over all cores, each beginning at the middle of the prior, then, where the frequencies
@@ -120,9 +122,11 @@ pub fn update_all(
                 break;
             }
             let other = update(simulator, frequencies, start)?;
+            let (iterations, starts) = (best.iterations + other.iterations, best.starts + 1);
             if other.residual < best.residual {
                 best = other;
             }
+            (best.iterations, best.starts) = (iterations, starts);
         }
         Ok(best)
     };

@@ -10,8 +10,15 @@ use super::tmcmc::{tmcmc, Samples, Settings, Stage, Target};
 use crate::simulator::Simulator;
 use crate::stats::{self, Stream};
 
-/// Simulated measurements at each point by default: points of a Sobol' sequence, whose moments move ln L by less than 0.1.
-pub const SIMULATED: usize = 128;
+/// Fewest simulated measurements at each point by default.
+const SIMULATED: usize = 128;
+
+/// Simulated measurements at each point for a batch of this size, by default: points of a Sobol' sequence, whose moments move
+/// ln L by less than a half. That error is 4n times the square of the moments' own, which falls as one over their number.
+pub fn simulated_for(measurements: usize) -> usize {
+    let needed = SIMULATED as f64 * (measurements as f64 / 500.0).sqrt();
+    (needed.ceil() as usize).clamp(SIMULATED, MOST_POINTS).next_power_of_two()
+}
 
 /// Settings for `samples` samples where each evaluation costs a hundred runs of the model: chains that move on until half of
 /// the correlation is left, which halves the evaluations and widens the scatter of the evidence by a third.
@@ -61,7 +68,7 @@ pub enum Error {
     Singular,
     /// More points or dimensions than the sequence has.
     #[error(
-        "{points} simulated measurements in {dimensions} dimensions: at most {MOST_POINTS} in {}",
+        "{points} simulated measurements in {dimensions} dimensions: two more than modes at least, {MOST_POINTS} in {} at most",
         sobol_burley::NUM_DIMENSIONS
     )]
     Points {
@@ -92,6 +99,8 @@ pub struct Estimate {
     pub evaluations: usize,
     /// Simulated measurements in all.
     pub model_runs: usize,
+    /// Least Bhattacharyya distance to the measurements over the samples: some (m + m(m + 1)/2)/4n of it is chance.
+    pub least_distance: f64,
 }
 
 impl<'a> Population<'a> {
@@ -119,7 +128,7 @@ impl<'a> Population<'a> {
         let noisy = simulator.is_noisy() && noise_multiple > 0.0;
         let dimensions = simulator.space().len() + if noisy { modes.len() } else { 0 };
         // Beyond these the crate gives numbers without meaning, and checks only in debug.
-        if !(2..=MOST_POINTS).contains(&simulated) || dimensions > sobol_burley::NUM_DIMENSIONS as usize {
+        if !(modes.len() + 2..=MOST_POINTS).contains(&simulated) || dimensions > sobol_burley::NUM_DIMENSIONS as usize {
             return Err(Error::Points { points: simulated, dimensions });
         }
         let scramble = stats::stream(seed, "scrambling of simulated measurements").next_u32();
@@ -157,22 +166,20 @@ impl<'a> Population<'a> {
             log_evidence: [samples.log_evidence, samples.log_evidence_std_error],
             evaluations: samples.evaluations,
             model_runs: samples.evaluations * self.scores.nrows(),
+            least_distance: -samples.log_likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max)
+                * self.epsilon_squared,
         };
         Ok((samples, estimate))
     }
 
     /// Moments of the simulated frequencies at θ; `None` where the structure has no frequencies.
     fn simulate(&self, theta: &[f64]) -> Option<Moments> {
-        let parameters = self.simulator.space().as_slice();
-        let (d, m) = (parameters.len(), self.modes.len());
+        let (d, m) = (self.simulator.space().len(), self.modes.len());
         let mut rows = Vec::with_capacity(self.scores.nrows() * m);
         let mut x = vec![0.0; d];
         for point in 0..self.scores.nrows() {
-            for (k, parameter) in parameters.iter().enumerate() {
-                let value = theta[k] + theta[d + k] * self.scores[(point, k)];
-                // An emulator ends where its runs do.
-                let inside = self.simulator.table().is_none();
-                x[k] = if inside { value } else { value.clamp(parameter.lower, parameter.upper) };
+            for (k, value) in x.iter_mut().enumerate() {
+                *value = theta[k] + theta[d + k] * self.scores[(point, k)];
             }
             let frequencies = self.simulator.frequencies_hz(&x).ok()?;
             for (place, &mode) in self.modes.iter().enumerate() {

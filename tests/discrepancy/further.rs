@@ -86,6 +86,27 @@ fn slope(answer: &Value) -> (f64, [f64; 2]) {
     (slope["value"].as_f64().unwrap(), [interval[0].as_f64().unwrap(), interval[1].as_f64().unwrap()])
 }
 
+/// Extends the structure by what the data show, and diagnoses the extension with them: nothing must be left.
+fn extended_finds_nothing(structure: &str, csv: &str) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    std::fs::write(path("structure.toml"), structure).unwrap();
+    std::fs::write(path("data.csv"), csv).unwrap();
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .args(["extend", "--structure", &path("structure.toml"), "--data", &path("data.csv")])
+        .args(["--out", &path("extended"), "--no-training"])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .args(["diagnose", "--json", "--structure", &path("extended/structure.json"), "--data", &path("data.csv")])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let left: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(left["verdict"], "nothing_found", "{}", left["summary"]);
+}
+
 #[test]
 fn a_table_names_the_parameter_that_follows_the_temperature_and_nothing_in_healthy_data() {
     let structure = table_structure(1);
@@ -103,6 +124,8 @@ fn a_table_names_the_parameter_that_follows_the_temperature_and_nothing_in_healt
     // The 90 % interval, widened by as much again.
     println!("slope {value} [{low}, {high}]");
     assert!((value + 0.004).abs() < high - low, "{value} [{low}, {high}]");
+    assert!(high < 0.0 && high - low < 0.002, "an interval that says nothing: [{low}, {high}]");
+    extended_finds_nothing(&structure, &hidden);
 
     let healthy = season(3, 3, |_, stream| chain_hz(draw(stream, 4.2e6), draw(stream, 3.6e6)));
     let silent = answer(&structure, &healthy, &[]);
@@ -190,4 +213,5 @@ fn a_beam_names_the_bearing_that_softens_in_the_warmth() {
     assert_eq!((target["kind"].as_str(), target["name"].as_str()), (Some("spring"), Some("bearing")), "{found:#}");
     assert_eq!(found["causes"][0]["covariate"], "temperature_c");
     assert!(number(&found, "/causes/0/probability") > 0.9);
+    extended_finds_nothing(BEAM, &hidden);
 }

@@ -231,7 +231,7 @@ fn mistakes_in_a_beam_are_named_with_their_place() {
         ("bending_stiffness_n_m2 = 3.0e8", "bending_stiffness_n_m2 = -1.0", "/beam/1/bending_stiffness_n_m2", "above 0"),
         ("mass_kg_per_m = 800.0", "mass_kg_per_m = 0.0", "/beam/1/mass_kg_per_m", "above 0"),
         ("elements = 6", "elements = 0", "/beam/1/elements", "at least one"),
-        ("elements = 6", "elements = 600", "/beam", "at most 200"),
+        ("elements = 6", "elements = 600", "/beam/1/elements", "at most 200"),
         ("at = \"pier\"", "at = \"end\"", "/mass/0/at", "does not move"),
         ("at = \"pier\"\n", "", "/mass/0/at", "no node"),
         ("to = \"end\"\nn_m_per_rad", "to = \"end\"\nn_per_m", "/spring/1/to", "support holds it already"),

@@ -70,6 +70,9 @@ fn data_without_a_distribution_are_refused() {
     let drawn = Drawn::new(simulator.space(), &moments()).unwrap().draw(&simulator, 20, 0.0, 3).unwrap();
     let many = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, 1 << 17, 1);
     assert!(matches!(many, Err(Error::Points { .. })));
+    // Fewer points than a covariance needs would have no likelihood anywhere.
+    let few = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, 4, 1);
+    assert!(matches!(few, Err(Error::Points { .. })));
 }
 
 #[test]
@@ -83,7 +86,7 @@ fn the_points_of_the_simulation_have_the_moments_of_thousands() {
     };
     let exact = log_likelihood(1 << 14, 1);
     for seed in 0..10 {
-        let few = log_likelihood(modalwatch::updating::stochastic::SIMULATED, seed);
+        let few = log_likelihood(modalwatch::updating::stochastic::simulated_for(count), seed);
         println!("ln L {few:.3} of few points, {exact:.3} of many");
         // A nat is what matters between two points of the posterior.
         assert!((few - exact).abs() < 0.5, "{few} {exact}");

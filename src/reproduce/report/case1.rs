@@ -95,7 +95,7 @@ fn compared(undamaged: Option<&State>, scenarios: &[State]) -> String {
     let told: Vec<String> = scenarios.iter().map(|state| damage_told(state, |_| true)).collect();
     let caption = format!(
         "Figure 13. Each stiffness in the damage scenarios against the undamaged state: the tinted area below δ shows \
-         the probability of damage (PoD), near 5 % where nothing has changed. {}.",
+         the probability of damage (PoD), near 5 % where nothing has changed; the figures are shares of the samples. {}.",
         told.join(". ")
     );
     let keys = key(Swatch::Line, OURS, "undamaged")

@@ -94,8 +94,9 @@ fn sensitivity(s: &Sensitivity) -> String {
         cells: outputs.clone().map(row).collect(),
     };
     let caption = "Figure 17. Total Sobol' indices: the share of the variance of each frequency that an input takes \
-                   part in. The paper finds both p12 and p23 in f1, p12 in f2, p23 in f3, and hardly anything of the \
-                   rest: the same cells should stand out here.";
+                   part in. The paper finds p23, and less of p12, in f1, p12 in f2, p23 in f3, and hardly anything of the \
+                   rest. The same cells stand out here, but one: the share of p12 in f1 is no larger than that of m2, and \
+                   both depend on how far masses and ground springs vary, which the paper does not state.";
     let shown = |input, output| {
         total(s, input, output).map_or_else(|| "–".to_owned(), |index| interval(index.value, index.interval_90, 3))
     };

@@ -53,9 +53,10 @@ fn contents(present: [bool; 2]) -> String {
 }
 
 fn reading(repetitions: usize) -> String {
+    let word = if repetitions == 1 { "repetition" } else { "repetitions" };
     let keys = strip_keys(["5–95 % of ours", "our median", "target", "the paper"]);
     format!(
-        "<p>Each row is one number that a method finds. <strong>Ours</strong>: median over {repetitions} repetitions, \
+        "<p>Each row is one number that a method finds. <strong>Ours</strong>: median over {repetitions} {word}, \
          each with measurements of its own, and the range from 5 to 95 % of them. <strong>Target</strong>: what the \
          measurements were drawn with. <strong>Paper</strong>: what the paper prints, from one run. \
          <strong>Paper at</strong>: the share of our repetitions below the paper's number, in bold where that \
@@ -63,7 +64,7 @@ fn reading(repetitions: usize) -> String {
          from the mean, standard deviation or share of the values actually drawn in the same repetition, averaged over \
          the repetitions. The target alone is no fair measure: a few dozen draws never have exactly the mean that they \
          were drawn with. <strong>PoD</strong>: probability of damage, the share of the distribution found below δ = μ \
-         − 1.645 σ of the undamaged state.</p><p class=\"keys\">The strips, each on a scale of its own: {keys}</p>"
+         − 1.645 σ of the undamaged state. The figures show the first repetition.</p><p class=\"keys\">The strips, each on a scale of its own: {keys}</p>"
     )
 }
 
