@@ -9,12 +9,13 @@ use super::observation::Observation;
 use crate::simulator::Simulator;
 use crate::stats;
 
-/// Weights count up to this many times their median. A flow is close to the posterior nearly everywhere; where it is not, a
-/// few draws must not stand for all.
-const LARGEST: f64 = 10.0;
+/// Share of the proposals that the weights must leave effective. Where the flow is further from the posterior (few sharp
+/// frequencies of many parameters: a thread through the box), a few draws would stand for all, and the sample would be narrower
+/// than it should: there the flow's own draws stay, which its calibration vouches for.
+const EFFECTIVE: f64 = 0.5;
 
-/// Least median, as a share of the mean: where most draws are far off, their weights say nothing of the others'.
-const LEAST_MEDIAN: f64 = 1e-3;
+/// Observations of one task: fewer cost more in handing over than they take.
+const AT_A_TIME: usize = 16;
 
 /// Draws of a flow, and what they are weighed by.
 pub(super) struct Proposals {
@@ -32,11 +33,11 @@ pub(super) struct Proposals {
 ///  w_s = p(y | x_s)/q(x_s | y),    ln p(y | x) = −Σ_i ½((y_i − f_i(x))/s_i)² + ln s_i,   s_i the noise at f_i(x)
 /// ```
 ///
-/// under the uniform prior, over the modes present; systematic resampling, then a shuffle, so that any first few are a
-/// sample too. A flow that bridges two humps leaves draws between them and in humps that are none: here they go.
+/// under the uniform prior, over the modes present; systematic resampling, then a shuffle, so that any first few are a sample
+/// too. A flow that bridges two humps leaves draws between them and in humps that are none: here they go. Where the weights
+/// leave fewer than half of the proposals effective, the flow's draws are kept as they are.
 ///
-/// Source: D. B. Rubin (1988), Using the SIR algorithm to simulate posterior distributions, Bayesian Statistics 3, 395–402;
-/// E. L. Ionides (2008), Truncated importance sampling, J. Comp. Graph. Stat. 17, 295–311.
+/// Source: D. B. Rubin (1988), Using the SIR algorithm to simulate posterior distributions, Bayesian Statistics 3, 395–402.
 pub(super) fn resample(
     simulator: &Simulator,
     observations: &[Observation],
@@ -48,6 +49,7 @@ pub(super) fn resample(
     let many = proposals.theta.nrows() / observations.len().max(1);
     let chosen: Vec<Vec<usize>> = observations
         .par_iter()
+        .with_min_len(AT_A_TIME)
         .enumerate()
         .map(|(row, observation)| {
             let rows = row * many..(row + 1) * many;
@@ -88,7 +90,7 @@ pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation
         };
         (0..each).map(one).collect::<Vec<f64>>()
     };
-    observations.par_iter().enumerate().flat_map_iter(of).collect()
+    observations.par_iter().with_min_len(AT_A_TIME).enumerate().flat_map_iter(of).collect()
 }
 
 fn log_likelihood(simulator: &Simulator, observation: &Observation, theta: &[f64]) -> f64 {
@@ -101,15 +103,15 @@ fn log_likelihood(simulator: &Simulator, observation: &Observation, theta: &[f64
     observation.frequencies_hz.iter().enumerate().map(one).sum()
 }
 
-/// Truncated weights; `None` where none of the draws has one.
+/// Weights, the greatest 1; `None` where they would leave fewer than [`EFFECTIVE`] of the draws.
 fn weights(log_weights: &[f64]) -> Option<Vec<f64>> {
     let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     if !largest.is_finite() {
         return None;
     }
     let weights: Vec<f64> = log_weights.iter().map(|w| (w - largest).exp()).collect();
-    let cap = LARGEST * stats::quantile(&weights, 0.5).max(LEAST_MEDIAN * stats::mean(&weights));
-    Some(weights.into_iter().map(|w| w.min(cap)).collect())
+    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
+    (sum * sum / squares >= EFFECTIVE * weights.len() as f64).then_some(weights)
 }
 
 /// `draws` indices, each as often as its weight says to within one, in random order.
@@ -148,11 +150,16 @@ mod tests {
     }
 
     #[test]
-    fn weights_are_cut_at_a_multiple_of_their_median_and_none_are_no_weights() {
-        let cut = weights(&[0.0, 0.0, 0.0, 5.0]).unwrap();
-        assert!((cut[3] / cut[0] - LARGEST).abs() < 1e-9, "{cut:?}");
+    fn weights_count_only_where_they_leave_half_of_the_draws() {
         let usual = weights(&[0.0, 0.1, -0.1]).unwrap();
         assert!((usual[1] / usual[2] - 0.2_f64.exp()).abs() < 1e-12);
+        // A few draws in a hump that is none weigh nothing, and change nothing for the others.
+        let mut leaked = vec![0.0; 98];
+        leaked.extend([-300.0, f64::NEG_INFINITY]);
+        let found = weights(&leaked).unwrap();
+        assert!(found[..98].iter().all(|w| (w - 1.0).abs() < 1e-12) && found[98] < 1e-100 && found[99] <= 0.0);
+        let wild: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.3).collect();
+        assert!(weights(&wild).is_none());
         assert!(weights(&[f64::NEG_INFINITY; 3]).is_none());
     }
 }

@@ -133,7 +133,7 @@ pub fn train(
         crate::flow::train::train(&flow, &weights, samples, epoch_pairs, &validation_pairs, settings, on_epoch)?;
 
     let weight_bytes = checkpoint::to_bytes(&weights)?;
-    let mut manifest = Manifest {
+    let manifest = Manifest {
         format: FORMAT,
         program_version: env!("CARGO_PKG_VERSION").to_owned(),
         structure: simulator.id().clone(),
@@ -160,21 +160,38 @@ pub fn train(
         identifiability: IdentifiabilityRecord { parameters: Vec::new(), groups: Vec::new() },
         self_test: SelfTest { frequencies_hz: Vec::new(), seed: settings.seed, expected: Vec::new() },
     };
-    // The trained flow measures itself: what goes into the manifest is what a loaded baseline gives.
     let draft = Baseline {
         flow,
         encoder,
         training_space: space,
         simulator: simulator.clone(),
         digest: manifest.weights_sha256.clone(),
-        manifest: manifest.clone(),
+        manifest,
     };
-    let held_out = simulator.training_set(HELD_OUT_SAMPLES, purpose_seed(settings.seed, "held-out set"))?;
-    let mut stream = stats::stream(settings.seed, "observations of held-out set");
+    certify(&draft, weight_bytes)
+}
+
+/// Measures a baseline anew, as at the end of its training: for one that an earlier version of this program trained, whose
+/// inference was another. Its weights stay, its manifest and so its digest become those that training it now would give.
+///
+/// # Errors
+/// As [`train`].
+pub fn renew(baseline: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
+    certify(baseline, weights)
+}
+
+/// The trained flow measures itself: what goes into the manifest is what a loaded baseline gives.
+fn certify(draft: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
+    let simulator = draft.simulator();
+    let mut manifest = draft.manifest.clone();
+    env!("CARGO_PKG_VERSION").clone_into(&mut manifest.program_version);
+    let seed = manifest.training.settings.seed;
+    let held_out = simulator.training_set(HELD_OUT_SAMPLES, purpose_seed(seed, "held-out set"))?;
+    let mut stream = stats::stream(seed, "observations of held-out set");
     let observations = observe(simulator, &manifest.conditions, &held_out, &mut stream);
-    manifest.validation = validate(&draft, &held_out.theta, &observations, settings.seed)?;
-    (manifest.calibration, _) = calibrate(&draft, purpose_seed(settings.seed, "calibration"))?;
-    manifest.identifiability = identifiability(&draft, purpose_seed(settings.seed, "identifiability"))?;
+    manifest.validation = validate(draft, &held_out.theta, &observations, seed)?;
+    (manifest.calibration, _) = calibrate(draft, purpose_seed(seed, "calibration"))?;
+    manifest.identifiability = identifiability(draft, purpose_seed(seed, "identifiability"))?;
     manifest.self_test.frequencies_hz = held_out.frequencies_hz.row(0).iter().copied().collect();
     let observation = Observation::complete(&manifest.self_test.frequencies_hz);
     // The flow's own draws: which of them the simulation keeps can hang on the last digit.
@@ -183,8 +200,8 @@ pub fn train(
 
     let mut manifest_json = serde_json::to_vec_pretty(&manifest).map_err(|e| Box::new(super::LoadError::from(e)))?;
     manifest_json.push(b'\n');
-    let baseline = Baseline::load(&manifest_json, &weight_bytes, simulator).map_err(Box::new)?;
-    Ok(Trained { baseline, manifest_json, weights: weight_bytes })
+    let baseline = Baseline::load(&manifest_json, &weights, simulator).map_err(Box::new)?;
+    Ok(Trained { baseline, manifest_json, weights })
 }
 
 /// True when the training ended before its last epoch because the loss was not finite.

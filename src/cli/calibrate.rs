@@ -8,6 +8,7 @@ use clap::Args;
 use super::write_whole;
 use crate::baseline::calibration::{calibrate as measure, CalibrationRecord, CellRanks, DRAWS};
 use crate::baseline::library::{find_structure, Library};
+use crate::baseline::train::renew;
 use crate::baseline::Baseline;
 use crate::plot::{escaped, page, table, Line, Plot};
 
@@ -23,6 +24,10 @@ pub struct CalibrateArgs {
     /// Seed of the simulations; training has used others
     #[arg(long, default_value_t = 1_000_003)]
     seed: u64,
+    /// Write what is measured into the manifest beside --model, as training it now would: for a baseline that an earlier
+    /// version of this program trained
+    #[arg(long, requires = "model")]
+    renew: bool,
     /// HTML page with the plots to write
     #[arg(long)]
     out: Option<PathBuf>,
@@ -36,7 +41,13 @@ pub struct CalibrateArgs {
 /// # Errors
 /// A baseline that is refused, a file that cannot be written, a calibration that fails.
 pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
-    let baseline = load(&args.structure, args.model.as_deref())?;
+    let mut baseline = load(&args.structure, args.model.as_deref())?;
+    if let Some(path) = args.model.as_deref().filter(|_| args.renew) {
+        let weights = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let renewed = renew(&baseline, weights)?;
+        write_whole(&path.with_extension("json"), &renewed.manifest_json)?;
+        baseline = renewed.baseline.into();
+    }
     let (record, ranks) = measure(&baseline, args.seed)?;
     if let Some(path) = &args.out {
         write_whole(path, html(&baseline, &record, &ranks).as_bytes())?;
