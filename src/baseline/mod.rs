@@ -38,6 +38,9 @@ const PROPOSALS: usize = 2;
 /// Most degrees of freedom of a structure whose eigenproblem is solved for every draw: a millisecond each beyond.
 const MOST_FREEDOMS_WEIGHED: usize = 80;
 
+/// Rows that go through the flow together: more fill no cache, and gigabytes where every step is remembered for training.
+const ROWS_AT_A_TIME: usize = 8_192;
+
 /// Draws that estimate which share of a posterior lies inside the prior.
 const SHARE_DRAWS: usize = 200;
 
@@ -325,10 +328,13 @@ impl Baseline {
             if pending.is_empty() {
                 break;
             }
-            let rows = Tensor::from_slice(&pending, pending.len(), &Device::Cpu)?;
-            let (x, log_q) = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
-            let real = x.to_dtype(DType::F64)?.to_vec2::<f64>()?;
-            let log_q = log_q.to_dtype(DType::F64)?.to_vec1::<f64>()?;
+            let (mut real, mut log_q) = (Vec::new(), Vec::new());
+            for part in pending.chunks((ROWS_AT_A_TIME / draws).max(1)) {
+                let rows = Tensor::from_slice(part, part.len(), &Device::Cpu)?;
+                let (x, own) = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
+                real.extend(x.to_dtype(DType::F64)?.to_vec2::<f64>()?);
+                log_q.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
+            }
             for (place, values) in real.iter().enumerate() {
                 let row = pending[place / draws] as usize;
                 if filled[row] == draws {
