@@ -137,7 +137,8 @@ impl<'a> Population<'a> {
             // The least step of the sequence: neither end has a finite score.
             stats::normal_quantile(uniform.clamp(f64::from(f32::EPSILON), 1.0 - f64::from(f32::EPSILON)))
         };
-        let scores = DMatrix::from_fn(simulated, dimensions, score);
+        let scores = standardised(DMatrix::from_fn(simulated, dimensions, score))
+            .ok_or(Error::Points { points: simulated, dimensions })?;
         let epsilon_squared = distance::epsilon_squared(found as f64);
         let noise_multiple = if noisy { noise_multiple } else { 0.0 };
         Ok(Self { simulator, modes: modes.to_vec(), measured, scores, noise_multiple, epsilon_squared })
@@ -194,6 +195,21 @@ impl<'a> Population<'a> {
         }
         Some(Moments::from_rows(&rows, m))
     }
+}
+
+/// The same points with mean 0 and covariance I, exactly: of a linear map their images then have the moments of infinitely
+/// many, and only its curvature is left to their number. `None` for fewer points than a covariance needs.
+///
+/// Source: J. Barraquand (1995), Numerical valuation of high dimensional multivariate European securities, Management Science
+/// 41, 1882–1891 (quadratic resampling).
+fn standardised(mut scores: DMatrix<f64>) -> Option<DMatrix<f64>> {
+    for mut column in scores.column_iter_mut() {
+        let mean = column.mean();
+        column.add_scalar_mut(-mean);
+    }
+    let covariance = scores.tr_mul(&scores) / (scores.nrows() as f64 - 1.0);
+    let whitened = covariance.cholesky()?.l().solve_lower_triangular(&scores.transpose())?;
+    Some(whitened.transpose())
 }
 
 impl Target for Population<'_> {
