@@ -332,10 +332,10 @@ impl Baseline {
             for part in pending.chunks((ROWS_AT_A_TIME / draws).max(1)) {
                 let rows = Tensor::from_slice(part, part.len(), &Device::Cpu)?;
                 let (x, own) = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
-                real.extend(x.to_dtype(DType::F64)?.to_vec2::<f64>()?);
+                real.extend(x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?);
                 log_q.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
             }
-            for (place, values) in real.iter().enumerate() {
+            for (place, values) in real.chunks_exact(d).enumerate() {
                 let row = pending[place / draws] as usize;
                 if filled[row] == draws {
                     continue;

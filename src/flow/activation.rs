@@ -71,13 +71,18 @@ fn contiguous<'a, T>(values: &'a [T], layout: &Layout) -> Result<&'a [T]> {
     }
 }
 
-fn silu_f32(x: &[f32]) -> Vec<f32> {
-    let mut result = vec![0.0; x.len()];
+/// silu(x) of each element, in its place.
+pub(super) fn silu_in_place(x: &mut [f32]) {
     pulp::Arch::new().dispatch(|| {
-        for (y, x) in result.iter_mut().zip(x) {
-            *y = x * sigmoid(*x);
+        for x in x.iter_mut() {
+            *x *= sigmoid(*x);
         }
     });
+}
+
+fn silu_f32(x: &[f32]) -> Vec<f32> {
+    let mut result = x.to_vec();
+    silu_in_place(&mut result);
     result
 }
 

@@ -78,6 +78,16 @@ impl CouplingUnit {
         Ok((Tensor::cat(&[&x1, &x2], 1)?, log_det))
     }
 
+    /// What scales and shifts the second half.
+    pub(super) fn on_second(&self) -> &Subnet {
+        &self.on_second
+    }
+
+    /// What scales and shifts the first half, if it is not empty.
+    pub(super) fn on_first(&self) -> Option<&Subnet> {
+        self.on_first.as_ref()
+    }
+
     fn halves(&self, x: &Tensor) -> Result<(Tensor, Tensor)> {
         Ok((x.narrow(1, 0, self.first)?, x.narrow(1, self.first, self.second)?))
     }
@@ -91,7 +101,7 @@ impl CouplingUnit {
 ///
 /// The clamp α bounds each scale to exp(±α), so that early training cannot overflow and far-off conditions cannot
 /// throw samples to infinity. W₃ and b₃ begin at 0: an untrained unit is the identity.
-struct Subnet {
+pub(super) struct Subnet {
     input: Dense,
     hidden: Dense,
     output: Dense,
@@ -108,6 +118,22 @@ impl Subnet {
             active,
             clamp,
         })
+    }
+
+    pub(super) fn input(&self) -> &Dense {
+        &self.input
+    }
+
+    pub(super) fn hidden(&self) -> &Dense {
+        &self.hidden
+    }
+
+    pub(super) fn output(&self) -> &Dense {
+        &self.output
+    }
+
+    pub(super) fn clamp(&self) -> f64 {
+        self.clamp
     }
 
     fn scale_and_shift(&self, input: &Tensor) -> Result<(Tensor, Tensor)> {

@@ -37,6 +37,16 @@ impl Dense {
         Ok(Self { weight, bias })
     }
 
+    /// W, `[outputs, inputs]`.
+    pub fn weight(&self) -> &Tensor {
+        &self.weight
+    }
+
+    /// b, `[outputs]`.
+    pub fn bias(&self) -> &Tensor {
+        &self.bias
+    }
+
     /// `x`: `[n, inputs]`; returns `[n, outputs]`.
     ///
     /// # Errors

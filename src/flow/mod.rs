@@ -14,11 +14,13 @@ pub mod context;
 pub mod coupling;
 pub mod dense;
 pub mod permutation;
+pub mod sampler;
 pub mod train;
 pub mod weights;
 
 use candle_core::{DType, Device, Result, Tensor, D};
 use candle_nn::VarBuilder;
+use nalgebra::DMatrix;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
@@ -180,9 +182,24 @@ impl Flow {
     /// A candle error when the shape of `context` is another.
     pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<(Tensor, Tensor)> {
         let (rows, features) = context.dims2()?;
-        let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
-        let z = standard_normal(rows * draws, self.architecture.parameters, stream).to_dtype(self.dtype)?;
-        let (x, log_det) = self.inverse(&z, &repeated)?;
+        let d = self.architecture.parameters;
+        let z = standard_normal(rows * draws, d, stream).to_dtype(self.dtype)?;
+        let (x, log_det) = match sampler::Sampler::new(self)? {
+            Some(sampler) => {
+                let context = DMatrix::from_vec(features, rows, context.flatten_all()?.to_vec1()?);
+                let mut values = z.flatten_all()?.to_vec1()?;
+                let log_det = sampler.inverse(&mut values, &context);
+                (
+                    Tensor::from_vec(values, (rows * draws, d), &Device::Cpu)?,
+                    Tensor::from_vec(log_det, rows * draws, &Device::Cpu)?,
+                )
+            }
+            None => {
+                let repeated =
+                    context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
+                self.inverse(&z, &repeated)?
+            }
+        };
         Ok((x, log_density(&z, &log_det)?))
     }
 }

@@ -97,6 +97,33 @@ fn the_log_determinant_is_that_of_the_finite_difference_jacobian() {
     }
 }
 
+/// The same draws by the tiles of `flow::sampler` and by candle, for sizes that fill tiles, leave rests and cut measurements.
+#[test]
+fn draws_by_tiles_are_those_of_the_readable_flow() {
+    for (parameters, rows, draws) in [(1, 3, 50), (2, 1, 1), (3, 50, 10), (5, 7, 64), (6, 2, 333)] {
+        let (flow, weights) = untrained_flow(&small(parameters, 4, 3), DType::F32, 3).unwrap();
+        for (name, var) in weights.iter().filter(|(name, _)| name.contains("output")) {
+            let values: Vec<f64> = normals(var.elem_count(), 3, name).iter().map(|v| 0.1 * v).collect();
+            var.set(&tensor(&values, var.shape().clone()).to_dtype(DType::F32).unwrap()).unwrap();
+        }
+        let y = tensor(&normals(4 * rows, 1, "y"), (rows, 1, 4)).to_dtype(DType::F32).unwrap();
+        let context = flow.summarise(&y).unwrap();
+        let (x, log_q) = flow.sample(&context, draws, &mut stats::stream(9, "latent")).unwrap();
+        let z = tensor(&normals(rows * draws * parameters, 9, "latent"), (rows * draws, parameters));
+        let width = context.dim(1).unwrap();
+        let repeated = context.unsqueeze(1).unwrap().expand((rows, draws, width)).unwrap();
+        let repeated = repeated.reshape((rows * draws, width)).unwrap();
+        let (expected, _) = flow.inverse(&z.to_dtype(DType::F32).unwrap(), &repeated).unwrap();
+        let expected_log_q = flow.log_prob(&expected, &repeated).unwrap();
+        let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let pairs =
+            flat(&x).into_iter().zip(flat(&expected)).chain(flat(&log_q).into_iter().zip(flat(&expected_log_q)));
+        for (found, expected) in pairs {
+            assert!((found - expected).abs() < 1e-5 * (1.0 + expected.abs()), "{found}, by candle {expected}");
+        }
+    }
+}
+
 #[test]
 fn the_density_integrates_to_one() {
     let (flow, _) = random_flow(&small(2, 3, 5), 5);
