@@ -47,34 +47,29 @@ pub(super) fn resample(
 ) -> DMatrix<f64> {
     let d = proposals.theta.ncols();
     let many = proposals.theta.nrows() / observations.len().max(1);
-    let chosen: Vec<Vec<usize>> = observations
-        .par_iter()
-        .with_min_len(AT_A_TIME)
-        .enumerate()
-        .map(|(row, observation)| {
-            let rows = row * many..(row + 1) * many;
-            if proposals.moved[row] {
-                return rows.take(draws).collect();
+    let log_likelihoods = log_likelihoods(simulator, observations, &proposals.theta);
+    let choose = |row: usize| -> Vec<usize> {
+        let rows = row * many..(row + 1) * many;
+        if proposals.moved[row] {
+            return rows.take(draws).collect();
+        }
+        // What has no number has no weight.
+        let log_weight = |place: usize| {
+            let weight = log_likelihoods[place] - proposals.log_density[place];
+            if weight.is_finite() {
+                weight
+            } else {
+                f64::NEG_INFINITY
             }
-            let simulator = observation.simulator(simulator);
-            let log_weight = |place: usize| {
-                let theta: Vec<f64> = proposals.theta.row(place).iter().copied().collect();
-                let weight = log_likelihood(&simulator, observation, &theta) - proposals.log_density[place];
-                // What has no number has no weight.
-                if weight.is_finite() {
-                    weight
-                } else {
-                    f64::NEG_INFINITY
-                }
-            };
-            let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
-            let mut stream = stats::stream(seed, &format!("resampling {row}"));
-            match weights(&log_weights) {
-                Some(weights) => systematic(&weights, draws, &mut stream).into_iter().map(|i| rows.start + i).collect(),
-                None => rows.take(draws).collect(),
-            }
-        })
-        .collect();
+        };
+        let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
+        let mut stream = stats::stream(seed, &format!("resampling {row}"));
+        match weights(&log_weights) {
+            Some(weights) => systematic(&weights, draws, &mut stream).into_iter().map(|i| rows.start + i).collect(),
+            None => rows.take(draws).collect(),
+        }
+    };
+    let chosen: Vec<Vec<usize>> = (0..observations.len()).map(choose).collect();
     let places: Vec<usize> = chosen.into_iter().flatten().collect();
     DMatrix::from_fn(places.len(), d, |row, column| proposals.theta[(places[row], column)])
 }

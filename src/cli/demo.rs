@@ -9,10 +9,9 @@ use serde_json::{json, Value};
 use tokio::sync::oneshot;
 
 use super::serve::{start, stop_signal};
-use super::simulate::at_intervals;
 use crate::baseline::library::find_structure;
 use crate::config::{Config, Flags, HttpFlags};
-use crate::measurement::ModalMeasurement;
+use crate::measurement::{at_intervals, ModalMeasurement};
 use crate::quantity::{Digest, Timestamp};
 use crate::simulator::population::Population;
 use crate::simulator::Simulator;

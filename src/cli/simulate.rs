@@ -7,8 +7,8 @@ use clap::Args;
 
 use super::{named_numbers, write_whole};
 use crate::baseline::library::find_structure;
-use crate::measurement::{csv, ModalMeasurement};
-use crate::quantity::{Hertz, OutOfRange, Timestamp};
+use crate::measurement::{at_intervals, csv};
+use crate::quantity::Timestamp;
 use crate::simulator::population::Population;
 
 /// Simulate measurements of a structure.
@@ -60,27 +60,4 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
         None => print!("{text}"),
     }
     Ok(())
-}
-
-/// Complete measurements at equal intervals, with a standard deviation as a share of each frequency, if one is given.
-///
-/// # Errors
-/// [`OutOfRange`] for a frequency or time that is none.
-pub fn at_intervals(
-    rows: &[Vec<f64>],
-    start: Timestamp,
-    interval_s: u32,
-    relative_std: Option<f64>,
-) -> Result<Vec<ModalMeasurement>, OutOfRange> {
-    let measurement = |(index, row): (usize, &Vec<f64>)| {
-        let micros = start.micros() + index as i64 * i64::from(interval_s) * 1_000_000;
-        Ok(ModalMeasurement {
-            measured_at: Timestamp::from_micros(micros)?,
-            frequencies_hz: row.iter().map(|f| Hertz::new(*f).map(Some)).collect::<Result<_, _>>()?,
-            std_hz: relative_std.map(|share| row.iter().map(|f| Some(share * f)).collect()),
-            covariates: std::collections::BTreeMap::new(),
-            settings: std::collections::BTreeMap::new(),
-        })
-    };
-    rows.iter().enumerate().map(measurement).collect()
 }

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
+use crate::quantity::{Digest, Hertz, OutOfRange, StructureId, Timestamp};
 
 /// Kind of a covariate's values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -92,4 +92,27 @@ impl MeasurementBatch {
         let first = times().min().expect("a batch is never empty");
         (first, times().max().expect("a batch is never empty"))
     }
+}
+
+/// Complete measurements at equal intervals, with a standard deviation as a share of each frequency, if one is given.
+///
+/// # Errors
+/// [`OutOfRange`] for a frequency or time that is none.
+pub fn at_intervals(
+    rows: &[Vec<f64>],
+    start: Timestamp,
+    interval_s: u32,
+    relative_std: Option<f64>,
+) -> Result<Vec<ModalMeasurement>, OutOfRange> {
+    let measurement = |(index, row): (usize, &Vec<f64>)| {
+        let micros = start.micros() + index as i64 * i64::from(interval_s) * 1_000_000;
+        Ok(ModalMeasurement {
+            measured_at: Timestamp::from_micros(micros)?,
+            frequencies_hz: row.iter().map(|f| Hertz::new(*f).map(Some)).collect::<Result<_, _>>()?,
+            std_hz: relative_std.map(|share| row.iter().map(|f| Some(share * f)).collect()),
+            covariates: BTreeMap::new(),
+            settings: BTreeMap::new(),
+        })
+    };
+    rows.iter().enumerate().map(measurement).collect()
 }

@@ -2,7 +2,6 @@
 
 use std::time::Instant;
 
-use anyhow::Context as _;
 use nalgebra::DMatrix;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
@@ -12,9 +11,9 @@ use super::{Accuracy, Compared, Method, Row, Settings, Spread, State, Time};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::Hyperparameters;
-use crate::measurement::ModalMeasurement;
+use crate::measurement::at_intervals;
 use crate::monitor::assess::{self, Draws};
-use crate::quantity::{Hertz, Timestamp};
+use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all};
@@ -22,6 +21,9 @@ use crate::updating::stochastic::{settings, simulated_for, Population};
 
 /// Posterior samples of each measurement (paper §5.2).
 pub const DRAWS: usize = 10;
+
+/// When the simulated measurements begin, microseconds since 1970; nothing depends on it.
+const START_US: i64 = 1_700_000_000_000_000;
 
 /// Factor of Eq. 21.
 const DELTA: f64 = 1.645;
@@ -121,7 +123,8 @@ impl Bench<'_> {
     fn cinn(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
         // Times are those of the flow alone; the samples come by the service's way, which moves measurements beyond the
         // prior box to its nearest point first.
-        let measurements = measurements(&data.frequencies_hz)?;
+        let rows: Vec<Vec<f64>> = data.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
+        let measurements = at_intervals(&rows, Timestamp::from_micros(START_US)?, 1, None)?;
         let observations: Vec<Observation> =
             measurements.iter().filter_map(|m| self.baseline.admit(m).observation).collect();
         let started = Instant::now();
@@ -141,21 +144,6 @@ fn of_samples(samples: Vec<Vec<f64>>, draws: usize, model_runs: Option<usize>) -
     let mean = samples.iter().map(|pool| moments(pool).mean).collect();
     let std = samples.iter().map(|pool| moments(pool).std.unwrap_or(f64::NAN)).collect();
     Found { samples, mean, std, seconds: 0.0, model_runs }
-}
-
-fn measurements(frequencies_hz: &DMatrix<f64>) -> anyhow::Result<Vec<ModalMeasurement>> {
-    let start = Timestamp::from_micros(1_700_000_000_000_000)?;
-    let one = |(index, row): (usize, nalgebra::RowDVector<f64>)| {
-        let hertz = |f: &f64| Hertz::new(*f).with_context(|| format!("{f} Hz is no frequency")).map(Some);
-        Ok(ModalMeasurement {
-            measured_at: Timestamp::from_micros(start.micros() + 1_000_000 * index as i64)?,
-            frequencies_hz: row.iter().map(hertz).collect::<anyhow::Result<_>>()?,
-            std_hz: None,
-            covariates: std::collections::BTreeMap::new(),
-            settings: std::collections::BTreeMap::new(),
-        })
-    };
-    frequencies_hz.row_iter().map(nalgebra::Matrix::into_owned).enumerate().map(one).collect()
 }
 
 /// δ of each parameter, for a loss (Eq. 21).

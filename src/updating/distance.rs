@@ -136,14 +136,6 @@ pub fn epsilon_squared(rows: f64) -> f64 {
     0.25 / rows
 }
 
-/// Rows that count where the simulated side is itself a sample: n·N/(n + N).
-///
-/// The means and covariances of both sides scatter, by 1/n and 1/N, and their difference by 1/n + 1/N.
-pub fn effective_rows(measured: usize, simulated: usize) -> f64 {
-    let (n, own) = (measured as f64, simulated as f64);
-    n * own / (n + own)
-}
-
 /// Replaces a lower triangle by its Cholesky factor; ln det of the matrix, or `None` where it is singular.
 fn factorise(triangle: &mut [f64], size: usize) -> Option<f64> {
     let mut log_determinant = 0.0;

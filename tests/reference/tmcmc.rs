@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Mutex;
 
 use modalwatch::stats::{self, Stream};
-use modalwatch::updating::distance::{bhattacharyya, effective_rows, epsilon_squared, log_likelihood, Moments};
+use modalwatch::updating::distance::{bhattacharyya, epsilon_squared, log_likelihood, Moments};
 use modalwatch::updating::tmcmc::{tmcmc, Error, Samples, Settings, Stage, Target};
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
@@ -494,7 +494,8 @@ fn the_likelihood_of_the_distance_gives_the_spread_of_the_exact_posterior() {
     let measured = Moments::from_matrix(&measured);
     // The same draws at every θ.
     let z: Vec<f64> = rows(simulated, 1, 0.0, 1.0, 5).iter().copied().collect();
-    let epsilon_squared = epsilon_squared(effective_rows(n, simulated));
+    // Both sides are samples: their means differ by 1/n + 1/N, as those of n·N/(n + N) rows against the truth.
+    let epsilon_squared = epsilon_squared((n * simulated) as f64 / (n + simulated) as f64);
     let target = InBox {
         bounds: vec![(0.0, 20.0), (0.1, 10.0)],
         log_likelihood: |x: &[f64]| {
