@@ -1,0 +1,169 @@
+//! `modalwatch token`: tokens without a running service.
+
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use clap::{Args, Subcommand};
+
+use crate::access::{write_admin_token, NewToken, Scope, TokenId, TokenRecord, TokenText};
+use crate::config::{Config, Flags};
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::store::{self, NewAuditEntry, Store};
+
+/// Make, list, revoke and rotate tokens while the service is stopped.
+#[derive(Debug, Args)]
+pub struct TokenArgs {
+    #[command(subcommand)]
+    command: TokenCommand,
+    /// Folder of the database [default: modalwatch-data]
+    #[arg(long, global = true)]
+    data_dir: Option<PathBuf>,
+    /// Configuration file (TOML)
+    #[arg(long, global = true)]
+    config: Option<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+enum TokenCommand {
+    /// Make a token; it is printed once.
+    Create {
+        /// What it is for, for people
+        #[arg(long)]
+        name: String,
+        /// ingest, read or admin; may be given several times
+        #[arg(long = "scope", required = true)]
+        scopes: Vec<Scope>,
+        /// The only structure it may be used for; may be given several times [default: all]
+        #[arg(long = "structure")]
+        structures: Vec<String>,
+        /// When it ends, RFC 3339 with an offset [default: never]
+        #[arg(long)]
+        expires_at: Option<String>,
+    },
+    /// List all tokens, without their secrets.
+    List,
+    /// Refuse a token from now on.
+    Revoke {
+        /// Its id: the part between the underscores
+        id: String,
+    },
+    /// Give a token a new secret; it is printed once.
+    Rotate {
+        /// Its id: the part between the underscores
+        id: String,
+        /// Seconds that the old secret stays good
+        #[arg(long, default_value_t = 3_600)]
+        overlap_s: u32,
+    },
+    /// Make an admin token file for MODALWATCH_ADMIN_TOKEN_FILE; needs no database.
+    File {
+        /// The new file, readable by its owner only
+        path: PathBuf,
+    },
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// What is wrong with the token, or a database that cannot be opened, such as that of a running service.
+pub async fn token(args: TokenArgs) -> anyhow::Result<()> {
+    if let TokenCommand::File { path } = &args.command {
+        write_admin_token(path)?;
+        println!("{}", path.display());
+        return Ok(());
+    }
+    let flags = Flags { data_dir: args.data_dir, ..Flags::default() };
+    let config = Config::read(args.config.as_deref(), &flags)?;
+    let store = Store::open(&config.data_dir).await.map_err(|error| match error {
+        store::Error::Locked(folder) => anyhow::anyhow!(
+            "the service is running on {}: ask it (POST /v1/tokens, DELETE /v1/tokens/{{id}}, POST \
+             /v1/tokens/{{id}}/rotation), or stop it first",
+            folder.display()
+        ),
+        other => other.into(),
+    })?;
+    let done = run(&store, args.command).await;
+    store.close().await;
+    done
+}
+
+async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
+    match command {
+        TokenCommand::Create { name, scopes, structures, expires_at } => {
+            let structures = structures.iter().map(|id| StructureId::parse(id)).collect::<Result<_, _>>();
+            let structures = structures.context("--structure")?;
+            let new = NewToken {
+                name,
+                scopes: scopes.into_iter().collect(),
+                structures: Some(structures).filter(|ids: &std::collections::BTreeSet<_>| !ids.is_empty()),
+                expires_at: expires_at.as_deref().map(Timestamp::parse).transpose().context("--expires-at")?,
+            };
+            create(store, new).await
+        }
+        TokenCommand::List => list(store).await,
+        TokenCommand::Revoke { id } => {
+            let record = find(store, &id).await?;
+            let revoked = TokenRecord { revoked_at: record.revoked_at.or(Some(Timestamp::now())), ..record };
+            store.audited(entry("revoke", &revoked.id), store.update_token(&revoked)).await?;
+            println!("{} is revoked", revoked.id);
+            Ok(())
+        }
+        TokenCommand::Rotate { id, overlap_s } => rotate(store, &id, overlap_s).await,
+        TokenCommand::File { .. } => unreachable!("it needs no database"),
+    }
+}
+
+fn entry(what: &str, id: &TokenId) -> NewAuditEntry {
+    NewAuditEntry::local(format!("modalwatch token {what}"), Some(format!("/v1/tokens/{id}")))
+}
+
+async fn create(store: &Store, new: NewToken) -> anyhow::Result<()> {
+    let now = Timestamp::now();
+    if let Some(problem) = new.problems(now).into_iter().next() {
+        anyhow::bail!("{}: {}", problem.pointer.trim_start_matches('/'), problem.message);
+    }
+    let text = TokenText::generate()?;
+    let record = new.record(&text, now);
+    store.audited(entry("create", &record.id), store.insert_token(&record)).await?;
+    show_once(&text);
+    Ok(())
+}
+
+async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
+    let (record, now) = (find(store, id).await?, Timestamp::now());
+    anyhow::ensure!(record.is_active(now), "token {id} is {}: make a new one", record.state(now));
+    let text = TokenText::with_id(record.id.clone())?;
+    let until = Timestamp::from_micros(now.micros() + i64::from(overlap_s) * 1_000_000)?;
+    let rotated = record.rotated(&text, until);
+    store.audited(entry("rotate", &rotated.id), store.update_token(&rotated)).await?;
+    eprintln!("The old secret is good until {until}.");
+    show_once(&text);
+    Ok(())
+}
+
+async fn list(store: &Store) -> anyhow::Result<()> {
+    let now = Timestamp::now();
+    println!("{:16}  {:7}  {:18}  {:20}  structures  name", "id", "state", "scopes", "expires");
+    for token in store.tokens().await? {
+        let scopes: Vec<&str> = token.scopes.iter().map(Scope::as_str).collect();
+        let expires = token.expires_at.map_or_else(|| "never".to_owned(), |at| at.to_string());
+        let structures = token
+            .structures
+            .as_ref()
+            .map_or_else(|| "all".to_owned(), |ids| ids.iter().map(StructureId::as_str).collect::<Vec<_>>().join(","));
+        let (state, scopes) = (token.state(now), scopes.join(","));
+        println!("{:16}  {state:7}  {scopes:18}  {expires:20}  {structures:10}  {}", token.id.as_str(), token.name);
+    }
+    Ok(())
+}
+
+/// The token alone on standard output, for scripts; what it means on standard error.
+fn show_once(text: &TokenText) {
+    eprintln!("This is shown once: the service keeps only its SHA-256.");
+    println!("{}", text.reveal());
+}
+
+async fn find(store: &Store, id: &str) -> anyhow::Result<TokenRecord> {
+    let found = store.tokens().await?.into_iter().find(|token| token.id.as_str() == id);
+    found.with_context(|| format!("there is no token {}; modalwatch token list shows all ids", shown(id)))
+}

@@ -1,0 +1,180 @@
+//! Where a request comes from, behind proxies or not.
+
+use std::convert::Infallible;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+
+use axum::extract::{ConnectInfo, FromRequestParts, Request};
+use axum::http::request::Parts;
+use ipnet::IpNet;
+
+use crate::access::{Actor, Grant};
+use crate::quantity::shown;
+
+/// Text that is neither an address nor a network.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0} is neither an address (10.0.0.7) nor a network (10.0.0.0/24)")]
+pub struct NotANetwork(String);
+
+/// Who asks, for limits and audit.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Client {
+    /// Address of the client, behind trusted proxies.
+    pub address: Option<IpAddr>,
+    /// Under what its requests are counted.
+    pub(super) key: Key,
+}
+
+/// Under what requests are counted: the token, else the address.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) enum Key {
+    /// A token by its id.
+    Token(String),
+    /// An address; of IPv6 the network of 64 bits, which one customer has.
+    Address(IpAddr),
+    /// Everybody else: clients without an address, and those beyond what is remembered.
+    Others,
+}
+
+impl Key {
+    pub(super) fn of_address(address: Option<IpAddr>) -> Self {
+        match address {
+            None => Self::Others,
+            Some(IpAddr::V6(address)) => {
+                let network = u128::from(address) >> 64 << 64;
+                Self::Address(IpAddr::V6(Ipv6Addr::from(network)))
+            }
+            Some(address) => Self::Address(address),
+        }
+    }
+}
+
+impl Client {
+    pub(super) fn new(grant: &Grant, address: Option<IpAddr>) -> Self {
+        let key = match grant.actor() {
+            Actor::Token { id, .. } => Key::Token(id.clone()),
+            Actor::Local | Actor::Nobody => Key::of_address(address),
+        };
+        Self { address, key }
+    }
+}
+
+impl<S: Send + Sync> FromRequestParts<S> for Client {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        let nobody = || Self { address: None, key: Key::Others };
+        Ok(parts.extensions.get::<Self>().cloned().unwrap_or_else(nobody))
+    }
+}
+
+/// The proxies whose `X-Forwarded-For` is believed.
+#[derive(Debug, Default)]
+pub(super) struct Proxies(Vec<IpNet>);
+
+impl Proxies {
+    /// Reads addresses and networks.
+    pub(super) fn parse(texts: &[String]) -> Result<Self, NotANetwork> {
+        let network = |text: &String| {
+            let network = text.parse::<IpNet>().or_else(|_| text.parse::<IpAddr>().map(IpNet::from));
+            network.map_err(|_| NotANetwork(shown(text)))
+        };
+        texts.iter().map(network).collect::<Result<_, _>>().map(Self)
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    fn trust(&self, address: IpAddr) -> bool {
+        self.0.iter().any(|network| network.contains(&address.to_canonical()))
+    }
+
+    /// The address of the client: that of the connection, or, where it is a trusted proxy's, the last one in
+    /// `X-Forwarded-For` that is none. What stands before that one is the client's own word.
+    pub(super) fn client(&self, request: &Request) -> Option<IpAddr> {
+        let peer = request.extensions().get::<ConnectInfo<SocketAddr>>()?.0.ip().to_canonical();
+        if !self.trust(peer) {
+            return Some(peer);
+        }
+        let lines = request.headers().get_all("x-forwarded-for").iter().rev();
+        let mut client = peer;
+        for text in lines.flat_map(|line| line.to_str().unwrap_or("?").split(',').rev()) {
+            let Ok(address) = text.trim().parse::<IpAddr>() else { break };
+            client = address.to_canonical();
+            if !self.trust(client) {
+                break;
+            }
+        }
+        Some(client)
+    }
+}
+
+/// Whether a `Host` is this machine by address or by a name that no name server outside gives: `localhost`, a bare name.
+pub(super) fn is_local_name(host: &str) -> bool {
+    if let Some(rest) = host.strip_prefix('[') {
+        let address = rest.split(']').next().unwrap_or_default();
+        return address.parse::<Ipv6Addr>().is_ok_and(|a| a.to_canonical().is_loopback());
+    }
+    let name = host.split(':').next().unwrap_or_default();
+    match name.parse::<IpAddr>() {
+        Ok(address) => address.is_loopback(),
+        Err(_) => !name.contains('.') || name.ends_with(".localhost"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn client(proxies: &[&str], peer: &str, forwarded: &[&str]) -> String {
+        let proxies: Vec<String> = proxies.iter().map(ToString::to_string).collect();
+        let peer: IpAddr = peer.parse().unwrap();
+        let mut request = Request::new(axum::body::Body::empty());
+        request.extensions_mut().insert(ConnectInfo(SocketAddr::new(peer, 1)));
+        for line in forwarded {
+            request.headers_mut().append("x-forwarded-for", line.parse().unwrap());
+        }
+        Proxies::parse(&proxies).unwrap().client(&request).unwrap().to_string()
+    }
+
+    #[test]
+    fn only_a_trusted_proxy_is_believed_and_only_its_own_word() {
+        let table: [(&[&str], &str, &[&str], &str); 8] = [
+            (&[], "192.0.2.1", &["203.0.113.9"], "192.0.2.1"),
+            (&["10.0.0.7"], "192.0.2.1", &["203.0.113.9"], "192.0.2.1"),
+            (&["10.0.0.7"], "10.0.0.7", &["203.0.113.9"], "203.0.113.9"),
+            (&["10.0.0.7"], "10.0.0.7", &["1.1.1.1, 203.0.113.9"], "203.0.113.9"),
+            (&["10.0.0.0/8"], "10.0.0.7", &["1.1.1.1, 203.0.113.9", "10.0.0.8"], "203.0.113.9"),
+            (&["10.0.0.7"], "10.0.0.7", &["1.1.1.1, nonsense"], "10.0.0.7"),
+            (&["10.0.0.7"], "10.0.0.7", &[], "10.0.0.7"),
+            (&["10.0.0.7"], "::ffff:10.0.0.7", &["2001:db8::5"], "2001:db8::5"),
+        ];
+        for (proxies, peer, forwarded, expected) in table {
+            assert_eq!(client(proxies, peer, forwarded), expected, "{proxies:?} {peer} {forwarded:?}");
+        }
+    }
+
+    #[test]
+    fn a_proxy_that_is_no_address_is_named() {
+        let error = Proxies::parse(&["proxy.local".to_owned()]).unwrap_err();
+        assert!(error.to_string().contains("\"proxy.local\""), "{error}");
+    }
+
+    #[test]
+    fn addresses_of_one_customer_are_one_key() {
+        let key = |text: &str| Key::of_address(Some(text.parse().unwrap()));
+        assert_eq!(key("2001:db8::1"), key("2001:db8::ffff:2"));
+        assert_ne!(key("2001:db8::1"), key("2001:db8:0:1::1"));
+        assert_ne!(key("192.0.2.1"), key("192.0.2.2"));
+    }
+
+    #[test]
+    fn names_from_outside_are_not_this_machine() {
+        for local in ["localhost", "localhost:8080", "127.0.0.1:1", "127.8.8.8", "[::1]:80", "x", "a.localhost"] {
+            assert!(is_local_name(local), "{local}");
+        }
+        for foreign in ["evil.example", "evil.example:8080", "192.0.2.1", "[2001:db8::1]", "localhost.evil.example"] {
+            assert!(!is_local_name(foreign), "{foreign}");
+        }
+    }
+}

@@ -1,0 +1,91 @@
+//! What each route needs: by rule, so that a route that nobody thought of is never open.
+
+use axum::http::Method;
+
+use crate::access::{Need, Scope};
+
+/// Routes that need no token. They show nothing of any structure.
+const OPEN: [&str; 6] = ["/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs"];
+/// Folders of files that need no token.
+const OPEN_FOLDERS: [&str; 2] = ["/assets/", "/docs/"];
+/// Routes that take batches.
+const INGEST: [&str; 1] = ["/v1/structures/{id}/batches"];
+/// Below `/v1`: what shows or changes the service itself, and needs admin even to read.
+const SERVICE: [&str; 6] = ["tokens", "audit", "webhooks", "backups", "quarantine", "retention"];
+/// Lists over all structures whose handlers leave out what the token may not see.
+const FILTERED: [&str; 4] = ["/v1/structures", "/v1/overview", "/v1/jobs", "/v1/events"];
+
+/// What a route is about; the id is in the path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AboutWhat {
+    /// The structure that the first parameter names.
+    Structure,
+    /// The structure of the diagnosis that the first parameter names.
+    Diagnosis,
+    /// A list that the handler filters.
+    Filtered,
+    /// The whole service.
+    Service,
+}
+
+/// What a route needs, and what it is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Class {
+    /// The scope.
+    pub need: Need,
+    /// The structure.
+    pub about: AboutWhat,
+}
+
+/// The class of a route by method and pattern; where there is no route (404), nothing is needed.
+pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
+    let Some(pattern) = pattern else {
+        return Class { need: Need::Nothing, about: AboutWhat::Service };
+    };
+    let reads = method == Method::GET || method == Method::HEAD;
+    let open = OPEN.contains(&pattern) || OPEN_FOLDERS.iter().any(|folder| pattern.starts_with(folder));
+    let mut segments = pattern.trim_start_matches('/').split('/');
+    let (version, collection, id) = (segments.next(), segments.next(), segments.next());
+    let in_service = version == Some("v1") && collection.is_some_and(|c| SERVICE.contains(&c));
+    let need = if reads && open {
+        Need::Nothing
+    } else if reads && !in_service && (version == Some("v1") || pattern == "/metrics") {
+        Need::Scope(Scope::Read)
+    } else if method == Method::POST && INGEST.contains(&pattern) {
+        Need::Scope(Scope::Ingest)
+    } else {
+        Need::Scope(Scope::Admin)
+    };
+    let about = match (version, collection, id) {
+        (Some("v1"), Some("structures"), Some(id)) if id.starts_with('{') => AboutWhat::Structure,
+        (Some("v1"), Some("diagnoses"), Some(id)) if id.starts_with('{') => AboutWhat::Diagnosis,
+        _ if reads && FILTERED.contains(&pattern) => AboutWhat::Filtered,
+        _ => AboutWhat::Service,
+    };
+    Class { need, about }
+}
+
+/// Whether a request of this class belongs into the audit.
+pub fn is_change(method: &Method, class: Class) -> bool {
+    let changes = [Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
+    class.need == Need::Scope(Scope::Admin) && changes.contains(method)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_route_that_nobody_thought_of_needs_a_token() {
+        let admin = Need::Scope(Scope::Admin);
+        let need = |method: Method, pattern| classify(&method, Some(pattern)).need;
+        assert_eq!(need(Method::GET, "/secret"), admin);
+        assert_eq!(need(Method::POST, "/healthz"), admin);
+        assert_eq!(need(Method::POST, "/v1/anything"), admin);
+        assert_eq!(need(Method::GET, "/v1/anything"), Need::Scope(Scope::Read));
+        assert_eq!(classify(&Method::GET, Some("/v1/anything")).about, AboutWhat::Service);
+        assert_eq!(need(Method::GET, "/docsecret"), admin);
+        assert_eq!(need(Method::GET, "/v1/webhooks/{id}"), admin);
+        assert_eq!(need(Method::from_bytes(b"PROPFIND").unwrap(), "/v1/structures"), admin);
+    }
+}

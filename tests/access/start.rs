@@ -1,0 +1,151 @@
+//! What the service starts with, and whom it serves before there is a token.
+
+use std::io::Read as _;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::{json, Value};
+
+use crate::helpers::{command, created, problem, Service};
+use crate::world::{first_token, program};
+
+const LIST: &str = "/v1/structures";
+
+/// A service on an address that other machines could reach (nobody asks it from there).
+fn public(data_dir: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    command.args(["serve", "--listen", "0.0.0.0:0", "--data-dir"]).arg(data_dir);
+    command.env("MODALWATCH__LOG__LEVEL", "warn").env_remove("MODALWATCH_ADMIN_TOKEN_FILE");
+    command
+}
+
+/// What a service says that must not start.
+fn refusal(command: &mut Command) -> String {
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let started = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if started.elapsed() > Duration::from_secs(20) {
+            child.kill().unwrap();
+            panic!("it should have refused to start: {command:?}");
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let mut text = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
+    assert!(!child.wait().unwrap().success(), "{text}");
+    text
+}
+
+#[tokio::test]
+async fn a_public_address_without_tokens_is_refused_with_the_way_to_make_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = refusal(&mut public(folder.path()));
+    assert!(text.contains("modalwatch token create --name me --scope admin --data-dir"), "{text}");
+
+    let behind_proxy = refusal(command(folder.path()).env("MODALWATCH__HTTP__TRUSTED_PROXIES", "[\"127.0.0.1\"]"));
+    assert!(behind_proxy.contains("http.trusted_proxies"), "{behind_proxy}");
+    let no_network = refusal(command(folder.path()).env("MODALWATCH__HTTP__TRUSTED_PROXIES", "[\"proxy.lan\"]"));
+    assert!(no_network.contains("\"proxy.lan\" is neither an address"), "{no_network}");
+
+    let token = first_token(folder.path());
+    let service = Service::spawn(&mut public(folder.path()));
+    let url = format!("http://127.0.0.1:{}{LIST}", service.address().rsplit(':').next().unwrap());
+    let ask = |token: Option<&str>| {
+        let request = service.client.get(&url);
+        token.map_or(request.try_clone().unwrap(), |token| request.bearer_auth(token)).send()
+    };
+    problem(ask(None).await.unwrap(), 401, "unauthorized").await;
+    assert_eq!(ask(Some(&token)).await.unwrap().status(), 200);
+}
+
+#[tokio::test]
+async fn an_insecure_public_service_says_so_loudly() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = public(folder.path());
+    command.env("MODALWATCH__ACCESS__INSECURE_PUBLIC", "true");
+    let log = folder.path().join("log");
+    let mut child = command.stdout(Stdio::piped()).stderr(std::fs::File::create(&log).unwrap()).spawn().unwrap();
+    let mut line = String::new();
+    std::io::BufRead::read_line(&mut std::io::BufReader::new(child.stdout.as_mut().unwrap()), &mut line).unwrap();
+    let port = line.trim().rsplit(':').next().unwrap().to_owned();
+    let ready: Value = reqwest::get(format!("http://127.0.0.1:{port}/readyz")).await.unwrap().json().await.unwrap();
+    let list = reqwest::get(format!("http://127.0.0.1:{port}{LIST}")).await.unwrap().status();
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert_eq!(list, 200);
+    assert!(ready["findings"][0]["code"] == "insecure", "{ready}");
+    let log = std::fs::read_to_string(log).unwrap();
+    assert!(log.contains("WARN") && log.contains("INSECURE"), "{log}");
+}
+
+#[tokio::test]
+async fn the_admin_token_file_opens_a_service_without_other_tokens() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("admin");
+    let data = folder.path().join("data");
+    let made = program(&["token", "file", file.to_str().unwrap()], &data);
+    assert!(made.status.success() && !data.exists(), "{made:?}");
+    let token = std::fs::read_to_string(&file).unwrap();
+    let token = token.trim();
+    assert_eq!(std::fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
+
+    // By the variable of its own, and by the setting.
+    for (name, listen) in
+        [("MODALWATCH_ADMIN_TOKEN_FILE", public(&data)), ("MODALWATCH__ACCESS__ADMIN_TOKEN_FILE", command(&data))]
+    {
+        let mut command = listen;
+        let service = Service::spawn(command.env(name, &file));
+        let url = format!("http://127.0.0.1:{}", service.address().rsplit(':').next().unwrap());
+        let ask = |path: &str| service.client.get(format!("{url}{path}"));
+        problem(ask(LIST).send().await.unwrap(), 401, "unauthorized").await;
+        assert_eq!(ask(LIST).bearer_auth(token).send().await.unwrap().status(), 200);
+        // With it, the first stored token need be no admin.
+        let body = json!({ "name": "gateway", "scopes": ["ingest"] });
+        let create = service.client.post(format!("{url}/v1/tokens")).bearer_auth(token).json(&body);
+        created(create.send().await.unwrap()).await;
+        let audit: Value = ask("/v1/audit").bearer_auth(token).send().await.unwrap().json().await.unwrap();
+        assert_eq!(audit["items"][0]["actor_name"], "admin token file", "{audit}");
+    }
+
+    let refused = |mode: u32, content: &str| {
+        std::fs::write(&file, content).unwrap();
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
+        refusal(command(&data).env("MODALWATCH_ADMIN_TOKEN_FILE", &file))
+    };
+    let readable = refused(0o644, token);
+    assert!(readable.contains("chmod 600") && !readable.contains(token), "{readable}");
+    let other = refused(0o600, "hunter2");
+    assert!(other.contains("holds no token") && !other.contains("hunter2"), "{other}");
+    let missing = refusal(command(&data).env("MODALWATCH_ADMIN_TOKEN_FILE", "/no/such/file"));
+    assert!(missing.contains("/no/such/file"), "{missing}");
+}
+
+#[tokio::test]
+async fn without_a_token_only_this_machine_is_served_and_the_first_token_closes_the_service() {
+    let folder = tempfile::tempdir().unwrap();
+    let service = Service::start(folder.path());
+    assert_eq!(service.get(LIST).send().await.unwrap().status(), 200);
+    let with = |name: &'static str, value: &'static str| service.get(LIST).header(name, value).send();
+    for header in ["x-forwarded-for", "forwarded", "x-real-ip", "via"] {
+        problem(with(header, "203.0.113.9").await.unwrap(), 401, "unauthorized").await;
+    }
+    problem(with("host", "evil.example").await.unwrap(), 403, "forbidden_origin").await;
+    problem(with("origin", "https://evil.example").await.unwrap(), 403, "forbidden_origin").await;
+    problem(with("origin", "null.example").await.unwrap(), 403, "forbidden_origin").await;
+    assert_eq!(with("origin", "http://localhost:3000").await.unwrap().status(), 200);
+
+    let weak = json!({ "name": "gateway", "scopes": ["ingest"] });
+    problem(service.post("/v1/tokens", &weak).await, 422, "first_token_must_be_admin").await;
+    let limited = json!({ "name": "x", "scopes": ["admin"], "structures": ["three-dof"] });
+    problem(service.post("/v1/tokens", &limited).await, 422, "first_token_must_be_admin").await;
+    assert_eq!(service.get(LIST).send().await.unwrap().status(), 200);
+    let first = created(service.post("/v1/tokens", &json!({ "name": "me", "scopes": ["admin"] })).await).await;
+    problem(service.get(LIST).send().await.unwrap(), 401, "unauthorized").await;
+    let admin = first["token"].as_str().unwrap();
+    let list =
+        |name: &'static str, value: &'static str| service.get(LIST).bearer_auth(admin).header(name, value).send();
+    assert_eq!(list("x-forwarded-for", "203.0.113.9").await.unwrap().status(), 200);
+    assert_eq!(list("host", "shm.example").await.unwrap().status(), 200);
+}
