@@ -1,0 +1,430 @@
+//! `/v1/webhooks`: who is told of alarms, what was sent, and what could not be.
+
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::{header, HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+
+use super::error::ApiError;
+use super::openapi::{BodyRefused, Conflict, DeliveryPath, Invalid, Unknown, WebhookPath};
+use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
+use super::Shared;
+use crate::measurement::check::Problem;
+use crate::notify::{new_secret, EVENT_KINDS};
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::store::{Delivery, DeliveryState, EventFilter, WebhookRecord, ALARM_KINDS};
+
+/// Most webhooks of a service: each may have a connection of its own.
+const MOST_WEBHOOKS: usize = 100;
+
+/// Query of the deliveries.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct DeliveryQuery {
+    /// Only those in this state; `dead` for dead letters.
+    #[param(pattern = "^(pending|delivered|dead)$")]
+    state: Option<String>,
+    /// Most items; 100 without.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
+    limit: Option<String>,
+    /// `next` of the page before.
+    #[param(pattern = "^[0-9]{1,18}$")]
+    cursor: Option<String>,
+}
+
+/// A webhook: where to, and what of.
+#[derive(Debug, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(as = WebhookInput)]
+struct WebhookBody {
+    /// Where messages are posted to: `https`, of an address that can be reached and is allowed.
+    #[schema(min_length = 1, examples("https://example.com/alarms"))]
+    url: String,
+    /// Kinds of events, such as `alarm.opened`; all without.
+    #[serde(default)]
+    events: Vec<String>,
+    /// Kinds of alarms, such as `damage`; all without.
+    #[serde(default)]
+    alarm_kinds: Vec<String>,
+    /// Ids of structures; all without.
+    #[serde(default)]
+    structures: Vec<String>,
+    /// Whether anything is sent; `true` without.
+    #[serde(default = "yes")]
+    #[schema(default = true)]
+    enabled: bool,
+}
+
+fn yes() -> bool {
+    true
+}
+
+/// Webhooks, oldest first.
+#[derive(Debug, Serialize, ToSchema)]
+struct WebhookList {
+    items: Vec<WebhookItem>,
+}
+
+/// A webhook; its secret is in the answers that make one, and in no other.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Webhook)]
+struct WebhookItem {
+    webhook: String,
+    url: String,
+    /// Empty for all.
+    events: Vec<String>,
+    /// Empty for all.
+    alarm_kinds: Vec<String>,
+    /// Empty for all.
+    structures: Vec<String>,
+    enabled: bool,
+    created_at: Timestamp,
+    updated_at: Timestamp,
+    /// Until when the secret before signs too.
+    #[schema(required)]
+    previous_secret_until: Option<Timestamp>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    secret: Option<String>,
+}
+
+/// A message to a webhook, and what became of it.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Delivery)]
+struct DeliveryItem {
+    delivery: i64,
+    message: String,
+    event: String,
+    structure: StructureId,
+    alarm: i64,
+    /// `pending`, `delivered` or `dead`.
+    state: &'static str,
+    attempts: u32,
+    created_at: Timestamp,
+    #[schema(required)]
+    next_attempt_at: Option<Timestamp>,
+    #[schema(required)]
+    last_attempt_at: Option<Timestamp>,
+    #[schema(required)]
+    last_status: Option<u16>,
+    #[schema(required)]
+    last_error: Option<String>,
+}
+
+/// Messages, newest first.
+#[derive(Debug, Serialize, ToSchema)]
+struct DeliveryPage {
+    webhook: String,
+    items: Vec<DeliveryItem>,
+    #[schema(required)]
+    next: Option<String>,
+}
+
+/// What came of a test.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = WebhookTest)]
+struct TestAnswer {
+    webhook: String,
+    delivered: bool,
+    #[schema(required)]
+    status: Option<u16>,
+    latency_ms: f64,
+    #[schema(required)]
+    error: Option<String>,
+}
+
+impl From<WebhookRecord> for WebhookItem {
+    fn from(w: WebhookRecord) -> Self {
+        let now = Timestamp::now();
+        Self {
+            webhook: w.id,
+            url: w.url,
+            events: w.filter.events,
+            alarm_kinds: w.filter.alarm_kinds,
+            structures: w.filter.structures,
+            enabled: w.enabled,
+            created_at: w.created_at,
+            updated_at: w.updated_at,
+            previous_secret_until: w.previous_secret.map(|(_, until)| until).filter(|until| *until > now),
+            secret: None,
+        }
+    }
+}
+
+impl From<Delivery> for DeliveryItem {
+    fn from(d: Delivery) -> Self {
+        Self {
+            delivery: d.id,
+            message: d.event.message_id,
+            event: d.event.kind,
+            structure: d.event.structure,
+            alarm: d.event.alarm,
+            state: d.state.as_str(),
+            attempts: d.attempts,
+            created_at: d.event.created_at,
+            next_attempt_at: (d.state == DeliveryState::Pending).then_some(d.next_at),
+            last_attempt_at: d.last_at,
+            last_status: d.last_status,
+            last_error: d.last_error,
+        }
+    }
+}
+
+/// `GET /v1/webhooks`: all of them, oldest first.
+///
+/// # Errors
+/// 500.
+#[utoipa::path(
+    get, path = "/v1/webhooks", tag = "webhooks", operation_id = "list_webhooks",
+    summary = "All webhooks", description = "Without their secrets, oldest first.",
+    responses((status = 200, description = "The webhooks", body = WebhookList))
+)]
+pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
+    let items: Vec<WebhookItem> = shared.monitor.store().webhooks().await?.into_iter().map(Into::into).collect();
+    Ok(Json(WebhookList { items }).into_response())
+}
+
+/// `POST /v1/webhooks`: 201 with the secret, which no other answer has.
+///
+/// # Errors
+/// 400, 415, 422 for the body, 409 when there are too many.
+#[utoipa::path(
+    post, path = "/v1/webhooks", tag = "webhooks", operation_id = "create_webhook",
+    summary = "Make a webhook",
+    description = "Messages are signed as Standard Webhooks has it; the secret is in this answer and in that of a rotation only.",
+    request_body(content = WebhookBody, example = json!({"url": "https://example.com/alarms", "structures": ["three-dof"]})),
+    responses(
+        (status = 201, description = "The webhook with its secret", body = WebhookItem,
+         headers(("Location" = String, description = "Path of the webhook"))),
+        BodyRefused, Conflict
+    )
+)]
+pub async fn create(State(shared): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, ApiError> {
+    let body: WebhookBody = json_body(&headers, body, shared.limits).await?;
+    check(&shared, &body).await?;
+    let now = Timestamp::now();
+    let record = WebhookRecord {
+        id: uuid::Uuid::now_v7().to_string(),
+        url: body.url,
+        secret: new_secret().map_err(|e| ApiError::internal(&e))?,
+        previous_secret: None,
+        filter: EventFilter { events: body.events, alarm_kinds: body.alarm_kinds, structures: body.structures },
+        enabled: body.enabled,
+        created_at: now,
+        updated_at: now,
+    };
+    if !shared.monitor.store().insert_webhook(record.clone(), MOST_WEBHOOKS).await? {
+        let detail = format!("there are {MOST_WEBHOOKS} webhooks already: delete one first");
+        return Err(ApiError::new(StatusCode::CONFLICT, "too_many_webhooks", detail));
+    }
+    let (location, secret) = (format!("/v1/webhooks/{}", record.id), record.secret.reveal().to_owned());
+    let item = WebhookItem { secret: Some(secret), ..record.into() };
+    Ok((StatusCode::CREATED, [(header::LOCATION, location)], Json(item)).into_response())
+}
+
+/// `GET /v1/webhooks/{id}`.
+///
+/// # Errors
+/// 404.
+#[utoipa::path(
+    get, path = "/v1/webhooks/{id}", tag = "webhooks", operation_id = "read_webhook",
+    summary = "A webhook", description = "Without its secret.",
+    params(WebhookPath),
+    responses((status = 200, description = "The webhook", body = WebhookItem), Unknown)
+)]
+pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
+    Ok(Json(WebhookItem::from(webhook(&shared, &id).await?)).into_response())
+}
+
+/// `PUT /v1/webhooks/{id}`: another address, filter or switch; secret and outbox stay.
+///
+/// # Errors
+/// 404; 400, 415, 422 for the body.
+#[utoipa::path(
+    put, path = "/v1/webhooks/{id}", tag = "webhooks", operation_id = "put_webhook",
+    summary = "Change a webhook", description = "Another address, filter or switch; secret and outbox stay.",
+    params(WebhookPath),
+    request_body(content = WebhookBody, example = json!({"url": "https://example.com/alarms", "enabled": false})),
+    responses((status = 200, description = "The webhook", body = WebhookItem), Unknown, BodyRefused)
+)]
+pub async fn put(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, ApiError> {
+    webhook(&shared, &id).await?;
+    let body: WebhookBody = json_body(&headers, body, shared.limits).await?;
+    check(&shared, &body).await?;
+    let filter = EventFilter { events: body.events, alarm_kinds: body.alarm_kinds, structures: body.structures };
+    shared.monitor.store().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
+    read(State(shared), ApiPath(id)).await
+}
+
+/// `DELETE /v1/webhooks/{id}`: 204; its outbox goes with it.
+///
+/// # Errors
+/// 404.
+#[utoipa::path(
+    delete, path = "/v1/webhooks/{id}", tag = "webhooks", operation_id = "delete_webhook",
+    summary = "Delete a webhook", description = "Its outbox goes with it.",
+    params(WebhookPath),
+    responses((status = 204, description = "It is gone"), Unknown)
+)]
+pub async fn remove(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
+    if shared.monitor.store().delete_webhook(&id).await? {
+        Ok(StatusCode::NO_CONTENT.into_response())
+    } else {
+        Err(unknown_webhook(&id))
+    }
+}
+
+/// `POST /v1/webhooks/{id}/test`: sends a message now, once, and answers what came of it.
+///
+/// # Errors
+/// 404.
+#[utoipa::path(
+    post, path = "/v1/webhooks/{id}/test", tag = "webhooks", operation_id = "test_webhook",
+    summary = "Try a webhook", description = "Sends a message now, once, and answers what came of it.",
+    params(WebhookPath),
+    responses((status = 200, description = "What came of it", body = TestAnswer), Unknown)
+)]
+pub async fn test(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
+    let webhook = webhook(&shared, &id).await?;
+    let attempt = shared.notifier.test(&webhook).await;
+    let answer = TestAnswer {
+        webhook: id,
+        delivered: attempt.error.is_none(),
+        status: attempt.status,
+        latency_ms: attempt.took.as_secs_f64() * 1e3,
+        error: attempt.error,
+    };
+    Ok(Json(answer).into_response())
+}
+
+/// `POST /v1/webhooks/{id}/secret`: a new secret; for a time the one before signs too, so that receivers can change over.
+///
+/// # Errors
+/// 404.
+#[utoipa::path(
+    post, path = "/v1/webhooks/{id}/secret", tag = "webhooks", operation_id = "rotate_webhook_secret",
+    summary = "Give a webhook another secret", description = "For a time the one before signs too.",
+    params(WebhookPath),
+    responses((status = 200, description = "The webhook with its new secret", body = WebhookItem), Unknown)
+)]
+pub async fn rotate(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
+    let (now, secret) = (Timestamp::now(), new_secret().map_err(|e| ApiError::internal(&e))?);
+    let until = shared.notifier.overlap_until(now);
+    if !shared.monitor.store().rotate_secret(&id, secret.clone(), until, now).await? {
+        return Err(unknown_webhook(&id));
+    }
+    let item = WebhookItem { secret: Some(secret.reveal().to_owned()), ..webhook(&shared, &id).await?.into() };
+    Ok(Json(item).into_response())
+}
+
+/// `GET /v1/webhooks/{id}/deliveries`: messages, newest first; `state=dead` for dead letters.
+///
+/// # Errors
+/// 404, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/webhooks/{id}/deliveries", tag = "webhooks", operation_id = "list_deliveries",
+    summary = "Messages of a webhook", description = "Newest first, a page at a time.",
+    params(WebhookPath, DeliveryQuery),
+    responses((status = 200, description = "A page", body = DeliveryPage), Unknown, Invalid)
+)]
+pub async fn deliveries(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    ApiQuery(query): ApiQuery<DeliveryQuery>,
+) -> Result<Response, ApiError> {
+    webhook(&shared, &id).await?;
+    let limit = page_limit(query.limit.as_deref())?;
+    let state = |text: &str| {
+        let found = DeliveryState::ALL.into_iter().find(|state| state.as_str() == text);
+        let message = || format!("{} is none of pending, delivered, dead", shown(text));
+        found.ok_or_else(|| ApiError::invalid_field("query/state", message()))
+    };
+    let state = query.state.as_deref().map(state).transpose()?;
+    let before = page_cursor(query.cursor.as_deref())?;
+    let found = shared.monitor.store().deliveries(&id, state, before, limit).await?;
+    let next = (found.len() == limit).then(|| found.last().map(|d| d.id.to_string())).flatten();
+    Ok(Json(DeliveryPage { webhook: id, items: found.into_iter().map(Into::into).collect(), next }).into_response())
+}
+
+/// `POST /v1/webhooks/{id}/deliveries/{delivery}/retry`: 202; it is tried now, and its retries begin anew.
+///
+/// # Errors
+/// 404, 409 for one that was delivered.
+#[utoipa::path(
+    post, path = "/v1/webhooks/{id}/deliveries/{delivery}/retry", tag = "webhooks", operation_id = "retry_delivery",
+    summary = "Send a message again", description = "It is tried now, and its retries begin anew.",
+    params(DeliveryPath),
+    responses((status = 202, description = "It is on its way", body = DeliveryItem), Unknown, Conflict)
+)]
+pub async fn retry(
+    State(shared): State<Shared>,
+    ApiPath((id, delivery)): ApiPath<(String, String)>,
+) -> Result<Response, ApiError> {
+    webhook(&shared, &id).await?;
+    let unknown = || {
+        let detail = format!("webhook {id} has no delivery {}", shown(&delivery));
+        ApiError::new(StatusCode::NOT_FOUND, "unknown_delivery", detail)
+    };
+    let number: i64 = delivery.parse().map_err(|_| unknown())?;
+    let found = shared.monitor.store().retry_delivery(&id, number, Timestamp::now()).await?.ok_or_else(unknown)?;
+    if found.state == DeliveryState::Delivered {
+        let detail = format!("delivery {number} was taken by the receiver: there is nothing to try again");
+        return Err(ApiError::new(StatusCode::CONFLICT, "already_delivered", detail));
+    }
+    Ok((StatusCode::ACCEPTED, Json(DeliveryItem::from(found))).into_response())
+}
+
+/// The number that a page begins behind.
+///
+/// # Errors
+/// 422 for anything that was not given out as one.
+pub fn page_cursor(text: Option<&str>) -> Result<Option<i64>, ApiError> {
+    let number = |text: &str| {
+        let message = || format!("{} was not given out by this service", shown(text));
+        text.parse::<i64>().map_err(|_| ApiError::invalid_field("query/cursor", message()))
+    };
+    text.map(number).transpose()
+}
+
+async fn webhook(shared: &Shared, id: &str) -> Result<WebhookRecord, ApiError> {
+    shared.monitor.store().webhook(id).await?.ok_or_else(|| unknown_webhook(id))
+}
+
+fn unknown_webhook(id: &str) -> ApiError {
+    ApiError::new(StatusCode::NOT_FOUND, "unknown_webhook", format!("there is no webhook {}", shown(id)))
+}
+
+async fn check(shared: &Shared, body: &WebhookBody) -> Result<(), ApiError> {
+    let mut problems = Vec::new();
+    if let Err(message) = shared.notifier.guard().check_new_url(&body.url).await {
+        problems.push(Problem::new("/url", message));
+    }
+    for (field, values, known) in
+        [("events", &body.events, &EVENT_KINDS[..]), ("alarm_kinds", &body.alarm_kinds, &ALARM_KINDS[..])]
+    {
+        for (index, value) in values.iter().enumerate().filter(|(_, value)| !known.contains(&value.as_str())) {
+            let message = format!("{} is none of {}", shown(value), known.join(", "));
+            problems.push(Problem::new(format!("/{field}/{index}"), message));
+        }
+    }
+    for (index, value) in body.structures.iter().enumerate() {
+        if structure_id(value).is_ok_and(|id| shared.monitor.structure(&id).is_ok()) {
+            continue;
+        }
+        problems.push(Problem::new(format!("/structures/{index}"), format!("there is no structure {}", shown(value))));
+    }
+    problems.truncate(20);
+    if problems.is_empty() {
+        Ok(())
+    } else {
+        Err(ApiError::invalid_input(problems))
+    }
+}

@@ -1,0 +1,160 @@
+//! The round: who has a message due, and sending it, each webhook in its own task.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio::task::{Id, JoinSet};
+use tracing::{debug, error, info, warn};
+
+use super::backoff::{after_failure, jitter, Next};
+use super::{later, Attempt, Notifier};
+use crate::quantity::Timestamp;
+use crate::store::{Delivery, DeliveryState, Error, Settlement, WebhookRecord};
+
+/// Longest time between two looks: a clock that jumps is noticed within it.
+const LONGEST_WAIT: Duration = Duration::from_mins(1);
+
+/// Shortest time between two looks: a burst of batches is one look.
+const SHORTEST_WAIT: Duration = Duration::from_millis(20);
+
+/// Pause after the store failed. What was sent and could not be noted is sent again, so not at once.
+const PAUSE_AFTER_FAILURE: Duration = Duration::from_secs(10);
+
+/// Time that attempts under way get when the service stops.
+const GRACE: Duration = Duration::from_secs(3);
+
+/// Between two removals of what is old.
+const PRUNE_EVERY: Duration = Duration::from_hours(1);
+
+impl Notifier {
+    /// Delivers messages until `stop` becomes true.
+    pub async fn run(self, mut stop: watch::Receiver<bool>) {
+        let mut turns = JoinSet::new();
+        let mut busy: BTreeMap<Id, String> = BTreeMap::new();
+        let mut prune = tokio::time::interval(PRUNE_EVERY);
+        loop {
+            let wait = match self.start_turns(&mut turns, &mut busy).await {
+                Ok(wait) => wait,
+                Err(failure) => {
+                    error!(error = %failure, "Could not look for messages to send: {failure}");
+                    PAUSE_AFTER_FAILURE
+                }
+            };
+            tokio::select! {
+                () = stopped(&mut stop) => break,
+                () = self.store.written() => tokio::time::sleep(SHORTEST_WAIT).await,
+                Some(ended) = turns.join_next_with_id() => {
+                    let id = ended.map_or_else(|panicked| panicked.id(), |(id, ())| id);
+                    busy.remove(&id);
+                }
+                _ = prune.tick() => self.prune().await,
+                () = tokio::time::sleep(wait) => {}
+            }
+        }
+        let rest = async { while turns.join_next().await.is_some() {} };
+        if tokio::time::timeout(GRACE, rest).await.is_err() {
+            debug!("Left messages that were on their way: they are sent again after the next start");
+        }
+    }
+
+    /// Starts a task for each webhook that has a message due and none under way; the time until the next one has.
+    async fn start_turns(&self, turns: &mut JoinSet<()>, busy: &mut BTreeMap<Id, String>) -> Result<Duration, Error> {
+        let now = Timestamp::now();
+        let found = self.store.webhook_turns(now, self.latest(now)).await?;
+        metrics::gauge!("modalwatch_webhook_pending").set(found.pending as f64);
+        metrics::gauge!("modalwatch_webhook_dead").set(found.dead as f64);
+        *self.trouble.lock().expect("no holder of this lock panics") = (found.failing, found.dead);
+        for webhook in found.due {
+            if !busy.values().any(|id| *id == webhook) {
+                let (notifier, id) = (self.clone(), webhook.clone());
+                let task = turns.spawn(async move { notifier.take_turn(&id).await });
+                busy.insert(task.id(), webhook);
+            }
+        }
+        let until = |next: Timestamp| Duration::from_micros((next.micros() - now.micros()).max(0).unsigned_abs());
+        Ok(found.next_at.map_or(LONGEST_WAIT, until).clamp(SHORTEST_WAIT, LONGEST_WAIT))
+    }
+
+    /// Sends the messages of a webhook in their order, until one fails or none is left.
+    async fn take_turn(&self, webhook: &str) {
+        loop {
+            match self.send_oldest(webhook).await {
+                Ok(true) => {}
+                Ok(false) => return,
+                Err(failure) => {
+                    error!(webhook.id = %webhook, error = %failure, "Could not read or note a message: {failure}");
+                    tokio::time::sleep(PAUSE_AFTER_FAILURE).await;
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Sends the oldest message of a webhook, if it is due. Whether the next one may follow.
+    async fn send_oldest(&self, webhook: &str) -> Result<bool, Error> {
+        let Some((hook, delivery)) = self.store.oldest_delivery(webhook).await? else { return Ok(false) };
+        let now = Timestamp::now();
+        if delivery.next_at > now && delivery.next_at <= self.latest(now) {
+            return Ok(false);
+        }
+        let attempt = self.send(&hook, &delivery.event).await;
+        let settlement = self.settlement(&delivery, &attempt, Timestamp::now());
+        report(&hook, &delivery, &attempt, settlement.state);
+        let state = settlement.state;
+        self.store.settle_delivery(delivery.id, settlement).await?;
+        Ok(state != DeliveryState::Pending)
+    }
+
+    fn settlement(&self, delivery: &Delivery, attempt: &Attempt, now: Timestamp) -> Settlement {
+        let failures = delivery.attempts + 1;
+        let failed = || after_failure(&self.settings, failures, delivery.started_at, now, jitter());
+        let (state, next_at) = match attempt.error.as_ref().map(|_| failed()) {
+            None => (DeliveryState::Delivered, now),
+            Some(Next::At(at)) => (DeliveryState::Pending, at),
+            Some(Next::GiveUp) => (DeliveryState::Dead, now),
+        };
+        Settlement { state, at: now, next_at, status: attempt.status, error: attempt.error.clone() }
+    }
+
+    /// No attempt is planned later than this; one that seems so was planned before the clock was set back.
+    fn latest(&self, now: Timestamp) -> Timestamp {
+        later(now, 2 * self.settings.longest_retry_s)
+    }
+
+    async fn prune(&self) {
+        let days = self.settings.keep_delivered_days as i64;
+        let Ok(before) = Timestamp::from_micros(Timestamp::now().micros() - days * 86_400_000_000) else { return };
+        match self.store.prune_outbox(before).await {
+            Ok(0) => {}
+            Ok(events) => info!(events, "Forgot {events} old events of the outbox"),
+            Err(failure) => error!(error = %failure, "Could not forget old events of the outbox: {failure}"),
+        }
+    }
+}
+
+/// Done when the service stops.
+async fn stopped(stop: &mut watch::Receiver<bool>) {
+    // Without a sender there is nobody left to stop it.
+    let _ = stop.wait_for(|stopped| *stopped).await;
+}
+
+fn report(webhook: &WebhookRecord, delivery: &Delivery, attempt: &Attempt, state: DeliveryState) {
+    let outcome = match state {
+        DeliveryState::Delivered => "delivered",
+        DeliveryState::Pending => "retry",
+        DeliveryState::Dead => "dead",
+    };
+    metrics::counter!("modalwatch_webhook_deliveries_total", "outcome" => outcome).increment(1);
+    let (id, message, kind) = (&webhook.id, &delivery.event.message_id, &delivery.event.kind);
+    let (duration_ms, attempts) = (attempt.took.as_secs_f64() * 1e3, delivery.attempts + 1);
+    match &attempt.error {
+        None => info!(webhook.id = %id, message, duration_ms, attempts, "Delivered {kind} to webhook {id}"),
+        Some(error) if state == DeliveryState::Dead => {
+            warn!(webhook.id = %id, message, attempts, error, "Gave up {kind} for webhook {id}: {error}");
+        }
+        Some(error) => {
+            warn!(webhook.id = %id, message, attempts, error, "Could not deliver {kind} to webhook {id}: {error}");
+        }
+    }
+}

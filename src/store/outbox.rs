@@ -1,0 +1,316 @@
+//! The outbox: messages to webhooks, one row for each webhook that wants one. SQL triggers fill it (migration 0005).
+
+use sqlx::FromRow;
+
+use super::webhook::{WebhookRecord, WebhookRow};
+use super::{bad_row, timestamp, Error, Store};
+use crate::quantity::{StructureId, Timestamp};
+
+/// How far a delivery has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DeliveryState {
+    /// It waits for its next attempt.
+    Pending,
+    /// The receiver has taken it.
+    Delivered,
+    /// It was tried until nobody would wait any longer.
+    Dead,
+}
+
+impl DeliveryState {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Pending, Self::Delivered, Self::Dead];
+
+    /// Its name, as stored and as answered.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Pending => "pending",
+            Self::Delivered => "delivered",
+            Self::Dead => "dead",
+        }
+    }
+}
+
+/// Something that happened to an alarm.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutboxEvent {
+    /// The same at every attempt.
+    pub message_id: String,
+    /// Such as `alarm.opened`.
+    pub kind: String,
+    /// The structure.
+    pub structure: StructureId,
+    /// Number of the alarm within the structure.
+    pub alarm: i64,
+    /// The alarm as it was then, JSON.
+    pub facts: String,
+    /// When it happened.
+    pub created_at: Timestamp,
+}
+
+/// A message to one webhook.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Delivery {
+    /// Its number.
+    pub id: i64,
+    /// What it tells.
+    pub event: OutboxEvent,
+    /// How far it has come.
+    pub state: DeliveryState,
+    /// Attempts so far.
+    pub attempts: u32,
+    /// Retries count from here.
+    pub started_at: Timestamp,
+    /// Next attempt, while pending.
+    pub next_at: Timestamp,
+    /// Last attempt.
+    pub last_at: Option<Timestamp>,
+    /// HTTP status of the last answer.
+    pub last_status: Option<u16>,
+    /// Why the last attempt failed.
+    pub last_error: Option<String>,
+}
+
+/// What an attempt has come to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settlement {
+    /// The state after it.
+    pub state: DeliveryState,
+    /// When it was.
+    pub at: Timestamp,
+    /// When the next one is; does not matter unless pending.
+    pub next_at: Timestamp,
+    /// HTTP status, if there was an answer.
+    pub status: Option<u16>,
+    /// Why it failed.
+    pub error: Option<String>,
+}
+
+/// Whose turn it is.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Turns {
+    /// Webhooks whose oldest waiting message is due.
+    pub due: Vec<String>,
+    /// When the next of the others is.
+    pub next_at: Option<Timestamp>,
+    /// Webhooks whose oldest waiting message has failed before.
+    pub failing: u64,
+    /// Messages that wait.
+    pub pending: u64,
+    /// Messages that were given up.
+    pub dead: u64,
+}
+
+#[derive(FromRow)]
+struct DeliveryRow {
+    delivery_id: i64,
+    state: String,
+    attempts: u32,
+    started_at_us: i64,
+    next_at_us: i64,
+    last_at_us: Option<i64>,
+    last_status: Option<u16>,
+    last_error: Option<String>,
+    message_id: String,
+    kind: String,
+    structure_id: String,
+    episode: i64,
+    facts: String,
+    created_at_us: i64,
+}
+
+const DELIVERY_COLUMNS: &str =
+    "d.delivery_id, d.state, d.attempts, d.started_at_us, d.next_at_us, d.last_at_us, d.last_status, d.last_error,
+     e.message_id, e.kind, e.structure_id, e.episode, e.facts, e.created_at_us";
+
+fn delivery(row: DeliveryRow) -> Result<Delivery, Error> {
+    let what = "webhook delivery";
+    let state = DeliveryState::ALL.into_iter().find(|state| state.as_str() == row.state);
+    Ok(Delivery {
+        id: row.delivery_id,
+        event: OutboxEvent {
+            message_id: row.message_id,
+            kind: row.kind,
+            structure: StructureId::parse(&row.structure_id).map_err(|e| bad_row(what)(&e))?,
+            alarm: row.episode,
+            facts: row.facts,
+            created_at: timestamp(what, row.created_at_us)?,
+        },
+        state: state.ok_or_else(|| bad_row(what)(&row.state))?,
+        attempts: row.attempts,
+        started_at: timestamp(what, row.started_at_us)?,
+        next_at: timestamp(what, row.next_at_us)?,
+        last_at: row.last_at_us.map(|at| timestamp(what, at)).transpose()?,
+        last_status: row.last_status,
+        last_error: row.last_error,
+    })
+}
+
+impl Store {
+    /// Done when something was written since the last call; for one listener.
+    pub async fn written(&self) {
+        self.written.notified().await;
+    }
+
+    /// Webhooks whose oldest waiting message is due, that is neither later than `now` nor, after the clock was set back, later
+    /// than `latest`.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn webhook_turns(&self, now: Timestamp, latest: Timestamp) -> Result<Turns, Error> {
+        let heads: Vec<(String, i64, i64)> = sqlx::query_as(
+            "select w.webhook_id, d.next_at_us, d.attempts from webhook w
+             join webhook_delivery d on d.delivery_id = (select min(delivery_id) from webhook_delivery
+                 where webhook_id = w.webhook_id and state = 'pending')
+             where w.enabled = 1",
+        )
+        .fetch_all(&self.reader)
+        .await?;
+        let (pending, dead): (i64, i64) = sqlx::query_as(
+            "select (select count(*) from webhook_delivery where state = 'pending'),
+                    (select count(*) from webhook_delivery where state = 'dead')",
+        )
+        .fetch_one(&self.reader)
+        .await?;
+        let mut turns = Turns { pending: pending.unsigned_abs(), dead: dead.unsigned_abs(), ..Turns::default() };
+        for (webhook, next_at_us, attempts) in heads {
+            turns.failing += u64::from(attempts > 0);
+            let next_at = timestamp("webhook delivery", next_at_us)?;
+            if next_at <= now || next_at > latest {
+                turns.due.push(webhook);
+            } else {
+                turns.next_at = Some(turns.next_at.map_or(next_at, |soonest| soonest.min(next_at)));
+            }
+        }
+        Ok(turns)
+    }
+
+    /// The oldest waiting message of a webhook, due or not; `None` when none waits or it is switched off.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn oldest_delivery(&self, webhook: &str) -> Result<Option<(WebhookRecord, Delivery)>, Error> {
+        let mut reader = self.reader.acquire().await?;
+        let hook: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = ? and enabled = 1")
+            .bind(webhook)
+            .fetch_optional(&mut *reader)
+            .await?;
+        let oldest = format!(
+            "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
+             where d.webhook_id = ? and d.state = 'pending' order by d.delivery_id limit 1"
+        );
+        let row: Option<DeliveryRow> =
+            sqlx::query_as(sqlx::AssertSqlSafe(oldest)).bind(webhook).fetch_optional(&mut *reader).await?;
+        hook.zip(row).map(|(hook, row)| Ok((hook.into_record()?, delivery(row)?))).transpose()
+    }
+
+    /// Notes what an attempt has come to.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn settle_delivery(&self, id: i64, settlement: Settlement) -> Result<(), Error> {
+        self.write(move |connection| {
+            Box::pin(async move {
+                sqlx::query(
+                    "update webhook_delivery set state = ?, attempts = attempts + 1, next_at_us = ?, last_at_us = ?,
+                         last_status = ?, last_error = ? where delivery_id = ?",
+                )
+                .bind(settlement.state.as_str())
+                .bind(settlement.next_at.micros())
+                .bind(settlement.at.micros())
+                .bind(settlement.status)
+                .bind(settlement.error)
+                .bind(id)
+                .execute(&mut *connection)
+                .await?;
+                Ok(())
+            })
+        })
+        .await
+    }
+
+    /// Messages of a webhook, newest first; behind number `before`, if given; only those in `state`, if given.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn deliveries(
+        &self,
+        webhook: &str,
+        state: Option<DeliveryState>,
+        before: Option<i64>,
+        limit: usize,
+    ) -> Result<Vec<Delivery>, Error> {
+        let select = format!(
+            "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
+             where d.webhook_id = ?1 and d.delivery_id < ?2 and (?3 is null or d.state = ?3)
+             order by d.delivery_id desc limit ?4"
+        );
+        let rows: Vec<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(webhook)
+            .bind(before.unwrap_or(i64::MAX))
+            .bind(state.map(DeliveryState::as_str))
+            .bind(limit as i64)
+            .fetch_all(&self.reader)
+            .await?;
+        rows.into_iter().map(delivery).collect()
+    }
+
+    /// Makes a message due now, its retries beginning anew; one that was delivered stays so. The message as it is then.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn retry_delivery(&self, webhook: &str, id: i64, now: Timestamp) -> Result<Option<Delivery>, Error> {
+        let webhook = webhook.to_owned();
+        self.write(move |connection| {
+            Box::pin(async move {
+                sqlx::query(
+                    "update webhook_delivery set state = 'pending', started_at_us = ?1, next_at_us = ?1
+                     where webhook_id = ?2 and delivery_id = ?3 and state <> 'delivered'",
+                )
+                .bind(now.micros())
+                .bind(&webhook)
+                .bind(id)
+                .execute(&mut *connection)
+                .await?;
+                let select = format!(
+                    "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
+                     where d.webhook_id = ? and d.delivery_id = ?"
+                );
+                let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+                    .bind(&webhook)
+                    .bind(id)
+                    .fetch_optional(&mut *connection)
+                    .await?;
+                row.map(delivery).transpose()
+            })
+        })
+        .await
+    }
+
+    /// Forgets what was delivered, and events that nobody waits for, from before a time. Waiting and dead messages stay.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn prune_outbox(&self, before: Timestamp) -> Result<u64, Error> {
+        self.write(move |connection| {
+            Box::pin(async move {
+                sqlx::query(
+                    "delete from webhook_delivery where state = 'delivered'
+                       and event_id in (select event_id from outbox_event where created_at_us < ?)",
+                )
+                .bind(before.micros())
+                .execute(&mut *connection)
+                .await?;
+                let forgotten = sqlx::query(
+                    "delete from outbox_event where created_at_us < ?
+                       and not exists (select 1 from webhook_delivery d where d.event_id = outbox_event.event_id)",
+                )
+                .bind(before.micros())
+                .execute(&mut *connection)
+                .await?;
+                Ok(forgotten.rows_affected())
+            })
+        })
+        .await
+    }
+}

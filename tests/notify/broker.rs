@@ -1,0 +1,92 @@
+//! A real broker, Debian's mosquitto, and a client that publishes to it.
+
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
+use tempfile::TempDir;
+
+/// Where Debian puts it, which is not in everybody's search path.
+const PLACES: [&str; 3] = ["mosquitto", "/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"];
+
+pub struct Broker {
+    child: Child,
+    pub port: u16,
+    folder: TempDir,
+}
+
+impl Broker {
+    /// A broker on a free port; `None`, with a line, where there is no mosquitto.
+    pub fn start() -> Option<Self> {
+        let folder = tempfile::tempdir().unwrap();
+        let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let config =
+            format!("listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nmax_queued_messages 0\n");
+        std::fs::write(folder.path().join("broker.conf"), config).unwrap();
+        let Some(child) = run(&folder.path().join("broker.conf")) else {
+            eprintln!("skipped: there is no mosquitto here (apt-get install mosquitto)");
+            return None;
+        };
+        let broker = Self { child, port, folder };
+        broker.wait();
+        Some(broker)
+    }
+
+    pub fn url(&self) -> String {
+        format!("mqtt://127.0.0.1:{}", self.port)
+    }
+
+    /// Ends the broker; what it kept for its clients is lost.
+    pub fn stop(&mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+
+    /// Starts it again on the same port.
+    pub fn restart(&mut self) {
+        self.child = run(&self.folder.path().join("broker.conf")).unwrap();
+        self.wait();
+    }
+
+    fn wait(&self) {
+        for _ in 0..200 {
+            if TcpStream::connect(("127.0.0.1", self.port)).is_ok() {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(25));
+        }
+        panic!("mosquitto does not listen on port {}", self.port);
+    }
+
+    /// Publishes messages and returns when the broker has them.
+    pub async fn publish(&self, messages: &[(&str, Vec<u8>)]) {
+        let name = format!("gateway-{}", uuid::Uuid::now_v7().simple());
+        let mut options = MqttOptions::new(name, "127.0.0.1", self.port);
+        options.set_max_packet_size(8 << 20, 8 << 20);
+        let (client, mut events) = AsyncClient::new(options, messages.len() + 10);
+        for (topic, payload) in messages {
+            client.publish(*topic, QoS::AtLeastOnce, false, payload.clone()).await.unwrap();
+        }
+        let mut missing = messages.len();
+        while missing > 0 {
+            let event = tokio::time::timeout(Duration::from_secs(10), events.poll()).await.unwrap().unwrap();
+            missing -= usize::from(matches!(event, Event::Incoming(Packet::PubAck(_))));
+        }
+    }
+}
+
+fn run(config: &Path) -> Option<Child> {
+    PLACES.iter().find_map(|place| {
+        let mut command = Command::new(place);
+        command.arg("-c").arg(config).stdout(Stdio::null()).stderr(Stdio::null()).spawn().ok()
+    })
+}
+
+impl Drop for Broker {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,34 @@
+//! The real program, a receiver of webhooks and a real broker: what others are told, and what they tell us.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
+mod broker;
+mod filters;
+#[allow(dead_code, reason = "shared with the tests of the API, which use all of it")]
+#[path = "../api/helpers.rs"]
+mod helpers;
+mod mqtt;
+mod receiver;
+mod webhooks;
+
+use std::time::Duration;
+
+use helpers::Service;
+
+/// Waits until `found` gives something; panics with `what` after 20 s.
+async fn eventually<T>(what: &str, mut found: impl AsyncFnMut() -> Option<T>) -> T {
+    for _ in 0..400 {
+        if let Some(value) = found().await {
+            return value;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    panic!("{what}: not within 20 s");
+}
+
+/// A figure of `/metrics`, by its name and labels as they are written there; 0 while it is not there.
+async fn metric(service: &Service, name: &str) -> f64 {
+    let text = service.get("/metrics").send().await.unwrap().text().await.unwrap();
+    let value = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok());
+    value.unwrap_or(0.0)
+}

@@ -1,0 +1,181 @@
+//! Batches from a broker: once each, whoever is killed; what is no batch is put aside and stops nothing.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::time::Duration;
+
+use serde_json::{json, Value};
+
+use crate::broker::Broker;
+use crate::helpers::{command, measurements, problem, Service};
+use crate::{eventually, metric};
+
+const TOPIC: &str = "modalwatch/three-dof/batches";
+
+fn start(data_dir: &Path, broker: &Broker) -> Service {
+    Service::spawn(command(data_dir).env("MODALWATCH__MQTT__URL", broker.url()))
+}
+
+/// A batch of three measurements whose times no other `number` has.
+fn batch(number: usize) -> Vec<u8> {
+    json!({ "measurements": measurements([4.0, 5.0, 6.0], 3, number * 2_000) }).to_string().into_bytes()
+}
+
+async fn connected(service: &Service, wanted: bool) {
+    eventually("the connection to the broker", async || {
+        ((metric(service, "modalwatch_mqtt_connected").await > 0.5) == wanted).then_some(())
+    })
+    .await;
+}
+
+async fn outcome(service: &Service, outcome: &str) -> usize {
+    metric(service, &format!("modalwatch_mqtt_messages_total{{outcome=\"{outcome}\"}}")).await as usize
+}
+
+async fn count(service: &Service, name: &str, at_least: usize) {
+    eventually(name, async || (outcome(service, name).await >= at_least).then_some(())).await;
+}
+
+async fn stored(service: &Service) -> Vec<Value> {
+    service.read("/v1/structures/three-dof/history?limit=1000").await["items"].as_array().unwrap().clone()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_message_is_a_batch_and_twice_the_same_is_one() {
+    let Some(broker) = Broker::start() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let service = start(folder.path(), &broker);
+    connected(&service, true).await;
+    let mut body: Value = serde_json::from_slice(&batch(0)).unwrap();
+    body["source"] = json!("gateway-7");
+    body["idempotency_key"] = json!("key-1");
+    let message = body.to_string().into_bytes();
+    broker.publish(&[(TOPIC, message.clone()), (TOPIC, message), (TOPIC, batch(1)), (TOPIC, batch(1))]).await;
+    count(&service, "stored", 2).await;
+    count(&service, "replayed", 2).await;
+    let items = stored(&service).await;
+    assert_eq!(items.len(), 2);
+    assert!(items.iter().all(|item| item["state"] == "assessed" && item["measurement_count"] == 3), "{items:?}");
+    assert_eq!(items.iter().filter(|item| item["source"] == "gateway-7").count(), 1);
+    // Over HTTP it is known too.
+    let again = service.post("/v1/structures/three-dof/batches", &serde_json::from_slice(&batch(1)).unwrap()).await;
+    assert_eq!(again.headers()["idempotency-replayed"], "true");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
+    let Some(broker) = Broker::start() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let service = Service::spawn(
+        command(folder.path())
+            .env("MODALWATCH__MQTT__URL", broker.url())
+            .env("MODALWATCH__MQTT__MAX_PAYLOAD_BYTES", "200000"),
+    );
+    connected(&service, true).await;
+    let mut conflict: Value = serde_json::from_slice(&batch(0)).unwrap();
+    conflict["measurements"][0]["frequencies_hz"][0] = json!(0.42);
+    let mut negative: Value = serde_json::from_slice(&batch(5)).unwrap();
+    negative["measurements"][1]["frequencies_hz"][2] = json!(-1.0);
+    let large = vec![b' '; 300_000];
+    broker
+        .publish(&[
+            (TOPIC, batch(0)),
+            (TOPIC, b"\xff\x00 hello".to_vec()),
+            (TOPIC, b"{\"measurements\": [], \"sorce\": 1}".to_vec()),
+            (TOPIC, negative.to_string().into_bytes()),
+            (TOPIC, conflict.to_string().into_bytes()),
+            (TOPIC, large),
+            ("modalwatch/nowhere/batches", batch(6)),
+            ("modalwatch/Ünter/batches", batch(7)),
+            (TOPIC, batch(1)),
+        ])
+        .await;
+    count(&service, "stored", 2).await;
+    count(&service, "quarantined", 7).await;
+    let page = service.read("/v1/quarantine").await;
+    let items = page["items"].as_array().unwrap();
+    assert_eq!(items.len(), 7, "{page}");
+    for reason in [
+        "the body is no JSON",
+        "/sorce: unknown field",
+        "/measurements/1/frequencies_hz/2",
+        "which has other content",
+        "more than mqtt.max_payload_bytes",
+        "no structure nowhere",
+        "structure id",
+    ] {
+        let found = items.iter().filter(|item| item["reason"].as_str().unwrap().contains(reason)).count();
+        assert_eq!(found, 1, "{reason}: {page}");
+    }
+    assert!(items.iter().all(|item| item["tries"] == 1 && item["topic"].as_str().unwrap().ends_with("/batches")));
+    let large = items.iter().find(|item| item["payload_bytes"] == 300_000).unwrap();
+    let whole = service.read(&format!("/v1/quarantine/{}", large["message"])).await;
+    assert_eq!(whole["payload"].as_str().unwrap().len(), 64 * 1024, "its beginning is kept");
+
+    // The same again is counted, not kept twice.
+    broker.publish(&[(TOPIC, b"\xff\x00 hello".to_vec())]).await;
+    count(&service, "quarantined", 8).await;
+    let again = service.read("/v1/quarantine?limit=1000").await;
+    let again = again["items"].as_array().unwrap();
+    assert_eq!((again.len(), again.iter().filter(|item| item["tries"] == 2).count()), (7, 1));
+    let path = format!("/v1/quarantine/{}", large["message"]);
+    assert_eq!(service.request(reqwest::Method::DELETE, &path).send().await.unwrap().status(), 204);
+    problem(service.request(reqwest::Method::DELETE, &path).send().await.unwrap(), 404, "unknown_message").await;
+    assert_eq!(stored(&service).await.len(), 2);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_broker_that_comes_back_without_its_memory_is_subscribed_again() {
+    let Some(mut broker) = Broker::start() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let service = start(folder.path(), &broker);
+    connected(&service, true).await;
+    broker.publish(&[(TOPIC, batch(0))]).await;
+    count(&service, "stored", 1).await;
+    broker.stop();
+    connected(&service, false).await;
+    // Meanwhile the other door is open.
+    let body = serde_json::from_slice(&batch(1)).unwrap();
+    assert_eq!(service.post("/v1/structures/three-dof/batches", &body).await.status(), 201);
+    broker.restart();
+    connected(&service, true).await;
+    broker.publish(&[(TOPIC, batch(2))]).await;
+    count(&service, "stored", 2).await;
+    assert_eq!(stored(&service).await.len(), 3);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_message_is_stored_exactly_once_whenever_the_service_is_killed() {
+    const MESSAGES: usize = 60;
+    let Some(broker) = Broker::start() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let mut service = start(folder.path(), &broker);
+    connected(&service, true).await;
+    let messages: Vec<(&str, Vec<u8>)> = (0..MESSAGES).map(|number| (TOPIC, batch(number))).collect();
+    broker.publish(&messages).await;
+    let mut seen = Vec::new();
+    for _ in 0..3 {
+        // In the middle of the work: at least one more is stored, and not all are acknowledged.
+        eventually("work", async || {
+            let working = outcome(&service, "stored").await > 0 || stored(&service).await.len() >= MESSAGES;
+            working.then_some(())
+        })
+        .await;
+        seen.push(stored(&service).await.len());
+        service.kill();
+        service = start(folder.path(), &broker);
+    }
+    // While nobody was there, one more came.
+    service.kill();
+    broker.publish(&[(TOPIC, batch(MESSAGES))]).await;
+    service = start(folder.path(), &broker);
+    eventually("all messages", async || (stored(&service).await.len() > MESSAGES).then_some(())).await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let items = stored(&service).await;
+    let times: BTreeSet<&str> = items.iter().map(|item| item["measured_from"].as_str().unwrap()).collect();
+    assert_eq!((items.len(), times.len()), (MESSAGES + 1, MESSAGES + 1));
+    println!("stored before each kill: {seen:?}");
+    assert!(seen[0] < MESSAGES, "the service was killed when all was done: the test shows nothing");
+    assert_eq!(service.read("/v1/quarantine").await["items"], json!([]));
+    assert_eq!(service.stop("TERM").code(), Some(0));
+}

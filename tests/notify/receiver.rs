@@ -1,0 +1,108 @@
+//! A receiver of webhooks: it notes what comes and answers as it is told to.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, Uri};
+use axum::response::{IntoResponse as _, Response};
+use axum::Router;
+use serde_json::Value;
+use tokio::net::TcpListener;
+
+use crate::eventually;
+
+/// How a receiver answers.
+#[derive(Debug, Clone)]
+pub enum Answer {
+    Status(u16),
+    RedirectTo(String),
+    Never,
+}
+
+/// A message as it came.
+#[derive(Debug, Clone)]
+pub struct Received {
+    pub path: String,
+    pub headers: HeaderMap,
+    pub body: Bytes,
+    pub answered: u16,
+}
+
+#[derive(Clone)]
+pub struct Receiver {
+    pub address: SocketAddr,
+    received: Arc<Mutex<Vec<Received>>>,
+    answer: Arc<Mutex<Answer>>,
+}
+
+impl Received {
+    pub fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).unwrap()
+    }
+
+    pub fn id(&self) -> &str {
+        self.headers["webhook-id"].to_str().unwrap()
+    }
+
+    pub fn kind(&self) -> String {
+        self.json()["type"].as_str().unwrap().to_owned()
+    }
+
+    /// Whether the library for receivers accepts the signature under a secret.
+    pub fn is_signed_with(&self, secret: &Value) -> bool {
+        let webhook = standardwebhooks::Webhook::new(secret.as_str().unwrap()).unwrap();
+        webhook.verify(&self.body, &self.headers).is_ok()
+    }
+}
+
+impl Receiver {
+    pub async fn start(answer: Answer) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let receiver = Self {
+            address: listener.local_addr().unwrap(),
+            received: Arc::default(),
+            answer: Arc::new(Mutex::new(answer)),
+        };
+        let router = Router::new().fallback(take).with_state(receiver.clone());
+        tokio::spawn(async move { axum::serve(listener, router).await });
+        receiver
+    }
+
+    pub fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.address)
+    }
+
+    pub fn answer(&self, answer: Answer) {
+        *self.answer.lock().unwrap() = answer;
+    }
+
+    pub fn all(&self) -> Vec<Received> {
+        self.received.lock().unwrap().clone()
+    }
+
+    pub fn taken(&self) -> Vec<Received> {
+        self.all().into_iter().filter(|r| r.answered == 200).collect()
+    }
+
+    /// Waits for so many messages, and returns all there are.
+    pub async fn wait_for(&self, count: usize) -> Vec<Received> {
+        eventually("messages", async || Some(self.all()).filter(|all| all.len() >= count)).await
+    }
+}
+
+async fn take(State(receiver): State<Receiver>, uri: Uri, headers: HeaderMap, body: Bytes) -> Response {
+    let answer = receiver.answer.lock().unwrap().clone();
+    let answered = match &answer {
+        Answer::Status(status) => *status,
+        Answer::RedirectTo(_) => 307,
+        Answer::Never => 0,
+    };
+    receiver.received.lock().unwrap().push(Received { path: uri.path().to_owned(), headers, body, answered });
+    match answer {
+        Answer::Status(status) => StatusCode::from_u16(status).unwrap().into_response(),
+        Answer::RedirectTo(location) => (StatusCode::TEMPORARY_REDIRECT, [("location", location)]).into_response(),
+        Answer::Never => std::future::pending().await,
+    }
+}
