@@ -1,0 +1,103 @@
+//! A structure out of one installation and into another.
+
+use serde_json::Value;
+
+use crate::helpers::{problem, spawn, Service};
+use crate::world::{answers, fails, run, text, with_past, without};
+
+/// What belongs to an installation and not to the structure: when something was computed or noticed here.
+const OF_THE_INSTALLATION: [&str; 4] = ["assessed_at", "noticed_at", "created_at", "updated_at"];
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn another_installation_answers_the_same_to_the_last_bit() {
+    let (mut service, folder) = spawn();
+    with_past(&service, 8).await;
+    let expected = answers(&service).await;
+    let elsewhere = tempfile::tempdir().unwrap();
+    let (online, offline) = (elsewhere.path().join("online.ndjson"), elsewhere.path().join("offline.ndjson"));
+    let url = format!("http://{}", service.address());
+    let data_dir = text(folder.path());
+    run(&["export", "--structure", "three-dof", "--data-dir", data_dir, "--url", &url, "--out", text(&online)]).await;
+    service.stop("TERM");
+    run(&["export", "--structure", "three-dof", "--data-dir", data_dir, "--out", text(&offline)]).await;
+    let lines = |path| std::fs::read_to_string(path).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
+    let (online_lines, offline_lines) = (lines(&online), lines(&offline));
+    // First and last line name the time of the export.
+    assert_eq!(online_lines[1..online_lines.len() - 1], offline_lines[1..offline_lines.len() - 1]);
+
+    let target = elsewhere.path().join("data");
+    let import = ["import", "--from", text(&online), "--data-dir", text(&target), "--json"];
+    let done: Value = serde_json::from_str(&run(&import).await).unwrap();
+    assert_eq!((&done["batches"], &done["batches_new"]), (&10.into(), &10.into()), "{done}");
+    assert_eq!((&done["undamaged_states"], &done["maintenance_windows"]), (&1.into(), &1.into()), "{done}");
+    assert_eq!(done["acknowledgements"], 1, "{done}");
+    assert_eq!(done["warnings"], serde_json::json!([]), "{done}");
+    let mut second = Service::start(&target);
+    let compare = |expected: &std::collections::BTreeMap<String, Value>,
+                   found: &std::collections::BTreeMap<String, Value>| {
+        for (path, expected) in expected {
+            let (mut expected, mut found) = (expected.clone(), found.get(path).cloned().unwrap_or(Value::Null));
+            without(&mut expected, &OF_THE_INSTALLATION);
+            without(&mut found, &OF_THE_INSTALLATION);
+            assert_eq!(expected, found, "{path}");
+        }
+        assert_eq!(expected.len(), found.len());
+    };
+    compare(&expected, &answers(&second).await);
+    second.stop("TERM");
+
+    // Once more: nothing is new, and nothing changes.
+    let again: Value = serde_json::from_str(&run(&import).await).unwrap();
+    for what in ["versions", "models", "batches_new", "undamaged_states", "maintenance_windows", "acknowledgements"] {
+        assert_eq!(again[what], 0, "{what}: {again}");
+    }
+    compare(&expected, &answers(&Service::start(&target)).await);
+}
+
+#[tokio::test]
+async fn an_archive_that_is_not_whole_or_not_true_is_refused_with_its_line() {
+    let (service, folder) = spawn();
+    with_past(&service, 4).await;
+    let file = folder.path().join("export.ndjson");
+    let url = format!("http://{}", service.address());
+    run(&[
+        "export",
+        "--structure",
+        "three-dof",
+        "--data-dir",
+        text(folder.path()),
+        "--url",
+        &url,
+        "--out",
+        text(&file),
+    ])
+    .await;
+    let whole = std::fs::read_to_string(&file).unwrap();
+    let lines: Vec<&str> = whole.lines().collect();
+    let refused = async |content: String| {
+        let target = tempfile::tempdir().unwrap();
+        let file = target.path().join("changed.ndjson");
+        std::fs::write(&file, content).unwrap();
+        let data_dir = target.path().join("data");
+        let said = fails(&["import", "--from", text(&file), "--data-dir", text(&data_dir)]).await;
+        let second = Service::start(&data_dir);
+        let history = second.read("/v1/structures/three-dof/history").await;
+        assert_eq!(history["items"], serde_json::json!([]), "something was stored");
+        said
+    };
+    let cut = refused(lines[..lines.len() - 1].join("\n") + "\n").await;
+    assert!(cut.contains("its last line is missing"), "{cut}");
+    let half = refused(whole[..whole.len() / 2].to_owned()).await;
+    assert!(half.contains("line ") && half.contains("no record of an archive"), "{half}");
+    let dropped = [&lines[..5], &lines[6..]].concat().join("\n") + "\n";
+    assert!(refused(dropped).await.contains("not whole"));
+    let empty = refused(String::new()).await;
+    assert!(empty.contains("not whole"), "{empty}");
+
+    let unknown = service.get("/v1/structures/bridge/export").send().await.unwrap();
+    problem(unknown, 404, "unknown_structure").await;
+    let out = folder.path().join("never.ndjson");
+    fails(&["export", "--structure", "bridge", "--data-dir", text(folder.path()), "--url", &url, "--out", text(&out)])
+        .await;
+    assert!(!out.exists(), "a file that is not whole was left behind");
+}

@@ -1,0 +1,16 @@
+//! Keeping the real program: backups, archives, models swapped under load, disks that fail, databases of earlier versions.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
+mod archive;
+mod backup;
+mod doctor;
+#[path = "../api/helpers.rs"]
+#[allow(dead_code, reason = "shared with the tests of the API")]
+mod helpers;
+mod migration;
+mod models;
+mod monitoring;
+mod storage;
+mod supervision;
+mod world;

@@ -1,0 +1,165 @@
+//! Disks that are full, fail and heal; old batches.
+
+use std::process::Command;
+use std::time::Duration;
+
+use reqwest::Response;
+use serde_json::{json, Value};
+
+use crate::helpers::{command, measurements, problem, spawn, Service};
+use crate::world::{run, settled, text, with_past};
+
+async fn post(service: &Service, start: usize) -> Response {
+    let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 4, start) });
+    service.post("/v1/structures/three-dof/batches", &body).await
+}
+
+/// Batches in the history.
+async fn history(service: &Service) -> usize {
+    service.read("/v1/structures/three-dof/history?limit=1000").await["items"].as_array().unwrap().len()
+}
+
+async fn metric(service: &Service, line: &str) -> f64 {
+    let text = service.get("/metrics").send().await.unwrap().text().await.unwrap();
+    let found = text.lines().find_map(|l| l.strip_prefix(line)).unwrap_or_else(|| panic!("no {line} in {text}"));
+    found.trim().parse().unwrap()
+}
+
+fn codes(list: &Value) -> Vec<&str> {
+    list.as_array().unwrap().iter().map(|reason| reason["code"].as_str().unwrap()).collect()
+}
+
+#[tokio::test]
+async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("config.toml");
+    let data = folder.path().join("data");
+    std::fs::write(&config, "").unwrap();
+    let service = Service::spawn(command(&data).arg("--config").arg(&config));
+    with_past(&service, 2).await;
+    // As if the disk had filled up: the floor is above what any disk has.
+    std::fs::write(&config, "[store]\nmin_free_bytes = 9000000000000000000\n").unwrap();
+    service.signal("HUP");
+    let refused = wait_for_status(&service, 507).await;
+    let stored = history(&service).await;
+    assert_eq!(refused.headers()["retry-after"], "30");
+    let refused = problem(refused, 507, "disk_full").await;
+    assert!(refused["detail"].as_str().unwrap().contains("send it again"), "{refused}");
+    let structure = json!({ "batches": ["x"] });
+    assert_ne!(service.post("/v1/structures/three-dof/baseline", &structure).await.status(), 500);
+    problem(service.post("/v1/backups", &json!({})).await, 507, "disk_full").await;
+    let ready = service.get("/readyz").send().await.unwrap();
+    assert_eq!(ready.status(), 503);
+    let ready: Value = ready.json().await.unwrap();
+    assert_eq!((&ready["ready"], codes(&ready["reasons"])), (&json!(false), vec!["disk_full"]), "{ready}");
+    assert_eq!(service.read("/healthz").await["status"], "alive");
+    assert_eq!(history(&service).await, stored);
+    assert!(metric(&service, "modalwatch_ready ").await < 0.5);
+    assert!(metric(&service, "modalwatch_write_failures_total{cause=\"disk_full\"} ").await >= 1.0);
+
+    std::fs::write(&config, "").unwrap();
+    service.signal("HUP");
+    wait_for_status(&service, 201).await;
+    assert_eq!(service.read("/readyz").await["ready"], true);
+    assert!(metric(&service, "modalwatch_ready ").await > 0.5);
+}
+
+/// Posts batches until one is answered like this: a signal takes its time.
+async fn wait_for_status(service: &Service, status: u16) -> Response {
+    for attempt in 0..100 {
+        let response = post(service, 86_400 * 100 + attempt * 4_000).await;
+        if response.status() == status {
+            return response;
+        }
+        tokio::time::sleep(Duration::from_millis(30)).await;
+    }
+    panic!("no post was answered {status}");
+}
+
+/// A limit on the size of files makes every write of the log fail, until it is lifted: the process is the same throughout.
+#[tokio::test]
+async fn a_disk_that_fails_is_answered_503_and_the_service_heals_by_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let service = command(folder.path());
+    let arguments: Vec<_> = service.get_args().map(|a| a.to_str().unwrap().to_owned()).collect();
+    let mut shell = Command::new("sh");
+    // Ignored, or the limit would end the process.
+    shell.args(["-c", "trap '' XFSZ; exec \"$0\" \"$@\""]).arg(service.get_program()).args(&arguments);
+    shell.env("MODALWATCH__LOG__LEVEL", "off");
+    let service = Service::spawn(&mut shell);
+    with_past(&service, 2).await;
+    let limit = |bytes: &str| {
+        let set =
+            Command::new("prlimit").args(["--pid", &service.pid().to_string(), &format!("--fsize={bytes}:")]).status();
+        assert!(set.unwrap().success());
+    };
+    limit("4096");
+    for round in 0..5 {
+        let refused = post(&service, 86_400 * 50 + round * 4_000).await;
+        let refused = problem(refused, 503, "disk_failed").await;
+        assert!(!refused["detail"].as_str().unwrap().contains('/'), "an internal path: {refused}");
+        let ready: Value = service.get("/readyz").send().await.unwrap().json().await.unwrap();
+        assert_eq!(codes(&ready["reasons"]), ["disk_failed"], "{ready}");
+        assert_eq!(history(&service).await, 4, "a refused batch is in the history");
+    }
+    limit("unlimited");
+    for round in 0..5 {
+        let taken = post(&service, 86_400 * 50 + round * 4_000).await;
+        assert_eq!(taken.status(), 201, "it did not heal: {}", taken.text().await.unwrap());
+    }
+    assert_eq!(service.read("/readyz").await["ready"], true);
+    assert!(metric(&service, "modalwatch_write_failures_total{cause=\"disk_failed\"} ").await >= 5.0);
+    settled(&service).await;
+}
+
+#[tokio::test]
+async fn batches_are_deleted_only_where_it_was_asked_for_and_never_those_of_states_and_alarms() {
+    let (mut service, folder) = spawn();
+    with_past(&service, 8).await;
+    let data_dir = text(folder.path()).to_owned();
+    let ids = async |service: &Service| {
+        let page = service.read("/v1/structures/three-dof/history?limit=1000").await;
+        page["items"].as_array().unwrap().iter().map(|i| i["batch"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+    };
+    let all = ids(&service).await;
+    assert_eq!(all.len(), 10);
+    let plan = service.read("/v1/retention").await;
+    assert_eq!((&plan["measurements_days"], &plan["would_delete"]), (&json!(0), &json!([])), "{plan}");
+    // Of ten batches, two are the undamaged state and the damaged ones belong to the alarm that lasts.
+    let alarms = service.read("/v1/structures/three-dof/alarms").await;
+    let opened = alarms["items"][0]["opened_batch"].as_str().unwrap().to_owned();
+    let first_of_alarm = all.iter().position(|id| *id == opened).unwrap();
+    let expected: Vec<String> = all[2..first_of_alarm].to_vec();
+    assert!(!expected.is_empty(), "{alarms}");
+    let plan = service.read("/v1/retention?days=1").await;
+    assert_eq!(plan["would_delete"][0]["batches"], expected.len(), "{plan}");
+    problem(service.get("/v1/retention?days=-1").send().await.unwrap(), 422, "invalid").await;
+    service.stop("TERM");
+
+    let dry = run(&["retention", "--dry-run", "--days", "1", "--data-dir", &data_dir]).await;
+    let dry: Value = serde_json::from_str(&dry).unwrap();
+    assert_eq!(dry["would_delete"], plan["would_delete"]);
+    let mut service = Service::start(folder.path());
+    assert_eq!(ids(&service).await, all, "a dry run, or a start without the setting, deleted something");
+    service.stop("TERM");
+
+    let mut deleting = command(folder.path());
+    deleting.env("MODALWATCH__RETENTION__MEASUREMENTS_DAYS", "1").env("MODALWATCH__RETENTION__EVERY_S", "1");
+    let service = Service::spawn(&mut deleting);
+    let kept: Vec<String> = all.iter().filter(|id| !expected.contains(id)).cloned().collect();
+    for _ in 0..200 {
+        if ids(&service).await == kept {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    assert_eq!(ids(&service).await, kept);
+    let deleted = metric(&service, "modalwatch_retention_deleted_batches_total ").await;
+    assert!((deleted - expected.len() as f64).abs() < 0.5, "{deleted}");
+    let gone = format!("/v1/structures/three-dof/batches/{}", expected[0]);
+    problem(service.get(&gone).send().await.unwrap(), 404, "unknown_batch").await;
+    let still = service.read("/v1/structures/three-dof/alarms?state=open").await;
+    assert_eq!(still["items"].as_array().unwrap().len(), alarms["items"].as_array().unwrap().len(), "{still}");
+    let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 86_400 * 40)).await;
+    assert_eq!(batch["assessment"]["undamaged_version"], 1, "{batch}");
+}

@@ -1,0 +1,108 @@
+//! A service with a past, everything it answers, and commands run beside it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::{json, Value};
+
+use crate::helpers::{created, measurements, Service};
+
+/// The program with arguments.
+pub fn program(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    command.args(arguments);
+    command
+}
+
+/// Runs a command that must succeed; what it printed.
+pub async fn run(arguments: &[&str]) -> String {
+    let output = output(arguments).await;
+    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{arguments:?}: {out}{err}");
+    out.into_owned()
+}
+
+/// Runs a command that must fail; what it said.
+pub async fn fails(arguments: &[&str]) -> String {
+    let output = output(arguments).await;
+    let text = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert_eq!(output.status.code(), Some(1), "{arguments:?} should fail: {text}");
+    text
+}
+
+async fn output(arguments: &[&str]) -> Output {
+    let mut command = program(arguments);
+    // The service answers on the same runtime as the test's client.
+    tokio::task::spawn_blocking(move || command.output().unwrap()).await.unwrap()
+}
+
+pub fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// A structure with an undamaged state, `later` batches of which the last are damaged, an acknowledged alarm and a maintenance
+/// window.
+pub async fn with_past(service: &Service, later: usize) {
+    let first = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
+    let second = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 86_400)).await;
+    let window = json!({ "from": "2026-01-10T00:00:00Z", "to": "2026-01-11T00:00:00Z", "reason": "new bearings" });
+    created(service.post("/v1/structures/three-dof/maintenance", &window).await).await;
+    let batches = json!({ "batches": [first["batch"], second["batch"]] });
+    created(service.post("/v1/structures/three-dof/baseline", &batches).await).await;
+    for i in 0..later {
+        let k2 = if i * 2 < later { 5.0 } else { 4.0 };
+        service.post_batch("three-dof", &measurements([4.0, k2, 6.0], 10, 86_400 * (i + 2))).await;
+    }
+    settled(service).await;
+    let open = service.read("/v1/structures/three-dof/alarms?state=open").await;
+    let alarm = open["items"][0]["alarm"].as_i64().unwrap_or_else(|| panic!("no alarm: {open}"));
+    let seen = json!({ "by": "Ida", "note": "on my way" });
+    let path = format!("/v1/structures/three-dof/alarms/{alarm}/acknowledgement");
+    assert!(service.post(&path, &seen).await.status().is_success());
+}
+
+/// Waits until no batch waits for its assessment.
+pub async fn settled(service: &Service) {
+    for _ in 0..400 {
+        let page = service.read("/v1/structures/three-dof/history?limit=1000").await;
+        if page["items"].as_array().unwrap().iter().all(|item| item["state"] == "assessed") {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(25)).await;
+    }
+    panic!("some batches were not assessed");
+}
+
+/// Everything that a service answers about `three-dof`, by path.
+pub async fn answers(service: &Service) -> BTreeMap<String, Value> {
+    let mut all = BTreeMap::new();
+    let history = "/v1/structures/three-dof/history?limit=1000";
+    let page = service.read(history).await;
+    for item in page["items"].as_array().unwrap() {
+        let path = format!("/v1/structures/three-dof/batches/{}", item["batch"].as_str().unwrap());
+        let answer = service.read(&path).await;
+        all.insert(path, answer);
+    }
+    all.insert(history.to_owned(), page);
+    for path in ["", "/exceedances", "/alarms", "/charts?limit=1000", "/maintenance", "/diagnoses"] {
+        let path = format!("/v1/structures/three-dof{path}");
+        let answer = service.read(&path).await;
+        all.insert(path, answer);
+    }
+    let structures = service.read("/v1/structures").await;
+    all.insert("/v1/structures".to_owned(), structures);
+    all
+}
+
+/// Takes away fields of that name at every depth.
+pub fn without(value: &mut Value, fields: &[&str]) {
+    match value {
+        Value::Object(members) => {
+            members.retain(|name, _| !fields.contains(&name.as_str()));
+            members.values_mut().for_each(|member| without(member, fields));
+        }
+        Value::Array(items) => items.iter_mut().for_each(|item| without(item, fields)),
+        _ => {}
+    }
+}
