@@ -63,12 +63,27 @@ pub fn columns(values: &[f64]) -> Vec<(f64, f64, f64)> {
 ///
 /// Empty without two different values. Source: Silverman (1986), Density Estimation, Eq. 3.31.
 pub fn kernel(values: &[f64]) -> Vec<(f64, f64)> {
-    let Some(Spread { values, low, high, quartiles, std }) = Spread::of(values) else { return Vec::new() };
-    // Where half of the values are the same, their quartiles say nothing of a width.
-    let scale = if quartiles > 0.0 { std.min(quartiles / 1.34) } else { std };
-    let h = 0.9 * scale * (values.len() as f64).powf(-0.2);
-    let at = |x: f64| values.iter().map(|v| normal(x, *v, h)).sum::<f64>() / values.len() as f64;
-    grid(low - 3.0 * h, high + 3.0 * h).map(|x| (x, at(x))).collect()
+    let Some(spread) = Spread::of(values) else { return Vec::new() };
+    let (h, low, high) = (spread.bandwidth(), spread.low, spread.high);
+    let density = kernel_density(spread);
+    grid(low - 3.0 * h, high + 3.0 * h).map(|x| (x, density(x))).collect()
+}
+
+/// The density of [`kernel`] at places of one's own; `None` without two different values.
+pub fn kernel_at(values: &[f64], places: &[f64]) -> Option<Vec<f64>> {
+    let density = kernel_density(Spread::of(values)?);
+    Some(places.iter().map(|x| density(*x)).collect())
+}
+
+fn kernel_density(mut spread: Spread) -> impl Fn(f64) -> f64 {
+    let h = spread.bandwidth();
+    spread.values.sort_by(f64::total_cmp);
+    let values = spread.values;
+    move |x| {
+        // A kernel is below 1e-17 of its height beyond nine bandwidths.
+        let near = values.partition_point(|v| *v < x - 9.0 * h)..values.partition_point(|v| *v <= x + 9.0 * h);
+        values[near].iter().map(|v| normal(x, *v, h)).sum::<f64>() / values.len() as f64
+    }
 }
 
 /// The density of a normal distribution over four standard deviations to both sides.
@@ -79,7 +94,8 @@ pub fn normal_curve(mean: f64, std: f64) -> Vec<(f64, f64)> {
     grid(mean - 4.0 * std, mean + 4.0 * std).map(|x| (x, normal(x, mean, std))).collect()
 }
 
-fn normal(x: f64, mean: f64, std: f64) -> f64 {
+/// Density of a normal distribution at `x`.
+pub fn normal(x: f64, mean: f64, std: f64) -> f64 {
     (-0.5 * ((x - mean) / std).powi(2)).exp() / (std * (2.0 * PI).sqrt())
 }
 
@@ -98,6 +114,13 @@ struct Spread {
 }
 
 impl Spread {
+    /// Bandwidth of Gaussian kernels.
+    fn bandwidth(&self) -> f64 {
+        // Where half of the values are the same, their quartiles say nothing of a width.
+        let scale = if self.quartiles > 0.0 { self.std.min(self.quartiles / 1.34) } else { self.std };
+        0.9 * scale * (self.values.len() as f64).powf(-0.2)
+    }
+
     fn of(values: &[f64]) -> Option<Self> {
         let values: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
         let std = stats::sample_std(&values)?;

@@ -2,7 +2,9 @@
 
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
-use modalwatch::store::{Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, Store};
+use modalwatch::store::{
+    Acknowledgement, Episode, EventFilter, MaintenanceWindow, NewChartPoint, Secret, Store, WebhookRecord,
+};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
 
@@ -161,4 +163,83 @@ async fn silence_is_one_alarm_until_something_comes() {
     assert!(store.set_silent(&bridge(), None, at(120)).await.unwrap());
     let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
     assert_eq!((episode.kind.as_str(), episode.opened_at, episode.ended_at), ("silence", at(10), Some(at(120))));
+}
+
+/// What the outbox has for a webhook that wants everything, oldest first.
+async fn told(store: &Store) -> Vec<String> {
+    let mut found = store.deliveries("hook", None, None, 100).await.unwrap();
+    found.reverse();
+    found.into_iter().map(|d| format!("{} {}", d.event.kind, d.event.alarm)).collect()
+}
+
+async fn opened_with_a_webhook() -> (Store, tempfile::TempDir) {
+    let (store, folder) = opened().await;
+    let webhook = WebhookRecord {
+        id: "hook".to_owned(),
+        url: "https://example.org".to_owned(),
+        secret: Secret::new("whsec_AA==".to_owned()),
+        previous_secret: None,
+        filter: EventFilter::default(),
+        enabled: true,
+        created_at: at(0),
+        updated_at: at(0),
+    };
+    assert!(store.insert_webhook(webhook.clone(), 1).await.unwrap());
+    assert!(!store.insert_webhook(WebhookRecord { id: "second".to_owned(), ..webhook }, 1).await.unwrap());
+    (store, folder)
+}
+
+#[tokio::test]
+async fn each_change_of_an_alarm_is_told_once_and_writing_it_again_is_no_change() {
+    let (store, _folder) = opened_with_a_webhook().await;
+    chart(&store, "b1", 1_000, 0.0).await;
+    chart(&store, "b3", 3_000, 4.0).await;
+    assert_eq!(told(&store).await, ["alarm.opened 1"]);
+    // It lasts, rises, is assessed again, and gets an earlier beginning: the same alarm.
+    chart(&store, "b4", 4_000, 6.0).await;
+    assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 4.0).await;
+    assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 4.5).await;
+    chart(&store, "b2", 2_000, 5.0).await;
+    assert_eq!(episodes(&store).await.len(), 1);
+    assert_eq!(told(&store).await, ["alarm.opened 1"]);
+    let seen = Acknowledgement { at: at(6_000), by: "night shift".to_owned(), note: None };
+    for _ in 0..2 {
+        store.acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
+    }
+    chart(&store, "b5", 5_000, 0.0).await;
+    chart(&store, "b6", 6_000, 0.0).await;
+    let so_far = ["alarm.opened 1", "alarm.acknowledged 1", "alarm.ended 1"];
+    assert_eq!(told(&store).await, so_far);
+    // Its end moves, but it has ended before and after.
+    assess(&store, "b5", batch("b5", 5_000, 1).time_span(), 0.1).await;
+    assert_eq!(told(&store).await, so_far);
+    // A corrected batch shows that it lasts, another that it has ended all the same.
+    assess(&store, "b6", batch("b6", 6_000, 1).time_span(), 7.0).await;
+    assert_eq!(told(&store).await[3..], ["alarm.reopened 1"]);
+    let facts = store.deliveries("hook", None, None, 1).await.unwrap().remove(0).event.facts;
+    assert!(facts.contains("\"ended_at_us\":null") && facts.contains("\"peak_shift\":7.0"), "{facts}");
+}
+
+#[tokio::test]
+async fn an_alarm_that_was_none_is_withdrawn_and_one_found_in_the_past_is_told_with_its_end() {
+    let (store, _folder) = opened_with_a_webhook().await;
+    chart(&store, "b1", 1_000, 4.0).await;
+    chart(&store, "b2", 2_000, 0.0).await;
+    assess(&store, "b1", batch("b1", 1_000, 1).time_span(), 1.0).await;
+    assert_eq!(told(&store).await, ["alarm.opened 1", "alarm.withdrawn 1"]);
+    for (i, shift) in [0.0, 0.0, 0.0, 0.0].into_iter().enumerate() {
+        chart(&store, &format!("c{i}"), 10_000 + 1_000 * i as i64, shift).await;
+    }
+    chart(&store, "late", 9_500, 8.0).await;
+    assert_eq!(told(&store).await[2..], ["alarm.opened 2", "alarm.ended 2"]);
+    assert_eq!(store.prune_outbox(at(1_000_000_000)).await.unwrap(), 0, "what waits is not forgotten");
+}
+
+#[tokio::test]
+async fn silence_is_told_when_it_begins_and_when_it_ends() {
+    let (store, _folder) = opened_with_a_webhook().await;
+    for since in [Some(at(5)), Some(at(5)), None, None] {
+        store.set_silent(&bridge(), since, at(100)).await.unwrap();
+    }
+    assert_eq!(told(&store).await, ["alarm.opened 1", "alarm.ended 1"]);
 }

@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod alarms;
+mod jobs;
+mod series;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;

@@ -1,0 +1,124 @@
+//! `/v1/events`: what happens, as server-sent events.
+
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::{HeaderName, StatusCode};
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream::{self, Stream};
+use tokio::sync::broadcast;
+use tokio::sync::broadcast::error::RecvError;
+
+use super::access::AccessControl;
+use super::error::ApiError;
+use super::openapi::StreamBusy;
+use super::Shared;
+use crate::access::Grant;
+use crate::monitor::events::News;
+use crate::quantity::StructureId;
+
+/// Streams at a time.
+pub const MOST_STREAMS: usize = 64;
+
+/// Time between two comments that keep proxies from closing a stream on which nothing happens.
+const KEEP_ALIVE: Duration = Duration::from_secs(15);
+
+/// Seconds after which a place may be free.
+const RETRY_AFTER_S: u32 = 10;
+
+/// Seconds after which a service that stops may be there again.
+const RETRY_AFTER_STOP_S: u32 = 5;
+
+/// Asks proxies such as nginx to pass events on at once.
+const NO_BUFFERING: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
+
+/// `GET /v1/events`: what happens to the structures that the token may see; a stream that ends with the
+/// token, or when the service stops. A client that is too slow misses events, is told so by an
+/// event `resync`, and goes on with what happens then.
+///
+/// # Errors
+/// 503 when there are too many streams, or the service stops.
+#[utoipa::path(
+    get, path = "/v1/events", tag = "results", operation_id = "watch_events",
+    summary = "What happens, as it happens",
+    description = "Server-sent events of the structures that the token may see: `batch`, `alarm`, `job` and `structure`, each with \
+                   a line of JSON, and `resync` for a client that was too slow and missed some. A comment comes every 15 s. \
+                   The stream ends with the token, or when the service stops.",
+    responses((status = 200, description = "The events", body = String, content_type = "text/event-stream"), StreamBusy)
+)]
+pub async fn events(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
+    let place = Arc::clone(&shared.streams).try_acquire_owned().map_err(|_| {
+        let detail = format!("{MOST_STREAMS} event streams are open, which is the most: close one, or ask again later");
+        ApiError::unavailable("too_many_streams", detail, RETRY_AFTER_S)
+    })?;
+    let news = shared.monitor.events().watch().ok_or_else(|| {
+        ApiError::unavailable("stopping", "the service stops: ask again when it is back", RETRY_AFTER_STOP_S)
+    })?;
+    let body = Sse::new(stream_of(news, move |about| holds(&shared.access, &grant, about), place))
+        .keep_alive(KeepAlive::new().interval(KEEP_ALIVE).text("still here"));
+    Ok((StatusCode::OK, [NO_BUFFERING], body).into_response())
+}
+
+/// The events of a watcher, as long as the bus is open and `may_see` answers; `place` is held until then.
+fn stream_of<P: Send>(
+    news: broadcast::Receiver<News>,
+    may_see: impl Fn(Option<&StructureId>) -> Option<bool> + Send,
+    place: P,
+) -> impl Stream<Item = Result<Event, Infallible>> + Send {
+    stream::unfold((news, may_see, place), |(mut news, may_see, place)| async move {
+        let event = loop {
+            let Ok(received) = tokio::time::timeout(KEEP_ALIVE, news.recv()).await else {
+                may_see(None)?;
+                continue;
+            };
+            match received {
+                Ok(news) if may_see(Some(news.structure()))? => {
+                    break Event::default().event(news.name()).json_data(&news).expect("news are plain data");
+                }
+                Ok(_) => {}
+                Err(RecvError::Lagged(_)) => break Event::default().event("resync").data("{}"),
+                Err(RecvError::Closed) => return None,
+            }
+        };
+        Some((Ok(event), (news, may_see, place)))
+    })
+}
+
+/// Whether the token may see the structure; `None` once it was revoked or has expired.
+fn holds(access: &AccessControl, grant: &Grant, structure: Option<&StructureId>) -> Option<bool> {
+    access.still_holds(grant).then(|| structure.is_none_or(|id| grant.may_see(id)))
+}
+
+#[cfg(test)]
+mod tests {
+    use http_body_util::BodyExt as _;
+
+    use super::*;
+    use crate::monitor::events::Events;
+
+    #[tokio::test]
+    async fn a_slow_watcher_is_told_so_once_and_goes_on_with_the_newest() {
+        let events = Events::default();
+        let slow = events.watch().unwrap();
+        let structure = |i: i32| StructureId::parse(&format!("s{i}")).unwrap();
+        for i in 0..5_000 {
+            events.publish(News::Structure { structure: structure(i) });
+        }
+        events.close();
+        let body = Sse::new(stream_of(slow, |_| Some(true), ()))
+            .into_response()
+            .into_body()
+            .collect()
+            .await
+            .unwrap()
+            .to_bytes();
+        let text = String::from_utf8(body.to_vec()).unwrap();
+        assert!(text.starts_with("event: resync\ndata: {}\n\nevent: structure\ndata: "), "{}", &text[..200]);
+        assert_eq!(text.matches("event: resync").count(), 1);
+        assert!(text.ends_with("event: structure\ndata: {\"structure\":\"s4999\"}\n\n"));
+        assert!(events.watch().is_none(), "a closed bus takes no watcher");
+    }
+}

@@ -1,0 +1,346 @@
+//! `/v1/structures/{id}/series`: all that can be drawn over time, short enough for a screen.
+
+use std::collections::BTreeMap;
+
+use axum::extract::State;
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+
+use super::error::ApiError;
+use super::openapi::{Invalid, StructurePath, Unknown};
+use super::request::{structure_id, ApiPath, ApiQuery, Window};
+use super::Shared;
+use crate::damage::{QuantityKind, UndamagedState};
+use crate::measurement::CovariateKind;
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::reduction::{Reduced, Row};
+use crate::store::{
+    ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
+};
+use crate::trust::{Code, Verdict};
+
+/// Points unless the client asks for another number.
+const DEFAULT_POINTS: usize = 1_000;
+/// Fewest and most points.
+const POINTS: [usize; 2] = [10, 5_000];
+/// Most alarms looked through, the newest.
+const MOST_ALARMS: usize = 1_000;
+
+/// Query of the series.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct SeriesQuery {
+    /// Batches that begin at this time or later.
+    #[param(value_type = Option<String>, format = DateTime)]
+    from: Option<String>,
+    /// Batches that begin before this time; it must be after `from`.
+    #[param(value_type = Option<String>, format = DateTime)]
+    to: Option<String>,
+    /// About how many points a series may have; 1000 without.
+    #[param(value_type = Option<u32>, minimum = 10, maximum = 5000)]
+    points: Option<String>,
+}
+
+/// All that can be drawn over time.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Series)]
+struct SeriesBody {
+    structure: StructureId,
+    /// As asked for; else the first and the last measurement.
+    #[schema(required)]
+    from: Option<Timestamp>,
+    #[schema(required)]
+    to: Option<Timestamp>,
+    batches: u64,
+    measurements: u64,
+    /// True when not every row of every series is there.
+    reduced: bool,
+    /// Every how many measurements one was looked at; only where there are too many for all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    thinned_to_every: Option<u64>,
+    frequencies: Frequencies,
+    parameters: Vec<Track>,
+    charts: Vec<Chart>,
+    trust: Vec<TrustPoint>,
+    alarms: Vec<AlarmSpan>,
+    maintenance: Vec<MaintenanceSpan>,
+}
+
+/// One entry a kept measurement, in `values_hz` with one value a mode; entries without any value are gaps in time.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = FrequencySeries)]
+struct Frequencies {
+    modes: usize,
+    nominal_hz: Vec<f64>,
+    times: Vec<Timestamp>,
+    values_hz: Vec<Vec<Option<f64>>>,
+    covariates: BTreeMap<String, Vec<Option<f64>>>,
+}
+
+/// A monitored quantity; `low` and `high` are the ends of the 90 % interval of the mean.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ParameterSeries)]
+struct Track {
+    name: String,
+    unit: String,
+    kind: QuantityKind,
+    #[schema(required)]
+    threshold: Option<f64>,
+    #[schema(required)]
+    undamaged_mean: Option<f64>,
+    times: Vec<Timestamp>,
+    batches: Vec<String>,
+    mean: Vec<Option<f64>>,
+    low: Vec<Option<f64>>,
+    high: Vec<Option<f64>>,
+    probability_of_damage: Vec<Option<f64>>,
+    pod_low: Vec<Option<f64>>,
+    pod_high: Vec<Option<f64>>,
+}
+
+/// A control chart, one entry a batch.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ChartSeries)]
+struct Chart {
+    chart: String,
+    times: Vec<Timestamp>,
+    batches: Vec<String>,
+    shift: Vec<Option<f64>>,
+    shift_limit: Vec<f64>,
+    ewma: Vec<Option<f64>>,
+    ewma_limit: Vec<Option<f64>>,
+    held: Vec<bool>,
+    state: Vec<String>,
+}
+
+/// Whether a batch was accepted.
+#[derive(Debug, Serialize, ToSchema)]
+struct TrustPoint {
+    time: Timestamp,
+    batch: String,
+    verdict: Verdict,
+    findings: Vec<Code>,
+    #[schema(required)]
+    p_value: Option<f64>,
+}
+
+/// An alarm, from its opening to its end.
+#[derive(Debug, Serialize, ToSchema)]
+struct AlarmSpan {
+    alarm: i64,
+    kind: String,
+    #[schema(required)]
+    parameter: Option<String>,
+    opened_at: Timestamp,
+    #[schema(required)]
+    ended_at: Option<Timestamp>,
+    state: &'static str,
+}
+
+/// A time without alarms.
+#[derive(Debug, Serialize, ToSchema)]
+struct MaintenanceSpan {
+    from: Timestamp,
+    to: Timestamp,
+    reason: String,
+}
+
+/// `GET /v1/structures/{id}/series`: frequencies, parameters, charts, trust, alarms and maintenance of the batches that begin
+/// in a window.
+///
+/// # Errors
+/// 404 for the structure, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/series", tag = "results", operation_id = "read_series",
+    summary = "All that can be drawn over time",
+    description = "Frequencies, parameters, charts, trust, alarms and maintenance of the batches that begin in a window. Long \
+                   series are reduced; the extremes of each piece are kept.",
+    params(StructurePath, SeriesQuery),
+    responses((status = 200, description = "The series", body = SeriesBody), Unknown, Invalid)
+)]
+pub async fn series(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    ApiQuery(query): ApiQuery<SeriesQuery>,
+) -> Result<Response, ApiError> {
+    let id = structure_id(&id)?;
+    let watched = shared.monitor.structure(&id)?;
+    let window = window(&query)?;
+    // A long window keeps three connections of the store busy: others have to find one free.
+    let _turn = shared.series.acquire().await.map_err(|e| ApiError::internal(&e))?;
+    let store = shared.monitor.store();
+    let extent = store.extent(&id, window).await?;
+    let (from, to) = (window.from.or(extent.measured.map(|m| m.0)), window.to.or(extent.measured.map(|m| m.1)));
+
+    let (modes, declared) = (watched.simulator.modes(), watched.simulator.covariates().iter());
+    let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
+    let (measured, quantities, (charts, trust)) = tokio::try_join!(
+        store.frequency_series(&id, window, &extent, modes, &names),
+        store.quantity_series(&id, window, &extent),
+        async {
+            let charts = store.chart_series(&id, window, &extent).await?;
+            Ok((charts, store.trust_series(&id, window, &extent).await?))
+        },
+    )?;
+    let reduced = measured.reduced
+        || trust.reduced
+        || extent.stride() > 1
+        || quantities.iter().any(|q| q.batches.reduced)
+        || charts.iter().any(|c| c.points.reduced);
+
+    // Its levels are drawn where batches are compared with it.
+    let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
+    let undamaged = store.undamaged(&id).await?.filter(|u| in_use == Some(&u.model_digest)).map(|u| u.state);
+    let within = |begin: Timestamp, end: Option<Timestamp>| {
+        to.is_none_or(|to| begin <= to) && from.is_none_or(|from| end.is_none_or(|end| end >= from))
+    };
+    let episodes = store.episodes(&id, None, false, MOST_ALARMS).await?;
+    let maintenance = store.maintenance(&id).await?;
+    let body = SeriesBody {
+        from,
+        to,
+        batches: extent.batches,
+        measurements: extent.measurements,
+        reduced,
+        thinned_to_every: Some(extent.stride()).filter(|stride| *stride > 1),
+        frequencies: frequencies(measured, watched.simulator.nominal_frequencies_hz(), &names)?,
+        parameters: quantities.into_iter().map(|q| track(q, undamaged.as_ref())).collect::<Result<_, _>>()?,
+        charts: charts.into_iter().map(chart).collect::<Result<_, _>>()?,
+        trust: trust.rows.into_iter().map(trust_point).collect::<Result<_, _>>()?,
+        alarms: episodes.into_iter().filter(|e| !e.withdrawn && within(e.opened_at, e.ended_at)).map(alarm).collect(),
+        maintenance: maintenance.into_iter().filter(|w| within(w.from, Some(w.to))).map(maintenance_span).collect(),
+        structure: id,
+    };
+    Ok(([(header::CACHE_CONTROL, "no-store")], Json(body)).into_response())
+}
+
+fn window(query: &SeriesQuery) -> Result<SeriesWindow, ApiError> {
+    let Window { from, to } = Window::of(query.from.as_deref(), query.to.as_deref())?;
+    if let (Some(from), Some(to)) = (from, to) {
+        if to <= from {
+            return Err(ApiError::invalid_field("query/to", format!("{to} is not after {from}, which is query/from")));
+        }
+    }
+    let points = match query.points.as_deref() {
+        None => DEFAULT_POINTS,
+        Some(text) => text.parse().ok().filter(|n| (POINTS[0]..=POINTS[1]).contains(n)).ok_or_else(|| {
+            let message = format!("{} must be a whole number from {} to {}", shown(text), POINTS[0], POINTS[1]);
+            ApiError::invalid_field("query/points", message)
+        })?,
+    };
+    Ok(SeriesWindow { from, to, points })
+}
+
+/// Measurements with an empty entry in each gap.
+fn frequencies(measured: Reduced<()>, nominal_hz: Vec<f64>, covariates: &[String]) -> Result<Frequencies, ApiError> {
+    let modes = nominal_hz.len();
+    let entries = measured.rows.len() + measured.gaps.len();
+    let (mut times, mut values_hz) = (Vec::with_capacity(entries), Vec::with_capacity(entries));
+    let mut of_covariates = vec![Vec::with_capacity(entries); covariates.len()];
+    let mut gaps = measured.gaps.into_iter().peekable();
+    let mut put = |time_us: i64, values: Vec<Option<f64>>| {
+        times.push(time(time_us)?);
+        of_covariates.iter_mut().zip(&values[modes..]).for_each(|(column, value)| column.push(*value));
+        values_hz.push(values[..modes].to_vec());
+        Ok::<_, ApiError>(())
+    };
+    for (index, row) in measured.rows.iter().enumerate() {
+        if let Some((middle, _)) = gaps.next_if(|(_, behind)| *behind == index) {
+            put(middle, vec![None; modes + covariates.len()])?;
+        }
+        put(row.time_us, row.values.iter().copied().map(number).collect())?;
+    }
+    let covariates = covariates.iter().cloned().zip(of_covariates).collect();
+    Ok(Frequencies { modes, nominal_hz, times, values_hz, covariates })
+}
+
+fn track(series: QuantitySeries, undamaged: Option<&UndamagedState>) -> Result<Track, ApiError> {
+    let state = undamaged.and_then(|state| state.quantities.iter().find(|q| q.name == series.name));
+    let rows = series.batches.rows;
+    let [mean, probability_of_damage] = columns(&rows);
+    let times = times(&rows)?;
+    let column = |of: fn(&QuantityMark) -> Option<f64>| rows.iter().map(|row| of(&row.tag)).collect();
+    Ok(Track {
+        name: series.name,
+        unit: series.unit,
+        kind: series.kind,
+        threshold: state.and_then(|q| q.threshold),
+        undamaged_mean: state.map(|q| q.mean),
+        times,
+        mean,
+        low: column(|mark| mark.mean_interval[0]),
+        high: column(|mark| mark.mean_interval[1]),
+        probability_of_damage,
+        pod_low: column(|mark| mark.probability_interval[0]),
+        pod_high: column(|mark| mark.probability_interval[1]),
+        batches: rows.into_iter().map(|row| row.tag.batch).collect(),
+    })
+}
+
+fn chart(series: ChartSeries) -> Result<Chart, ApiError> {
+    let rows = series.points.rows;
+    let [shift, ewma] = columns(&rows);
+    let mut chart = Chart {
+        chart: series.chart,
+        times: times(&rows)?,
+        batches: Vec::with_capacity(rows.len()),
+        shift,
+        shift_limit: Vec::with_capacity(rows.len()),
+        ewma,
+        ewma_limit: Vec::with_capacity(rows.len()),
+        held: Vec::with_capacity(rows.len()),
+        state: Vec::with_capacity(rows.len()),
+    };
+    for row in rows {
+        let ChartMark { batch, shift_limit, ewma_limit, held, state } = row.tag;
+        chart.batches.push(batch);
+        chart.shift_limit.push(shift_limit);
+        chart.ewma_limit.push(ewma_limit);
+        chart.held.push(held);
+        chart.state.push(state);
+    }
+    Ok(chart)
+}
+
+fn trust_point(row: Row<TrustMark>) -> Result<TrustPoint, ApiError> {
+    let TrustMark { batch, verdict, findings } = row.tag;
+    let p_value = row.values.first().copied().and_then(number);
+    Ok(TrustPoint { time: time(row.time_us)?, batch, verdict, findings, p_value })
+}
+
+fn alarm(episode: Episode) -> AlarmSpan {
+    AlarmSpan {
+        alarm: episode.number,
+        state: episode.state(),
+        parameter: (episode.kind == "damage").then_some(episode.series),
+        kind: episode.kind,
+        opened_at: episode.opened_at,
+        ended_at: episode.ended_at,
+    }
+}
+
+fn maintenance_span(window: MaintenanceWindow) -> MaintenanceSpan {
+    MaintenanceSpan { from: window.from, to: window.to, reason: window.reason }
+}
+
+/// The first N values of each row as columns.
+fn columns<T, const N: usize>(rows: &[Row<T>]) -> [Vec<Option<f64>>; N] {
+    std::array::from_fn(|channel| rows.iter().map(|row| number(row.values[channel])).collect())
+}
+
+fn times<T>(rows: &[Row<T>]) -> Result<Vec<Timestamp>, ApiError> {
+    rows.iter().map(|row| time(row.time_us)).collect()
+}
+
+fn time(micros: i64) -> Result<Timestamp, ApiError> {
+    Timestamp::from_micros(micros).map_err(|e| ApiError::internal(&e))
+}
+
+/// JSON has no NaN.
+fn number(value: f64) -> Option<f64> {
+    Some(value).filter(|value| value.is_finite())
+}

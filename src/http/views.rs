@@ -1,0 +1,297 @@
+//! What a dashboard shows at a glance: `/v1/overview`, `/v1/jobs`, `/v1/structures/{id}/batches/{batch}/detail`.
+
+use std::sync::Arc;
+
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::error::ApiError;
+use super::openapi::{BatchPath, Busy, Conflict, Invalid, Unknown};
+use super::request::{structure_id, ApiPath};
+use super::Shared;
+use crate::access::Grant;
+use crate::alarm::machine::State as AlarmState;
+use crate::assessment::Assessment;
+use crate::monitor::{BatchDetail, ModeDetail, ParameterDetail, Watched};
+use crate::quantity::{Hertz, StructureId, Timestamp};
+use crate::store::{JobKind, JobRecord, JobState, StructureOverview};
+use crate::trust::Verdict;
+
+/// Jobs listed.
+const LISTED_JOBS: usize = 100;
+
+/// All structures at a glance.
+#[derive(Debug, Serialize, ToSchema)]
+struct Overview {
+    items: Vec<OverviewItem>,
+    /// Diagnoses and extensions that run or wait.
+    jobs_running: usize,
+}
+
+/// A structure at a glance.
+#[derive(Debug, Serialize, ToSchema)]
+struct OverviewItem {
+    id: StructureId,
+    /// `normal`, `pending`, `alarming`, `recovering`, `silent`, `unassessed` or `no_model`.
+    state: &'static str,
+    open_alarms: u64,
+    unacknowledged_alarms: u64,
+    #[schema(required)]
+    last_measured_at: Option<Timestamp>,
+    #[schema(required)]
+    last_received_at: Option<Timestamp>,
+    batches: u64,
+    #[schema(required)]
+    latest: Option<Latest>,
+    #[schema(required)]
+    model_digest: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model_missing: Option<String>,
+    #[schema(required)]
+    calibration_passed: Option<bool>,
+    #[schema(required)]
+    undamaged_version: Option<u32>,
+}
+
+/// The assessed batch that was measured last.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = LatestAssessment)]
+struct Latest {
+    batch: String,
+    trust: Verdict,
+    exceeds: bool,
+    #[schema(required)]
+    max_probability_of_damage: Option<f64>,
+    #[schema(required)]
+    max_parameter: Option<String>,
+    findings: usize,
+}
+
+/// Jobs, newest first.
+#[derive(Debug, Serialize, ToSchema)]
+struct JobList {
+    items: Vec<JobItem>,
+}
+
+/// A diagnosis or an extension.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Job)]
+struct JobItem {
+    job: String,
+    structure: StructureId,
+    kind: JobKind,
+    state: JobState,
+    #[schema(required)]
+    progress: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    failure: Option<String>,
+    created_at: Timestamp,
+    #[schema(required)]
+    finished_at: Option<Timestamp>,
+    #[schema(required)]
+    verdict: Option<String>,
+    #[schema(required)]
+    summary: Option<String>,
+}
+
+/// The densities behind a batch, and what they predict.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = BatchDetail)]
+struct DetailBody {
+    structure: StructureId,
+    batch: String,
+    model_digest: String,
+    measurement_count: usize,
+    /// Measurements whose values are in `measured_hz`, evenly chosen.
+    measurements_shown: usize,
+    /// Posterior samples behind the predictions, evenly chosen.
+    simulations: usize,
+    parameters: Vec<ParameterBody>,
+    modes: Vec<ModeBody>,
+}
+
+/// Densities of a parameter, per unit, on one grid.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ParameterDensities)]
+struct ParameterBody {
+    name: String,
+    unit: String,
+    grid: Vec<f64>,
+    prior: Vec<f64>,
+    posterior: Vec<f64>,
+    #[schema(required)]
+    undamaged: Option<Vec<f64>>,
+    #[schema(required)]
+    threshold: Option<f64>,
+}
+
+/// A mode, counted from 1; 90 % of the predicted frequencies lie between `low` and `high`, which hold no noise.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ModeFrequencies)]
+struct ModeBody {
+    mode: usize,
+    measured_hz: Vec<Option<Hertz>>,
+    predicted_mean_hz: f64,
+    predicted_low_hz: f64,
+    predicted_high_hz: f64,
+}
+
+/// `GET /v1/overview`: all structures that the token may see, with the state of their alarms and their newest answer.
+///
+/// # Errors
+/// 500.
+#[utoipa::path(
+    get, path = "/v1/overview", tag = "results", operation_id = "overview",
+    summary = "All structures at a glance",
+    description = "Those that the token may see, each with the state of its alarms and its newest assessment.",
+    responses((status = 200, description = "The structures by id", body = Overview))
+)]
+pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
+    let store = shared.monitor.store();
+    let mut items = Vec::new();
+    for found in store.overview().await?.into_iter().filter(|found| grant.may_see(&found.id)) {
+        let watched = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
+        let assessment = match &found.latest_assessed {
+            Some(batch) => store.assessment(&found.id, batch).await?,
+            None => None,
+        };
+        items.push(item(found, watched, assessment));
+    }
+    let jobs_running = shared.monitor.jobs_running();
+    Ok(Json(Overview { items, jobs_running }).into_response())
+}
+
+fn item(
+    found: StructureOverview,
+    watched: Result<Arc<Watched>, String>,
+    assessment: Option<Assessment>,
+) -> OverviewItem {
+    let baseline = watched.and_then(|watched| watched.baseline.clone());
+    let (baseline, model_missing) = (baseline.as_ref().ok(), baseline.as_ref().err());
+    OverviewItem {
+        state: state(&found, baseline.is_some()),
+        model_digest: baseline.map(|b| b.digest().to_string()),
+        model_missing: model_missing.cloned(),
+        calibration_passed: baseline.map(|b| b.manifest().calibration.passed()),
+        latest: found.latest_assessed.zip(assessment).map(|(batch, assessment)| latest(batch, &assessment)),
+        id: found.id,
+        open_alarms: found.open_alarms,
+        unacknowledged_alarms: found.unacknowledged_alarms,
+        last_measured_at: found.last_measured_at,
+        last_received_at: found.last_received_at,
+        batches: found.batches,
+        undamaged_version: found.undamaged_version,
+    }
+}
+
+/// The one word for a structure: the weightiest of what is true of it.
+fn state(found: &StructureOverview, has_model: bool) -> &'static str {
+    let on_a_chart = |state: AlarmState| found.chart_states.contains(&state);
+    if on_a_chart(AlarmState::Alarming) {
+        AlarmState::Alarming.as_str()
+    } else if on_a_chart(AlarmState::Recovering) {
+        AlarmState::Recovering.as_str()
+    } else if found.silent {
+        AlarmState::Silent.as_str()
+    } else if !has_model {
+        "no_model"
+    } else if found.latest_assessed.is_none() {
+        "unassessed"
+    } else if on_a_chart(AlarmState::Pending) {
+        AlarmState::Pending.as_str()
+    } else {
+        AlarmState::Normal.as_str()
+    }
+}
+
+fn latest(batch: String, assessment: &Assessment) -> Latest {
+    let damages = assessment.quantities.iter().filter_map(|q| Some((q, q.damage.as_ref()?)));
+    let worst = damages.clone().max_by(|(_, a), (_, b)| a.probability_of_damage.total_cmp(&b.probability_of_damage));
+    Latest {
+        batch,
+        trust: assessment.trust.verdict,
+        exceeds: damages.clone().any(|(_, damage)| damage.exceeds),
+        max_probability_of_damage: worst.map(|(_, damage)| damage.probability_of_damage),
+        max_parameter: worst.map(|(quantity, _)| quantity.name.clone()),
+        findings: assessment.trust.findings.len(),
+    }
+}
+
+/// `GET /v1/jobs`: diagnoses and extensions of all structures that the token may see, newest first.
+///
+/// # Errors
+/// 500.
+#[utoipa::path(
+    get, path = "/v1/jobs", tag = "diagnoses", operation_id = "list_jobs",
+    summary = "Jobs", description = "Diagnoses and extensions of all structures that the token may see: the newest hundred, newest first.",
+    responses((status = 200, description = "The jobs", body = JobList))
+)]
+pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
+    let item = |(job, progress): (JobRecord, Option<String>)| JobItem {
+        job: job.id,
+        structure: job.structure,
+        kind: job.kind,
+        state: job.state,
+        progress,
+        failure: job.failure,
+        created_at: job.created_at,
+        finished_at: job.finished_at,
+        verdict: job.verdict,
+        summary: job.summary,
+    };
+    let jobs = shared.monitor.jobs(LISTED_JOBS).await?;
+    let items: Vec<JobItem> = jobs.into_iter().filter(|(job, _)| grant.may_see(&job.structure)).map(item).collect();
+    Ok(Json(JobList { items }).into_response())
+}
+
+/// `GET /v1/structures/{id}/batches/{batch}/detail`: densities and predicted frequencies, drawn as the assessment was.
+///
+/// # Errors
+/// 404 for structure or batch, 409 when it is not assessed, 503 when the queue is full.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/batches/{batch}/detail", tag = "results", operation_id = "read_batch_detail",
+    summary = "A batch in detail",
+    description = "The densities of the parameters, and the frequencies that the posterior predicts beside those measured.",
+    params(BatchPath),
+    responses((status = 200, description = "The densities", body = DetailBody), Unknown, Invalid, Conflict, Busy)
+)]
+pub async fn detail(
+    State(shared): State<Shared>,
+    ApiPath((id, batch)): ApiPath<(String, String)>,
+) -> Result<Response, ApiError> {
+    let id = structure_id(&id)?;
+    let detail = shared.monitor.batch_detail(&id, &batch).await?;
+    Ok(Json(detail_body(id, batch, detail)).into_response())
+}
+
+fn detail_body(structure: StructureId, batch: String, detail: BatchDetail) -> DetailBody {
+    let parameter = |p: ParameterDetail| ParameterBody {
+        name: p.name,
+        unit: p.unit,
+        grid: p.grid,
+        prior: p.prior,
+        posterior: p.posterior,
+        undamaged: p.undamaged,
+        threshold: p.threshold,
+    };
+    let mode = |(index, m): (usize, ModeDetail)| ModeBody {
+        mode: index + 1,
+        measured_hz: m.measured_hz,
+        predicted_mean_hz: m.predicted_mean_hz,
+        predicted_low_hz: m.predicted_interval_hz[0],
+        predicted_high_hz: m.predicted_interval_hz[1],
+    };
+    DetailBody {
+        structure,
+        batch,
+        model_digest: detail.model_digest.to_string(),
+        measurement_count: detail.measurements,
+        measurements_shown: detail.shown,
+        simulations: detail.simulations,
+        parameters: detail.parameters.into_iter().map(parameter).collect(),
+        modes: detail.modes.into_iter().enumerate().map(mode).collect(),
+    }
+}

@@ -1,0 +1,373 @@
+//! Long series made short enough for a screen, without losing what stands out in them.
+//!
+//! The time of a series is cut into buckets of equal length. Of each bucket stay the first and the last row, and for each
+//! channel the rows with the smallest and the largest value and the first row that has none. What was kept does not depend on
+//! the order in which the rows come, but for rows that tie. Memory is that of the kept rows and eight bytes for each row.
+
+use std::sync::Arc;
+
+/// A time without rows counts as a gap when it is longer than so many median spacings.
+pub const GAP_SPACINGS: i64 = 10;
+
+/// Rows that a bucket can keep on behalf of one channel: first, last, smallest, largest, missing.
+const ROLES_OF_ONE_CHANNEL: usize = 5;
+
+/// A row of a series: one value a channel at one time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Row<T> {
+    /// Microseconds since 1970.
+    pub time_us: i64,
+    /// One value a channel; NaN where there is none.
+    pub values: Vec<f64>,
+    /// What the row carries besides.
+    pub tag: T,
+}
+
+/// What is left of a series, in the order of time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Reduced<T> {
+    /// Rows that were kept, as they came.
+    pub rows: Vec<Row<T>>,
+    /// Gaps: the middle of the time without rows, and the index of the kept row behind it.
+    pub gaps: Vec<(i64, usize)>,
+    /// True when rows were left out.
+    pub reduced: bool,
+}
+
+/// Takes the rows of a series one by one and keeps those that a plot needs.
+#[derive(Debug)]
+pub struct Reducer<T> {
+    span: (i64, i64),
+    points: usize,
+    channels: usize,
+    times: Vec<i64>,
+    /// All rows, until they are more than `points`.
+    all: Vec<Arc<Numbered<T>>>,
+    buckets: Vec<Option<Box<Bucket<T>>>>,
+}
+
+/// A row with its number in the order of arrival.
+#[derive(Debug)]
+struct Numbered<T> {
+    number: usize,
+    row: Row<T>,
+}
+
+#[derive(Debug)]
+struct Bucket<T> {
+    first: Arc<Numbered<T>>,
+    last: Arc<Numbered<T>>,
+    smallest: Vec<Option<Arc<Numbered<T>>>>,
+    largest: Vec<Option<Arc<Numbered<T>>>>,
+    missing: Vec<Option<Arc<Numbered<T>>>>,
+}
+
+impl<T> Reducer<T> {
+    /// A reducer of rows between two times, both included. Series of at most `points` rows stay as they are; of longer ones
+    /// stay at most 2·`points` rows for each channel.
+    ///
+    /// A row outside the times counts to the bucket next to it.
+    pub fn new(span: (i64, i64), points: usize, channels: usize) -> Self {
+        Self { span, points, channels, times: Vec::new(), all: Vec::new(), buckets: Vec::new() }
+    }
+
+    /// Number of buckets.
+    pub fn buckets(&self) -> usize {
+        (2 * self.points / ROLES_OF_ONE_CHANNEL).max(1)
+    }
+
+    /// Bucket of a time.
+    pub fn bucket(&self, time_us: i64) -> usize {
+        let (from, to) = self.span;
+        let length = (i128::from(to) - i128::from(from)).max(0) + 1;
+        let place = (i128::from(time_us) - i128::from(from)) * self.buckets() as i128 / length;
+        place.clamp(0, self.buckets() as i128 - 1) as usize
+    }
+
+    /// Takes a row; `tag` is asked for only when the row is kept for now.
+    pub fn push(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> T) {
+        let pushed: Result<(), std::convert::Infallible> = self.try_push(time_us, values, || Ok(tag()));
+        pushed.unwrap_or_else(|never| match never {});
+    }
+
+    /// Takes a row with a tag that can fail.
+    ///
+    /// # Errors
+    /// That of `tag`.
+    pub fn try_push<E>(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> Result<T, E>) -> Result<(), E> {
+        debug_assert_eq!(values.len(), self.channels, "one value a channel");
+        let number = self.times.len();
+        self.times.push(time_us);
+        let whole = || {
+            let row = Row { time_us, values: values.to_vec(), tag: tag()? };
+            Ok(Arc::new(Numbered { number, row }))
+        };
+        if number < self.points {
+            self.all.push(whole()?);
+            return Ok(());
+        }
+        if self.buckets.is_empty() {
+            self.buckets.resize_with(self.buckets(), || None);
+            for kept in std::mem::take(&mut self.all) {
+                let bucket = self.bucket(kept.row.time_us);
+                Bucket::take(&mut self.buckets[bucket], kept.row.time_us, &kept.row.values, || Ok(Arc::clone(&kept)))?;
+            }
+        }
+        let bucket = self.bucket(time_us);
+        Bucket::take(&mut self.buckets[bucket], time_us, values, whole)
+    }
+
+    /// The rows that were kept, and the gaps between them.
+    pub fn finish(mut self) -> Reduced<T> {
+        let mut kept = self.all;
+        kept.extend(self.buckets.into_iter().flatten().flat_map(|bucket| bucket.rows()));
+        kept.sort_by_key(|row| (row.row.time_us, row.number));
+        kept.dedup_by_key(|row| row.number);
+        // Each row was held by one or several places of its bucket, of which one is left.
+        let rows: Vec<Row<T>> = kept.into_iter().filter_map(Arc::into_inner).map(|row| row.row).collect();
+        self.times.sort_unstable();
+        Reduced { gaps: gaps(&self.times, &rows), reduced: rows.len() < self.times.len(), rows }
+    }
+}
+
+impl<T> Bucket<T> {
+    /// Takes a row into the places that it deserves; `row` makes it, at most once.
+    fn take<E>(
+        place: &mut Option<Box<Self>>,
+        time_us: i64,
+        values: &[f64],
+        row: impl FnOnce() -> Result<Arc<Numbered<T>>, E>,
+    ) -> Result<(), E> {
+        let Some(bucket) = place else {
+            let row = row()?;
+            let none = || values.iter().map(|_| None).collect::<Vec<_>>();
+            let mut bucket = Self {
+                first: Arc::clone(&row),
+                last: Arc::clone(&row),
+                smallest: none(),
+                largest: none(),
+                missing: none(),
+            };
+            bucket.places(time_us, values).into_iter().for_each(|place| bucket.put(place, &row));
+            *place = Some(Box::new(bucket));
+            return Ok(());
+        };
+        let places = bucket.places(time_us, values);
+        if !places.is_empty() {
+            let row = row()?;
+            for place in places {
+                bucket.put(place, &row);
+            }
+        }
+        Ok(())
+    }
+
+    /// The places in which a row beats what is there.
+    fn places(&self, time_us: i64, values: &[f64]) -> Vec<Place> {
+        let mut places = Vec::new();
+        if time_us < self.first.row.time_us {
+            places.push(Place::First);
+        }
+        if time_us >= self.last.row.time_us {
+            places.push(Place::Last);
+        }
+        for (channel, value) in values.iter().enumerate() {
+            let held = |place: &Option<Arc<Numbered<T>>>| place.as_ref().map(|held| held.row.values[channel]);
+            if value.is_nan() {
+                let earlier = self.missing[channel].as_ref().is_none_or(|held| time_us < held.row.time_us);
+                places.extend(earlier.then_some(Place::Missing(channel)));
+                continue;
+            }
+            if held(&self.smallest[channel]).is_none_or(|least| *value < least) {
+                places.push(Place::Smallest(channel));
+            }
+            if held(&self.largest[channel]).is_none_or(|most| *value > most) {
+                places.push(Place::Largest(channel));
+            }
+        }
+        places
+    }
+
+    fn put(&mut self, place: Place, row: &Arc<Numbered<T>>) {
+        let row = Arc::clone(row);
+        match place {
+            Place::First => self.first = row,
+            Place::Last => self.last = row,
+            Place::Smallest(channel) => self.smallest[channel] = Some(row),
+            Place::Largest(channel) => self.largest[channel] = Some(row),
+            Place::Missing(channel) => self.missing[channel] = Some(row),
+        }
+    }
+
+    /// The kept rows, each once; this drops all other handles on them.
+    fn rows(self) -> Vec<Arc<Numbered<T>>> {
+        let of_channels = [self.smallest, self.largest, self.missing].into_iter().flatten().flatten();
+        let mut rows: Vec<_> = [self.first, self.last].into_iter().chain(of_channels).collect();
+        rows.sort_by_key(|row| row.number);
+        rows.dedup_by_key(|row| row.number);
+        rows
+    }
+}
+
+/// Why a bucket keeps a row.
+#[derive(Debug, Clone, Copy)]
+enum Place {
+    First,
+    Last,
+    Smallest(usize),
+    Largest(usize),
+    Missing(usize),
+}
+
+/// Longest spacing that is no gap, from the times of all rows, ascending; `None` with fewer than two different times.
+pub fn longest_spacing(times: &[i64]) -> Option<i64> {
+    let mut spacings: Vec<i64> =
+        times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).filter(|spacing| *spacing > 0).collect();
+    if spacings.is_empty() {
+        return None;
+    }
+    let middle = (spacings.len() - 1) / 2;
+    let (_, median, _) = spacings.select_nth_unstable(middle);
+    Some(median.saturating_mul(GAP_SPACINGS))
+}
+
+/// Between each two neighbours of the kept rows, the longest time without rows, if it is a gap.
+fn gaps<T>(times: &[i64], rows: &[Row<T>]) -> Vec<(i64, usize)> {
+    let Some(longest) = longest_spacing(times) else { return Vec::new() };
+    let mut gaps = Vec::new();
+    let mut behind = times.iter().copied().peekable();
+    for (index, pair) in rows.windows(2).enumerate() {
+        let (from, to) = (pair[0].time_us, pair[1].time_us);
+        while behind.next_if(|time| *time <= from).is_some() {}
+        let (mut last, mut widest) = (from, (0, from));
+        while let Some(time) = behind.next_if(|time| *time <= to) {
+            widest = widest.max((time.saturating_sub(last), last));
+            last = time;
+        }
+        if widest.0 > longest {
+            gaps.push((widest.1 + widest.0 / 2, index + 1));
+        }
+    }
+    gaps
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Rows of a series in any order: times, values of `channels` channels, numbers as tags.
+    fn series(channels: usize) -> impl Strategy<Value = Vec<(i64, Vec<f64>)>> {
+        let value = prop_oneof![9 => -1e3..1e3, 1 => Just(f64::NAN)];
+        let step = prop_oneof![20 => 0_i64..1_000, 1 => 5_000_i64..100_000];
+        let row = (step, prop::collection::vec(value, channels));
+        prop::collection::vec(row, 0..700).prop_map(|rows| {
+            let mut time = 0;
+            let timed = rows.into_iter().map(|(step, values)| {
+                time += step;
+                (time, values)
+            });
+            timed.collect()
+        })
+    }
+
+    fn reduce(input: &[(i64, Vec<f64>)], points: usize, channels: usize) -> (Reduced<usize>, Vec<usize>) {
+        let span = input.iter().map(|row| row.0);
+        let span = (span.clone().min().unwrap_or(0), span.max().unwrap_or(0));
+        let mut reducer = Reducer::new(span, points, channels);
+        let buckets = input.iter().map(|row| reducer.bucket(row.0)).collect();
+        for (index, (time, values)) in input.iter().enumerate() {
+            reducer.push(*time, values, || index);
+        }
+        (reducer.finish(), buckets)
+    }
+
+    fn same(a: &[f64], b: &[f64]) -> bool {
+        a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits())
+    }
+
+    /// Everything that holds of what is left, whatever came in and in whatever order.
+    fn check(input: &[(i64, Vec<f64>)], points: usize, channels: usize) {
+        let (left, buckets) = reduce(input, points, channels);
+        assert!(left.rows.windows(2).all(|pair| pair[0].time_us <= pair[1].time_us), "in the order of time");
+        for row in &left.rows {
+            let (time, values) = &input[row.tag];
+            assert!(*time == row.time_us && same(values, &row.values), "rows stay as they came");
+        }
+        let mut tags: Vec<usize> = left.rows.iter().map(|row| row.tag).collect();
+        tags.sort_unstable();
+        tags.dedup();
+        assert_eq!(tags.len(), left.rows.len(), "no row twice");
+        assert_eq!(left.reduced, left.rows.len() < input.len());
+        if input.len() <= points {
+            assert!(!left.reduced);
+        }
+        assert!(left.rows.len() <= (2 * points * channels).max(points), "{} rows", left.rows.len());
+        for channel in 0..channels {
+            for bucket in 0..=buckets.iter().copied().max().unwrap_or(0) {
+                let of_input = || (0..input.len()).filter(|i| buckets[*i] == bucket).map(|i| input[i].1[channel]);
+                let of_left = || left.rows.iter().filter(|r| buckets[r.tag] == bucket).map(|r| r.values[channel]);
+                // `min` and `max` of f64 pass NaN over.
+                assert_eq!(of_input().reduce(f64::min).map(f64::to_bits), of_left().reduce(f64::min).map(f64::to_bits));
+                assert_eq!(of_input().reduce(f64::max).map(f64::to_bits), of_left().reduce(f64::max).map(f64::to_bits));
+                assert_eq!(of_input().any(f64::is_nan), of_left().any(f64::is_nan), "a missing value stays visible");
+            }
+        }
+        let mut times: Vec<i64> = input.iter().map(|row| row.0).collect();
+        times.sort_unstable();
+        let longest = longest_spacing(&times).unwrap_or(i64::MAX);
+        for pair in times.windows(2).filter(|pair| pair[1] - pair[0] > longest) {
+            let behind = left.rows.iter().position(|row| row.time_us >= pair[1]).expect("the last row is always kept");
+            let (gap, _) = left.gaps.iter().find(|gap| gap.1 == behind).expect("a gap is marked");
+            assert!(left.rows[behind - 1].time_us < *gap && *gap < left.rows[behind].time_us);
+        }
+        for (middle, behind) in &left.gaps {
+            let next = times.partition_point(|time| time < middle);
+            assert!(times[next] - times[next - 1] > longest, "a gap is where nothing was measured");
+            assert!(left.rows[behind - 1].time_us < *middle && *middle < left.rows[*behind].time_us);
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
+
+        #[test]
+        fn extremes_missing_values_and_gaps_stay(
+            (channels, input) in (1_usize..4).prop_flat_map(|channels| (Just(channels), series(channels))),
+            points in 5_usize..150,
+        ) {
+            check(&input, points, channels);
+        }
+
+        #[test]
+        fn whatever_the_order_in_which_rows_come(input in series(2).prop_shuffle(), points in 5_usize..150) {
+            check(&input, points, 2);
+        }
+
+        #[test]
+        fn a_short_series_stays_as_it_is(input in series(2)) {
+            let (left, _) = reduce(&input, input.len(), 2);
+            let tags: Vec<usize> = left.rows.iter().map(|row| row.tag).collect();
+            prop_assert_eq!(tags, (0..input.len()).collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn one_spike_among_twenty_thousand_stays_and_little_else() {
+        let value = |i: i64| if i == 13_579 { 50.0 } else { (i as f64 * 0.37).sin() };
+        let input: Vec<_> = (0..20_000).map(|i| (i * 600_000_000, vec![value(i)])).collect();
+        let (left, _) = reduce(&input, 500, 1);
+        assert!(left.rows.iter().any(|row| row.tag == 13_579));
+        assert!(left.rows.len() <= 1_000 && left.gaps.is_empty(), "{} rows", left.rows.len());
+    }
+
+    #[test]
+    fn ends_of_time_are_no_danger() {
+        let mut reducer = Reducer::new((i64::MIN, i64::MAX), 5, 1);
+        for time in [i64::MIN, -1, 0, 1, i64::MAX, 3, 4] {
+            reducer.push(time, &[0.0], || ());
+        }
+        assert!(reducer.finish().rows.len() >= 2);
+    }
+}
