@@ -1,0 +1,160 @@
+// A control chart: the shift of each batch and its running mean, with their limits and the alarms.
+
+import { h } from "../dom.js";
+import { count, local, number, timeElement, words } from "../format.js";
+import { stateChip, stateWord, urgency } from "../states.js";
+import { chart, curve, draw, mark, merged, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
+import { figure } from "./figure.js";
+import { FIT_CHART, alarmSpans } from "./parameters.js";
+import { colour } from "./theme.js";
+
+const KEYS = [
+  { mark: "dot-1", text: "shift of a batch" },
+  { mark: "dash-bad", text: "its limit" },
+  { mark: "line-2", text: "running mean (EWMA)" },
+  { mark: "dash-2", text: "its limit" },
+  { mark: "triangle", text: "alarming or pending" },
+  { mark: "ring", text: "held: moved nothing" },
+  { mark: "alarm-span", text: "alarm" },
+  { mark: "maintenance-span", text: "maintenance" },
+];
+
+const label = (chart) => (chart === FIT_CHART ? "fit of the simulation" : chart);
+
+const isBeyond = (state) => state === "alarming" || state === "pending";
+
+export function control(group, selectBatch) {
+  const picker = h("div", { class: "picker", role: "group", "aria-label": "Control chart of" });
+  const frame = figure({
+    name: "control",
+    title: "Control chart",
+    hint: "Shift towards damage from the undamaged state, in standard errors. On the chart of the fit, 1 stands for a rejected batch.",
+    keys: KEYS,
+    tools: picker,
+  });
+  let one = null;
+  let chosen = null;
+  let newest = null;
+
+  const show = () => {
+    one?.end();
+    one = null;
+    const series = newest;
+    const all = series.charts.filter((c) => c.times.length > 0);
+    if (all.length === 0) {
+      picker.replaceChildren();
+      return frame.empty("Control charts begin with the first batch after an undamaged state was declared.");
+    }
+    frame.empty(null);
+    // Unless somebody chose, the chart that needs them most.
+    const worst = all.toSorted(
+      (a, b) => urgency(a.state.at(-1)) - urgency(b.state.at(-1)) || (a.chart === FIT_CHART) - (b.chart === FIT_CHART),
+    )[0];
+    const c = all.find((chart) => chart.chart === chosen) ?? worst;
+    const focused = picker.contains(document.activeElement) ? document.activeElement.dataset.chart : null;
+    picker.replaceChildren(
+      ...all.map((other) =>
+        h(
+          "button",
+          {
+            type: "button",
+            "aria-pressed": String(other === c),
+            dataset: { chart: other.chart },
+            onclick: () => ((chosen = other.chart), show()),
+          },
+          label(other.chart),
+          isBeyond(other.state.at(-1)) && " ",
+          isBeyond(other.state.at(-1)) && stateChip(other.state.at(-1)),
+        ),
+      ),
+    );
+    if (focused) [...picker.children].find((b) => b.dataset.chart === focused)?.focus();
+
+    const filled = withGaps(c.times.map(seconds), [c.shift, c.shift_limit, c.ewma, c.ewma_limit]);
+    const [shift, shiftLimit, ewma, ewmaLimit] = filled.columns;
+    const alarms = alarmSpans(series.alarms, c.chart);
+    const windows = series.maintenance.map((w) => [seconds(w.from), seconds(w.to)]);
+    const dots = (u) =>
+      draw(u, (pen) => {
+        filled.times.forEach((time, i) => {
+          const row = filled.origin[i];
+          if (row < 0 || shift[i] === null) return;
+          const [x, y] = [u.valToPos(time, "x", true), u.valToPos(shift[i], "y", true)];
+          if (x < u.bbox.left || x > u.bbox.left + u.bbox.width) return;
+          pen.fillStyle = pen.strokeStyle = colour(isBeyond(c.state[row]) ? "bad" : "curve-1");
+          pen.lineWidth = 1.5 * devicePixelRatio;
+          if (c.held[row]) {
+            pen.fillStyle = colour("panel");
+            mark(pen, "dot", x, y, 6);
+          }
+          mark(
+            pen,
+            c.held[row] ? "ring" : isBeyond(c.state[row]) ? "triangle" : "dot",
+            x,
+            y,
+            isBeyond(c.state[row]) ? 9 : 5,
+          );
+        });
+      });
+    const options = merged(group.options(), {
+      height: 260,
+      select: (index) => filled.origin[index] >= 0 && selectBatch(c.batches[filled.origin[index]]),
+      series: [
+        {},
+        curve("curve-1", { width: 0.5, points: { show: false } }),
+        curve("bad", { dash: [2, 3] }),
+        curve("curve-2", { width: 2 }),
+        curve("curve-2", { dash: [6, 4] }),
+      ],
+      axes: [timeAxis(), valueAxis("standard errors")],
+      scales: { y: { range: (u, low, high) => [Math.min(0, low ?? 0) - 0.5, Math.max(1, high ?? 1) * 1.08 + 0.2] } },
+      hooks: {
+        drawClear: [
+          (u) => {
+            shade(u, windows, "maintenance");
+            shade(u, alarms, "bad", { opacity: 0.16 });
+            shade(u, filled.gaps, "ink-soft", { striped: true });
+          },
+        ],
+        draw: [dots],
+        setCursor: [(u) => frame.read(readout(u))],
+      },
+    });
+    one = chart(frame.plot, options, [filled.times, shift, shiftLimit, ewma, ewmaLimit]);
+
+    const what = (row) => `${stateWord(c.state[row])}${c.held[row] ? ", held" : ""}`;
+    function readout(u) {
+      const row = filled.origin[u.cursor.idx ?? -1] ?? -1;
+      if (row < 0) return "";
+      return [
+        timeElement(c.times[row]),
+        ` · ${label(c.chart)}: shift ${number(c.shift[row], 3)} (limit ${number(c.shift_limit[row], 3)}), running mean ${number(c.ewma[row], 3)} (limit ${number(c.ewma_limit[row], 3)}) · ${what(row)}`,
+      ];
+    }
+    const last = c.times.length - 1;
+    frame.summarise(
+      `Chart of ${label(c.chart)}, ${count(c.times.length, "batch", "batches")} to ${local(c.times[last])}. Latest: ${what(last)}, shift ` +
+        `${number(c.shift[last], 3)} of ${number(c.shift_limit[last], 3)} standard errors; ${count(alarms.length, "alarm")} in view. ` +
+        "Arrow keys read the values, Enter opens the batch.",
+    );
+    frame.tabulate(() => ({
+      columns: ["Time", "Shift (standard errors)", "Limit", "Running mean", "Limit", "State"],
+      rows: c.times.map((time, i) => [
+        timeElement(time),
+        number(c.shift[i], 3),
+        number(c.shift_limit[i], 3),
+        number(c.ewma[i], 3),
+        number(c.ewma_limit[i], 3),
+        words(what(i)),
+      ]),
+    }));
+  };
+
+  return {
+    element: frame.element,
+    update(series) {
+      newest = series;
+      show();
+    },
+  };
+}

@@ -1,0 +1,129 @@
+// The frame of every chart: title, keys, the drawing, a line that reads the cursor, and the same data as a table.
+
+import { fill, h, icon } from "../dom.js";
+
+/** Most rows of a table: a longer one is cut at its old end, and says so. */
+const MOST_ROWS = 500;
+
+let numbering = 0;
+
+/** What the marks of a drawing mean; one list may serve several figures. */
+export function keyList(keys) {
+  return h(
+    "ul",
+    { class: "keys", hidden: keys.length === 0 },
+    keys.map(({ mark, text }) => h("li", null, h("span", { class: `mark ${mark}`, "aria-hidden": "true" }), text)),
+  );
+}
+
+/**
+ * A figure. `keys` are `{mark, text}`; marks are classes of `figures.css`. What a figure offers:
+ * `plot` (where to draw), `summarise(text)`, `read(nodes)`, `empty(text)`, `tabulate(() => ({columns, rows, newestLast}))`.
+ */
+export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
+  numbering += 1;
+  const id = `figure-${numbering}`;
+  const plot = h("div", {
+    class: "plot",
+    role: "img",
+    tabindex: 0,
+    "aria-labelledby": `${id}-title`,
+    "aria-describedby": `${id}-summary`,
+  });
+  const summary = h("p", { class: "hidden-text", id: `${id}-summary` });
+  const readout = h("p", { class: "readout" });
+  const note = h("p", { class: "empty", hidden: true });
+  const table = h("div", {
+    class: "table-wrap",
+    role: "region",
+    tabindex: 0,
+    hidden: true,
+    id: `${id}-table`,
+    "aria-label": `${title} as a table`,
+  });
+  const toggle = h(
+    "button",
+    { type: "button", class: "quiet as-table", "aria-expanded": "false", "aria-controls": `${id}-table` },
+    icon("table"),
+    "Show as table",
+  );
+  const legend = keyList(keys);
+  const element = h(
+    "figure",
+    { class: "figure", dataset: { figure: name } },
+    h("figcaption", null, h(level, { id: `${id}-title` }, title), hint && h("p", { class: "fine" }, hint), tools),
+    legend,
+    note,
+    plot,
+    summary,
+    h("div", { class: "below" }, toggle, readout),
+    table,
+  );
+
+  let makeTable = null;
+  const drawTable = () => {
+    if (table.hidden || !makeTable) return;
+    const { columns, rows, newestLast = true } = makeTable();
+    const shown = newestLast ? rows.slice(-MOST_ROWS).reverse() : rows.slice(0, MOST_ROWS);
+    const cut =
+      rows.length > shown.length
+        ? `, the ${newestLast ? "newest" : "first"} ${shown.length} of ${rows.length} rows`
+        : "";
+    fill(
+      table,
+      h(
+        "table",
+        null,
+        h("caption", null, `${title}${cut}`),
+        h(
+          "thead",
+          null,
+          h(
+            "tr",
+            null,
+            columns.map((c) => h("th", { scope: "col" }, c)),
+          ),
+        ),
+        h(
+          "tbody",
+          null,
+          shown.map((row) =>
+            h(
+              "tr",
+              null,
+              row.map((cell) => h("td", null, cell)),
+            ),
+          ),
+        ),
+      ),
+    );
+  };
+  toggle.addEventListener("click", () => {
+    table.hidden = !table.hidden;
+    toggle.setAttribute("aria-expanded", String(!table.hidden));
+    fill(toggle, icon(table.hidden ? "table" : "chart"), table.hidden ? "Show as table" : "Hide the table");
+    drawTable();
+  });
+  // Charts share their cursor: only the one in use speaks.
+  plot.addEventListener("focus", () => readout.setAttribute("aria-live", "polite"));
+  plot.addEventListener("blur", () => readout.removeAttribute("aria-live"));
+
+  return {
+    element,
+    plot,
+    summarise: (text) => fill(summary, text),
+    read: (...nodes) => fill(readout, nodes),
+    empty: (text) => {
+      note.hidden = !text;
+      fill(note, text ?? "");
+      plot.hidden = Boolean(text);
+      legend.hidden = Boolean(text) || keys.length === 0;
+      toggle.hidden = Boolean(text);
+      if (text) fill(plot);
+    },
+    tabulate: (make) => {
+      makeTable = make;
+      drawTable();
+    },
+  };
+}

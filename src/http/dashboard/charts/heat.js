@@ -1,0 +1,137 @@
+// Probability of damage as a map: parameters up, time across.
+
+import { count, local, percent, timeElement } from "../format.js";
+import { LEFT, chart, draw, mark, merged, seconds, timeAxis, valueAxis } from "./base.js";
+import { figure } from "./figure.js";
+import { rejectedBatches } from "./parameters.js";
+import { colour } from "./theme.js";
+
+/** Steps of the map, with their upper ends; the first is what the undamaged state shows. */
+const STEPS = [0.05, 0.2, 0.4, 0.6, 0.8, 1.0];
+
+const stepOf = (probability) => STEPS.findIndex((end) => probability <= end + 1e-12);
+
+export function heat(group, selectBatch) {
+  const ends = STEPS.map((end) => Math.round(100 * end));
+  const frame = figure({
+    name: "heat",
+    title: "Probability of damage, parameter by time",
+    keys: [
+      ...ends.map((end, i) => ({ mark: `heat-${i}`, text: i === 0 ? `up to ${end} %` : `${ends[i - 1]} to ${end} %` })),
+      { mark: "cross", text: "withheld: batch rejected" },
+    ],
+  });
+  let one = null;
+
+  return {
+    element: frame.element,
+    update(series) {
+      const { parameters } = series;
+      const rejected = rejectedBatches(series);
+      one?.end();
+      one = null;
+      const rows = parameters.filter((p) => p.probability_of_damage.some((v) => v !== null && v !== undefined));
+      if (rows.length === 0)
+        return frame.empty("Needs an undamaged state to compare with: see “Model and undamaged state”.");
+      frame.empty(null);
+      // Reduction may keep different batches for each parameter: the map knows them all.
+      const cells = new Map();
+      rows.forEach((p, r) =>
+        p.times.forEach((time, i) => {
+          const key = p.batches[i];
+          if (!cells.has(key)) cells.set(key, { time, values: [] });
+          cells.get(key).values[r] = p.probability_of_damage[i] ?? null;
+        }),
+      );
+      const columns = [...cells.entries()]
+        .map(([batch, cell]) => ({ batch, ...cell, at: seconds(cell.time) }))
+        .sort((a, b) => a.at - b.at);
+      const times = columns.map((c) => c.at);
+      const edges = edgesOf(times);
+      const paint = (u) =>
+        draw(u, (pen) => {
+          const { left, top, width, height } = u.bbox;
+          pen.beginPath();
+          pen.rect(left, top, width, height);
+          pen.clip();
+          columns.forEach((column, i) => {
+            const a = u.valToPos(edges[i][0], "x", true);
+            const b = u.valToPos(edges[i][1], "x", true);
+            if (b < left || a > left + width) return;
+            const [from, wide] = [Math.floor(a), Math.max(Math.ceil(b) - Math.floor(a), 2 * devicePixelRatio)];
+            rows.forEach((_, r) => {
+              const value = column.values[r];
+              // Nothing was kept here, or nothing compared: batches of the undamaged state itself.
+              if (value === undefined || (value === null && !rejected.has(column.batch))) return;
+              const y = Math.round(u.valToPos(r, "y", true));
+              const tall = Math.round(u.valToPos(r + 1, "y", true)) - y - 2 * devicePixelRatio;
+              if (value === null) {
+                pen.strokeStyle = colour("bad");
+                pen.lineWidth = 1.5 * devicePixelRatio;
+                mark(pen, "cross", (a + b) / 2, y + tall / 2, 7);
+              } else {
+                pen.fillStyle = colour(`heat-${stepOf(value)}`);
+                pen.fillRect(from, y, wide, tall);
+              }
+            });
+          });
+        });
+      const options = merged(group.options(), {
+        height: 52 + Math.max(30 * rows.length, 60),
+        select: (index) => selectBatch(columns[index].batch),
+        series: [{}, { stroke: "transparent", points: { show: false } }],
+        axes: [
+          timeAxis(),
+          valueAxis(null, {
+            splits: () => rows.map((_, r) => r + 0.5),
+            values: () => rows.map((p) => short(p.name)),
+            grid: { show: false },
+            ticks: { show: false },
+            size: LEFT,
+          }),
+        ],
+        scales: { y: { range: [0, rows.length], dir: -1 } },
+        hooks: { draw: [paint], setCursor: [(u) => frame.read(readout(u))] },
+      });
+      one = chart(frame.plot, options, [times, times.map(() => 0)]);
+
+      const told = ({ batch, values }, r) => {
+        if (values[r] === undefined) return "not kept here";
+        if (values[r] === null) return rejected.has(batch) ? "withheld" : "not compared";
+        return percent(values[r]);
+      };
+      function readout(u) {
+        const column = columns[u.cursor.idx ?? -1];
+        return column
+          ? [timeElement(column.time), ` · ${rows.map((p, r) => `${p.name} ${told(column, r)}`).join(" · ")}`]
+          : "";
+      }
+      const latest = columns.at(-1);
+      const most = rows.map((_, r) => r).sort((a, b) => (latest.values[b] ?? -1) - (latest.values[a] ?? -1))[0];
+      frame.summarise(
+        `${count(rows.length, "parameter")} over ${count(columns.length, "batch", "batches")} to ${local(latest.time)}. ` +
+          `Highest in the latest batch: ${rows[most].name} ${told(latest, most)}. Arrow keys read the values, Enter opens the batch.`,
+      );
+      frame.tabulate(() => ({
+        columns: ["Time", ...rows.map((p) => p.name)],
+        rows: columns.map((c) => [timeElement(c.time), ...rows.map((_, r) => told(c, r))]),
+      }));
+    },
+  };
+}
+
+/** Each column reaches half-way to its neighbours, but not across a long pause. */
+function edgesOf(times) {
+  const steps = times
+    .slice(1)
+    .map((t, i) => t - times[i])
+    .sort((a, b) => a - b);
+  const usual = steps[Math.floor(steps.length / 2)] ?? 3600;
+  return times.map((time, i) => {
+    const before = Math.min((time - (times[i - 1] ?? time - usual)) / 2, usual);
+    const after = Math.min(((times[i + 1] ?? time + usual) - time) / 2, usual);
+    return [time - before, time + after];
+  });
+}
+
+const short = (name) => (name.length > 9 ? `${name.slice(0, 8)}…` : name);

@@ -1,0 +1,223 @@
+// Each parameter: its mean with the 90 % interval against the threshold, and below it the probability of damage.
+
+import { h } from "../dom.js";
+import { count, local, number, percent, percentWithin, quantity, timeElement } from "../format.js";
+import {
+  band,
+  chart,
+  curve,
+  draw,
+  edge,
+  fewPoints,
+  mark,
+  merged,
+  rule,
+  seconds,
+  shade,
+  timeAxis,
+  valueAxis,
+  withGaps,
+} from "./base.js";
+import { figure, keyList } from "./figure.js";
+import { colour } from "./theme.js";
+import { spread } from "./tracks.js";
+
+const KEYS = [
+  { mark: "line-1", text: "mean" },
+  { mark: "band-1", text: "90 % interval" },
+  { mark: "dash-bad", text: "threshold δ" },
+  { mark: "dash", text: "undamaged mean" },
+  { mark: "line-2", text: "probability of damage" },
+  { mark: "triangle", text: "above its limit" },
+  { mark: "cross", text: "withheld: batch rejected" },
+  { mark: "alarm-span", text: "alarm" },
+  { mark: "maintenance-span", text: "maintenance" },
+];
+
+/** The chart that follows how well the simulation fits; the others are named after their parameter. */
+export const FIT_CHART = "simulation:fit";
+
+/** Later than any measurement, seconds. */
+const NEVER_S = 1e11;
+
+/** Spans of time of the alarms of a chart, seconds; those still open have no end. */
+export function alarmSpans(alarms, chart) {
+  const isOfChart = (a) =>
+    chart === FIT_CHART ? a.kind === "simulation_does_not_fit" : a.kind === "damage" && a.parameter === chart;
+  return alarms
+    .filter((a) => isOfChart(a) && a.state !== "withdrawn")
+    .map((a) => [seconds(a.opened_at), a.ended_at ? seconds(a.ended_at) : NEVER_S]);
+}
+
+/** Ids of the batches whose probabilities are withheld; those of the undamaged state have none either. */
+export function rejectedBatches(series) {
+  return new Set(series.trust.filter((item) => item.verdict === "rejected").map((item) => item.batch));
+}
+
+/** Charts of all parameters in a grid; `selectBatch(id)` when somebody picks a point. */
+export function parameters(group, selectBatch) {
+  const grid = h("div", { class: "grid", dataset: { figures: "parameters" } });
+  const made = new Map();
+  return {
+    element: h("div", { class: "stack" }, h("h3", null, "Parameters and probability of damage"), keyList(KEYS), grid),
+    update(series, limit) {
+      const names = series.parameters.map((p) => p.name);
+      for (const [name, one] of made) {
+        if (!names.includes(name)) {
+          one.end();
+          one.element.remove();
+          made.delete(name);
+        }
+      }
+      for (const parameter of series.parameters) {
+        if (!made.has(parameter.name)) {
+          const one = parameterFigure(group, parameter, selectBatch);
+          made.set(parameter.name, one);
+          grid.append(one.element);
+        }
+        made.get(parameter.name).update(parameter, series, limit);
+      }
+    },
+  };
+}
+
+function parameterFigure(group, { name, unit }, selectBatch) {
+  const title = unit && unit !== "1" ? `${name} (${unit})` : name;
+  const frame = figure({ name: `parameter-${name}`, title, level: "h4" });
+  let charts = [];
+  const end = () => {
+    charts.forEach((c) => c.end());
+    charts = [];
+  };
+
+  const update = (p, series, limit) => {
+    end();
+    if (p.times.length === 0) return frame.empty("Not assessed in this span of time.");
+    frame.empty(null);
+    const filled = withGaps(p.times.map(seconds), [
+      p.mean,
+      p.low,
+      p.high,
+      p.probability_of_damage,
+      p.pod_low,
+      p.pod_high,
+    ]);
+    const [mean, lower, upper, pod, podLow, podHigh] = filled.columns;
+    const alarms = alarmSpans(series.alarms, name);
+    const windows = series.maintenance.map((w) => [seconds(w.from), seconds(w.to)]);
+    const background = (u) => {
+      shade(u, windows, "maintenance");
+      shade(u, alarms, "bad", { opacity: 0.16 });
+      shade(u, filled.gaps, "ink-soft", { striped: true });
+    };
+    const select = (index) => filled.origin[index] >= 0 && selectBatch(p.batches[filled.origin[index]]);
+    const points = fewPoints(p.times.length);
+    const include = [p.threshold, p.undamaged_mean].filter((v) => v !== null && v !== undefined);
+
+    const above = merged(group.options(), {
+      height: 190,
+      select,
+      series: [{}, curve("curve-1", { points }), edge(), edge()],
+      bands: [band(3, 2, "curve-1", 0.22)],
+      axes: [timeAxis(false), valueAxis(title)],
+      scales: {
+        y: { range: (u, a, b) => spread(Math.min(a ?? Infinity, ...include), Math.max(b ?? -Infinity, ...include)) },
+      },
+      hooks: {
+        drawClear: [background],
+        draw: [
+          (u) => {
+            rule(u, p.undamaged_mean, "ink-soft");
+            rule(u, p.threshold, "bad", [2, 3]);
+          },
+        ],
+        setCursor: [(u) => frame.read(readout(u))],
+      },
+    });
+    const rejected = rejectedBatches(series);
+    const isWithheld = (row) => row >= 0 && rejected.has(p.batches[row]);
+    const withheld = filled.times.filter((_, i) => pod[i] === null && isWithheld(filled.origin[i]));
+    const below = merged(group.options(), {
+      height: 150,
+      select,
+      series: [{}, curve("curve-2", { points }), edge(), edge()],
+      bands: [band(3, 2, "curve-2", 0.22)],
+      axes: [
+        timeAxis(),
+        valueAxis("damage (%)", { values: (u, splits) => splits.map((v) => String(Math.round(100 * v))) }),
+      ],
+      scales: { y: { range: [-0.04, 1.04] } },
+      hooks: {
+        drawClear: [background],
+        draw: [
+          (u) => {
+            rule(u, limit, "bad", [2, 3]);
+            marks(u, filled.times, pod, limit, withheld);
+          },
+        ],
+      },
+    });
+    charts = [
+      chart(frame.plot, above, [filled.times, mean, lower, upper], frame.plot),
+      chart(frame.plot, below, [filled.times, pod, podLow, podHigh], null),
+    ];
+
+    function readout(u) {
+      const row = filled.origin[u.cursor.idx ?? -1] ?? -1;
+      if (row < 0) return "";
+      const damage = p.probability_of_damage[row] ?? null;
+      const told =
+        damage === null
+          ? isWithheld(row)
+            ? "probability of damage withheld"
+            : "not compared with an undamaged state"
+          : `probability of damage ${percentWithin(damage, p.pod_low[row], p.pod_high[row])}`;
+      return [
+        timeElement(p.times[row]),
+        ` · ${quantity(p.mean[row], unit)} (${number(p.low[row])} to ${number(p.high[row])}) · ${told}`,
+      ];
+    }
+    const last = p.probability_of_damage.at(-1);
+    frame.summarise(
+      `${count(p.times.length, "batch", "batches")} to ${local(p.times.at(-1))}. Latest mean ${quantity(p.mean.at(-1), unit)}` +
+        `${p.threshold === null ? "" : `, threshold ${quantity(p.threshold, unit)}`}, probability of damage ` +
+        `${last === null || last === undefined ? "not given" : percent(last)}; withheld for ${count(withheld.length, "batch", "batches")}. ` +
+        "Arrow keys read the values, Enter opens the batch.",
+    );
+    frame.tabulate(() => ({
+      columns: ["Time", `Mean (${unit})`, "90 % interval", "Probability of damage", "90 % interval"],
+      rows: p.times.map((time, i) => [
+        timeElement(time),
+        number(p.mean[i]),
+        `${number(p.low[i])} to ${number(p.high[i])}`,
+        (p.probability_of_damage[i] ?? null) === null
+          ? isWithheld(i)
+            ? "withheld"
+            : "–"
+          : percent(p.probability_of_damage[i]),
+        (p.pod_low[i] ?? null) === null ? "–" : `${percent(p.pod_low[i])} to ${percent(p.pod_high[i])}`,
+      ]),
+    }));
+  };
+  return { element: frame.element, update, end };
+}
+
+/** Triangles above the limit, crosses where the probability is withheld. */
+function marks(u, times, values, limit, withheld) {
+  const inside = (x) => x >= u.bbox.left && x <= u.bbox.left + u.bbox.width;
+  const many = values.filter((v) => v > limit).length > 120;
+  draw(u, (pen) => {
+    pen.fillStyle = colour("bad");
+    times.forEach((time, i) => {
+      if (values[i] === null || values[i] <= limit) return;
+      const x = u.valToPos(time, "x", true);
+      if (inside(x)) mark(pen, "triangle", x, u.valToPos(values[i], "y", true), many ? 4 : 8);
+    });
+    pen.strokeStyle = colour("bad");
+    pen.lineWidth = 2 * devicePixelRatio;
+    for (const time of withheld) {
+      const x = u.valToPos(time, "x", true);
+      if (inside(x)) mark(pen, "cross", x, u.bbox.top + u.bbox.height - 8 * devicePixelRatio, 8);
+    }
+  });
+}

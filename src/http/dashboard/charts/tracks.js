@@ -1,0 +1,179 @@
+// Frequencies over time, one lane a mode, with the covariates below; pauses striped, missing modes marked.
+
+import { count, local, number, quantity, timeElement } from "../format.js";
+import { GAP_SHARE, chart, curve, draw, fewPoints, mark, merged, seconds, shade, timeAxis, valueAxis } from "./base.js";
+import { figure } from "./figure.js";
+import { colour } from "./theme.js";
+
+const LANE_PX = 112;
+
+/** Units that stand at the end of the name of a covariate. */
+const UNITS = {
+  c: "°C",
+  k: "K",
+  hz: "Hz",
+  n: "N",
+  kn: "kN",
+  m: "m",
+  mm: "mm",
+  percent: "%",
+  pa: "Pa",
+  kpa: "kPa",
+  bar: "bar",
+  kg: "kg",
+  t: "t",
+  v: "V",
+  s: "s",
+};
+
+function covariateLabel(name) {
+  const cut = name.lastIndexOf("_");
+  const unit = name.endsWith("m_per_s") ? "m/s" : UNITS[name.slice(cut + 1)];
+  const rest = name.endsWith("m_per_s") ? name.slice(0, -8) : name.slice(0, cut);
+  return unit && cut > 0
+    ? { label: `${rest.replaceAll("_", " ")} (${unit})`, unit }
+    : { label: name.replaceAll("_", " "), unit: "" };
+}
+
+/** Values of mode `m` at every kept measurement. */
+const lane = (frequencies, m) => frequencies.values_hz.map((row) => row?.[m] ?? null);
+
+export function tracks(group) {
+  const frame = figure({
+    name: "tracks",
+    title: "Measured frequencies and conditions",
+    hint: "One lane a mode. Drag to zoom, double-click to see all again.",
+    keys: [
+      { mark: "line-1", text: "frequency, Hz" },
+      { mark: "dash", text: "nominal" },
+      { mark: "line-3", text: "condition" },
+      { mark: "cross", text: "mode not identified" },
+      { mark: "striped", text: "nothing measured" },
+    ],
+  });
+  let charts = [];
+
+  return {
+    element: frame.element,
+    update({ frequencies, maintenance, reduced }) {
+      charts.forEach((c) => c.end());
+      charts = [];
+      const times = frequencies?.times.map(seconds) ?? [];
+      if (times.length === 0) return frame.empty("No measurement in this span of time.");
+      frame.empty(null);
+      const modes = Array.from({ length: frequencies.modes }, (_, m) => lane(frequencies, m));
+      const covariates = Object.entries(frequencies.covariates ?? {});
+      const isPause = times.map((_, i) =>
+        [...modes, ...covariates.map(([, values]) => values)].every((values) => (values[i] ?? null) === null),
+      );
+      const pauses = times.flatMap((_, i) =>
+        isPause[i] ? [[times[i - 1] ?? times[i], times[i + 1] ?? times[i]]] : [],
+      );
+      // Measurements may come in bursts, and then there is a pause after each: striped are only those that stand out.
+      const lengths = pauses.map(([from, to]) => to - from).sort((a, b) => a - b);
+      const usual = lengths.length > 4 ? 2 * lengths[Math.floor(lengths.length / 2)] : 0;
+      const least = Math.max(usual, GAP_SHARE * (times.at(-1) - times[0]));
+      const gaps = pauses.filter(([from, to]) => to - from > least);
+      const windows = maintenance.map((w) => [seconds(w.from), seconds(w.to)]);
+      const lanes = [
+        ...modes.map((values, m) => ({
+          label: `mode ${m + 1} (Hz)`,
+          values,
+          nominal: frequencies.nominal_hz?.[m],
+          colour: "curve-1",
+          missing: true,
+        })),
+        ...covariates.map(([name, values]) => ({ ...covariateLabel(name), values, colour: "curve-3" })),
+      ];
+      lanes.forEach((one, index) => {
+        const last = index === lanes.length - 1;
+        const holes = one.missing ? times.filter((_, i) => !isPause[i] && one.values[i] === null) : [];
+        const options = merged(group.options(), {
+          height: LANE_PX + (last ? 32 : 0),
+          series: [{}, curve(one.colour, { points: fewPoints(times.length) })],
+          axes: [timeAxis(last), valueAxis(one.label)],
+          scales: { y: { range: (u, low, high) => spread(low, high) } },
+          hooks: {
+            drawClear: [
+              (u) => {
+                shade(u, gaps, "ink-soft", { striped: true });
+                shade(u, windows, "maintenance");
+              },
+            ],
+            draw: [
+              (u) => {
+                nominal(u, one.nominal);
+                marks(u, holes);
+              },
+            ],
+            setCursor: index === 0 ? [(u) => frame.read(readout(u))] : [],
+          },
+        });
+        charts.push(chart(frame.plot, options, [times, one.values], index === 0 ? frame.plot : null));
+      });
+
+      function readout(u) {
+        const row = u.cursor.idx ?? -1;
+        if (row < 0 || isPause[row]) return "";
+        const values = modes.map(
+          (values, m) => `mode ${m + 1} ${values[row] === null ? "not identified" : quantity(values[row], "Hz", 5)}`,
+        );
+        const conditions = covariates.map(([name, values]) => `${name} ${number(values[row])}`);
+        return [timeElement(frequencies.times[row]), ` · ${[...values, ...conditions].join(" · ")}`];
+      }
+      const missing = modes.reduce((sum, values) => sum + values.filter((v, i) => v === null && !isPause[i]).length, 0);
+      frame.summarise(
+        `${count(frequencies.modes, "mode")} at ${count(times.length, "point")}${reduced ? ", extremes kept of more measurements," : ""} from ` +
+          `${local(frequencies.times[0])} to ${local(frequencies.times.at(-1))}; ${count(missing, "value")} not identified, ` +
+          `${count(gaps.length, "long pause")}. Arrow keys read the values.`,
+      );
+      frame.tabulate(() => ({
+        columns: ["Time", ...modes.map((_, m) => `Mode ${m + 1} (Hz)`), ...covariates.map(([name]) => name)],
+        rows: frequencies.times.flatMap((time, i) =>
+          isPause[i]
+            ? []
+            : [
+                [
+                  timeElement(time),
+                  ...modes.map((v) => (v[i] === null ? "not identified" : number(v[i], 6))),
+                  ...covariates.map(([, v]) => number(v[i])),
+                ],
+              ],
+        ),
+      }));
+    },
+  };
+}
+
+/** A range with air, also when all values are the same. */
+export function spread(low, high) {
+  if (low === null || high === null) return [0, 1];
+  const air = (high - low) * 0.08 || Math.abs(high) * 0.01 || 1;
+  return [low - air, high + air];
+}
+
+function nominal(u, value) {
+  const { min, max } = u.scales.y;
+  if (value === undefined || value === null || value < min || value > max) return;
+  const y = u.valToPos(value, "y", true);
+  draw(u, (pen) => {
+    pen.strokeStyle = colour("ink-soft");
+    pen.setLineDash([4 * devicePixelRatio, 4 * devicePixelRatio]);
+    pen.beginPath();
+    pen.moveTo(u.bbox.left, y);
+    pen.lineTo(u.bbox.left + u.bbox.width, y);
+    pen.stroke();
+  });
+}
+
+function marks(u, times) {
+  draw(u, (pen) => {
+    pen.strokeStyle = colour("bad");
+    pen.lineWidth = 1.5 * devicePixelRatio;
+    const y = u.bbox.top + u.bbox.height - 5 * devicePixelRatio;
+    for (const time of times) {
+      const x = u.valToPos(time, "x", true);
+      if (x >= u.bbox.left && x <= u.bbox.left + u.bbox.width) mark(pen, "cross", x, y, 6);
+    }
+  });
+}

@@ -1,0 +1,117 @@
+// Numbers with units and times in the viewer's zone.
+
+import { h } from "./dom.js";
+
+const MISSING = "–";
+
+const full = new Intl.DateTimeFormat(undefined, {
+  year: "numeric",
+  month: "short",
+  day: "2-digit",
+  hour: "2-digit",
+  minute: "2-digit",
+  hour12: false,
+});
+const withZone = new Intl.DateTimeFormat(undefined, { timeZoneName: "short" });
+
+/** Name of the viewer's time zone now, for axes. */
+export function zone() {
+  return withZone.formatToParts(new Date()).find((part) => part.type === "timeZoneName")?.value ?? "local time";
+}
+
+/** A time as text in the viewer's zone. */
+export function local(time) {
+  if (!Number.isFinite(new Date(time).getTime())) return MISSING;
+  return full.format(new Date(time));
+}
+
+/** A time in UTC, to the second. */
+export function utc(time) {
+  return `${new Date(time).toISOString().slice(0, 19).replace("T", " ")} UTC`;
+}
+
+/** An element with the local time; UTC in its title. */
+export function timeElement(time) {
+  if (!time) return h("span", null, MISSING);
+  return h("time", { datetime: new Date(time).toISOString(), title: utc(time) }, local(time));
+}
+
+/** The same, told from now; kept fresh by `refreshAges`. */
+export function age(time) {
+  if (!time) return h("span", null, "never");
+  const iso = new Date(time).toISOString();
+  return h("time", { datetime: iso, title: `${local(time)} (${utc(time)})`, dataset: { age: iso } }, ago(time));
+}
+
+export function refreshAges() {
+  for (const element of document.querySelectorAll("[data-age]")) {
+    const text = ago(element.dataset.age);
+    if (element.textContent !== text) element.textContent = text;
+  }
+}
+
+const STEPS = [
+  ["year", 31557600],
+  ["month", 2629800],
+  ["day", 86400],
+  ["hour", 3600],
+  ["minute", 60],
+];
+
+function ago(time) {
+  const seconds = (Date.now() - new Date(time)) / 1000;
+  const [name, length] = STEPS.find(([, length]) => Math.abs(seconds) >= length) ?? ["second", 1];
+  if (name === "second") return seconds < -1 ? "in the future" : "just now";
+  const count = Math.round(Math.abs(seconds) / length);
+  const words = `${count} ${name}${count === 1 ? "" : "s"}`;
+  return seconds < 0 ? `in ${words}` : `${words} ago`;
+}
+
+/** A number with so many significant digits. */
+export function number(value, digits = 4) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return MISSING;
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 1e-3 || size >= 1e6)) {
+    const [mantissa, exponent] = value.toExponential(digits - 1).split("e");
+    return `${Number(mantissa)}·10${[...String(Number(exponent))].map((c) => SUPERSCRIPT[c]).join("")}`;
+  }
+  return String(Number(value.toPrecision(digits)));
+}
+
+const SUPERSCRIPT = Object.fromEntries([..."0123456789-"].map((c, i) => [c, "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"[i]]));
+
+/** A number with its unit. */
+export function quantity(value, unit, digits) {
+  return unit && unit !== "1" ? `${number(value, digits)} ${unit}` : number(value, digits);
+}
+
+/** A probability in per cent; small ones are not rounded to nothing. */
+export function percent(probability) {
+  if (probability === null || probability === undefined || !Number.isFinite(probability)) return MISSING;
+  const value = 100 * probability;
+  if (value > 0 && value < 0.1) return "< 0.1 %";
+  if (value < 100 && value > 99.9) return "> 99.9 %";
+  return `${value < 10 ? Number(value.toFixed(1)) : Math.round(value)} %`;
+}
+
+/** A probability with its interval. */
+export function percentWithin(probability, low, high) {
+  const interval = Number.isFinite(low) && Number.isFinite(high) && low !== null && high !== null;
+  return interval ? `${percent(probability)} (${percent(low)} to ${percent(high)})` : percent(probability);
+}
+
+/** `snake_case` as words. */
+export function words(code) {
+  const text = String(code).replaceAll("_", " ");
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** First digits of a digest, the whole of it in the title. */
+export function digest(value) {
+  return value ? h("code", { title: value }, value.slice(0, 12)) : h("span", null, MISSING);
+}
+
+/** `1 batch`, `2 batches`. */
+export function count(n, one, many = `${one}s`) {
+  return `${n} ${n === 1 ? one : many}`;
+}

@@ -1,0 +1,135 @@
+// Alarms of a structure: what is open, what was, and who has seen it.
+
+import { at, read, send } from "../api.js";
+import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
+import { count, number, timeElement, words } from "../format.js";
+
+const STATE = {
+  open: ["alarm", "bad", "Open"],
+  ended: ["check", "good", "Ended"],
+  withdrawn: ["cross", "idle", "Withdrawn"],
+};
+
+/** Alarms that are over and shown all the same. */
+const SHOWN_OVER = 2;
+
+/** An alarm in words. */
+export function alarmWords(alarm) {
+  if (alarm.kind === "damage")
+    return `${alarm.parameter} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
+  if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit what is measured";
+  if (alarm.kind === "silence") return "no measurement for longer than agreed";
+  return words(alarm.kind).toLowerCase();
+}
+
+/** Asks who has seen an alarm; resolves to the alarm as it is then. */
+export function acknowledgeDialog(structure, alarm) {
+  return ask({
+    title: "Acknowledge the alarm",
+    body: h(
+      "p",
+      null,
+      `${structure}: ${alarmWords(alarm)}. The alarm stays open until the measurements end it; others see that you know of it.`,
+    ),
+    fields: [
+      {
+        name: "by",
+        label: "Your name",
+        required: true,
+        maxlength: 500,
+        autocomplete: "name",
+        value: localStorage.getItem("modalwatch.name") ?? "",
+      },
+      { name: "note", label: "Note (may be empty)", type: "textarea", maxlength: 500 },
+    ],
+    confirm: "Acknowledge",
+    submit: async ({ by, note }) => {
+      const body = { by: by.trim() };
+      // Notes are one line: the service takes printable characters only.
+      const line = note.trim().replace(/\s+/g, " ");
+      if (line) body.note = line;
+      const seen = await send(at(structure, `/alarms/${alarm.alarm}/acknowledgement`), body);
+      localStorage.setItem("modalwatch.name", body.by);
+      notify(`Alarm ${alarm.alarm} of ${structure} is acknowledged.`);
+      return seen;
+    },
+  });
+}
+
+export function alarms(structure) {
+  const content = h("div", null);
+  const element = h(
+    "section",
+    { id: "alarms", class: "panel", "aria-labelledby": "alarms-title" },
+    h("h2", { id: "alarms-title" }, "Alarms"),
+    content,
+  );
+  const load = async () => {
+    try {
+      const { items } = await read(at(structure, "/alarms?limit=50"));
+      // What is open, and the last that are over; the rest folds away.
+      const over = items.filter((alarm) => alarm.state !== "open");
+      const older = over.slice(SHOWN_OVER);
+      const shown = items.filter((alarm) => !older.includes(alarm));
+      refill(
+        content,
+        items.length === 0
+          ? h("p", { class: "soft" }, "There has been no alarm.")
+          : [
+              h("ul", { class: "alarms" }, shown.map(line)),
+              older.length > 0 &&
+                h(
+                  "details",
+                  null,
+                  h("summary", null, `${count(older.length, "older alarm")}`),
+                  h("ul", { class: "alarms" }, older.map(line)),
+                ),
+            ],
+      );
+    } catch (error) {
+      fill(content, problem(error, load));
+    }
+  };
+  const line = (alarm) => {
+    const [sign, kind, word] = STATE[alarm.state] ?? ["note", "idle", alarm.state];
+    const open = alarm.state === "open";
+    return h(
+      "li",
+      { class: open && !alarm.acknowledgement ? "unseen" : "seen", dataset: { key: alarm.alarm } },
+      h("span", { class: `chip ${kind}` }, icon(sign), word),
+      h(
+        "span",
+        { class: "grow" },
+        alarmWords(alarm),
+        h(
+          "span",
+          { class: "fine" },
+          "from ",
+          timeElement(alarm.opened_at),
+          alarm.ended_at && [" to ", timeElement(alarm.ended_at)],
+        ),
+        alarm.acknowledgement &&
+          h(
+            "span",
+            { class: "fine" },
+            `seen by ${alarm.acknowledgement.by}, `,
+            timeElement(alarm.acknowledgement.at),
+            alarm.acknowledgement.note && `: ${alarm.acknowledgement.note}`,
+          ),
+      ),
+      open &&
+        !alarm.acknowledgement &&
+        h(
+          "button",
+          {
+            type: "button",
+            class: "primary",
+            onclick: () => acknowledgeDialog(structure, alarm).then((done) => done && load()),
+          },
+          "Acknowledge",
+          h("span", { class: "hidden-text" }, ` alarm ${alarm.alarm}`),
+        ),
+    );
+  };
+  return { element, load };
+}

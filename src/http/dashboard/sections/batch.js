@@ -1,0 +1,220 @@
+// One batch in detail: its densities, its frequencies against the prediction, and what speaks for or against it.
+
+import { at, read } from "../api.js";
+import { densities } from "../charts/density.js";
+import { modes } from "../charts/modes.js";
+import { cell, fill, h, icon, problem } from "../dom.js";
+import { count, digest, local, number, percentWithin, quantity, timeElement, words } from "../format.js";
+import { trustChip } from "../states.js";
+
+const EFFECTS = {
+  reject: ["cross", "bad", "rejects the batch"],
+  hold_alarm: ["note", "warn", "holds alarms"],
+  note: ["note", "idle", "to note"],
+};
+
+export function batch(structure) {
+  const picker = h("select", { id: "batch-picker", onchange: () => choose(picker.value) });
+  const earlier = h("button", { type: "button", "aria-label": "Earlier batch", onclick: () => step(1) }, icon("left"));
+  const later = h("button", { type: "button", "aria-label": "Later batch", onclick: () => step(-1) }, icon("right"));
+  const description = h("div", null);
+  const density = densities();
+  const mode = modes();
+  const drawn = h("div", { class: "stack" }, density.element, mode.element);
+  const element = h(
+    "section",
+    { id: "batch", class: "panel", "aria-labelledby": "batch-title" },
+    h("h2", { id: "batch-title", tabindex: -1 }, "Batch"),
+    h("p", { class: "row" }, h("label", { for: "batch-picker" }, "Batch of"), earlier, picker, later),
+    description,
+    drawn,
+  );
+  let list = [];
+  let chosen = null;
+  /** The newest batch is followed until somebody chooses another. */
+  let following = true;
+
+  const step = (by) => {
+    const index = list.findIndex((item) => item.batch === chosen) + by;
+    if (index >= 0 && index < list.length) choose(list[index].batch);
+  };
+  const choose = (id) => {
+    following = id === list[0]?.batch;
+    chosen = id;
+    return show();
+  };
+
+  const show = async () => {
+    const id = chosen;
+    const place = list.findIndex((item) => item.batch === id);
+    picker.value = id ?? "";
+    earlier.disabled = place < 0 || place >= list.length - 1;
+    later.disabled = place <= 0;
+    element.classList.add("busy");
+    try {
+      const path = at(structure, `/batches/${encodeURIComponent(id)}`);
+      // A batch that could not be assessed has no detail; what is known of it is shown all the same.
+      const [told, detail] = await Promise.all([read(path), read(`${path}/detail`).catch((error) => ({ error }))]);
+      if (id !== chosen) return;
+      fill(description, describe(told), detail.error && told.assessment && problem(detail.error, show));
+      drawn.hidden = Boolean(detail.error);
+      if (!detail.error) {
+        density.update(detail);
+        mode.update(detail);
+      }
+    } catch (error) {
+      if (id === chosen) fill(description, problem(error, show));
+    } finally {
+      element.classList.remove("busy");
+    }
+  };
+
+  return {
+    element,
+    /** The batches of the span in view; follows the newest. */
+    async update(series) {
+      const newest = [...series.trust].reverse();
+      const changed = newest.length !== list.length || newest[0]?.batch !== list[0]?.batch;
+      list = newest;
+      if (list.length === 0) {
+        drawn.hidden = true;
+        picker.disabled = true;
+        chosen = null;
+        return fill(description, h("p", { class: "soft" }, "No assessed batch in this span of time."));
+      }
+      picker.disabled = false;
+      if (following || !chosen) chosen = list[0].batch;
+      if (changed) {
+        const known = list.some((item) => item.batch === chosen);
+        fill(
+          picker,
+          !known && h("option", { value: chosen }, chosen),
+          list.map((item) =>
+            h(
+              "option",
+              { value: item.batch },
+              `${local(item.time)}${item.verdict === "rejected" ? " – rejected" : ""}`,
+            ),
+          ),
+        );
+      }
+      if (changed || drawn.hidden) await show();
+    },
+    /** Another batch, from a chart. */
+    async select(id) {
+      await choose(id);
+      element.scrollIntoView({
+        block: "start",
+        behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth",
+      });
+      document.getElementById("batch-title")?.focus({ preventScroll: true });
+    },
+    again: () => chosen && show(),
+  };
+}
+
+function describe(told) {
+  const a = told.assessment;
+  const facts = [
+    ["Measured", h("span", null, timeElement(told.measured_from), " to ", timeElement(told.measured_to))],
+    ["Received", timeElement(told.received_at)],
+    [
+      "Measurements",
+      a
+        ? `${told.measurement_count}, of which ${a.measurements_used} used, ${a.measurements_left_out} left out, ${a.measurements_outside} outside the prior`
+        : String(told.measurement_count),
+    ],
+    ["Source", told.source],
+    ["State", words(told.state)],
+    a && [
+      "Trust",
+      h(
+        "span",
+        null,
+        trustChip(a.trust, a.findings.length),
+        a.fit_p_value !== null ? ` p of fit ${number(a.fit_p_value, 2)}` : "",
+      ),
+    ],
+    a && ["Model", digest(a.model_digest)],
+    ["Batch", h("code", null, told.batch)],
+  ].filter(Boolean);
+  return [
+    h(
+      "dl",
+      { class: "facts" },
+      facts.map(([name, value]) => h("div", null, h("dt", null, name), h("dd", null, value))),
+    ),
+    told.failure && h("p", { class: "callout bad" }, icon("alarm"), `The assessment failed: ${told.failure}`),
+    told.next_step && h("p", { class: "callout" }, icon("note"), told.next_step),
+    a?.trust === "rejected" &&
+      h(
+        "p",
+        { class: "callout bad" },
+        icon("cross"),
+        "Rejected: the probability of damage is withheld and no damage alarm raised. The findings say why.",
+      ),
+    a?.findings.length > 0 && h("ul", { class: "findings", "aria-label": "Findings" }, a.findings.map(finding)),
+    a && parameterTable(a),
+  ];
+}
+
+function finding(f) {
+  const [sign, kind, text] = EFFECTS[f.effect] ?? EFFECTS.note;
+  return h(
+    "li",
+    null,
+    h("span", { class: `chip ${kind}` }, icon(sign), words(f.code)),
+    h(
+      "span",
+      { class: "grow" },
+      f.message,
+      h(
+        "span",
+        { class: "fine" },
+        text,
+        f.measurements?.length > 0 && `, ${count(f.measurements.length, "measurement")}`,
+      ),
+    ),
+  );
+}
+
+function parameterTable(a) {
+  const interval = (pair) => (pair ? `${number(pair[0])} to ${number(pair[1])}` : "–");
+  const withheld = a.trust === "rejected";
+  const line = (p) =>
+    h(
+      "tr",
+      null,
+      h("th", { scope: "row" }, p.name),
+      cell("Mean", quantity(p.mean, p.unit)),
+      cell("90 % interval", interval(p.mean_interval)),
+      cell("Threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
+      cell("Change", p.relative_change === null ? "–" : `${number(100 * p.relative_change, 3)} %`),
+      cell(
+        "Probability of damage",
+        p.probability_of_damage === null
+          ? withheld
+            ? "withheld"
+            : "–"
+          : percentWithin(p.probability_of_damage, ...(p.probability_of_damage_interval ?? [null, null])),
+        p.exceeds && " ",
+        p.exceeds && h("span", { class: "chip bad" }, icon("alarm"), "above the limit"),
+      ),
+    );
+  const columns = ["Parameter", "Mean", "90 % interval", "Threshold δ", "Change", "Probability of damage"];
+  return h(
+    "table",
+    { class: "cards" },
+    h("caption", { class: "hidden-text" }, "Parameters of the batch"),
+    h(
+      "thead",
+      null,
+      h(
+        "tr",
+        null,
+        columns.map((c) => h("th", { scope: "col" }, c)),
+      ),
+    ),
+    h("tbody", null, a.parameters.map(line)),
+  );
+}

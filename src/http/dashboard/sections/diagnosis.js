@@ -1,0 +1,160 @@
+// What the simulation gets wrong: diagnoses, their reports, and the extension of the model by what they found.
+
+import { at, read, send } from "../api.js";
+import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
+import { age, number, words } from "../format.js";
+import { progress } from "../jobs.js";
+import { jobChip } from "../states.js";
+
+/** Verdicts that name something a model can be extended by. */
+const EXTENDS = ["cause", "several", "ambiguous"];
+
+export function diagnosis(structure, changed) {
+  const content = h("div", null);
+  const begin = h("button", { type: "button", onclick: () => diagnose() }, "Diagnose");
+  const back = h("button", { type: "button", class: "danger", onclick: () => stepBack() }, "Step back");
+  const element = h(
+    "section",
+    { id: "diagnosis", class: "panel", "aria-labelledby": "diagnosis-title" },
+    h("h2", { id: "diagnosis-title" }, "Diagnosis of the model"),
+    h(
+      "p",
+      { class: "fine" },
+      "A diagnosis shows where the simulation deviates from what is measured, names the cause, and measures what naming it gains.",
+    ),
+    content,
+    h("p", { class: "buttons start" }, begin, back),
+  );
+
+  const load = async () => {
+    try {
+      const { items } = await read(at(structure, "/diagnoses"));
+      // Progress is with the single diagnosis only.
+      const full = await Promise.all(
+        items
+          .slice(0, 10)
+          .map(async (item) => (isBusy(item) || item === items[0] ? { ...item, ...(await details(item)) } : item)),
+      );
+      back.hidden = !items.some((item) => item.extension === "done" || item.extension?.state === "done");
+      refill(
+        content,
+        full.length === 0
+          ? h("p", { class: "soft" }, "There has been no diagnosis yet.")
+          : h("ul", { class: "alarms" }, full.map(line)),
+      );
+    } catch (error) {
+      fill(content, problem(error, load));
+    }
+  };
+  const details = async (item) => {
+    const told = await read(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}`);
+    return {
+      progress: told.progress,
+      failure: told.failure ?? told.extension?.failure,
+      gain: told.result?.gain ?? null,
+      extension: told.extension?.state ?? null,
+      added: told.extension?.result?.added,
+    };
+  };
+  const isBusy = (item) => item.state === "running" || item.extension === "running";
+
+  const line = (item) => {
+    const done = item.state === "done";
+    const extendable =
+      done && EXTENDS.includes(item.verdict) && (item.extension === null || item.extension === "failed");
+    return h(
+      "li",
+      { dataset: { key: item.diagnosis } },
+      jobChip(item.extension === "running" ? "running" : item.state),
+      h(
+        "span",
+        { class: "grow" },
+        item.verdict && h("strong", null, words(item.verdict), ". "),
+        item.summary,
+        gainWords(item.gain),
+        isBusy(item) && progress(item.progress ?? "waiting", "diagnosis"),
+        item.extension === "done" &&
+          h(
+            "span",
+            { class: "fine" },
+            `The model was extended by it${item.added?.length ? `: ${item.added.join("; ")}` : ""}.`,
+          ),
+        item.failure && h("span", { class: "fine bad-text" }, item.failure),
+        h("span", { class: "fine" }, "begun ", age(item.created_at)),
+      ),
+      done && h("a", { class: "button", href: `#/diagnoses/${encodeURIComponent(item.diagnosis)}` }, "Report"),
+      extendable && h("button", { type: "button", class: "primary", onclick: () => extend(item) }, "Extend the model"),
+    );
+  };
+
+  const diagnose = async () => {
+    const done = await ask({
+      title: "Diagnose the model",
+      body: h(
+        "p",
+        null,
+        "All batches of the structure are searched for what the simulation gets wrong; the last quarter is held out to measure the gain. It runs in the background for seconds to minutes and changes nothing.",
+      ),
+      confirm: "Diagnose",
+      submit: () => send(at(structure, "/diagnoses"), {}),
+    });
+    if (done) await load();
+  };
+  const extend = async (item) => {
+    const done = await ask({
+      title: "Extend the model?",
+      body: [
+        h("p", null, h("strong", null, item.summary)),
+        h(
+          "ul",
+          null,
+          [
+            "A new version of the structure gets this cause as an effect.",
+            "A new baseline is trained and calibrated for it, in the background, for minutes.",
+            "If it passes its calibration it takes the place of the present one at once; otherwise nothing changes.",
+            "The undamaged state is taken again from the same batches, and all batches are assessed again: charts and alarms change.",
+            "“Step back” returns to the version before.",
+          ].map((text) => h("li", null, text)),
+        ),
+      ],
+      confirm: "Extend the model",
+      submit: () => send(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}/extension`, {}),
+    });
+    if (done) {
+      notify("The extension runs; its progress is shown here and under Jobs.");
+      await load();
+    }
+  };
+  const stepBack = async () => {
+    const done = await ask({
+      title: "Step back?",
+      body: h(
+        "p",
+        null,
+        "The version of the structure before the last extension comes back with its baseline, and all batches are assessed again. The extension stays stored with its diagnosis.",
+      ),
+      confirm: "Step back",
+      danger: true,
+      submit: () => send(at(structure, "/extension"), undefined, "DELETE"),
+    });
+    if (done) {
+      notify("Went back to the version before; batches are being assessed again.");
+      await load();
+      changed();
+    }
+  };
+  return { element, load };
+}
+
+function gainWords(gain) {
+  if (!gain) return null;
+  const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
+  const { before, after } = gain.rms_error_percent;
+  const alarms = gain.false_alarms_per_1000;
+  return h(
+    "span",
+    { class: "fine" },
+    icon("chart"),
+    `Gain on ${gain.holdout_rows} held-out measurements: error of a predicted frequency ${number(mean(before), 2)} % → ${number(mean(after), 2)} %, false alarms per 1000 batches ${number(alarms.before, 2)} → ${number(alarms.after, 2)}.`,
+  );
+}

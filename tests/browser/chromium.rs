@@ -1,0 +1,171 @@
+//! Headless Chromium over the DevTools protocol: as much of a client as these tests need.
+
+use std::io::{BufRead as _, BufReader};
+use std::net::TcpStream;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::{json, Value};
+use tempfile::TempDir;
+use tungstenite::{Message, WebSocket};
+
+/// Longest wait for anything on a page.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A browser with one page, ended when dropped.
+pub struct Page {
+    child: Child,
+    socket: WebSocket<TcpStream>,
+    session: String,
+    last_id: u64,
+    complaints: Vec<String>,
+    _profile: TempDir,
+}
+
+/// Whether there is a Chromium; the tests say so and pass when there is none.
+pub fn is_installed() -> bool {
+    Command::new("chromium").arg("--version").output().is_ok_and(|output| output.status.success())
+}
+
+impl Page {
+    /// Starts a browser with an empty page.
+    pub fn open() -> Self {
+        let profile = tempfile::tempdir().unwrap();
+        let mut command = Command::new("chromium");
+        command.args(["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]);
+        command.args(["--remote-debugging-port=0", "--disable-background-networking", "--disable-component-update"]);
+        command.arg(format!("--user-data-dir={}", profile.path().display())).arg("about:blank");
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+        let url = lines.find_map(|line| Some(line.ok()?.strip_prefix("DevTools listening on ")?.to_owned())).unwrap();
+        // What it goes on to print must be read, or the pipe fills and it waits.
+        std::thread::spawn(move || lines.for_each(drop));
+
+        let address = url.trim_start_matches("ws://").split('/').next().unwrap();
+        let stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let (socket, _) = tungstenite::client(url.as_str(), stream).unwrap();
+        let (session, complaints) = (String::new(), Vec::new());
+        let mut page = Self { child, socket, session, last_id: 0, complaints, _profile: profile };
+        let target = page.call("Target.createTarget", &json!({ "url": "about:blank" }));
+        let attach = json!({ "targetId": target["targetId"], "flatten": true });
+        page.call("Target.attachToTarget", &attach)["sessionId"].as_str().unwrap().clone_into(&mut page.session);
+        for domain in ["Runtime.enable", "Log.enable", "Page.enable"] {
+            page.call(domain, &json!({}));
+        }
+        page
+    }
+
+    /// Calls a method of the protocol; what the page complains of meanwhile is kept.
+    pub fn call(&mut self, method: &str, params: &Value) -> Value {
+        self.last_id += 1;
+        let mut command = json!({ "id": self.last_id, "method": method, "params": params });
+        if !self.session.is_empty() {
+            command["sessionId"] = json!(self.session);
+        }
+        self.socket.send(Message::text(command.to_string())).unwrap();
+        loop {
+            let Message::Text(text) = self.socket.read().unwrap() else { continue };
+            let message: Value = serde_json::from_str(&text).unwrap();
+            if message["id"] == self.last_id {
+                assert!(message["error"].is_null(), "{method}: {}", message["error"]);
+                return message["result"].clone();
+            }
+            self.hear(&message);
+        }
+    }
+
+    fn hear(&mut self, event: &Value) {
+        let params = &event["params"];
+        let complaint = match event["method"].as_str() {
+            Some("Runtime.exceptionThrown") => Some(&params["exceptionDetails"]),
+            Some("Runtime.consoleAPICalled") if params["type"] == "error" || params["type"] == "warning" => {
+                Some(&params["args"])
+            }
+            // Violations of the content security policy arrive here.
+            Some("Log.entryAdded") if params["entry"]["level"] == "error" => Some(&params["entry"]),
+            _ => None,
+        };
+        self.complaints.extend(complaint.map(Value::to_string));
+    }
+
+    /// What the page has complained of since the last time.
+    pub fn complaints(&mut self) -> Vec<String> {
+        self.evaluate("1");
+        std::mem::take(&mut self.complaints)
+    }
+
+    /// Value of a JavaScript expression; a promise is waited for.
+    pub fn evaluate(&mut self, expression: &str) -> Value {
+        let params = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
+        let outcome = self.call("Runtime.evaluate", &params);
+        let shown: String = expression.chars().take(200).collect();
+        assert!(outcome["exceptionDetails"].is_null(), "{shown}: {}", outcome["exceptionDetails"]);
+        outcome["result"]["value"].clone()
+    }
+
+    /// Waits until an expression is true; gives its value.
+    pub fn wait_for(&mut self, expression: &str) -> Value {
+        let started = Instant::now();
+        loop {
+            let value = self.evaluate(expression);
+            if !matches!(value, Value::Null | Value::Bool(false)) {
+                return value;
+            }
+            let complaints = &self.complaints;
+            assert!(started.elapsed() < PATIENCE, "{expression} did not become true; the page says {complaints:?}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// Colours and width of the window.
+    pub fn look(&mut self, theme: &str, width: u32) {
+        let features = json!([{ "name": "prefers-color-scheme", "value": theme }]);
+        self.call("Emulation.setEmulatedMedia", &json!({ "features": features }));
+        let metrics = json!({ "width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 500 });
+        self.call("Emulation.setDeviceMetricsOverride", &metrics);
+    }
+
+    /// Loads an address anew and waits for the view.
+    pub fn visit(&mut self, url: &str) {
+        // Another hash alone would not load the page again.
+        self.call("Page.navigate", &json!({ "url": "about:blank" }));
+        self.call("Page.navigate", &json!({ "url": url }));
+        self.wait_for("Boolean(document.querySelector('main .view'))");
+    }
+
+    /// Runs a script before every page.
+    pub fn prepare(&mut self, script: &str) {
+        self.call("Page.addScriptToEvaluateOnNewDocument", &json!({ "source": script }));
+    }
+
+    /// Presses a key.
+    pub fn press(&mut self, key: &str) {
+        let code = match key {
+            "Tab" => 9,
+            "Enter" => 13,
+            "Escape" => 27,
+            "ArrowRight" => 39,
+            other => panic!("no code for {other}"),
+        };
+        let mut down = json!({ "type": "keyDown", "key": key, "code": key, "windowsVirtualKeyCode": code });
+        if key == "Enter" {
+            down["text"] = json!("\r");
+        }
+        self.call("Input.dispatchKeyEvent", &down);
+        let up = json!({ "type": "keyUp", "key": key, "code": key, "windowsVirtualKeyCode": code });
+        self.call("Input.dispatchKeyEvent", &up);
+    }
+
+    /// Types into what has the focus.
+    pub fn type_text(&mut self, text: &str) {
+        self.call("Input.insertText", &json!({ "text": text }));
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,332 @@
+//! Every view complete, quiet and accessible; live; usable by keyboard.
+
+use std::sync::OnceLock;
+
+use serde_json::{json, Value};
+use tempfile::TempDir;
+use tokio::sync::{Mutex, MutexGuard};
+
+use crate::chromium::{is_installed, Page};
+use crate::helpers::{created, measurements, repository, spawn, Service};
+
+const UNDAMAGED: [f64; 3] = [4.0, 5.0, 6.0];
+const DAMAGED: [f64; 3] = [3.2, 5.0, 6.0];
+const DAY_S: usize = 86_400;
+const PER_BATCH: usize = 20;
+
+/// One browser at a time: each takes a core.
+async fn turn() -> Option<MutexGuard<'static, ()>> {
+    static TURN: OnceLock<Mutex<()>> = OnceLock::new();
+    if is_installed() {
+        return Some(TURN.get_or_init(Mutex::default).lock().await);
+    }
+    eprintln!("skipped: chromium is not installed (.ci/tools installs it)");
+    None
+}
+
+async fn post(service: &Service, k: [f64; 3], day: usize) -> String {
+    let answer = service.post_batch("three-dof", &measurements(k, PER_BATCH, day * DAY_S)).await;
+    answer["batch"].as_str().unwrap().to_owned()
+}
+
+/// An undamaged state, healthy days, a pause, a batch in another unit, and a loss of k1 that raises an alarm.
+async fn watched_bridge(service: &Service) {
+    let mut batches = vec![post(service, UNDAMAGED, 0).await, post(service, UNDAMAGED, 1).await];
+    let baseline = json!({ "batches": batches });
+    created(service.post("/v1/structures/three-dof/baseline", &baseline).await).await;
+    for day in [2, 3, 12, 13] {
+        batches.push(post(service, UNDAMAGED, day).await);
+    }
+    let mut swapped = measurements(UNDAMAGED, PER_BATCH, 14 * DAY_S);
+    for measurement in &mut swapped {
+        measurement["frequencies_hz"].as_array_mut().unwrap().swap(0, 1);
+    }
+    let rejected = service.post_batch("three-dof", &swapped).await;
+    assert_eq!(rejected["assessment"]["trust"], "rejected", "{rejected}");
+    for day in 15..18 {
+        post(service, DAMAGED, day).await;
+    }
+    let alarms = service.read("/v1/structures/three-dof/alarms?state=open").await;
+    assert_eq!(alarms["items"][0]["parameter"], "k1", "{alarms}");
+}
+
+fn at(service: &Service, view: &str) -> String {
+    format!("http://{}/{view}", service.address())
+}
+
+/// The page of the structure, with its charts drawn.
+fn visit_structure(page: &mut Page, service: &Service) {
+    page.visit(&at(service, "#/structures/three-dof"));
+    page.wait_for("document.querySelectorAll('figure canvas').length >= 12");
+    page.wait_for("document.querySelectorAll('[data-figure^=density] canvas').length === 3");
+}
+
+/// Figures whose canvas is missing or blank.
+const BLANK_FIGURES: &str = "
+    [...document.querySelectorAll('figure')].filter((figure) => figure.offsetParent !== null).filter((figure) => {
+        const canvases = [...figure.querySelectorAll('canvas')];
+        return canvases.length === 0 || canvases.some((canvas) => {
+            if (canvas.width === 0 || canvas.height === 0) return true;
+            const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+            const seen = new Set();
+            for (let i = 0; i < data.length; i += 4) if (data[i + 3] > 0) seen.add(data[i] << 16 | data[i + 1] << 8 | data[i + 2]);
+            return seen.size < 3;
+        });
+    }).map((figure) => figure.dataset.figure)";
+
+/// Text alternatives that are missing: an image needs a name and a description, and its table.
+const UNTOLD_FIGURES: &str = "
+    [...document.querySelectorAll('figure')].filter((figure) => figure.offsetParent !== null).filter((figure) => {
+        const plot = figure.querySelector('[role=img]');
+        const summary = document.getElementById(plot.getAttribute('aria-describedby'))?.textContent ?? '';
+        const button = figure.querySelector('.as-table');
+        button.click();
+        const rows = figure.querySelectorAll('.table-wrap tbody tr').length;
+        button.click();
+        return summary.length < 20 || rows === 0;
+    }).map((figure) => figure.dataset.figure)";
+
+/// Serious and critical findings of axe-core; `None` where it is not installed.
+fn axe_findings(page: &mut Page) -> Option<Value> {
+    let source = std::fs::read_to_string(repository("target/browser/node_modules/axe-core/axe.min.js")).ok()?;
+    page.evaluate(&format!("{source}; undefined"));
+    let run = "axe.run(document).then(({ violations, passes }) => ({
+        rules: passes.length,
+        serious: violations.filter((v) => ['serious', 'critical'].includes(v.impact))
+            .map((v) => [v.id, v.nodes.map((n) => n.html.slice(0, 200) + ' ' + n.failureSummary)]),
+    }))";
+    let outcome = page.evaluate(run);
+    assert!(outcome["rules"].as_u64().unwrap() > 10, "axe looked at too little: {outcome}");
+    Some(outcome["serious"].clone())
+}
+
+fn check_view(page: &mut Page, what: &str) {
+    assert_eq!(page.evaluate(BLANK_FIGURES), json!([]), "blank figures: {what}");
+    assert_eq!(page.evaluate(UNTOLD_FIGURES), json!([]), "figures without words: {what}");
+    let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
+    assert_eq!(overflow, json!(0), "the page scrolls sideways: {what}");
+    match axe_findings(page) {
+        Some(serious) => assert_eq!(serious, json!([]), "axe: {what}"),
+        None => eprintln!("skipped: axe-core is not in target/browser (.ci/tools installs it)"),
+    }
+    assert_eq!(page.complaints(), Vec::<String>::new(), "console: {what}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_view_is_complete_quiet_and_accessible_in_both_themes_and_on_a_phone() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder): (Service, TempDir) = spawn();
+    watched_bridge(&service).await;
+    let diagnosis = service.post("/v1/structures/three-dof/diagnoses", &json!({})).await.json::<Value>().await.unwrap();
+    let diagnosis = diagnosis["diagnosis"].as_str().unwrap().to_owned();
+    let mut page = Page::open();
+    page.visit(&at(&service, "#/jobs"));
+    page.wait_for(&format!("document.querySelector('[data-job=\"{diagnosis}\"]')?.textContent.includes('Done')"));
+
+    for (theme, width) in [("light", 1280), ("dark", 1280), ("light", 390), ("dark", 390)] {
+        page.look(theme, width);
+        let seen = |view: &str| format!("{view}, {theme}, {width} px");
+        page.visit(&at(&service, ""));
+        page.wait_for("document.querySelectorAll('table.fleet tbody tr').length === 3");
+        page.wait_for("document.querySelector('tr[data-structure=three-dof]').textContent.includes('Alarm')");
+        let ground = page.evaluate("getComputedStyle(document.body).backgroundColor");
+        let dark = ["rgb(13, 19, 25)", "rgb(244, 246, 248)"][usize::from(theme == "light")];
+        assert_eq!(ground, json!(dark), "{}", seen("colours"));
+        check_view(&mut page, &seen("fleet"));
+
+        visit_structure(&mut page, &service);
+        for figure in ["parameter-k1", "control", "heat", "trust", "tracks", "density-k1", "modes"] {
+            page.wait_for(&format!("document.querySelectorAll('[data-figure=\"{figure}\"] canvas').length > 0"));
+        }
+        check_view(&mut page, &seen("structure"));
+
+        // One that nothing was measured on says what to do.
+        page.visit(&at(&service, "#/structures/rig"));
+        page.wait_for("document.querySelector('main .blank')?.textContent.includes('curl')");
+        check_view(&mut page, &seen("structure without batches"));
+
+        page.visit(&at(&service, "#/jobs"));
+        page.wait_for("document.querySelectorAll('[data-job]').length > 0");
+        check_view(&mut page, &seen("jobs"));
+
+        page.visit(&at(&service, &format!("#/diagnoses/{diagnosis}")));
+        page.wait_for("document.querySelector('.report')?.shadowRoot.textContent.includes('In short')");
+        check_view(&mut page, &seen("report"));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_batch_posted_elsewhere_appears_without_a_reload() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    watched_bridge(&service).await;
+    let mut page = Page::open();
+    visit_structure(&mut page, &service);
+    page.wait_for("document.getElementById('live').textContent === 'Live'");
+    let before = page.evaluate("document.querySelectorAll('#batch-picker option').length").as_u64().unwrap();
+    page.evaluate("window.sameLoad = true");
+
+    let batch = post(&service, UNDAMAGED, 19).await;
+    page.wait_for(&format!("document.querySelectorAll('#batch-picker option').length === {}", before + 1));
+    page.wait_for(&format!("document.getElementById('batch').textContent.includes('{batch}')"));
+    assert_eq!(page.evaluate("window.sameLoad"), json!(true), "the page was loaded again");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+
+    page.visit(&at(&service, ""));
+    page.wait_for("document.querySelector('tr[data-structure=three-dof]')?.textContent.includes('11 batches')");
+    post(&service, UNDAMAGED, 20).await;
+    page.wait_for("document.querySelector('tr[data-structure=three-dof]').textContent.includes('12 batches')");
+}
+
+/// What has the focus: its tag, text and whether the focus can be seen.
+const FOCUSED: &str = "(() => {
+    const element = document.activeElement;
+    const { outlineStyle, outlineWidth } = getComputedStyle(element);
+    return { tag: element.tagName, text: element.textContent.trim(), label: element.getAttribute('aria-label'),
+             row: element.closest('tr')?.dataset.structure ?? null,
+             visible: outlineStyle !== 'none' && parseFloat(outlineWidth) >= 2 };
+})()";
+
+/// Presses Tab until `wanted` has the focus; every stop on the way must show it.
+fn tab_to(page: &mut Page, wanted: impl Fn(&Value) -> bool) -> Value {
+    for _ in 0..120 {
+        page.press("Tab");
+        let focused = page.evaluate(FOCUSED);
+        if focused["tag"] == "BODY" {
+            continue;
+        }
+        assert_eq!(focused["visible"], true, "the focus cannot be seen: {focused}");
+        if wanted(&focused) {
+            return focused;
+        }
+    }
+    panic!("Tab does not lead there");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn everything_is_reached_and_done_by_keyboard() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    watched_bridge(&service).await;
+    let mut page = Page::open();
+    page.visit(&at(&service, ""));
+    page.wait_for("document.querySelectorAll('table.fleet tbody tr').length === 3");
+    page.wait_for("document.querySelectorAll('.alarms li').length > 0");
+
+    tab_to(&mut page, |f| f["text"] == "Skip to the content");
+    tab_to(&mut page, |f| f["text"] == "Fleet");
+    tab_to(&mut page, |f| f["text"].as_str().unwrap().starts_with("Jobs"));
+    tab_to(&mut page, |f| f["label"].as_str().is_some_and(|l| l.starts_with("Colours")));
+    tab_to(&mut page, |f| f["text"].as_str().unwrap().starts_with("Acknowledge"));
+    page.press("Enter");
+    page.wait_for("document.querySelector('dialog[open]') !== null");
+    page.press("Escape");
+    page.wait_for("document.querySelector('dialog') === null");
+    let back = page.evaluate(FOCUSED);
+    assert!(back["text"].as_str().unwrap().starts_with("Acknowledge"), "the focus is lost: {back}");
+
+    tab_to(&mut page, |f| f["row"] == "three-dof");
+    page.press("Enter");
+    page.wait_for("document.querySelector('[data-page=structure]') !== null");
+    page.wait_for("document.querySelectorAll('[data-figure=control] canvas').length > 0");
+    tab_to(&mut page, |f| f["text"] == "1 week");
+    page.press("Enter");
+    page.wait_for("[...document.querySelectorAll('.spans button')].some((b) => b.ariaPressed === 'true' && b.textContent === '1 week')");
+    // A chart is read by arrow keys.
+    page.evaluate("document.querySelector('[data-figure=control] .plot').focus()");
+    page.press("ArrowRight");
+    page.wait_for("document.querySelector('[data-figure=control] .readout').textContent.includes('shift')");
+    tab_to(&mut page, |f| f["text"] == "Show as table");
+    page.press("Enter");
+    page.wait_for("document.querySelectorAll('[data-figure=control] .table-wrap tbody tr').length > 0");
+    tab_to(&mut page, |f| f["text"] == "Diagnose");
+    page.press("Enter");
+    page.wait_for("document.querySelector('dialog[open]')?.textContent.includes('held out')");
+    page.press("Escape");
+    page.wait_for("document.querySelector('dialog') === null");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    watched_bridge(&service).await;
+    let mut page = Page::open();
+    visit_structure(&mut page, &service);
+    page.evaluate("document.querySelector('#alarms button').click()");
+    page.wait_for("document.querySelector('dialog[open] input[name=by]') !== null");
+    page.evaluate("document.querySelector('input[name=by]').focus()");
+    page.type_text("Ines Vogel");
+    page.press("Enter");
+    page.wait_for("document.getElementById('alarms').textContent.includes('seen by Ines Vogel')");
+    let alarms = service.read("/v1/structures/three-dof/alarms").await;
+    assert_eq!(alarms["items"][0]["acknowledgement"]["by"], "Ines Vogel", "{alarms}");
+
+    page.evaluate("document.querySelector('#maintenance button').click()");
+    page.wait_for("document.querySelector('dialog[open] input[name=reason]') !== null");
+    page.evaluate("document.querySelector('input[name=reason]').focus()");
+    page.type_text("new bearings");
+    // An end before the beginning is refused by the service, and the dialog says so.
+    page.evaluate("document.querySelector('input[name=to]').value = '2020-01-01T00:00'");
+    page.press("Enter");
+    page.wait_for("document.querySelector('dialog .problem')?.textContent.includes('/to')");
+    assert!(page.complaints().iter().all(|c| c.contains("422")), "only the refused request is told of");
+    page.evaluate("document.querySelector('input[name=to]').value = '2100-01-01T00:00'");
+    page.evaluate("document.querySelector('dialog .primary').click()");
+    page.wait_for("document.getElementById('maintenance').textContent.includes('new bearings')");
+    let windows = service.read("/v1/structures/three-dof/maintenance").await;
+    assert_eq!(windows["items"][0]["reason"], "new bearings", "{windows}");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+/// A service that wants a token, as the page sees it.
+const WANTS_TOKEN: &str = "
+    const send = window.fetch;
+    window.fetch = (path, options) => {
+        const given = new Headers(options?.headers).get('authorization');
+        if (given === 'Bearer mw_right') return send(path, options);
+        const body = JSON.stringify({ title: 'Unauthorized', status: 401, code: 'unauthorized', detail: 'a token is needed', request_id: 'id-1' });
+        return Promise.resolve(new Response(body, { status: 401, headers: { 'content-type': 'application/problem+json' } }));
+    };";
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_is_asked_for_once_and_a_wrong_one_again() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    let mut page = Page::open();
+    page.prepare(WANTS_TOKEN);
+    page.call("Page.navigate", &json!({ "url": at(&service, "") }));
+    for (attempt, token) in ["mw_wrong", "mw_right"].into_iter().enumerate() {
+        page.wait_for("document.querySelectorAll('dialog[open] input[name=token]').length === 1");
+        let told = page.evaluate("document.querySelector('dialog').textContent.includes('did not take the token')");
+        assert_eq!(told, json!(attempt > 0));
+        page.evaluate("document.querySelector('input[name=token]').focus()");
+        page.type_text(token);
+        page.press("Enter");
+        page.wait_for(&format!("sessionStorage.getItem('modalwatch.token') === '{token}'"));
+    }
+    page.wait_for("document.querySelectorAll('table.fleet tbody tr').length === 3");
+    page.wait_for("document.getElementById('live').textContent === 'Live'");
+    assert_eq!(page.evaluate("document.querySelector('dialog')"), Value::Null);
+    assert_eq!(page.evaluate("localStorage.getItem('modalwatch.token')"), Value::Null, "the token outlives the tab");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_lost_service_is_shown_and_the_page_recovers_by_itself() {
+    let Some(_turn) = turn().await else { return };
+    let (mut service, folder) = spawn();
+    let mut page = Page::open();
+    page.visit(&at(&service, ""));
+    page.wait_for("document.getElementById('live').textContent === 'Live'");
+    service.kill();
+    page.wait_for("document.getElementById('live').textContent === 'Reconnecting'");
+
+    let address = service.address().to_owned();
+    let mut again = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    again.args(["serve", "--listen", &address, "--data-dir"]).arg(folder.path());
+    let service = Service::spawn(&mut again);
+    post(&service, UNDAMAGED, 0).await;
+    page.wait_for("document.getElementById('live').textContent === 'Live'");
+    page.wait_for("document.querySelector('tr[data-structure=three-dof]').textContent.includes('1 batch')");
+}
