@@ -7,7 +7,7 @@ use crate::quantity::{Digest, Timestamp};
 use crate::trust::Trust;
 
 /// How far a stored batch has come.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BatchState {
     /// On disk, not assessed yet: it waits for its turn or for a trained baseline.

@@ -79,7 +79,7 @@ pub fn probability_of_damage(pool: &[f64], threshold: f64, direction: DamageDire
 }
 
 /// What a quantity is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum QuantityKind {
     /// A parameter of the structure.
@@ -114,7 +114,7 @@ pub struct QuantitySamples {
 }
 
 /// The undamaged state of one quantity.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct UndamagedQuantity {
     /// Name of the quantity.
     pub name: String,
@@ -139,7 +139,7 @@ pub struct UndamagedQuantity {
 }
 
 /// Mean and spread of single measurements in the undamaged state, noise included.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct ChartReference {
     /// Mean of the posterior means of the measurements, in the quantity's unit.
     pub mean: f64,
@@ -175,7 +175,7 @@ pub struct UndamagedState {
 }
 
 /// The values of a covariate that an undamaged state saw.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SeenCovariate {
     /// Least and largest number.

@@ -20,8 +20,9 @@ pub struct OutOfRange {
 }
 
 /// A natural frequency: finite and above 0 Hz.
-#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, utoipa::ToSchema)]
 #[serde(transparent)]
+#[schema(value_type = f64, exclusive_minimum = 0)]
 pub struct Hertz(f64);
 
 impl Hertz {
@@ -72,7 +73,8 @@ impl Probability {
 }
 
 /// A point in time, whole microseconds since 1970-01-01T00:00:00Z; written as RFC 3339 in UTC.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, utoipa::ToSchema)]
+#[schema(value_type = String, format = DateTime, examples("2026-03-01T12:00:00Z"))]
 pub struct Timestamp(jiff::Timestamp);
 
 impl Timestamp {
@@ -106,6 +108,10 @@ impl Timestamp {
 
     /// The system clock now.
     pub fn now() -> Self {
+        fault_point!("clock", |micros| {
+            let micros = micros.and_then(|text| text.parse().ok()).expect("the test gives microseconds");
+            Self::from_micros(micros).expect("the test gives a time within the calendar")
+        });
         Self::from_micros(jiff::Timestamp::now().as_microsecond()).expect("the clock is within the calendar")
     }
 
@@ -130,8 +136,9 @@ impl Serialize for Timestamp {
 /// Name of a structure: 1 to 64 of `a–z 0–9 - _ .`, beginning with a letter or digit.
 ///
 /// It becomes a path segment and a folder name, so nothing else is let in.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schema(value_type = String, min_length = 1, max_length = 64, pattern = "^[a-z0-9][a-z0-9._-]*$", examples("three-dof"))]
 pub struct StructureId(String);
 
 impl StructureId {
@@ -178,8 +185,9 @@ impl From<StructureId> for String {
 }
 
 /// SHA-256 of some content, written as 64 hexadecimal digits.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(transparent)]
+#[schema(value_type = String, pattern = "^[0-9a-f]{64}$")]
 pub struct Digest(String);
 
 impl Digest {

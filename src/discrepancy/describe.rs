@@ -17,7 +17,7 @@ use crate::stats;
 const Z90: f64 = 1.644_853_626_951_472;
 
 /// What a cause acts on.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct TargetName {
     /// `spring`, `spring_group`, `mass`, `mass_group`, `frequency_scale`, `frequency_offset`, `setting`, `added_spring`,
     /// `oscillator`, `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table.
@@ -33,7 +33,7 @@ pub struct TargetName {
 }
 
 /// A number of a cause.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct NamedNumber {
     /// `swing` over the middle 90 % of the covariate or `size`, then the numbers of the law.
     pub name: String,
@@ -46,7 +46,7 @@ pub struct NamedNumber {
 }
 
 /// A cause, as the report gives it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Cause {
     /// What changes.
     pub target: TargetName,

@@ -22,7 +22,7 @@ const BOOTSTRAPS: usize = 500;
 const BLOCKS: usize = 20;
 
 /// A figure before and after the extension.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Change<T> {
     /// By the simulation as it was.
     pub before: T,
@@ -31,7 +31,7 @@ pub struct Change<T> {
 }
 
 /// Log predictive density.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DensityChange {
     /// Nats a row, simulation as it was.
     pub before: f64,
@@ -44,7 +44,7 @@ pub struct DensityChange {
 }
 
 /// The gain table.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Gain {
     /// Rows it was measured on.
     pub holdout_rows: usize,

@@ -19,8 +19,9 @@ const ALL_PAIRS_MASSES: usize = 12;
 const MOST_ADDED: usize = 400;
 
 /// What kind of thing a cause is, which says how plausible it is and what to do about it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
+#[schema(as = CauseClass)]
 pub enum Class {
     /// Weather, load, moisture.
     Environment,

@@ -13,7 +13,7 @@ use crate::simulator::law::lagged;
 use crate::stats;
 
 /// Shape of one misfit: a mode's residual, or a parameter's drift, over a covariate.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Misfit {
     /// Mode, from 1, whose frequencies deviate.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -30,7 +30,7 @@ pub struct Misfit {
 }
 
 /// What the best explanation leaves.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Remainder {
     /// Function of the covariates that it goes with, such as `temperature_c × humidity_percent`.
     pub function: String,

@@ -56,8 +56,9 @@ const MISFIT_SHOWN: f64 = 0.01;
 const COLLINEAR: f64 = 0.98;
 
 /// What was found.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
+#[schema(as = DiagnosisVerdict)]
 pub enum Verdict {
     /// One cause, nearly sure.
     Cause,
@@ -72,7 +73,7 @@ pub enum Verdict {
 }
 
 /// A cause that was not chosen.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Alternative {
     /// The cause.
     #[serde(flatten)]
@@ -86,7 +87,7 @@ pub struct Alternative {
 }
 
 /// The answer to "what does the simulation get wrong?".
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Diagnosis {
     /// The structure.
     pub structure: String,

@@ -50,7 +50,8 @@ pub struct RawMeasurement {
 }
 
 /// A mistake in the input and its place.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[schema(as = InputProblem)]
 pub struct Problem {
     /// JSON pointer, or line and column of a table.
     pub pointer: String,

@@ -1,7 +1,9 @@
 //! Measurements as a table.
 //!
 //! Columns: `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, declared covariates by name, `set_<parameter>`; an empty
-//! cell is a missing value. Separator `,`, `;` or tab, found from the header; with `;` or tab a decimal comma is read.
+//! cell is a missing value. Separator `,`, `;` or tab, found from the header or from a first line `sep=;`; with `;` or tab a
+//! decimal comma is read. What spreadsheets add is taken: a byte order mark, CRLF, blanks about cells, empty lines, columns
+//! without a name and without a value.
 
 use std::collections::BTreeMap;
 
@@ -60,7 +62,7 @@ pub fn offered(
         let line = error.position().map_or(1, csv::Position::line);
         vec![Problem::new(format!("line {line}"), error.to_string())]
     };
-    let mut records = reader(text, separator).into_records();
+    let mut records = reader(text, separator).into_records().skip(usize::from(named_separator(text).is_some()));
     let Some(header) = records.next() else { return Ok(Vec::new()) };
     let header = header.map_err(|e| problem(&e))?;
     let unknown: Vec<usize> =
@@ -100,6 +102,22 @@ fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
     Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
 }
 
+/// The separator that a first line `sep=;` names, as some spreadsheets write it.
+fn named_separator(text: &str) -> Option<u8> {
+    let line = text.lines().next()?.trim_matches('"');
+    let separator = line.get(..4).filter(|start| start.eq_ignore_ascii_case("sep=")).and(line.get(4..))?;
+    [b',', b';', b'\t'].into_iter().find(|s| separator.as_bytes() == [*s])
+}
+
+/// Line of the file on which a record stands, from 1: the reader gives the place where it began to look for it, before the
+/// line ends and empty lines in front of it.
+fn line_of(text: &str, record: &csv::StringRecord) -> u64 {
+    let Some(position) = record.position() else { return 1 };
+    let rest = text.as_bytes().get(position.byte() as usize..).unwrap_or_default();
+    let passed = rest.iter().take_while(|b| b"\r\n".contains(b)).filter(|b| **b == b'\n').count();
+    position.line() + passed as u64
+}
+
 fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
     csv::ReaderBuilder::new()
         .delimiter(separator)
@@ -113,6 +131,8 @@ fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
 #[derive(Debug, Clone, PartialEq)]
 enum Column {
     Ignored,
+    /// Without a name: spreadsheets write such columns behind the last; a value in one has no meaning.
+    Unnamed,
     Time,
     Frequency(usize),
     Std(usize),
@@ -133,7 +153,7 @@ pub fn read(
     let text = text(bytes)?;
     let separator = separator(text);
     let mut reader = reader(text, separator);
-    let mut records = reader.records();
+    let mut records = reader.records().skip(usize::from(named_separator(text).is_some()));
     let mut next = || match records.next() {
         None => Ok(None),
         Some(Ok(record)) => Ok(Some(record)),
@@ -145,10 +165,10 @@ pub fn read(
     let Some(header) = next()? else {
         return Err(vec![Problem::new("line 1", "the table is empty: its first line names the columns")]);
     };
-    let columns = columns(&header, modes, covariates, options)?;
+    let columns = columns(&header, line_of(text, &header), modes, covariates, options)?;
     let mut measurements = Vec::new();
     while let Some(record) = next()? {
-        let line = record.position().map_or(1, csv::Position::line);
+        let line = line_of(text, &record);
         if record.iter().all(str::is_empty) {
             continue;
         }
@@ -157,8 +177,11 @@ pub fn read(
     Ok(measurements)
 }
 
-/// The separator that is most frequent in the header.
+/// The separator that the table names, or else the one that is most frequent in its header.
 fn separator(text: &str) -> u8 {
+    if let Some(named) = named_separator(text) {
+        return named;
+    }
     let header = text.lines().find(|line| !line.trim().is_empty()).unwrap_or_default();
     let count = |c: u8| header.bytes().filter(|b| *b == c).count();
     [b',', b';', b'\t'].into_iter().rev().max_by_key(|c| count(*c)).unwrap_or(b',')
@@ -166,11 +189,11 @@ fn separator(text: &str) -> u8 {
 
 fn columns(
     header: &csv::StringRecord,
+    line: u64,
     modes: usize,
     covariates: &[Covariate],
     options: &CsvOptions,
 ) -> Result<Vec<Column>, Vec<Problem>> {
-    let line = header.position().map_or(1, csv::Position::line);
     let mut problems = Vec::new();
     let mut add = |message: String| problems.push(Problem::new(format!("line {line}"), message));
     let mut columns: Vec<Column> = Vec::new();
@@ -189,7 +212,7 @@ fn columns(
             Some(Column::Frequency(mode) | Column::Std(mode)) if *mode >= modes => {
                 add(format!("column {}: the structure has {modes} modes", shown(name)));
             }
-            Some(other) if *other != Column::Ignored && columns.contains(other) => {
+            Some(other) if ![Column::Ignored, Column::Unnamed].contains(other) && columns.contains(other) => {
                 add(format!("column {} is there twice", shown(name)));
             }
             Some(_) => {}
@@ -215,6 +238,9 @@ fn columns(
 
 fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<Column> {
     let lower = name.to_ascii_lowercase();
+    if name.is_empty() {
+        return Some(Column::Unnamed);
+    }
     let mode = |text: &str| {
         let number: usize = text.strip_prefix('f')?.strip_suffix("_hz")?.parse().ok()?;
         number.checked_sub(1)
@@ -266,6 +292,10 @@ fn row(
         };
         match column {
             Column::Ignored => {}
+            Column::Unnamed => {
+                let message = format!("{} stands in a column without a name: name it in the first line", shown(cell));
+                return Err(vec![Problem::new(format!("line {line}"), message)]);
+            }
             Column::Time => raw.measured_at = Some(cell.to_owned()),
             Column::Frequency(mode) => raw.frequencies_hz[*mode] = Some(number(format!("f{}_hz", mode + 1))?),
             Column::Std(mode) => {

@@ -1,9 +1,11 @@
 //! What arrives: measured natural frequencies, already checked. Values of these types are valid.
 //!
-//! [`check`] turns raw values into these types, [`csv`] reads and writes them as tables.
+//! [`check`] turns raw values into these types, [`body`] reads them from JSON, [`csv`] reads and writes them as tables.
 
+pub mod body;
 pub mod check;
 pub mod csv;
+pub mod json;
 
 use std::collections::BTreeMap;
 
@@ -12,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::quantity::{Digest, Hertz, OutOfRange, StructureId, Timestamp};
 
 /// Kind of a covariate's values.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CovariateKind {
     /// A finite number, in the unit of the covariate's name.
@@ -32,7 +34,7 @@ pub struct Covariate {
 }
 
 /// Value of a covariate at one measurement.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(untagged)]
 pub enum CovariateValue {
     /// A finite number.
@@ -42,7 +44,7 @@ pub enum CovariateValue {
 }
 
 /// The natural frequencies identified from one record, mode by mode.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct ModalMeasurement {
     /// When it was measured.
     pub measured_at: Timestamp,

@@ -16,7 +16,7 @@ use crate::parameter::DamageDirection;
 use crate::quantity::{json_pointer, shown, Digest};
 
 /// A structure as a file describes it; `simulator::Simulator` is the checked form.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StructureDefinition {
     /// Name of the structure, see [`crate::quantity::StructureId`].
@@ -62,7 +62,7 @@ pub struct StructureDefinition {
 }
 
 /// An effect: target × law × covariate, with what is known of its numbers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EffectDefinition {
     /// Unique name.
@@ -93,7 +93,7 @@ pub struct EffectDefinition {
 }
 
 /// What an effect changes.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum TargetDefinition {
     /// Stiffness of these springs, k(1 + g).
@@ -115,7 +115,7 @@ pub enum TargetDefinition {
 }
 
 /// What computes the frequencies.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SimulationKind {
     /// Bodies on springs.
@@ -128,7 +128,7 @@ pub enum SimulationKind {
 }
 
 /// A place along a beam.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NodeDefinition {
     /// Unique name; `ground` is taken.
@@ -141,7 +141,7 @@ pub struct NodeDefinition {
 }
 
 /// What holds a node of a beam.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Support {
     /// Nothing.
@@ -156,7 +156,7 @@ pub enum Support {
 }
 
 /// A span of constant cross-section between two nodes.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BeamDefinition {
     /// Unique name.
@@ -180,7 +180,7 @@ fn usual_elements() -> usize {
 }
 
 /// Runs of a finite-element model, one line each: a column for every parameter by its name, and `f1_hz`, `f2_hz`, ….
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TableDefinition {
     /// A CSV file, relative to the structure file; its text takes its place as soon as the file is read.
@@ -196,7 +196,7 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 }
 
 /// Standard deviation of one measured frequency.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum MeasurementNoise {
     /// As a share of the frequency.
@@ -222,7 +222,7 @@ impl MeasurementNoise {
 }
 
 /// A mass.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MassDefinition {
     /// Unique name; `ground` is taken.
@@ -235,7 +235,7 @@ pub struct MassDefinition {
 }
 
 /// A spring between two masses or nodes, or one of them and the ground.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SpringDefinition {
     /// Unique name.
@@ -253,7 +253,7 @@ pub struct SpringDefinition {
 }
 
 /// An unknown parameter.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ParameterDefinition {
     /// Unique name.
@@ -272,7 +272,7 @@ pub struct ParameterDefinition {
 }
 
 /// What is known of a parameter before measuring.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Prior {
     /// Equally probable between the two values.
@@ -280,7 +280,7 @@ pub enum Prior {
 }
 
 /// A stiffness that a parameter sets: a spring or a span.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sets {
     /// Name of the spring.
@@ -295,7 +295,7 @@ pub struct Sets {
 }
 
 /// Stiffness as a function of a parameter.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Law {
     /// k = a·exp(b·p) + c.
@@ -303,7 +303,7 @@ pub enum Law {
 }
 
 /// Constants of k = a·exp(b·p) + c (paper Eq. 25).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Exponential {
     /// N/m.
@@ -329,7 +329,7 @@ impl Law {
 }
 
 /// Something measured beside the frequencies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CovariateDefinition {
     /// Unique name with its unit, such as `temperature_c`.

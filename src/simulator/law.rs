@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 const SERIES: f64 = 1e-4;
 
 /// Form of a law. u = c − reference.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LawKind {
     /// g = size.

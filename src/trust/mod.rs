@@ -12,8 +12,9 @@ use serde::{Deserialize, Serialize};
 use crate::baseline::Baseline;
 
 /// Whether the probability of damage of a batch may be used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
+#[schema(as = TrustVerdict)]
 pub enum Verdict {
     /// Nothing speaks against it.
     Accepted,
@@ -22,8 +23,9 @@ pub enum Verdict {
 }
 
 /// What a finding does to the answer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
+#[schema(as = FindingEffect)]
 pub enum Effect {
     /// The reader is told.
     Note,
@@ -34,8 +36,9 @@ pub enum Effect {
 }
 
 /// What was found; the names are part of the API.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
+#[schema(as = FindingCode)]
 pub enum Code {
     /// No parameters of the prior give these frequencies within their noise.
     SimulationDoesNotFit,
@@ -82,7 +85,7 @@ pub enum Code {
 }
 
 /// One thing a reader must know before believing the figures.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Finding {
     /// Its name.
     pub code: Code,

@@ -90,3 +90,69 @@ proptest! {
         let _ = read(text.as_bytes(), 3, &covariates(), &options());
     }
 }
+
+/// What spreadsheets and loggers do to a table: each of these is the same two measurements.
+#[test]
+fn the_ways_a_table_is_written_are_read_alike() {
+    let (covariates, space) = (covariates(), space());
+    let expectation = Expectation {
+        modes: 3,
+        frequency_limits_hz: (0.01, 100.0),
+        covariates: &covariates,
+        space: &space,
+        now: Timestamp::now(),
+        max_measurements: 100,
+    };
+    let plain = "measured_at,f1_hz,f2_hz,f3_hz,std_f1_hz,temperature_c,Operator,set_k1\n\
+                 2026-01-01T00:00:00Z,0.41,0.74,0.93,0.001,-3.5,anna,4.5\n\
+                 2026-01-01T00:10:00Z,0.42,,0.94,,,,\n";
+    let of = |text: &str| check_measurements(read(text.as_bytes(), 3, &covariates, &options()).unwrap(), &expectation);
+    let expected = of(plain).unwrap();
+    assert_eq!((expected.len(), expected[1].frequencies_hz[1]), (2, None));
+    let semicolons = plain.replace(',', ";");
+    let with_each_line = |f: &dyn Fn(&str) -> String| plain.lines().map(f).collect::<String>();
+    let cases: Vec<(&str, String)> = vec![
+        ("byte order mark", format!("\u{feff}{plain}")),
+        ("CRLF", plain.replace('\n', "\r\n")),
+        ("CR alone", plain.replace('\n', "\r")),
+        ("no newline at the end", plain.trim_end().to_owned()),
+        ("newlines at the end", format!("{plain}\n\n")),
+        ("empty lines", plain.replace('\n', "\n\n")),
+        ("lines of separators", format!("{plain},,,,,,,\n")),
+        ("blanks about cells", plain.replace(',', " , ")),
+        ("blanks at the ends of lines", with_each_line(&|line| format!("{line}  \t\n"))),
+        ("semicolons", semicolons.clone()),
+        ("semicolons and decimal commas", semicolons.replace("0.", "0,").replace("-3.5", "-3,5").replace("4.5", "4,5")),
+        ("tabs", plain.replace(',', "\t")),
+        (
+            "tabs and decimal commas",
+            plain.replace(',', "\t").replace("0.", "0,").replace("3.5", "3,5").replace("4.5", "4,5"),
+        ),
+        ("upper case", plain.replacen("measured_at,f1_hz,f2_hz", "Measured_At,F1_Hz,F2_HZ", 1)),
+        ("case of covariates", plain.replacen("temperature_c,Operator", "Temperature_C,operator", 1)),
+        ("quotes", with_each_line(&|line| format!("\"{}\"\n", line.replace(',', "\",\"")))),
+        ("columns without a name", with_each_line(&|line| format!("{line},,\n"))),
+        ("sep=", format!("sep=;\r\n{}", semicolons.replace('\n', "\r\n"))),
+        ("all at once", format!("\u{feff}SEP=;\r\n{};;", semicolons.replace('\n', ";;\r\n").replace("0.", "0,"))),
+    ];
+    for (name, text) in cases {
+        assert_eq!(of(&text), Ok(expected.clone()), "{name}:\n{text}");
+    }
+}
+
+#[test]
+fn what_cannot_be_meant_is_refused_with_its_line() {
+    let refused = |text: &str| read(text.as_bytes(), 3, &covariates(), &options()).unwrap_err().remove(0);
+    for (text, place, message) in [
+        ("measured_at;f1_hz;f2_hz;f3_hz\n\n2026-01-01T00:00:00Z;1.234,5;1;1\n", "line 3, column f1_hz", "is no number"),
+        ("measured_at,f1_hz,f2_hz,f3_hz,\r\n2026-01-01T00:00:00Z,1,1,1,7\r\n", "line 2", "column without a name"),
+        ("measured_at,f1_hz,f2_hz,f3_hz\r\n\r\n2026-01-01T00:00:00Z,1,x,1", "line 3, column f2_hz", "is no number"),
+        ("sep=;\nmeasured_at;f1_hz;f2_hz\n", "line 2", "missing column f3_hz"),
+        ("measured_at,f1_hz,F1_HZ,f2_hz,f3_hz\n", "line 1", "is there twice"),
+        ("", "line 1", "empty"),
+    ] {
+        let problem = refused(text);
+        assert_eq!(problem.pointer, place, "{text}: {problem:?}");
+        assert!(problem.message.contains(message), "{text}: {problem:?}");
+    }
+}

@@ -1,0 +1,293 @@
+//! `/v1/structures/{id}/measurements`: what was measured, as it was measured.
+//!
+//! JSON comes a page at a time; CSV, NDJSON and Parquet come as one file for the whole window. A file is made page by page while
+//! it is sent: memory stays the same whatever its size, and no transaction stays open for a slow reader.
+
+use axum::body::{Body, Bytes};
+use axum::extract::State;
+use axum::http::{header, HeaderMap};
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use futures_util::stream::try_unfold;
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+
+use super::error::ApiError;
+use super::history::link_next;
+use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
+use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
+use super::table::{Cell, Format, Kind, TableWriter};
+use super::Shared;
+use crate::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
+use crate::monitor::Watched;
+use crate::quantity::{shown, Hertz, StructureId, Timestamp};
+use crate::store::{MeasurementPlace, MeasurementQuery, Store, StoredMeasurement};
+
+/// Measurements read at a time.
+const PAGE: usize = 2_000;
+
+/// Of Parquet, whose row groups are better large.
+const ROW_GROUP: usize = 10_000;
+
+/// Query of the measurements.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct MeasurementParams {
+    /// Taken at this time or later.
+    #[param(value_type = Option<String>, format = DateTime)]
+    from: Option<String>,
+    /// Taken before this time.
+    #[param(value_type = Option<String>, format = DateTime)]
+    to: Option<String>,
+    /// Without it, `Accept` decides.
+    #[param(value_type = Option<ExportFormat>, inline)]
+    format: Option<String>,
+    /// Most measurements; without it 100 as JSON, all of them as another format.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
+    limit: Option<String>,
+    /// `next` of the page before.
+    #[param(pattern = "^[0-9]{1,16}~[0-9a-z-]{1,64}~[0-9]{1,9}$")]
+    cursor: Option<String>,
+}
+
+/// How measurements are written.
+#[derive(ToSchema)]
+#[schema(rename_all = "lowercase")]
+#[expect(dead_code, reason = "only its description is used")]
+enum ExportFormat {
+    Json,
+    Csv,
+    Ndjson,
+    #[cfg(feature = "parquet")]
+    Parquet,
+}
+
+/// Measurements in the order of the history.
+#[derive(Debug, Serialize, ToSchema)]
+struct MeasurementPage {
+    structure: StructureId,
+    items: Vec<MeasurementItem>,
+    /// Cursor of the next page; `null` on the last.
+    next: Option<String>,
+}
+
+/// A measurement with where it came from.
+#[derive(Debug, Serialize, ToSchema)]
+struct MeasurementItem {
+    batch: String,
+    source: String,
+    #[serde(flatten)]
+    measurement: ModalMeasurement,
+}
+
+impl From<StoredMeasurement> for MeasurementItem {
+    fn from(stored: StoredMeasurement) -> Self {
+        Self { batch: stored.place.batch_id, source: stored.source, measurement: stored.measurement }
+    }
+}
+
+/// `GET /v1/structures/{id}/measurements`: raw measurements of a window.
+///
+/// # Errors
+/// 404 for the structure, 406 for Parquet where it is not built in, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/measurements", tag = "batches", operation_id = "export_measurements",
+    summary = "Raw measurements",
+    description = "What was measured, in the order of the history: batches by their first measurement, in a batch as they came. \
+                   JSON comes a page at a time, the header `Link` has the path of the next; CSV, NDJSON and Parquet come as \
+                   one file for the whole window. A table has the columns `measured_at`, `source`, `batch`, `f1_hz` …, \
+                   `std_f1_hz` …, the declared covariates, `set_<parameter>`; posted again with `ignore=source,batch` it is \
+                   the same batch.",
+    params(StructurePath, MeasurementParams),
+    responses(
+        (status = 200, description = "Measurements", content(
+            (MeasurementPage = "application/json"), (String = "text/csv"), (MeasurementItem = "application/x-ndjson"),
+            ("application/vnd.apache.parquet")
+        ), headers(("Link" = String, description = "The next page, `rel=\"next\"`"))),
+        Unknown, Invalid, NotAcceptable
+    )
+)]
+pub async fn measurements(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    ApiQuery(query): ApiQuery<MeasurementParams>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let id = structure_id(&id)?;
+    let watched = shared.monitor.structure(&id)?;
+    let allowed = [Format::Json, Format::Csv, Format::Ndjson, Format::Parquet];
+    let format = Format::of(query.format.as_deref(), &headers, &allowed)?;
+    let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
+    let after = query.cursor.as_deref().map(place).transpose()?;
+    let limit = query.limit.as_deref().map(|limit| page_limit(Some(limit))).transpose()?;
+    let store = shared.monitor.store().clone();
+    let mut page = MeasurementQuery { from: window.from, to: window.to, limit: page_limit(None)?, after };
+    if format != Format::Json {
+        page.limit = if format == Format::Parquet { ROW_GROUP } else { PAGE };
+        let writer = Writer::new(format, &watched)?;
+        let export = Export { store, structure: id, page, left: limit, writer };
+        return export.answer(format).await;
+    }
+    page.limit = limit.unwrap_or(page.limit);
+    let found = store.measurements(&id, &page).await?;
+    let next = (found.len() == page.limit).then(|| found.last().map(|m| cursor(&m.place))).flatten();
+    let items = found.into_iter().map(MeasurementItem::from).collect();
+    let mut response = Json(MeasurementPage { structure: id.clone(), items, next: next.clone() }).into_response();
+    let given = [("from", &query.from), ("to", &query.to), ("format", &query.format), ("limit", &query.limit)];
+    link_next(&mut response, &format!("/v1/structures/{id}/measurements"), &given, next.as_deref());
+    Ok(response)
+}
+
+fn cursor(place: &MeasurementPlace) -> String {
+    format!("{}~{}~{}", place.batch_from.micros(), place.batch_id, place.ordinal)
+}
+
+fn place(text: &str) -> Result<MeasurementPlace, ApiError> {
+    let mut parts = text.splitn(3, '~');
+    let time = parts.next().and_then(|t| t.parse().ok()).and_then(|t| Timestamp::from_micros(t).ok());
+    let batch = parts.next().filter(|batch| batch.len() <= 64);
+    if let (Some(batch_from), Some(batch), Some(ordinal)) = (time, batch, parts.next().and_then(|n| n.parse().ok())) {
+        return Ok(MeasurementPlace { batch_from, batch_id: batch.to_owned(), ordinal });
+    }
+    let message = format!("{} was not given out by this service", shown(text));
+    Err(ApiError::invalid_field("query/cursor", message))
+}
+
+/// A file on its way.
+struct Export {
+    store: Store,
+    structure: StructureId,
+    /// The next page to read.
+    page: MeasurementQuery,
+    /// Measurements left of those asked for; `None` for all.
+    left: Option<usize>,
+    writer: Writer,
+}
+
+/// A part of the file, and the rest of it; no rest behind the last part.
+type Part = (Bytes, Option<Export>);
+
+impl Export {
+    async fn answer(self, format: Format) -> Result<Response, ApiError> {
+        let name = format!("attachment; filename=\"{}-measurements.{}\"", self.structure, format.name());
+        // The first part before the status: what fails at once is still an answer of its own.
+        let first = self.part().await?;
+        let parts = try_unfold(Some(first), |part: Option<Part>| async {
+            let Some((bytes, rest)) = part else { return Ok(None) };
+            let next = match rest {
+                Some(rest) => Some(rest.part().await.map_err(|_| std::io::Error::other("the export failed"))?),
+                None => None,
+            };
+            Ok::<_, std::io::Error>(Some((bytes, next)))
+        });
+        let headers = [
+            (header::CONTENT_TYPE, format.content_type()),
+            (header::CONTENT_DISPOSITION, name.as_str()),
+            (header::CACHE_CONTROL, "no-store"),
+        ];
+        Ok((headers, Body::from_stream(parts)).into_response())
+    }
+
+    async fn part(mut self) -> Result<Part, ApiError> {
+        self.page.limit = self.left.map_or(self.page.limit, |left| left.min(self.page.limit));
+        let found = self.store.measurements(&self.structure, &self.page).await?;
+        self.left = self.left.map(|left| left - found.len());
+        let last = found.len() < self.page.limit || self.left == Some(0);
+        self.page.after = found.last().map(|m| m.place.clone()).or(self.page.after);
+        // Thousands of rows take milliseconds to write: not on an async thread.
+        let mut writer = self.writer;
+        let write = move || {
+            let bytes = writer.write(found)?;
+            Ok::<_, ApiError>(if last { ([bytes, writer.end()?].concat(), None) } else { (bytes, Some(writer)) })
+        };
+        let (bytes, writer) = tokio::task::spawn_blocking(write).await.map_err(|e| ApiError::internal(&e))??;
+        let rest = writer.map(|writer| Self { writer, ..self });
+        Ok((bytes.into(), rest))
+    }
+}
+
+/// Writes measurements as one of the formats that are files.
+enum Writer {
+    Ndjson,
+    Table { table: TableWriter, columns: Columns },
+}
+
+/// The columns that depend on the structure.
+struct Columns {
+    modes: usize,
+    covariates: Vec<Covariate>,
+    settings: Vec<String>,
+}
+
+impl Writer {
+    fn new(format: Format, watched: &Watched) -> Result<Self, ApiError> {
+        if format == Format::Ndjson {
+            return Ok(Self::Ndjson);
+        }
+        let simulator = &watched.simulator;
+        let columns = Columns {
+            modes: simulator.modes(),
+            covariates: simulator.covariates().to_vec(),
+            settings: simulator.space().iter().map(|p| p.name.clone()).collect(),
+        };
+        Ok(Self::Table { table: TableWriter::new(format, &columns.header())?, columns })
+    }
+
+    fn write(&mut self, measurements: Vec<StoredMeasurement>) -> Result<Vec<u8>, ApiError> {
+        match self {
+            Self::Ndjson => {
+                let mut text = Vec::new();
+                for stored in measurements {
+                    let item = MeasurementItem::from(stored);
+                    serde_json::to_writer(&mut text, &item).map_err(|e| ApiError::internal(&e))?;
+                    text.push(b'\n');
+                }
+                Ok(text)
+            }
+            Self::Table { table, columns } => table.rows(measurements.into_iter().map(|m| columns.row(m)).collect()),
+        }
+    }
+
+    fn end(self) -> Result<Vec<u8>, ApiError> {
+        match self {
+            Self::Ndjson => Ok(Vec::new()),
+            Self::Table { table, .. } => table.end(),
+        }
+    }
+}
+
+impl Columns {
+    fn header(&self) -> Vec<(String, Kind)> {
+        let mut header = vec![
+            ("measured_at".to_owned(), Kind::Time),
+            ("source".to_owned(), Kind::Text),
+            ("batch".to_owned(), Kind::Text),
+        ];
+        header.extend((1..=self.modes).map(|mode| (format!("f{mode}_hz"), Kind::Number)));
+        header.extend((1..=self.modes).map(|mode| (format!("std_f{mode}_hz"), Kind::Number)));
+        header.extend(self.covariates.iter().map(|c| {
+            let kind = if c.kind == CovariateKind::Number { Kind::Number } else { Kind::Text };
+            (c.name.clone(), kind)
+        }));
+        header.extend(self.settings.iter().map(|name| (format!("set_{name}"), Kind::Number)));
+        header
+    }
+
+    fn row(&self, stored: StoredMeasurement) -> Vec<Cell> {
+        let StoredMeasurement { place, source, measurement: m } = stored;
+        let mut row = vec![Cell::Time(m.measured_at), Cell::Text(source), Cell::Text(place.batch_id)];
+        row.extend(
+            (0..self.modes).map(|mode| Cell::number(m.frequencies_hz.get(mode).copied().flatten().map(Hertz::get))),
+        );
+        let std = |mode: usize| m.std_hz.as_ref().and_then(|stds| stds.get(mode).copied().flatten());
+        row.extend((0..self.modes).map(|mode| Cell::number(std(mode))));
+        row.extend(self.covariates.iter().map(|c| match m.covariates.get(&c.name) {
+            Some(CovariateValue::Number(number)) => Cell::Number(*number),
+            Some(CovariateValue::Category(text)) => Cell::Text(text.clone()),
+            None => Cell::Empty,
+        }));
+        row.extend(self.settings.iter().map(|name| Cell::number(m.settings.get(name).copied())));
+        row
+    }
+}
