@@ -30,7 +30,7 @@ const COVERAGE_TOLERANCE: f64 = 0.03;
 const GOOD_COVERAGE: [f64; 2] = [0.89, 0.91];
 
 /// What was measured of a flow's calibration; part of the manifest.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CalibrationRecord {
     /// Simulated measurements in each cell.
@@ -44,8 +44,9 @@ pub struct CalibrationRecord {
 }
 
 /// One size of noise with one set of modes.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = CalibrationCell)]
 pub struct Cell {
     /// Noise as a multiple of the structure's.
     pub noise_multiple: f64,
@@ -58,8 +59,9 @@ pub struct Cell {
 }
 
 /// Calibration of one parameter in one cell.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = CalibrationParameter)]
 pub struct CellParameter {
     /// Name of the parameter.
     pub name: String,

@@ -32,7 +32,7 @@ pub struct IdentifiabilityRecord {
 }
 
 /// What one measurement says of one parameter, over the prior.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ParameterIdentifiability {
     /// Name of the parameter.

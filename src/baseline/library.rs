@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::Baseline;
-use crate::quantity::StructureId;
+use crate::flow::checkpoint::LARGEST_FILE_BYTES;
+use crate::quantity::{Digest, StructureId};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::simulator::Simulator;
 
@@ -27,8 +28,14 @@ pub struct Entry {
     pub baseline: Option<Arc<Baseline>>,
 }
 
+/// A file of the models folder that was not read, and why.
+struct Unread {
+    file: String,
+    reason: String,
+}
+
 /// A file that was found and refused.
-#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
 pub struct Refusal {
     /// The file.
     pub file: String,
@@ -43,6 +50,18 @@ pub struct Refusal {
 pub struct Library {
     entries: BTreeMap<StructureId, Entry>,
     refusals: Vec<Refusal>,
+    folder: Option<PathBuf>,
+}
+
+/// The two files of a trained baseline.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BaselineFiles {
+    /// The manifest.
+    pub manifest: Vec<u8>,
+    /// The weights.
+    pub weights: Vec<u8>,
+    /// `program` for those shipped inside it, else the folder.
+    pub kept_in: String,
 }
 
 /// Why a models folder cannot be read at all.
@@ -64,17 +83,58 @@ impl Library {
     /// # Errors
     /// [`FolderError`] when `folder` cannot be listed.
     pub fn open(folder: Option<&Path>) -> Result<Self, FolderError> {
-        let mut library = Self::default();
+        let mut library = Self { folder: folder.map(Path::to_owned), ..Self::default() };
         for (name, files) in shipped_folders() {
             library.add(&format!("shipped:{name}"), &files);
         }
         if let Some(path) = folder {
             let failed = |source| FolderError { path: path.to_owned(), source };
-            for (name, files) in read_folders(path).map_err(failed)? {
-                library.add(&path.join(name).display().to_string(), &files);
+            for (name, (files, unread)) in read_folders(path).map_err(failed)? {
+                let origin = path.join(name).display().to_string();
+                let structure = library.add(&origin, &files);
+                for Unread { file, reason } in unread {
+                    library.refuse(format!("{origin}/{file}"), structure.as_ref(), &reason);
+                }
             }
         }
         Ok(library)
+    }
+
+    /// The same places read again: what lies there now.
+    ///
+    /// # Errors
+    /// [`FolderError`] when the folder cannot be listed.
+    pub fn read_again(&self) -> Result<Self, FolderError> {
+        Self::open(self.folder.as_deref())
+    }
+
+    /// The folder that goes over the shipped baselines.
+    pub fn folder(&self) -> Option<&Path> {
+        self.folder.as_deref()
+    }
+
+    /// The files of the baseline with this digest, if they still lie where they were read from.
+    ///
+    /// # Errors
+    /// [`FolderError`] when the folder cannot be listed.
+    pub fn files_of(&self, digest: &Digest) -> Result<Option<BaselineFiles>, FolderError> {
+        let mut folders: Vec<(String, Folder)> =
+            shipped_folders().into_values().map(|files| ("program".to_owned(), files)).collect();
+        if let Some(path) = &self.folder {
+            let failed = |source| FolderError { path: path.clone(), source };
+            let own = read_folders(path).map_err(failed)?;
+            folders.extend(own.into_iter().map(|(name, (files, _))| (path.join(name).display().to_string(), files)));
+        }
+        for (kept_in, files) in folders {
+            for (name, manifest) in files.iter().filter(|(name, _)| has_extension(name, "json")) {
+                let weights = files.get(&name.replace(".json", ".safetensors"));
+                if let Some(weights) = weights.filter(|_| Digest::of_file(manifest) == *digest) {
+                    let (manifest, weights) = (manifest.clone(), weights.clone());
+                    return Ok(Some(BaselineFiles { manifest, weights, kept_in }));
+                }
+            }
+        }
+        Ok(None)
     }
 
     /// A structure by its id.
@@ -92,13 +152,15 @@ impl Library {
         &self.refusals
     }
 
-    fn add(&mut self, origin: &str, files: &Folder) {
-        let Some((name, text)) = files.iter().find(|(name, _)| is_definition(name)) else {
-            return;
-        };
+    /// Takes up a folder; the structure in it, if there is one.
+    fn add(&mut self, origin: &str, files: &Folder) -> Option<StructureId> {
+        let (name, text) = files.iter().find(|(name, _)| is_definition(name))?;
         let simulator = match read_definition(name, text, |file| in_folder(files, file)) {
             Ok(simulator) => simulator,
-            Err(error) => return self.refuse(format!("{origin}/{name}"), None, &error),
+            Err(error) => {
+                self.refuse(format!("{origin}/{name}"), None, &error);
+                return None;
+            }
         };
         let id = simulator.id().clone();
         let mut baseline = None;
@@ -115,7 +177,8 @@ impl Library {
                 Err(error) => self.refuse(path, Some(&id), &error),
             }
         }
-        self.entries.insert(id, Entry { simulator, baseline });
+        self.entries.insert(id.clone(), Entry { simulator, baseline });
+        Some(id)
     }
 
     fn refuse(&mut self, file: String, structure: Option<&StructureId>, reason: &dyn std::fmt::Display) {
@@ -217,23 +280,38 @@ fn shipped_folders() -> BTreeMap<String, Folder> {
     folders
 }
 
-fn read_folders(path: &Path) -> std::io::Result<BTreeMap<String, Folder>> {
+/// The files of a models folder by folder, and those that were not read: one bad file must not keep the service from starting.
+fn read_folders(path: &Path) -> std::io::Result<BTreeMap<String, (Folder, Vec<Unread>)>> {
     let mut folders = BTreeMap::new();
     for entry in std::fs::read_dir(path)? {
         let entry = entry?;
         if !entry.file_type()?.is_dir() {
             continue;
         }
-        let mut files = Folder::new();
+        let (mut files, mut unread) = (Folder::new(), Vec::new());
         for file in std::fs::read_dir(entry.path())? {
             let file = file?;
             let name = file.file_name().to_string_lossy().into_owned();
             let ours = is_definition(&name) || ["safetensors", "json", "csv"].iter().any(|e| has_extension(&name, e));
             if ours && file.file_type()?.is_file() {
-                files.insert(name, std::fs::read(file.path())?);
+                match read_bounded(&file.path()) {
+                    Ok(bytes) => drop(files.insert(name, bytes)),
+                    Err(reason) => unread.push(Unread { file: name, reason }),
+                }
             }
         }
-        folders.insert(entry.file_name().to_string_lossy().into_owned(), files);
+        folders.insert(entry.file_name().to_string_lossy().into_owned(), (files, unread));
     }
     Ok(folders)
+}
+
+/// A file that is no larger than any of ours can be; what is wrong with it otherwise.
+fn read_bounded(path: &Path) -> Result<Vec<u8>, String> {
+    let most = LARGEST_FILE_BYTES as u64;
+    let cannot = |error: std::io::Error| format!("it cannot be read: {error}");
+    let bytes = std::fs::metadata(path).map_err(cannot)?.len();
+    if bytes > most {
+        return Err(format!("it has {bytes} bytes, larger than the {most} that are read"));
+    }
+    std::fs::read(path).map_err(cannot)
 }

@@ -55,7 +55,7 @@ pub struct Whitening {
 }
 
 /// What the flow is conditioned on beside the frequencies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Conditions {
     /// Lower and upper end of the box it was trained in, one pair a parameter, in parameter units: the prior with a margin.
@@ -69,7 +69,7 @@ pub struct Conditions {
 }
 
 /// Sizes of one effect that a flow was trained for.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EffectRange {
     /// Its place among all sizes of the structure's effects.
@@ -81,7 +81,7 @@ pub struct EffectRange {
 }
 
 /// The noise a flow was trained for, as multiples of the structure's own; modes may be missing within it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NoiseRange {
     /// Least noise: less is taken as this much.
@@ -107,7 +107,7 @@ pub struct TrainingRecord {
 }
 
 /// Figures on simulated pairs that neither trained nor chose anything.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ValidationRecord {
     /// Pairs used.
@@ -123,7 +123,7 @@ pub struct ValidationRecord {
 }
 
 /// How well one parameter is recovered (paper Fig. 8).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ParameterValidation {
     /// Name of the parameter.

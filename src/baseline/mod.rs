@@ -169,6 +169,7 @@ impl Baseline {
     /// # Errors
     /// [`LoadError`], one variant for each way it can be wrong.
     pub fn load(manifest_bytes: &[u8], weights: &[u8], simulator: &Simulator) -> Result<Self, LoadError> {
+        fault_point!("baseline::load", |_| Err(LoadError::SelfTest { difference: 1.0 }));
         let manifest: Manifest = serde_json::from_slice(manifest_bytes)?;
         if manifest.format != manifest::FORMAT {
             return Err(LoadError::Format { found: manifest.format });

@@ -1,0 +1,181 @@
+//! The n-th call fails, for all n: whatever breaks on the way of a batch, a retry stores it once and assesses it.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::OnceLock;
+
+use super::{Error, Ingested, Monitor, MonitorSettings};
+use crate::assessment::BatchState;
+use crate::baseline::library::Library;
+use crate::fault::Faults;
+use crate::measurement::{MeasurementBatch, ModalMeasurement};
+use crate::quantity::{Hertz, StructureId, Timestamp};
+use crate::simulator::Simulator;
+use crate::store::{self, HistoryQuery, Store};
+
+fn structure() -> StructureId {
+    StructureId::parse("three-dof").unwrap()
+}
+
+/// What the structure shows in measurement `row`: stiffnesses spread by ±2 %.
+fn measured_hz(row: usize) -> Vec<Option<Hertz>> {
+    static SIMULATOR: OnceLock<Simulator> = OnceLock::new();
+    let simulator = SIMULATOR.get_or_init(|| Library::open(None).unwrap().get(&structure()).unwrap().simulator.clone());
+    let wave = |phase: usize| 1.0 + 0.02 * ((row * 7 + phase * 3) as f64).sin();
+    let exact = simulator.frequencies_hz(&[4.0 * wave(0), 5.0 * wave(1), 6.0 * wave(2)]).unwrap();
+    exact.into_iter().map(|f| Hertz::new(f).ok()).collect()
+}
+
+/// Batch `number`: three measurements at times of its own.
+fn batch(number: usize) -> MeasurementBatch {
+    let one = |i: usize| ModalMeasurement {
+        measured_at: Timestamp::from_micros(1_767_225_600_000_000 + (3 * number + i) as i64 * 1_000_000).unwrap(),
+        frequencies_hz: measured_hz(3 * number + i),
+        std_hz: None,
+        covariates: BTreeMap::new(),
+        settings: BTreeMap::new(),
+    };
+    MeasurementBatch {
+        structure: structure(),
+        source: "logger".to_owned(),
+        idempotency_key: Some(format!("key-{number}")),
+        measurements: (0..3).map(one).collect(),
+    }
+}
+
+async fn open(folder: &Path) -> Monitor {
+    let mut opened = Store::open(folder).await;
+    for _ in 0..200 {
+        // Tasks of the monitor before this one may still hold it.
+        if !matches!(opened, Err(store::Error::Locked(_))) {
+            break;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        opened = Store::open(folder).await;
+    }
+    let store = opened.expect("the store opens");
+    Monitor::open(store, Library::open(None).unwrap(), MonitorSettings::default()).await.unwrap()
+}
+
+/// Ids of all batches, each of which must be assessed and whole.
+async fn stored(monitor: &Monitor) -> Vec<String> {
+    let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
+    let items = monitor.store().history(&structure(), &query).await.unwrap();
+    for item in &items {
+        assert_eq!((item.state, item.measurement_count), (BatchState::Assessed, 3), "{}", item.batch_id);
+        assert!(item.assessment.is_some());
+        // Compares the measurements with their digest.
+        monitor.store().batch(&structure(), &item.batch_id).await.unwrap().unwrap();
+    }
+    items.into_iter().map(|item| item.batch_id).collect()
+}
+
+/// Posts a batch again until it is taken, as a client does that was answered with an error.
+async fn retried(monitor: &Monitor, number: usize, tries: usize) -> Ingested {
+    for _ in 0..tries {
+        if let Ok(taken) = monitor.ingest(batch(number)).await {
+            return taken;
+        }
+    }
+    panic!("batch {number} was not taken in {tries} tries");
+}
+
+#[tokio::test]
+async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    let (mut number, mut failures) = (0, 0);
+    for point in ["store::begin", "store::measurement", "store::commit", "store::committed", "store::read"] {
+        // Once as an error, once as a panic, and as an error that stays until somebody mends it.
+        for (action, stays) in [("1*return", false), ("1*panic", false), ("return", true)] {
+            for call in 0.. {
+                faults.set(point, &format!("{call}*off->{action}"));
+                let outcome = monitor.ingest(batch(number)).await;
+                let Err(error) = outcome else {
+                    // No call was left to fail.
+                    assert!(call >= 2, "{point} is called {call} times only");
+                    faults.clear(point);
+                    number += 1;
+                    break;
+                };
+                assert!(matches!(error, Error::Store(_) | Error::Panicked), "{point} {action}: {error}");
+                if stays {
+                    assert!(monitor.ingest(batch(number)).await.is_err(), "{point} fails still");
+                    faults.clear(point);
+                }
+                let taken = retried(&monitor, number, 3).await;
+                assert_eq!(taken.view.record.state, BatchState::Assessed, "{point} {action}, call {call}");
+                assert!(monitor.ingest(batch(number)).await.unwrap().replayed);
+                (number, failures) = (number + 1, failures + 1);
+                assert!(call < 50, "{point} never runs out");
+            }
+        }
+    }
+    let ids = stored(&monitor).await;
+    assert_eq!(ids.len(), number, "each batch once");
+    println!("{failures} calls failed over {number} batches");
+    drop(faults);
+    monitor.store().close().await;
+    drop(monitor);
+    // And so it is for whoever opens it next: opening checks the file.
+    let monitor = open(folder.path()).await;
+    assert_eq!(stored(&monitor).await, ids);
+}
+
+#[tokio::test]
+async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    // The first commit stores the batch, the second would store its assessment.
+    faults.set("store::commit", "1*off->return");
+    assert!(monitor.ingest(batch(0)).await.is_err());
+    faults.clear("store::commit");
+    for _ in 0..100 {
+        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+        let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
+        let items = monitor.store().history(&structure(), &query).await.unwrap();
+        if items.len() == 1 && items[0].state == BatchState::Assessed {
+            return;
+        }
+    }
+    panic!("the batch still waits");
+}
+
+#[tokio::test]
+async fn a_model_that_cannot_be_loaded_is_named_and_the_others_serve() {
+    let faults = Faults::arm();
+    for call in 0..3 {
+        faults.set("baseline::load", &format!("{call}*off->1*return"));
+        let library = Library::open(None).unwrap();
+        assert_eq!(library.refusals().len(), 1, "call {call}");
+        assert_eq!(library.iter().filter(|(_, entry)| entry.baseline.is_some()).count(), 2);
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).await.unwrap();
+        let monitor = Monitor::open(store, library, MonitorSettings::default()).await.unwrap();
+        assert_eq!(monitor.baselines_in_use(), 2);
+    }
+}
+
+#[tokio::test]
+async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    let mut ids = Vec::new();
+    for number in 0..6 {
+        ids.push(monitor.ingest(batch(number)).await.unwrap().view.record.batch_id);
+    }
+    // A year back.
+    faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
+    monitor.declare_undamaged(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
+    for _ in 0..100 {
+        let view = monitor.batch(&structure(), &ids[5]).await.unwrap();
+        if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    panic!("the comparison with the undamaged state is not the current assessment");
+}

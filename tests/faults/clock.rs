@@ -1,0 +1,119 @@
+//! Clocks that jump: `faketime` moves the system clock of the running program, while time goes on for its timers.
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde_json::{json, Value};
+
+use crate::helpers::{command, created, Service};
+use crate::kit::{audit, batch, body, history, post, ready, there, Acknowledged, BATCHES};
+
+const LIBRARY: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
+
+/// Sets the program's clock: `+0`, `-365d`, or a time at which it stands still.
+fn set(file: &Path, time: &str) {
+    // Written beside and renamed: the program may read at any moment.
+    let beside = file.with_extension("new");
+    std::fs::write(&beside, format!("{time}\n")).unwrap();
+    std::fs::rename(&beside, file).unwrap();
+}
+
+/// Open alarms of silence.
+async fn silence_alarms(service: &Service) -> usize {
+    let alarms = service.read("/v1/structures/three-dof/alarms").await;
+    let open = |a: &&Value| a["kind"] == "silence" && a["ended_at"].is_null();
+    alarms["items"].as_array().unwrap().iter().filter(open).count()
+}
+
+async fn wait_for_silence(service: &Service, wanted: usize) {
+    for _ in 0..200 {
+        if silence_alarms(service).await == wanted {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+    panic!("{} alarms of silence, not {wanted}", silence_alarms(service).await);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_current() {
+    if !there(LIBRARY, "faketime") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (data, file) = (folder.path().join("data"), folder.path().join("clock"));
+    set(&file, "+0");
+    let mut command = command(&data);
+    command.env("LD_PRELOAD", LIBRARY).env("FAKETIME_TIMESTAMP_FILE", &file).env("FAKETIME_NO_CACHE", "1");
+    // Clocks jump because somebody sets them; the monotonic clock never does.
+    command.env("FAKETIME_DONT_FAKE_MONOTONIC", "1").env("DONT_FAKE_MONOTONIC", "1");
+    let mut service = Service::spawn(command.env("MODALWATCH__MONITOR__ALARM__SILENCE_AFTER_S", "3600"));
+    let mut acknowledged = Acknowledged::default();
+    let mut number = 0;
+    let mut take = async |service: &Service| {
+        let given = batch("logger", number, 10);
+        number += 1;
+        let answer = created(service.post(BATCHES, &body(&given)).await).await;
+        assert_eq!(answer["state"], "assessed", "{answer}");
+        acknowledged.add(&given, &answer);
+        answer
+    };
+    let undamaged = take(&service).await["batch"].clone();
+    let other = take(&service).await["batch"].as_str().unwrap().to_owned();
+
+    // A year back: what was measured now is refused with the reason, what was measured then is taken.
+    set(&file, "-365d");
+    let (status, answer) = post(&service, &batch("logger", 2, 10)).await.unwrap();
+    let year = answer["detail"].as_str().unwrap_or_default().contains("in the future: it is 20");
+    assert!(status == 422 && year, "{answer}");
+    let early =
+        json!({ "measurements": [{ "measured_at": "2020-06-01T00:00:00Z", "frequencies_hz": [0.49, 0.92, 1.24] }] });
+    let early = created(service.post(BATCHES, &early).await).await;
+    assert!(early["received_at"].as_str() < Some("2026"), "the clock is not set back: {early}");
+    // What is decided now counts, although it is "earlier" than what was decided before.
+    let declared = service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [undamaged] })).await;
+    created(declared).await;
+    let path = format!("{BATCHES}/{other}");
+    let mut answer = Value::Null;
+    for _ in 0..100 {
+        answer = service.read(&path).await;
+        if answer["assessment"]["undamaged_version"] == 1 {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+    assert_eq!(answer["assessment"]["undamaged_version"], 1, "{answer}");
+
+    // A day ahead: nobody has sent anything for so long, until somebody does.
+    set(&file, "+1d");
+    wait_for_silence(&service, 1).await;
+    take(&service).await;
+    wait_for_silence(&service, 0).await;
+    // And back again: that day is no silence.
+    set(&file, "+0");
+    take(&service).await;
+    tokio::time::sleep(Duration::from_secs(6)).await;
+    assert_eq!(silence_alarms(&service).await, 0);
+
+    // Standing still: ids are distinct all the same, and requests still time out by the other clock.
+    set(&file, "2027-01-01 00:00:00");
+    let mut ids: Vec<String> = Vec::new();
+    for _ in 0..8 {
+        ids.push(take(&service).await["batch"].as_str().unwrap().to_owned());
+    }
+    ids.sort();
+    ids.dedup();
+    assert_eq!(ids.len(), 8);
+    assert!(ready(&service).await.0);
+    let page = service.read("/v1/structures/three-dof/history?limit=100").await;
+    let times: Vec<&str> =
+        page["items"].as_array().unwrap().iter().map(|i| i["measured_from"].as_str().unwrap()).collect();
+    assert!(times.is_sorted() && times.len() == 13, "{times:?}");
+    assert!(service.stop("TERM").success());
+
+    // The next start has the right clock.
+    let mut service = Service::start(&data);
+    assert_eq!(history(&service).await.len(), 13);
+    assert!(service.stop("TERM").success());
+    audit(&data, &acknowledged).await;
+}

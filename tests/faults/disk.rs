@@ -1,0 +1,251 @@
+//! Disks that are full, files that may not grow, are deleted or locked: writes are refused, reads go on, and it heals by itself.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use serde_json::{json, Value};
+use tempfile::TempDir;
+
+use crate::helpers::{command, Service};
+use crate::kit::{
+    all_assessed, audit, batch, define_plain, history, history_of, plain_batch, post, ready, ready_again, there,
+    without_floor, Acknowledged, PLAIN,
+};
+
+/// A file system of a few MiB in memory.
+struct SmallDisk {
+    folder: TempDir,
+}
+
+impl SmallDisk {
+    /// Mounts one; says so and gives none where that is not allowed.
+    fn mount(mebibytes: usize) -> Option<Self> {
+        let folder = tempfile::tempdir().unwrap();
+        let size = format!("size={mebibytes}m");
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", &size, "tmpfs"]).arg(folder.path()).output();
+        if mounted.is_ok_and(|output| output.status.success()) {
+            return Some(Self { folder });
+        }
+        println!("skipped: a small file system cannot be mounted here (root may)");
+        None
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("-l").arg(self.folder.path()).status();
+    }
+}
+
+/// Posts batches until three in a row are refused; each refusal must be a 503 or a 507 that says why.
+async fn fill(service: &Service, acknowledged: &mut Acknowledged) -> usize {
+    let (mut number, mut refused) = (0, 0);
+    while refused < 3 {
+        assert!(number < 2_000, "the disk does not fill up");
+        let given = plain_batch("filler", number, 150);
+        number += 1;
+        let (status, answer) = post(service, &given).await.unwrap();
+        if status == 201 {
+            acknowledged.add(&given, &answer);
+            refused = 0;
+        } else {
+            refusal(status, &answer);
+            refused += 1;
+        }
+    }
+    number
+}
+
+/// A write that could not be done is answered 503 or 507 with a code of its own.
+fn refusal(status: u16, answer: &Value) {
+    assert!([503, 507].contains(&status), "{status}: {answer}");
+    assert!(answer["code"].is_string() && answer["code"] != "internal", "{answer}");
+}
+
+/// Everything that was acknowledged is read, and nothing is written, while the disk is full; then it is not full any more.
+async fn full_and_healed(service: &Service, acknowledged: &mut Acknowledged, heal: impl FnOnce()) {
+    define_plain(service).await;
+    let early = batch("early", 0, 10);
+    acknowledged.add(&early, &post(service, &early).await.unwrap().1);
+    let refused = fill(service, acknowledged).await - 1;
+    // The last free bytes of the log go to the check itself.
+    let mut reasons = Value::Null;
+    for _ in 0..2_000 {
+        let (is_ready, found) = ready(service).await;
+        if !is_ready {
+            reasons = found;
+            break;
+        }
+    }
+    assert!(reasons.to_string().contains("nothing can be stored"), "{reasons}");
+    assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
+    let stored = &history(service).await | &history_of(service, PLAIN).await;
+    assert!(acknowledged.0.keys().all(|id| stored.contains(id)), "reads must go on");
+    let some = acknowledged.0.keys().next_back().unwrap();
+    let read = service.read(&format!("/v1/structures/{PLAIN}/batches/{some}")).await;
+    assert_eq!(read["content_digest"], acknowledged.0[some].as_str());
+    // One that needs an assessment as well.
+    let (status, answer) = post(service, &batch("during", 0, 10)).await.unwrap();
+    refusal(status, &answer);
+
+    heal();
+    ready_again(service, Duration::from_secs(20)).await;
+    // The batch that was refused is taken now, once, and those whose assessment could not be stored have one, asked or not.
+    for given in [plain_batch("filler", refused, 150), batch("during", 0, 10), batch("after", 0, 10)] {
+        let (status, answer) = post(service, &given).await.unwrap();
+        assert_eq!(status, 201, "{answer}");
+        assert_eq!(
+            answer["state"],
+            if given.structure.as_str() == PLAIN { "received" } else { "assessed" },
+            "{answer}"
+        );
+        acknowledged.add(&given, &answer);
+    }
+    all_assessed(service, Duration::from_secs(30)).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_full_disk_refuses_writes_serves_reads_and_heals_without_a_restart() {
+    let Some(disk) = SmallDisk::mount(7) else { return };
+    let data = disk.folder.path().join("data");
+    let mut service = Service::spawn(without_floor(&mut command(&data)));
+    // Small enough a database that the log may not grow for long before it is written back.
+    let ballast = disk.folder.path().join("ballast");
+    std::fs::write(&ballast, vec![0; 4 << 20]).unwrap();
+    let mut acknowledged = Acknowledged::default();
+    full_and_healed(&service, &mut acknowledged, || std::fs::remove_file(&ballast).unwrap()).await;
+    assert!(service.stop("TERM").success());
+    let audit = audit(&data, &acknowledged).await;
+    println!("{} acknowledged, {} stored", acknowledged.0.len(), audit.stored);
+    assert_eq!(audit.unassessed, 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn files_that_may_not_grow_refuse_writes_and_heal_without_a_restart() {
+    if !there("/usr/bin/prlimit", "util-linux") || !there("/bin/bash", "bash") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let plain = command(folder.path());
+    // The signal that comes with the limit would end the program; the failed write is what is wanted.
+    let mut limited = Command::new("/bin/bash");
+    limited.args(["-c", "trap '' XFSZ; ulimit -S -f 1500; exec \"$0\" \"$@\""]);
+    limited.arg(plain.get_program()).args(plain.get_args()).env("MODALWATCH__LOG__LEVEL", "error");
+    let mut service = Service::spawn(without_floor(&mut limited));
+    let mut acknowledged = Acknowledged::default();
+    let pid = service.pid().to_string();
+    let heal = || {
+        let raised = Command::new("/usr/bin/prlimit").args(["--pid", &pid, "--fsize=unlimited:"]).status().unwrap();
+        assert!(raised.success());
+    };
+    full_and_healed(&service, &mut acknowledged, heal).await;
+    assert!(service.stop("TERM").success());
+    assert_eq!(audit(folder.path(), &acknowledged).await.unassessed, 0);
+}
+
+fn database(folder: &Path) -> PathBuf {
+    folder.join("modalwatch.sqlite")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_database_that_is_deleted_while_open_acknowledges_nothing_more() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut service = Service::start(folder.path());
+    let mut acknowledged = Acknowledged::default();
+    for number in 0..5 {
+        let given = batch("before", number, 5);
+        acknowledged.add(&given, &post(&service, &given).await.unwrap().1);
+    }
+    let away = folder.path().join("away");
+    for file in ["modalwatch.sqlite", "modalwatch.sqlite-wal"] {
+        std::fs::rename(folder.path().join(file), &away).unwrap();
+        for number in 0..3 {
+            let given = batch(file.strip_prefix("modalwatch.").unwrap(), number, 5);
+            let (status, answer) = post(&service, &given).await.unwrap();
+            assert_eq!((status, &answer["code"]), (503, &json!("database_gone")), "{file}: {answer}");
+        }
+        let (is_ready, reasons) = ready(&service).await;
+        assert!(!is_ready && reasons.to_string().contains("deleted or replaced"), "{reasons}");
+        assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
+        // Put back before anything else wrote there, it goes on.
+        std::fs::rename(&away, folder.path().join(file)).unwrap();
+        assert!(ready(&service).await.0);
+    }
+    // Replaced by another file of the same name.
+    std::fs::copy(database(folder.path()), &away).unwrap();
+    std::fs::rename(database(folder.path()), folder.path().join("original")).unwrap();
+    std::fs::rename(&away, database(folder.path())).unwrap();
+    let (status, answer) = post(&service, &batch("replaced", 0, 5)).await.unwrap();
+    assert_eq!((status, &answer["code"]), (503, &json!("database_gone")), "{answer}");
+    std::fs::rename(folder.path().join("original"), database(folder.path())).unwrap();
+
+    let given = batch("after", 0, 5);
+    let (status, answer) = post(&service, &given).await.unwrap();
+    assert_eq!(status, 201, "{answer}");
+    acknowledged.add(&given, &answer);
+    service.kill();
+    Service::start(folder.path()).stop("TERM");
+    audit(folder.path(), &acknowledged).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_costs_only_space() {
+    use sqlx::Connection as _;
+    let folder = tempfile::tempdir().unwrap();
+    let mut service = Service::start(folder.path());
+    let mut acknowledged = Acknowledged::default();
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(database(folder.path()));
+    let mut other = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    define_plain(&service).await;
+    let given = batch("before", 0, 5);
+    acknowledged.add(&given, &post(&service, &given).await.unwrap().1);
+
+    // A reader that stays keeps the log from being written back: it grows, and nothing else happens.
+    sqlx::query("begin").execute(&mut other).await.unwrap();
+    sqlx::query("select count(*) from measurement").fetch_all(&mut other).await.unwrap();
+    let log = folder.path().join("modalwatch.sqlite-wal");
+    let mut number = 0;
+    while std::fs::metadata(&log).unwrap().len() < 8 << 20 {
+        let given = plain_batch("during", number, 150);
+        let (status, answer) = post(&service, &given).await.unwrap();
+        assert_eq!(status, 201, "{answer}");
+        acknowledged.add(&given, &answer);
+        number += 1;
+        assert!(number < 1_000);
+    }
+    sqlx::query("rollback").execute(&mut other).await.unwrap();
+    let grown = std::fs::metadata(&log).unwrap().len();
+    for number in 0..40 {
+        let given = plain_batch("later", number, 150);
+        acknowledged.add(&given, &post(&service, &given).await.unwrap().1);
+    }
+    let after = std::fs::metadata(&log).unwrap().len();
+    assert!(after <= grown + (2 << 20), "the log goes on growing: {grown}, then {after} bytes");
+
+    // A writer for a second is waited for.
+    sqlx::query("begin immediate").execute(&mut other).await.unwrap();
+    let waiting = batch("waiting", 0, 5);
+    let (answered, ()) = tokio::join!(post(&service, &waiting), async {
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        // Reads do not wait.
+        assert_eq!(history(&service).await.len(), 1);
+        sqlx::query("rollback").execute(&mut other).await.unwrap();
+    });
+    let (status, answer) = answered.unwrap();
+    assert_eq!(status, 201, "{answer}");
+    acknowledged.add(&waiting, &answer);
+
+    // One for longer is not, and once it is gone everything goes on.
+    sqlx::query("begin immediate").execute(&mut other).await.unwrap();
+    let refused = batch("refused", 0, 5);
+    let (status, answer) = post(&service, &refused).await.unwrap();
+    refusal(status, &answer);
+    sqlx::query("rollback").execute(&mut other).await.unwrap();
+    let (status, answer) = post(&service, &refused).await.unwrap();
+    assert_eq!(status, 201, "{answer}");
+    acknowledged.add(&refused, &answer);
+    other.close().await.unwrap();
+    assert!(service.stop("TERM").success());
+    audit(folder.path(), &acknowledged).await;
+}

@@ -1,0 +1,242 @@
+//! Batches that cost nothing to make, a client that writes down what was acknowledged, and a look into the database afterwards.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
+use modalwatch::quantity::{Hertz, StructureId, Timestamp};
+use modalwatch::store::Store;
+use serde_json::{json, Value};
+
+use crate::helpers::{repository, Service};
+
+pub const BATCHES: &str = "/v1/structures/three-dof/batches";
+pub const STRUCTURE: &str = "three-dof";
+/// The same structure under another id, without a trained baseline: its batches are stored and wait.
+pub const PLAIN: &str = "plain";
+
+/// 2026-01-01T00:00:00Z, µs.
+const EPOCH_MICROS: i64 = 1_767_225_600_000_000;
+
+/// Frequencies of the structure at stiffnesses spread by ±2 %, Hz.
+fn bank() -> &'static [Vec<f64>] {
+    static BANK: OnceLock<Vec<Vec<f64>>> = OnceLock::new();
+    BANK.get_or_init(|| {
+        let simulator = modalwatch::baseline::library::find_structure(STRUCTURE).unwrap();
+        let wave = |i: usize, phase: usize| 1.0 + 0.02 * ((i * 7 + phase * 3) as f64).sin();
+        let one = |i| simulator.frequencies_hz(&[4.0 * wave(i, 0), 5.0 * wave(i, 1), 6.0 * wave(i, 2)]).unwrap();
+        (0..32).map(one).collect()
+    })
+}
+
+/// Batch `number` of a source: `count` measurements ten seconds apart, none at a time of another number.
+pub fn batch(source: &str, number: usize, count: usize) -> MeasurementBatch {
+    let one = |i: usize| {
+        let row = number * count + i;
+        let jitter = 1.0 + 1e-4 * ((row % 9_973) as f64).sin();
+        ModalMeasurement {
+            measured_at: Timestamp::from_micros(EPOCH_MICROS + 10_000_000 * row as i64).unwrap(),
+            frequencies_hz: bank()[row % 32].iter().map(|f| Some(Hertz::new(f * jitter).unwrap())).collect(),
+            std_hz: None,
+            covariates: BTreeMap::new(),
+            settings: BTreeMap::new(),
+        }
+    };
+    MeasurementBatch {
+        structure: StructureId::parse(STRUCTURE).unwrap(),
+        source: source.to_owned(),
+        idempotency_key: None,
+        measurements: (0..count).map(one).collect(),
+    }
+}
+
+/// A batch of the structure without a baseline, for what is only about storing.
+pub fn plain_batch(source: &str, number: usize, count: usize) -> MeasurementBatch {
+    MeasurementBatch { structure: StructureId::parse(PLAIN).unwrap(), ..batch(source, number, count) }
+}
+
+/// Defines the structure without a baseline.
+pub async fn define_plain(service: &Service) {
+    let text = std::fs::read_to_string(repository("models/three-dof/structure.toml")).unwrap();
+    let text = text.replace("id = \"three-dof\"", "id = \"plain\"");
+    let request = service.request(reqwest::Method::PUT, "/v1/structures/plain");
+    let answer = request.header("content-type", "application/toml").body(text).send().await.unwrap();
+    assert!(answer.status().is_success(), "{}", answer.text().await.unwrap());
+}
+
+/// The body that posts a batch.
+pub fn body(batch: &MeasurementBatch) -> Value {
+    json!({ "source": batch.source, "measurements": batch.measurements })
+}
+
+/// Posts a batch; the status, and the answer if it is JSON. `None` when the connection broke.
+pub async fn post(service: &Service, batch: &MeasurementBatch) -> Option<(u16, Value)> {
+    let path = format!("/v1/structures/{}/batches", batch.structure);
+    let response = service.request(reqwest::Method::POST, &path).json(&body(batch)).send().await.ok()?;
+    let status = response.status().as_u16();
+    Some((status, response.json().await.unwrap_or(Value::Null)))
+}
+
+/// What was acknowledged: digest of the content by the id that the service gave.
+#[derive(Default)]
+pub struct Acknowledged(pub BTreeMap<String, String>);
+
+impl Acknowledged {
+    /// Writes down a 201.
+    pub fn add(&mut self, batch: &MeasurementBatch, answer: &Value) {
+        let digest = batch.content_digest().to_string();
+        assert_eq!(answer["content_digest"], digest.as_str(), "another batch was acknowledged: {answer}");
+        let id = answer["batch"].as_str().unwrap().to_owned();
+        if let Some(other) = self.0.insert(id, digest.clone()) {
+            assert_eq!(other, digest, "one id was given to two batches");
+        }
+    }
+}
+
+/// What a database holds of the monitored structure.
+pub struct Audit {
+    pub stored: usize,
+    pub unassessed: usize,
+}
+
+/// Looks through the database of a service that has stopped: SQLite finds nothing wrong with it, every batch is whole and as its
+/// digest says, no measurement is there twice, and everything acknowledged is there.
+pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
+    use sqlx::Connection as _;
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(data_dir.join("modalwatch.sqlite"));
+    let mut connection = sqlx::SqliteConnection::connect_with(&options).await.unwrap();
+    let (found,): (String,) = sqlx::query_as("pragma integrity_check").fetch_one(&mut connection).await.unwrap();
+    assert_eq!(found, "ok");
+    let orphans = sqlx::query("pragma foreign_key_check").fetch_all(&mut connection).await.unwrap();
+    assert!(orphans.is_empty(), "{} rows refer to nothing", orphans.len());
+    let (halves,): (i64,) = sqlx::query_as(
+        "select count(*) from measurement_batch b where measurement_count <>
+             (select count(*) from measurement m where (m.structure_id, m.batch_id) = (b.structure_id, b.batch_id))",
+    )
+    .fetch_one(&mut connection)
+    .await
+    .unwrap();
+    assert_eq!(halves, 0, "half batches");
+    let (doubled,): (i64,) = sqlx::query_as(
+        "select count(*) from (select 1 from measurement group by structure_id, source, measured_at_us having count(*) > 1)",
+    )
+    .fetch_one(&mut connection)
+    .await
+    .unwrap();
+    assert_eq!(doubled, 0, "measurements that are stored twice");
+    let rows: Vec<(String, String, String, String)> =
+        sqlx::query_as("select structure_id, batch_id, content_digest, state from measurement_batch")
+            .fetch_all(&mut connection)
+            .await
+            .unwrap();
+    connection.close().await.unwrap();
+    let stored: BTreeMap<&str, &str> = rows.iter().map(|(_, id, digest, _)| (id.as_str(), digest.as_str())).collect();
+    let lost: Vec<&String> = acknowledged
+        .0
+        .iter()
+        .filter(|(id, digest)| stored.get(id.as_str()) != Some(&digest.as_str()))
+        .map(|(id, _)| id)
+        .collect();
+    assert!(lost.is_empty(), "{} of {} acknowledged batches are lost: {lost:?}", lost.len(), acknowledged.0.len());
+    // The measurements themselves: reading a batch compares them with its digest.
+    let store = Store::open(data_dir).await.unwrap();
+    for (structure, id, ..) in &rows {
+        let structure = StructureId::parse(structure).unwrap();
+        store.batch(&structure, id).await.unwrap().expect("a listed batch is there");
+    }
+    store.close().await;
+    let of_monitored = || rows.iter().filter(|(structure, ..)| structure == STRUCTURE);
+    Audit {
+        stored: of_monitored().count(),
+        unassessed: of_monitored().filter(|(.., state)| state != "assessed").count(),
+    }
+}
+
+/// Ids in the history of the monitored structure, from first to last; none may be there twice.
+pub async fn history(service: &Service) -> BTreeSet<String> {
+    history_of(service, STRUCTURE).await
+}
+
+/// Ids in the history of a structure.
+pub async fn history_of(service: &Service, structure: &str) -> BTreeSet<String> {
+    let (mut ids, mut path) = (BTreeSet::new(), format!("/v1/structures/{structure}/history?limit=1000"));
+    loop {
+        let page = service.read(&path).await;
+        for item in page["items"].as_array().unwrap() {
+            assert!(ids.insert(item["batch"].as_str().unwrap().to_owned()), "twice in the history: {item}");
+        }
+        let Some(cursor) = page["next"].as_str() else { return ids };
+        path = format!("/v1/structures/{structure}/history?limit=1000&cursor={cursor}");
+    }
+}
+
+/// Waits until no batch of the history waits for its assessment.
+pub async fn all_assessed(service: &Service, limit: Duration) {
+    let started = Instant::now();
+    loop {
+        let page = service.read(&format!("/v1/structures/{STRUCTURE}/history?limit=1000")).await;
+        let items = page["items"].as_array().unwrap();
+        assert!(page["next"].is_null(), "more batches than one page");
+        let waiting = items.iter().filter(|item| item["state"] == "received").count();
+        if waiting == 0 {
+            assert!(items.iter().all(|item| item["state"] == "assessed"), "{page}");
+            return;
+        }
+        assert!(started.elapsed() < limit, "{waiting} batches are not assessed after {limit:?}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Whether `/readyz` says yes, and its reasons if not.
+pub async fn ready(service: &Service) -> (bool, Value) {
+    let response = service.get("/readyz").send().await.unwrap();
+    let ready = response.status() == 200;
+    let answer: Value = response.json().await.unwrap();
+    assert_eq!(answer["ready"], ready, "{answer}");
+    (ready, answer["reasons"].clone())
+}
+
+/// Waits until `/readyz` says yes.
+pub async fn ready_again(service: &Service, limit: Duration) {
+    let started = Instant::now();
+    loop {
+        let (is_ready, reasons) = ready(service).await;
+        if is_ready {
+            return;
+        }
+        assert!(started.elapsed() < limit, "not ready after {limit:?}: {reasons}");
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+}
+
+/// Memory that a process has in RAM, MiB.
+pub fn resident_mib(pid: u32) -> f64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+    line.split_whitespace().next().unwrap().parse::<f64>().unwrap() / 1024.0
+}
+
+/// File handles that a process has open.
+pub fn open_files(pid: u32) -> usize {
+    std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count()
+}
+
+/// Whether a file is there; where it is not, says what is skipped and what to install.
+pub fn there(path: &str, package: &str) -> bool {
+    let there = Path::new(path).exists();
+    if !there {
+        println!("skipped: {path} is not there (apt-get install {package})");
+    }
+    there
+}
+
+/// Lets a service write until its disk is full, where it would stop before.
+pub fn without_floor(command: &mut std::process::Command) -> &mut std::process::Command {
+    let defaults = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch")).args(["config", "print"]).output();
+    if String::from_utf8(defaults.unwrap().stdout).unwrap().contains("min_free_bytes") {
+        command.env("MODALWATCH__STORE__MIN_FREE_BYTES", "0");
+    }
+    command
+}

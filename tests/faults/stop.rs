@@ -1,0 +1,68 @@
+//! The way down: SIGTERM with a request that never ends, and a second SIGTERM.
+
+use std::io::Write as _;
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use crate::helpers::{command, Service};
+use crate::kit::{audit, batch, body, post, Acknowledged, BATCHES};
+
+/// A request whose body never comes.
+fn hanging(service: &Service) -> TcpStream {
+    let mut stream = TcpStream::connect(service.address()).unwrap();
+    let head = format!(
+        "POST {BATCHES} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n\r\n{{"
+    );
+    stream.write_all(head.as_bytes()).unwrap();
+    std::thread::sleep(Duration::from_millis(200));
+    stream
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_request_that_never_ends_holds_the_stop_no_longer_than_the_drain_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = command(folder.path());
+    let mut service = Service::spawn(command.env("MODALWATCH__HTTP__DRAIN_S", "1"));
+    let _hanging = hanging(&service);
+    let started = Instant::now();
+    let status = service.stop("TERM");
+    assert!(status.success(), "{status}");
+    assert!(started.elapsed() < Duration::from_secs(10), "it took {:?}", started.elapsed());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_second_sigterm_ends_the_process_at_once_and_what_was_acknowledged_stays() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut service = Service::start(folder.path());
+    let mut acknowledged = Acknowledged::default();
+    let first = batch("a", 0, 5);
+    acknowledged.add(&first, &post(&service, &first).await.unwrap().1);
+    let _hanging = hanging(&service);
+    // Load until the end.
+    let (url, client) = (format!("http://{}{BATCHES}", service.address()), service.client.clone());
+    let load = tokio::spawn(async move {
+        let mut taken = Vec::new();
+        for number in 0.. {
+            let given = batch("b", number, 5);
+            let Ok(response) = client.post(&url).json(&body(&given)).send().await else { break };
+            if response.status() != 201 {
+                break;
+            }
+            let Ok(answer) = response.json::<serde_json::Value>().await else { break };
+            taken.push((given, answer));
+        }
+        taken
+    });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    service.signal("TERM");
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    let started = Instant::now();
+    // The drain time is 30 s: only the second signal can end it now.
+    let status = service.stop("TERM");
+    assert!(!status.success(), "it was cut off: {status}");
+    assert!(started.elapsed() < Duration::from_secs(5), "it took {:?}", started.elapsed());
+    for (given, answer) in load.await.unwrap() {
+        acknowledged.add(&given, &answer);
+    }
+    audit(folder.path(), &acknowledged).await;
+}

@@ -1,0 +1,59 @@
+//! A table of measurements: any bytes are measurements or problems with their line, never a panic. What was taken is written and
+//! read back as it was.
+#![no_main]
+
+use std::sync::OnceLock;
+
+use libfuzzer_sys::fuzz_target;
+use modalwatch::measurement::check::{check_measurements, Expectation};
+use modalwatch::measurement::csv::{offered, read, write, CsvOptions, Times};
+use modalwatch::measurement::{Covariate, CovariateKind, ModalMeasurement};
+use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
+use modalwatch::quantity::Timestamp;
+
+fn space() -> &'static ParameterSpace {
+    static SPACE: OnceLock<ParameterSpace> = OnceLock::new();
+    SPACE.get_or_init(|| {
+        let (name, unit) = ("k1".to_owned(), "N/m".to_owned());
+        ParameterSpace::new(vec![Parameter { name, unit, lower: 0.5, upper: 9.0, damage: DamageDirection::Decrease }])
+    })
+}
+
+fn covariates() -> [Covariate; 2] {
+    [
+        Covariate { name: "temperature_c".to_owned(), kind: CovariateKind::Number },
+        Covariate { name: "Operator".to_owned(), kind: CovariateKind::Category },
+    ]
+}
+
+fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
+    let covariates = covariates();
+    let options = CsvOptions { times, ignore: vec!["lab".to_owned()], time_column: None };
+    let raw = match read(bytes, 3, &covariates, &options) {
+        Ok(raw) => raw,
+        Err(problems) => {
+            assert!(!problems.is_empty());
+            return None;
+        }
+    };
+    let expectation = Expectation {
+        modes: 3,
+        frequency_limits_hz: (0.001, 1_000.0),
+        covariates: &covariates,
+        space: space(),
+        now: Timestamp::from_micros(1_800_000_000_000_000).unwrap(),
+        max_measurements: 5_000,
+    };
+    check_measurements(raw, &expectation).ok()
+}
+
+fuzz_target!(|bytes: &[u8]| {
+    let options = CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: Some("Zeit".to_owned()) };
+    let _ = offered(bytes, &covariates(), &options, 5);
+    let _ = read(bytes, 3, &covariates(), &options);
+    let _ = checked(bytes, Times::RowNumber);
+    let Some(taken) = checked(bytes, Times::Required) else { return };
+    let table = write(&taken);
+    let again = checked(table.as_bytes(), Times::Required);
+    assert_eq!(again.as_ref(), Some(&taken), "{table}");
+});
