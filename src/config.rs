@@ -6,12 +6,20 @@ use figment::providers::{Env, Format as _, Serialized, Toml};
 use figment::Figment;
 use serde::{Deserialize, Serialize};
 
+use crate::access::AccessSettings;
 use crate::http::HttpSettings;
+use crate::monitor::retention::RetentionSettings;
 use crate::monitor::MonitorSettings;
+use crate::mqtt::MqttSettings;
+use crate::notify::NotifySettings;
+use crate::store::StoreSettings;
 use crate::telemetry::LogSettings;
 
 /// Prefix of the environment variables; `__` stands between section and key.
 const ENVIRONMENT: &str = "MODALWATCH__";
+
+/// Names the admin token file.
+const ADMIN_TOKEN_FILE: &str = "MODALWATCH_ADMIN_TOKEN_FILE";
 
 /// The commented defaults, as a file.
 pub const DEFAULT_FILE: &str = include_str!("config.default.toml");
@@ -27,8 +35,18 @@ pub struct Config {
     pub models_dir: Option<PathBuf>,
     /// Towards clients.
     pub http: HttpSettings,
+    /// Who gets in.
+    pub access: AccessSettings,
     /// How batches are taken and assessed.
     pub monitor: MonitorSettings,
+    /// Messages to other programs.
+    pub notify: NotifySettings,
+    /// Batches from a broker.
+    pub mqtt: MqttSettings,
+    /// Where the database may lie, and the room it needs.
+    pub store: StoreSettings,
+    /// How long batches are kept.
+    pub retention: RetentionSettings,
     /// Logs.
     pub log: LogSettings,
 }
@@ -39,7 +57,12 @@ impl Default for Config {
             data_dir: PathBuf::from("modalwatch-data"),
             models_dir: None,
             http: HttpSettings::default(),
+            access: AccessSettings::default(),
             monitor: MonitorSettings::default(),
+            notify: NotifySettings::default(),
+            mqtt: MqttSettings::default(),
+            store: StoreSettings::default(),
+            retention: RetentionSettings::default(),
             log: LogSettings::default(),
         }
     }
@@ -87,6 +110,9 @@ pub enum Error {
     /// An unknown key or a value of the wrong type; the message names key and origin.
     #[error("configuration: {0}")]
     Value(Box<figment::Error>),
+    /// A setting of the broker that cannot be used.
+    #[error("configuration: {0}")]
+    Mqtt(#[from] crate::mqtt::SettingError),
     /// A value out of range.
     #[error("configuration: {key} is {value}: it must be {must}")]
     Range {
@@ -110,15 +136,32 @@ impl Config {
             let text = std::fs::read_to_string(path).map_err(|source| Error::File { path: path.to_owned(), source })?;
             figment = figment.merge(Toml::string(&text));
         }
-        figment = figment.merge(Env::prefixed(ENVIRONMENT).split("__")).merge(Serialized::defaults(flags));
+        // A file's name under a name of its own: what holds a secret is set apart from the settings.
+        let admin_file = Env::raw().only(&[ADMIN_TOKEN_FILE]).map(|_| "access.admin_token_file".into());
+        figment =
+            figment.merge(admin_file).merge(Env::prefixed(ENVIRONMENT).split("__")).merge(Serialized::defaults(flags));
         let config: Self = figment.extract().map_err(|e| Error::Value(Box::new(e)))?;
         config.check()?;
         Ok(config)
     }
 
+    /// Keys whose values differ from those of `other`, such as `http.listen`.
+    pub fn differing_keys(&self, other: &Self) -> Vec<String> {
+        let flat = |config: &Self| {
+            let value = serde_json::to_value(config).expect("settings are plain data");
+            let mut keys = std::collections::BTreeMap::new();
+            flatten(String::new(), &value, &mut keys);
+            keys
+        };
+        let (here, there) = (flat(self), flat(other));
+        let all: std::collections::BTreeSet<&String> = here.keys().chain(there.keys()).collect();
+        all.into_iter().filter(|key| here.get(*key) != there.get(*key)).cloned().collect()
+    }
+
     fn check(&self) -> Result<(), Error> {
         let positive = [
             ("http.max_body_bytes", self.http.max_body_bytes as u64),
+            ("http.max_bulk_bytes", self.http.max_bulk_bytes as u64),
             ("http.header_timeout_s", self.http.header_timeout_s),
             ("http.body_timeout_s", self.http.body_timeout_s),
             ("http.max_connections", self.http.max_connections as u64),
@@ -126,6 +169,8 @@ impl Config {
             ("monitor.draws_for_population", self.monitor.draws_for_population as u64),
             ("monitor.max_measurements", self.monitor.max_measurements as u64),
             ("monitor.compute.queue", self.monitor.compute.queue as u64),
+            ("store.max_wal_bytes", self.store.max_wal_bytes),
+            ("retention.every_s", self.retention.every_s),
         ];
         if let Some(&(key, value)) = positive.iter().find(|(_, value)| *value == 0) {
             return Err(Error::Range { key, value: value.to_string(), must: "at least 1" });
@@ -137,10 +182,30 @@ impl Config {
         if let Some((key, value)) = draws.into_iter().find(|(_, value)| *value > 10_000) {
             return Err(Error::Range { key, value: value.to_string(), must: "at most 10000" });
         }
+        if let Some((key, value, must)) = self.notify.problem() {
+            return Err(Error::Range { key, value, must });
+        }
+        self.mqtt.check()?;
+        if self.retention.measurements_days > 36_500 {
+            let value = self.retention.measurements_days.to_string();
+            return Err(Error::Range { key: "retention.measurements_days", value, must: "at most 36500" });
+        }
         if let Some((key, value, must)) = self.monitor.alarm.problem() {
             return Err(Error::Range { key, value, must });
         }
         Ok(())
+    }
+}
+
+/// The leaves of a tree of settings, by their keys.
+fn flatten(path: String, value: &serde_json::Value, keys: &mut std::collections::BTreeMap<String, serde_json::Value>) {
+    let serde_json::Value::Object(members) = value else {
+        keys.insert(path, value.clone());
+        return;
+    };
+    for (name, member) in members {
+        let below = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+        flatten(below, member, keys);
     }
 }
 
@@ -161,6 +226,17 @@ mod tests {
         std::fs::write(&path, "[http]\nlisten = \"127.0.0.1:1\"\nlistn = 3\n").unwrap();
         let error = Config::read(Some(&path), &Flags::default()).unwrap_err().to_string();
         assert!(error.contains("listn"), "{error}");
+    }
+
+    #[test]
+    fn what_changed_is_named_by_its_keys() {
+        let before = Config::default();
+        let mut after = before.clone();
+        assert_eq!(before.differing_keys(&after), Vec::<String>::new());
+        after.log.level = "debug".to_owned();
+        after.retention.measurements_days = 5;
+        after.models_dir = Some(PathBuf::from("models"));
+        assert_eq!(before.differing_keys(&after), ["log.level", "models_dir", "retention.measurements_days"]);
     }
 
     #[test]

@@ -13,8 +13,11 @@
 //!  cli · http                            the doors      words for people and programs
 //!  config · telemetry                    what the doors are set to, and what they log
 //!  reproduce                             the exam       the paper's cases by all methods, beside its figures
+//!  mqtt                                  the letter box batches from a broker
 //!  monitor                               the office     what happens to a batch
+//!  notify                                the messenger  who is told of alarms: webhooks
 //!  store                                 the archive    the only room that speaks SQL
+//!  access                                who may do what: tokens and scopes
 //!  assessment                            the result of one batch
 //!  alarm                                 charts, limits, states: when to wake somebody
 //!  discrepancy                           the study: what the simulation gets wrong, and what would mend it
@@ -27,7 +30,7 @@
 //!  simulator                             the bench      parameters in, natural frequencies out
 //!  physics | emulator | gsa | flow       workshops      structures | tables of runs | global sensitivity | networks
 //!  parameter · measurement               what is unknown · what arrives
-//!  quantity · stats · plot               the foundation
+//!  quantity · stats · plot · reduction · volume   the foundation
 //! ```
 //!
 //! # Reading order
@@ -85,6 +88,10 @@
 //! - R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
 //!   doi:10.1080/00031305.1996.10473566.
 
+#[macro_use]
+mod fault;
+
+pub mod access;
 pub mod alarm;
 pub mod assessment;
 pub mod baseline;
@@ -99,11 +106,14 @@ pub mod hierarchy;
 pub mod http;
 pub mod measurement;
 pub mod monitor;
+pub mod mqtt;
+pub mod notify;
 pub mod parameter;
 pub mod physics;
 pub mod plot;
 pub mod posterior;
 pub mod quantity;
+pub mod reduction;
 pub mod reproduce;
 pub mod simulator;
 pub mod stats;
@@ -111,3 +121,4 @@ pub mod store;
 pub mod telemetry;
 pub mod trust;
 pub mod updating;
+pub mod volume;

@@ -108,7 +108,9 @@ pub async fn demo(args: DemoArgs) -> anyhow::Result<()> {
         None => free_address().await,
     };
     let flags = Flags { data_dir: Some(data_dir), models_dir: None, http: HttpFlags { listen: Some(listen) } };
-    let config = Config::read(None, &flags)?;
+    let mut config = Config::read(None, &flags)?;
+    // The demonstration asks its own service, without a token.
+    config.access.admin_token_file = None;
     let (stop, stopped) = oneshot::channel::<()>();
     let signal = stop_signal()?;
     let shutdown = async move {
@@ -146,7 +148,7 @@ async fn free_address() -> String {
 
 async fn post_case_1(url: &str, seed: u64) -> anyhow::Result<Report> {
     let simulator = find_structure(STRUCTURE)?;
-    let client = reqwest::Client::new();
+    let client = crate::notify::client_builder().build()?;
     let structure_url = format!("{url}/v1/structures/{STRUCTURE}");
     let mut scenarios = Vec::new();
     let mut realised_thresholds = [0.0; 3];

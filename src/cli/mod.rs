@@ -1,14 +1,23 @@
 //! The door for people: one function a command.
 
+mod archive;
 mod assess;
+mod backup;
 mod calibrate;
 mod demo;
 mod design_alarm;
 mod diagnose;
+mod doctor;
+mod healthcheck;
 mod measurements;
+mod reload;
+mod remote;
 mod reproduce;
+mod retention;
 mod serve;
 mod simulate;
+mod supervisor;
+mod token;
 mod train;
 mod update;
 
@@ -57,12 +66,22 @@ enum Command {
         #[command(subcommand)]
         what: ConfigCommand,
     },
+    /// Make, list, revoke and rotate tokens while the service is stopped.
+    Token(token::TokenArgs),
     /// Ask a running service whether it is ready; exit status 0 when it is.
-    Healthcheck {
-        /// Where it listens.
-        #[arg(long, default_value = "http://127.0.0.1:8080")]
-        url: String,
-    },
+    Healthcheck(healthcheck::HealthcheckArgs),
+    /// Look at everything the service needs and say what is wrong; exit status 1 when something is.
+    Doctor(doctor::DoctorArgs),
+    /// Copy the database into a folder, checked, while the service runs or not.
+    Backup(backup::BackupArgs),
+    /// Put the database of a backup into a data folder.
+    Restore(backup::RestoreArgs),
+    /// Write one structure with its measurements, states and baselines into a file for another installation.
+    Export(archive::ExportArgs),
+    /// Take such a file.
+    Import(archive::ImportArgs),
+    /// Say which batches are older than asked to keep, or delete them.
+    Retention(retention::RetentionArgs),
 }
 
 #[derive(Debug, Subcommand)]
@@ -95,13 +114,16 @@ pub struct ServeArgs {
 }
 
 impl ServeArgs {
-    fn read(&self) -> Result<Config, crate::config::Error> {
-        let flags = Flags {
+    fn flags(&self) -> Flags {
+        Flags {
             data_dir: self.data_dir.clone(),
             models_dir: self.models.clone(),
             http: HttpFlags { listen: self.listen.clone() },
-        };
-        Config::read(self.config.as_deref(), &flags)
+        }
+    }
+
+    fn read(&self) -> Result<Config, crate::config::Error> {
+        Config::read(self.config.as_deref(), &self.flags())
     }
 }
 
@@ -113,8 +135,9 @@ pub fn run() -> anyhow::Result<()> {
     match Cli::parse().command {
         Command::Serve(args) => {
             let config = args.read()?;
-            telemetry::start(&config.log).map_err(anyhow::Error::msg)?;
-            block_on(serve::serve(config))
+            let log = telemetry::start(&config.log).map_err(anyhow::Error::msg)?;
+            let reloading = reload::Reloading { file: args.config.clone(), flags: args.flags(), log };
+            block_on(serve::serve(config, reloading))
         }
         Command::Demo(args) => block_on(demo::demo(args)),
         Command::Train(args) => train::train(&args),
@@ -134,20 +157,19 @@ pub fn run() -> anyhow::Result<()> {
             print!("{}", toml::to_string(&config.read()?)?);
             Ok(())
         }
-        Command::Healthcheck { url } => block_on(healthcheck(&url)),
+        Command::Token(args) => block_on(token::token(args)),
+        Command::Healthcheck(args) => block_on(healthcheck::healthcheck(&args)),
+        Command::Doctor(args) => block_on(doctor::doctor(&args)),
+        Command::Backup(args) => block_on(backup::backup(&args)),
+        Command::Restore(args) => block_on(backup::restore(&args)),
+        Command::Export(args) => block_on(archive::export(&args)),
+        Command::Import(args) => block_on(archive::import(&args)),
+        Command::Retention(args) => block_on(retention::retention(&args)),
     }
 }
 
 fn block_on(future: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
     tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(future)
-}
-
-async fn healthcheck(url: &str) -> anyhow::Result<()> {
-    let response = reqwest::get(format!("{url}/readyz")).await?;
-    let (status, text) = (response.status(), response.text().await?);
-    println!("{text}");
-    anyhow::ensure!(status.is_success(), "not ready: {status}");
-    Ok(())
 }
 
 /// Turns the settings a person gives as `name=a,b` into name and numbers.

@@ -86,11 +86,14 @@ pub fn from_bytes(bytes: &[u8], architecture: &Architecture, dtype: DType) -> Re
         }
         tensors.insert(name, Tensor::from_vec(values, view.shape(), &Device::Cpu)?.to_dtype(dtype)?);
     }
+    let names: Vec<String> = tensors.keys().cloned().collect();
+    // First the flow: an architecture that claims to be gigantic does not fit the file, and is not built to be compared with it.
+    let flow = Flow::new(architecture, &VarBuilder::from_tensors(tensors, dtype, &Device::Cpu))?;
     let (_, expected) = super::weights::untrained_flow(architecture, DType::F32, 0)?;
-    if let Some(name) = tensors.keys().find(|name| !expected.contains_key(*name)) {
-        return Err(Error::Foreign { name: name.clone() });
+    if let Some(name) = names.into_iter().find(|name| !expected.contains_key(name)) {
+        return Err(Error::Foreign { name });
     }
-    Ok(Flow::new(architecture, &VarBuilder::from_tensors(tensors, dtype, &Device::Cpu))?)
+    Ok(flow)
 }
 
 /// One tensor's bytes for the writer.

@@ -184,21 +184,14 @@ impl Flow {
         let (rows, features) = context.dims2()?;
         let d = self.architecture.parameters;
         let z = standard_normal(rows * draws, d, stream).to_dtype(self.dtype)?;
-        let (x, log_det) = match sampler::Sampler::new(self)? {
-            Some(sampler) => {
-                let context = DMatrix::from_vec(features, rows, context.flatten_all()?.to_vec1()?);
-                let mut values = z.flatten_all()?.to_vec1()?;
-                let log_det = sampler.inverse(&mut values, &context);
-                (
-                    Tensor::from_vec(values, (rows * draws, d), &Device::Cpu)?,
-                    Tensor::from_vec(log_det, rows * draws, &Device::Cpu)?,
-                )
-            }
-            None => {
-                let repeated =
-                    context.unsqueeze(1)?.expand((rows, draws, features))?.reshape((rows * draws, features))?;
-                self.inverse(&z, &repeated)?
-            }
+        let (x, log_det) = if let Some(sampler) = sampler::Sampler::new(self)? {
+            let context = DMatrix::from_vec(features, rows, context.flatten_all()?.to_vec1()?);
+            let mut values = z.flatten_all()?.to_vec1()?;
+            let log_det = Tensor::new(sampler.inverse(&mut values, &context), &Device::Cpu)?;
+            (Tensor::from_vec(values, (rows * draws, d), &Device::Cpu)?, log_det)
+        } else {
+            let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?;
+            self.inverse(&z, &repeated.reshape((rows * draws, features))?)?
         };
         Ok((x, log_density(&z, &log_det)?))
     }

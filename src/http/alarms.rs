@@ -6,47 +6,100 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
 use super::answer::ChartBody;
 use super::error::ApiError;
+use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
 use super::Shared;
-use crate::quantity::{shown, StructureId, Timestamp};
+use crate::baseline::identifiability::ParameterIdentifiability;
+use crate::quantity::{shown, Digest, StructureId, Timestamp};
 use crate::store::{Acknowledgement, Episode, MaintenanceWindow};
 
 /// Longest name or note.
 const LONGEST_TEXT: usize = 500;
 
 /// Query of the alarms.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 pub struct AlarmQuery {
+    /// `open` for those that last; all without.
+    #[param(value_type = Option<AlarmFilter>, inline)]
     state: Option<String>,
+    /// Most alarms of the page; 100 without.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
+    /// `next` of the page before.
+    #[param(pattern = "^[0-9]{1,18}$")]
     cursor: Option<String>,
 }
 
+/// Which alarms.
+#[derive(ToSchema)]
+#[schema(rename_all = "lowercase")]
+#[expect(dead_code, reason = "only its description is used")]
+enum AlarmFilter {
+    Any,
+    Open,
+}
+
 /// Query of the charts.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 pub struct ChartQuery {
+    /// Most points of each chart; 100 without.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
 }
 
-#[derive(Debug, Serialize)]
+/// Alarms, newest first.
+#[derive(Debug, Serialize, ToSchema)]
 struct AlarmPage {
     structure: StructureId,
     items: Vec<AlarmItem>,
+    /// Cursor of the next page; `null` on the last.
     next: Option<String>,
 }
 
+/// Points of the charts.
+#[derive(Debug, Serialize, ToSchema)]
+struct ChartPage {
+    structure: StructureId,
+    items: Vec<ChartBody>,
+}
+
+/// Maintenance windows, newest first.
+#[derive(Debug, Serialize, ToSchema)]
+struct MaintenanceList {
+    structure: StructureId,
+    items: Vec<MaintenanceItem>,
+}
+
+/// What the modes can tell apart.
+#[derive(Debug, Serialize, ToSchema)]
+struct Identifiability {
+    structure: StructureId,
+    model_digest: Digest,
+    parameters: Vec<ParameterIdentifiability>,
+    /// Groups of parameters that cannot be told apart, by name: their damage is told for the group.
+    groups: Vec<Vec<String>>,
+}
+
 /// An episode: from the alarm to its end.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Alarm)]
 struct AlarmItem {
+    /// Its number.
     alarm: i64,
+    /// `damage`, `simulation_does_not_fit` or `silence`.
     kind: String,
+    /// Of a damage alarm.
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
+    /// `open`, `ended`, or `withdrawn` when late data showed that there was none.
     state: &'static str,
     opened_at: Timestamp,
     opened_batch: Option<String>,
@@ -59,29 +112,43 @@ struct AlarmItem {
     acknowledgement: Option<AcknowledgementItem>,
 }
 
-#[derive(Debug, Serialize)]
+/// Who has seen an alarm.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Acknowledgement)]
 struct AcknowledgementItem {
     at: Timestamp,
     by: String,
     note: Option<String>,
 }
 
-#[derive(Debug, Deserialize)]
+/// Who has seen an alarm, and what they say of it.
+#[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = AcknowledgementInput)]
 struct AcknowledgementBody {
+    #[schema(min_length = 1, max_length = 500, pattern = "^[^\\x00-\\x1f\\x7f-\\x9f]+$")]
     by: String,
+    #[schema(min_length = 1, max_length = 500, pattern = "^[^\\x00-\\x1f\\x7f-\\x9f]+$")]
     note: Option<String>,
 }
 
-#[derive(Debug, Deserialize)]
+/// A time in which batches move no chart.
+#[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = MaintenanceInput)]
 struct MaintenanceBody {
+    #[schema(format = DateTime)]
     from: String,
+    /// Later than `from`.
+    #[schema(format = DateTime)]
     to: String,
+    #[schema(min_length = 1, max_length = 500, pattern = "^[^\\x00-\\x1f\\x7f-\\x9f]+$")]
     reason: String,
 }
 
-#[derive(Debug, Serialize)]
+/// A time in which batches move no chart.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Maintenance)]
 struct MaintenanceItem {
     from: Timestamp,
     to: Timestamp,
@@ -93,11 +160,7 @@ impl From<Episode> for AlarmItem {
         let damage = e.kind == "damage";
         Self {
             alarm: e.number,
-            state: match (e.withdrawn, e.ended_at) {
-                (true, _) => "withdrawn",
-                (false, Some(_)) => "ended",
-                (false, None) => "open",
-            },
+            state: e.state(),
             parameter: damage.then_some(e.series),
             peak_shift_standard_errors: (damage && e.peak_shift.is_finite()).then_some(e.peak_shift),
             undamaged_version: damage.then_some(e.undamaged_version),
@@ -115,6 +178,12 @@ impl From<Episode> for AlarmItem {
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/alarms", tag = "alarms", operation_id = "list_alarms",
+    summary = "Alarms", description = "Alarms with their beginning and end, newest first, a page at a time.",
+    params(StructurePath, AlarmQuery),
+    responses((status = 200, description = "A page", body = AlarmPage), Unknown, Invalid)
+)]
 pub async fn list(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
@@ -143,6 +212,13 @@ pub async fn list(
 ///
 /// # Errors
 /// 400, 415, 422 for the body, 404 for structure or alarm.
+#[utoipa::path(
+    post, path = "/v1/structures/{id}/alarms/{alarm}/acknowledgement", tag = "alarms", operation_id = "acknowledge_alarm",
+    summary = "Acknowledge an alarm", description = "Somebody has seen it; the first acknowledgement stays.",
+    params(AlarmPath),
+    request_body(content = AcknowledgementBody, example = json!({"by": "A. Engineer", "note": "inspection on Monday"})),
+    responses((status = 200, description = "The alarm", body = AlarmItem), Unknown, BodyRefused)
+)]
 pub async fn acknowledge(
     State(shared): State<Shared>,
     ApiPath((id, number)): ApiPath<(String, String)>,
@@ -161,6 +237,7 @@ pub async fn acknowledge(
     let acknowledgement = Acknowledgement { at: Timestamp::now(), by: body.by, note: body.note };
     let parsed: i64 = number.parse().map_err(|_| unknown())?;
     let episode = shared.monitor.store().acknowledge(&id, parsed, acknowledgement).await?.ok_or_else(unknown)?;
+    shared.monitor.tell_acknowledged(&id, &episode);
     Ok(Json(AlarmItem::from(episode)).into_response())
 }
 
@@ -168,6 +245,12 @@ pub async fn acknowledge(
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/charts", tag = "alarms", operation_id = "read_charts",
+    summary = "Alarm charts", description = "The newest points of each chart, oldest first.",
+    params(StructurePath, ChartQuery),
+    responses((status = 200, description = "The points", body = ChartPage), Unknown, Invalid)
+)]
 pub async fn charts(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
@@ -177,13 +260,21 @@ pub async fn charts(
     shared.monitor.structure(&id)?;
     let points = shared.monitor.store().charts(&id, page_limit(query.limit.as_deref())?).await?;
     let items: Vec<ChartBody> = points.into_iter().map(ChartBody::from).collect();
-    Ok(Json(serde_json::json!({ "structure": id, "items": items })).into_response())
+    Ok(Json(ChartPage { structure: id, items }).into_response())
 }
 
 /// `POST /v1/structures/{id}/maintenance`: batches measured in the window move no chart.
 ///
 /// # Errors
 /// 400, 415, 422 for the body, 404 for the structure.
+#[utoipa::path(
+    post, path = "/v1/structures/{id}/maintenance", tag = "alarms", operation_id = "add_maintenance",
+    summary = "Announce maintenance", description = "Batches measured in the window move no chart.",
+    params(StructurePath),
+    request_body(content = MaintenanceBody, example = json!(
+        {"from": "2026-03-01T08:00:00Z", "to": "2026-03-01T16:00:00Z", "reason": "bearing replaced"})),
+    responses((status = 201, description = "The window", body = MaintenanceItem), Unknown, BodyRefused)
+)]
 pub async fn add_maintenance(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
@@ -210,19 +301,31 @@ pub async fn add_maintenance(
 ///
 /// # Errors
 /// 404 for the structure.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/maintenance", tag = "alarms", operation_id = "list_maintenance",
+    summary = "Maintenance windows", description = "Newest first.",
+    params(StructurePath),
+    responses((status = 200, description = "The windows", body = MaintenanceList), Unknown, Invalid)
+)]
 pub async fn maintenance(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
     let windows = shared.monitor.store().maintenance(&id).await?;
     let item = |w: MaintenanceWindow| MaintenanceItem { from: w.from, to: w.to, reason: w.reason };
     let items: Vec<MaintenanceItem> = windows.into_iter().map(item).collect();
-    Ok(Json(serde_json::json!({ "structure": id, "items": items })).into_response())
+    Ok(Json(MaintenanceList { structure: id, items }).into_response())
 }
 
 /// `GET /v1/structures/{id}/identifiability`: what the modes can tell apart, by the trained baseline in use.
 ///
 /// # Errors
 /// 404 for the structure, 409 without a trained baseline.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/identifiability", tag = "structures", operation_id = "read_identifiability",
+    summary = "What the modes can tell apart", description = "By the trained baseline in use.",
+    params(StructurePath),
+    responses((status = 200, description = "For each parameter", body = Identifiability), Unknown, Invalid, Conflict)
+)]
 pub async fn identifiability(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
@@ -230,9 +333,12 @@ pub async fn identifiability(State(shared): State<Shared>, ApiPath(id): ApiPath<
         ApiError::from(crate::monitor::Error::NoModel { structure: id.clone(), reason: reason.clone() })
     })?;
     let record = &baseline.manifest().identifiability;
-    let body = serde_json::json!({
-        "structure": id, "model_digest": baseline.digest(), "parameters": record.parameters, "groups": record.groups,
-    });
+    let body = Identifiability {
+        structure: id,
+        model_digest: baseline.digest().clone(),
+        parameters: record.parameters.clone(),
+        groups: record.groups.clone(),
+    };
     Ok(Json(body).into_response())
 }
 

@@ -1,17 +1,19 @@
 //! JSON bodies of answers: units in field names, times in RFC 3339 UTC, never NaN.
 
 use serde::Serialize;
+use utoipa::ToSchema;
 
+use super::table::{Cell, Kind};
 use crate::assessment::{Assessment, BatchState};
 use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
 use crate::monitor::BatchView;
 use crate::quantity::Timestamp;
-use crate::store::{HistoryEntry, StoredChartPoint, UndamagedRecord};
+use crate::store::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
 use crate::trust::{Finding, Verdict};
 
 /// One batch.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 pub struct Batch {
     structure: String,
     batch: String,
@@ -55,15 +57,16 @@ impl Batch {
             measurements: with_measurements.then_some(record.batch.measurements),
         }
     }
+}
 
-    /// Path of the batch.
-    pub fn location(&self) -> String {
-        format!("/v1/structures/{}/batches/{}", self.structure, self.batch)
-    }
+/// Path of a batch.
+pub fn location(record: &BatchRecord) -> String {
+    format!("/v1/structures/{}/batches/{}", record.batch.structure, record.batch_id)
 }
 
 /// What a batch says of the structure.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Assessment)]
 pub struct AssessmentBody {
     model_digest: String,
     structure_digest: String,
@@ -92,7 +95,8 @@ pub struct AssessmentBody {
 
 /// One monitored quantity of a batch: mean and standard deviation are those of the population behind the batch, intervals
 /// have 90 % probability.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ParameterAssessment)]
 pub struct ParameterBody {
     name: String,
     unit: String,
@@ -114,7 +118,8 @@ pub struct ParameterBody {
 }
 
 /// The estimate of the paper: moments of all samples together.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = PooledEstimate)]
 pub struct PooledBody {
     mean: f64,
     std: Option<f64>,
@@ -124,7 +129,8 @@ pub struct PooledBody {
 }
 
 /// A batch on an alarm chart.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ChartPoint)]
 pub struct ChartBody {
     batch: String,
     measured_to: Timestamp,
@@ -216,7 +222,7 @@ impl From<QuantityAssessment> for ParameterBody {
 }
 
 /// One batch of the history.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 pub struct HistoryItem {
     batch: String,
     source: String,
@@ -246,70 +252,74 @@ impl From<HistoryEntry> for HistoryItem {
     }
 }
 
-/// Columns of the history as CSV: one row for each batch and quantity, or one with empty places without an assessment.
-pub const HISTORY_COLUMNS: [&str; 25] = [
-    "batch",
-    "source",
-    "measured_from",
-    "measured_to",
-    "measurement_count",
-    "state",
-    "parameter",
-    "unit",
-    "mean",
-    "mean_low",
-    "mean_high",
-    "std",
-    "std_low",
-    "std_high",
-    "edge_mass",
-    "threshold",
-    "probability_of_damage",
-    "probability_of_damage_low",
-    "probability_of_damage_high",
-    "exceeds",
-    "relative_change",
-    "pooled_mean",
-    "pooled_std",
-    "trust",
-    "model_digest",
+/// Columns of the history as a table: one row for each batch and quantity, or one with empty places without an assessment.
+pub const HISTORY_COLUMNS: [(&str, Kind); 25] = [
+    ("batch", Kind::Text),
+    ("source", Kind::Text),
+    ("measured_from", Kind::Time),
+    ("measured_to", Kind::Time),
+    ("measurement_count", Kind::Count),
+    ("state", Kind::Text),
+    ("parameter", Kind::Text),
+    ("unit", Kind::Text),
+    ("mean", Kind::Number),
+    ("mean_low", Kind::Number),
+    ("mean_high", Kind::Number),
+    ("std", Kind::Number),
+    ("std_low", Kind::Number),
+    ("std_high", Kind::Number),
+    ("edge_mass", Kind::Number),
+    ("threshold", Kind::Number),
+    ("probability_of_damage", Kind::Number),
+    ("probability_of_damage_low", Kind::Number),
+    ("probability_of_damage_high", Kind::Number),
+    ("exceeds", Kind::Flag),
+    ("relative_change", Kind::Number),
+    ("pooled_mean", Kind::Number),
+    ("pooled_std", Kind::Number),
+    ("trust", Kind::Text),
+    ("model_digest", Kind::Text),
 ];
 
 impl HistoryItem {
     /// Rows in the order of [`HISTORY_COLUMNS`].
-    pub fn csv_rows(&self) -> Vec<Vec<String>> {
+    pub fn rows(&self) -> Vec<Vec<Cell>> {
         let batch = [
-            self.batch.clone(),
-            self.source.clone(),
-            self.measured_from.to_string(),
-            self.measured_to.to_string(),
-            self.measurement_count.to_string(),
-            self.state.as_str().to_owned(),
+            Cell::Text(self.batch.clone()),
+            Cell::Text(self.source.clone()),
+            Cell::Time(self.measured_from),
+            Cell::Time(self.measured_to),
+            Cell::Count(self.measurement_count as i64),
+            Cell::Text(self.state.as_str().to_owned()),
         ];
         let Some(assessment) = &self.assessment else {
-            return vec![batch.into_iter().chain(vec![String::new(); 19]).collect()];
+            let empty = std::iter::repeat_n(Cell::Empty, HISTORY_COLUMNS.len() - batch.len());
+            return vec![batch.into_iter().chain(empty).collect()];
         };
+        let trust = if assessment.trust == Verdict::Accepted { "accepted" } else { "rejected" };
+        let low = |interval: Option<[f64; 2]>| Cell::number(interval.map(|i| i[0]));
+        let high = |interval: Option<[f64; 2]>| Cell::number(interval.map(|i| i[1]));
         let row = |p: &ParameterBody| {
             let quantity = [
-                p.name.clone(),
-                p.unit.clone(),
-                p.mean.to_string(),
-                cell(p.mean_interval.map(|i| i[0])),
-                cell(p.mean_interval.map(|i| i[1])),
-                cell(p.std),
-                cell(p.std_interval.map(|i| i[0])),
-                cell(p.std_interval.map(|i| i[1])),
-                p.edge_mass.to_string(),
-                cell(p.threshold),
-                cell(p.probability_of_damage),
-                cell(p.probability_of_damage_interval.map(|i| i[0])),
-                cell(p.probability_of_damage_interval.map(|i| i[1])),
-                cell(p.exceeds),
-                cell(p.relative_change),
-                p.pooled.mean.to_string(),
-                cell(p.pooled.std),
-                if assessment.trust == Verdict::Accepted { "accepted" } else { "rejected" }.to_owned(),
-                assessment.model_digest.clone(),
+                Cell::Text(p.name.clone()),
+                Cell::Text(p.unit.clone()),
+                Cell::Number(p.mean),
+                low(p.mean_interval),
+                high(p.mean_interval),
+                Cell::number(p.std),
+                low(p.std_interval),
+                high(p.std_interval),
+                Cell::Number(p.edge_mass),
+                Cell::number(p.threshold),
+                Cell::number(p.probability_of_damage),
+                low(p.probability_of_damage_interval),
+                high(p.probability_of_damage_interval),
+                p.exceeds.map_or(Cell::Empty, Cell::Flag),
+                Cell::number(p.relative_change),
+                Cell::Number(p.pooled.mean),
+                Cell::number(p.pooled.std),
+                Cell::Text(trust.to_owned()),
+                Cell::Text(assessment.model_digest.clone()),
             ];
             batch.iter().cloned().chain(quantity).collect()
         };
@@ -317,12 +327,8 @@ impl HistoryItem {
     }
 }
 
-fn cell<T: ToString>(value: Option<T>) -> String {
-    value.map_or_else(String::new, |v| v.to_string())
-}
-
 /// The undamaged state of a structure.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 pub struct Undamaged {
     structure: String,
     version: u32,

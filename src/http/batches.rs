@@ -1,6 +1,4 @@
-//! `/v1/structures/{id}/batches`: post and read.
-
-use std::collections::BTreeMap;
+//! `/v1/structures/{id}/batches`: post and read; many at once in [`super::bulk`].
 
 use axum::body::{Body, Bytes};
 use axum::extract::State;
@@ -8,79 +6,112 @@ use axum::http::{header, HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::Deserialize;
+use utoipa::IntoParams;
 
-use super::answer;
+use super::access::Client;
+use super::bulk::{self, BulkAnswer};
 use super::error::ApiError;
-use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery};
-use super::Shared;
-use crate::measurement::check::{
-    check_idempotency_key, check_measurements, check_source, Place, Problem, RawMeasurement,
-};
+use super::openapi::{BatchPath, BodyRefused, Busy, Invalid, StructurePath, Unknown};
+use super::request::{media_type, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery};
+use super::{answer, Shared};
+use crate::measurement::body::{MessageBody, PostBody, RawBatch};
+use crate::measurement::check::{check_idempotency_key, check_source};
 use crate::measurement::csv::{self, CsvOptions, Times};
-use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
-use crate::monitor::{MissingCovariate, Monitor, Watched};
+use crate::measurement::MeasurementBatch;
+use crate::monitor::{Monitor, Watched};
 use crate::quantity::StructureId;
 
 /// The client's own key for a batch.
-const IDEMPOTENCY_KEY: HeaderName = HeaderName::from_static("idempotency-key");
+pub const IDEMPOTENCY_KEY: HeaderName = HeaderName::from_static("idempotency-key");
 /// Says that this batch had been posted before.
 const IDEMPOTENCY_REPLAYED: HeaderName = HeaderName::from_static("idempotency-replayed");
 
-/// Source of a batch that names none.
-const DEFAULT_SOURCE: &str = "default";
-
-#[derive(Debug, Deserialize)]
+/// Query of a post; for CSV and NDJSON, which have no place for a common source.
+#[derive(Debug, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
-struct BatchBody {
-    source: Option<String>,
-    measurements: Vec<MeasurementBody>,
-}
-
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct MeasurementBody {
-    measured_at: Option<String>,
-    frequencies_hz: Vec<Option<f64>>,
-    std_hz: Option<Vec<Option<f64>>>,
-    #[serde(default)]
-    covariates: BTreeMap<String, CovariateValue>,
-    #[serde(default)]
-    settings: BTreeMap<String, f64>,
-}
-
-/// Query of a post; for CSV, which has no place for a source.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 pub struct PostQuery {
+    /// Instrument, gateway or campaign, unless the body names one.
+    #[param(min_length = 1, max_length = 64, pattern = "^[A-Za-z0-9_.:-]+$")]
     source: Option<String>,
     /// Columns of a CSV that are not read, separated by commas.
     ignore: Option<String>,
 }
 
-/// `POST /v1/structures/{id}/batches`: 201 with the assessment; the batch is on disk before.
+/// Headers of a post.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Header)]
+#[expect(dead_code, reason = "only its description is used")]
+struct PostHeaders {
+    /// The client's own key for the batch; not for NDJSON, whose lines have their own.
+    #[param(rename = "Idempotency-Key", min_length = 1, max_length = 128, pattern = "^[!-~]+$")]
+    idempotency_key: Option<String>,
+}
+
+/// `POST /v1/structures/{id}/batches`: 201 with the assessment, or 200 with what became of each line of NDJSON.
 ///
 /// # Errors
-/// 400, 413, 415 and 422 for the body, 404 for the structure, 503 when the queue is full.
+/// 400, 413, 415 and 422 for the body, 404 for the structure, 429 beyond the measurements a second
+/// of `http.rate_limit`, 503 when the queue is full.
+#[utoipa::path(
+    post, path = "/v1/structures/{id}/batches", tag = "batches", operation_id = "post_batches",
+    summary = "Post measurements",
+    description = "One batch as JSON or CSV: it is on disk before it is assessed, and the assessment comes with the answer. \
+                   Many batches as NDJSON, one a line: each is stored by itself, a line that is refused does not stop the \
+                   others, and the answer (200) tells of each in its place. What was posted before is not stored again: a \
+                   batch is known by `Idempotency-Key`, a measurement by structure, source and time.",
+    params(StructurePath, PostQuery, PostHeaders),
+    request_body(
+        description = "CSV: a header with `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, covariates by name and \
+                       `set_<parameter>`; separator `,`, `;` or tab, decimal comma with the last two.",
+        content(
+            (PostBody = "application/json", example = json!({"source": "tower-1", "measurements": [
+                {"measured_at": "2026-03-01T12:00:00Z", "frequencies_hz": [0.4949, 0.9250, 1.2434]}]})),
+            (MessageBody = "application/x-ndjson", example = json!(
+                "{\"source\":\"tower-1\",\"measurements\":[{\"measured_at\":\"2026-03-01T12:20:00Z\",\
+                 \"frequencies_hz\":[0.4949,0.9250,1.2434]}]}\n")),
+            (String = "text/csv", example = json!(
+                "measured_at,f1_hz,f2_hz,f3_hz\n2026-03-01T12:10:00Z,0.4949,0.9250,1.2434\n"))
+        )
+    ),
+    responses(
+        (status = 200, description = "NDJSON: what became of each line", body = BulkAnswer),
+        (status = 201, description = "The batch with its assessment", body = answer::Batch, headers(
+            ("Location" = String, description = "Path of the batch"),
+            ("Idempotency-Replayed" = String, description = "`true` when it had been posted before")
+        )),
+        Unknown, BodyRefused, Busy
+    )
+)]
 pub async fn create(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
     ApiQuery(query): ApiQuery<PostQuery>,
+    client: Client,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
+    if let Some(source) = &query.source {
+        let in_query = |problem| ApiError::invalid_input(vec![problem]).at("query/source");
+        check_source(source).map_err(in_query)?;
+    }
+    let kind = media_type(&headers);
+    if kind.as_deref() == Some("application/x-ndjson") {
+        return bulk::create(&shared, &client, (id, query.source), &headers, body).await;
+    }
     let key = idempotency_key(&headers)?;
     let bytes = read_body(body, &headers, shared.limits).await?;
-    let kind = media_type(&headers);
     let monitor = shared.monitor.clone();
     // A body of thousands of measurements takes milliseconds to parse: not on an async thread.
     let parse = move || parse_batch(&monitor, &watched, id, key, kind.as_deref(), &bytes, query);
     let batch = tokio::task::spawn_blocking(parse).await.map_err(|e| ApiError::internal(&e))??;
+    shared.access.take_measurements(&client, batch.measurements.len())?;
     let ingested = shared.monitor.ingest(batch).await?;
 
+    let location = answer::location(&ingested.view.record);
     let body = answer::Batch::new(ingested.view, false);
-    let location = body.location();
     let mut response = (StatusCode::CREATED, [(header::LOCATION, location)], Json(body)).into_response();
     if ingested.replayed {
         response.headers_mut().insert(IDEMPOTENCY_REPLAYED, header::HeaderValue::from_static("true"));
@@ -88,10 +119,16 @@ pub async fn create(
     Ok(response)
 }
 
-/// `GET /v1/structures/{id}/batches/{batch}`: measurements and current assessment.
+/// `GET /v1/structures/{id}/batches/{batch}`.
 ///
 /// # Errors
 /// 404.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/batches/{batch}", tag = "batches", operation_id = "read_batch",
+    summary = "A batch", description = "The batch with its measurements and its current assessment.",
+    params(BatchPath),
+    responses((status = 200, description = "The batch", body = answer::Batch), Unknown, Invalid)
+)]
 pub async fn read(
     State(shared): State<Shared>,
     ApiPath((id, batch)): ApiPath<(String, String)>,
@@ -118,50 +155,18 @@ fn parse_batch(
     bytes: &Bytes,
     query: PostQuery,
 ) -> Result<MeasurementBatch, ApiError> {
-    let (source, raw) = match kind {
-        Some("application/json") => from_json(bytes)?,
+    let mut raw = match kind {
+        Some("application/json") => RawBatch::of_post(bytes, idempotency_key)?,
         Some("text/csv") => {
             let ignore = query.ignore.as_deref().unwrap_or_default().split(',').map(|c| c.trim().to_owned());
             let ignore = ignore.filter(|column| !column.is_empty()).collect();
             let options = CsvOptions { times: Times::Required, ignore, time_column: None };
             let simulator = &watched.simulator;
-            let raw = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
-            (None, raw.map_err(ApiError::invalid_input)?)
+            let read = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
+            RawBatch { source: None, idempotency_key, measurements: read.map_err(ApiError::invalid_input)? }
         }
-        other => return Err(unsupported_media_type(other, "application/json or text/csv")),
+        other => return Err(unsupported_media_type(other, "application/json, text/csv or application/x-ndjson")),
     };
-    let source = source.or(query.source).unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
-    check_source(&source).map_err(|problem| ApiError::invalid_input(vec![problem]))?;
-    let places: Vec<Place> = raw.iter().map(|r| r.place).collect();
-    let measurements = check_measurements(raw, &monitor.expectation(watched)).map_err(ApiError::invalid_input)?;
-    if monitor.settings().missing_covariate == MissingCovariate::Refuse {
-        let missing = |(m, place): (&ModalMeasurement, &Place)| {
-            let missing = watched.simulator.effect_sizes(&m.covariates).missing;
-            missing
-                .into_iter()
-                .map(|name| {
-                    let message = format!("{name} is missing: the simulation of this structure depends on it");
-                    Problem::new(place.of_covariate(&name), message)
-                })
-                .collect::<Vec<_>>()
-        };
-        let problems: Vec<Problem> = measurements.iter().zip(&places).flat_map(missing).take(20).collect();
-        if !problems.is_empty() {
-            return Err(ApiError::invalid_input(problems));
-        }
-    }
-    Ok(MeasurementBatch { structure, source, idempotency_key, measurements })
-}
-
-fn from_json(bytes: &[u8]) -> Result<(Option<String>, Vec<RawMeasurement>), ApiError> {
-    let body: BatchBody = parse_json(bytes)?;
-    let raw = |(index, m): (usize, MeasurementBody)| RawMeasurement {
-        place: Place::Json { index },
-        measured_at: m.measured_at,
-        frequencies_hz: m.frequencies_hz,
-        std_hz: m.std_hz,
-        covariates: m.covariates,
-        settings: m.settings,
-    };
-    Ok((body.source, body.measurements.into_iter().enumerate().map(raw).collect()))
+    raw.source = raw.source.or(query.source);
+    monitor.check(watched, structure, raw).map_err(ApiError::invalid_input)
 }

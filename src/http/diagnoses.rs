@@ -7,37 +7,56 @@ use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
+use utoipa::ToSchema;
 
 use super::error::ApiError;
-use super::request::{json_body, structure_id, ApiPath};
+use super::openapi::{BodyRefused, Busy, Conflict, DiagnosisPath, Invalid, StructurePath, Unknown};
+use super::request::{json_body, structure_id, whole_number, ApiPath};
 use super::Shared;
-use crate::monitor::{DiagnosisRequest, ExtensionTraining};
-use crate::quantity::{StructureId, Timestamp};
+use crate::discrepancy::Diagnosis;
+use crate::monitor::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{DiagnosisRecord, JobState};
 
 /// Diagnoses listed of one structure.
 const LISTED: usize = 100;
 
 /// Body of a request for a diagnosis; `{}` diagnoses all batches.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schema(as = DiagnosisInput)]
 struct DiagnosisBody {
+    /// Ids of batches; all without.
     batches: Vec<String>,
+    /// Measurements kept for measuring the gain, such as `last:0.25`; that without.
+    #[schema(pattern = r"^(last:0?\.[0-9]{1,6}|where:[^=]+=.+)$", examples("last:0.25", "where:operator=anna"))]
     holdout: Option<String>,
+    /// Seed of the bootstrap; 1 without.
+    #[serde(deserialize_with = "whole_number")]
+    #[schema(value_type = Option<u64>, maximum = 9_007_199_254_740_991_i64)]
     seed: Option<u64>,
 }
 
 /// Body of a request for an extension; `{}` trains as the baseline before was trained.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schema(as = ExtensionInput)]
 struct ExtensionBody {
-    samples: Option<usize>,
-    epochs: Option<usize>,
+    /// Simulated pairs.
+    #[serde(deserialize_with = "whole_number")]
+    #[schema(value_type = Option<u64>, minimum = 1000, maximum = 2_000_000)]
+    samples: Option<u64>,
+    /// Passes over them.
+    #[serde(deserialize_with = "whole_number")]
+    #[schema(value_type = Option<u64>, minimum = 1, maximum = 2000)]
+    epochs: Option<u64>,
+    /// Use the flow even if it fails its calibration; every answer says so then.
     accept_uncalibrated: bool,
 }
 
 /// A diagnosis as it is answered.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = DiagnosisJob)]
 struct DiagnosisAnswer {
     diagnosis: String,
     structure: StructureId,
@@ -49,22 +68,27 @@ struct DiagnosisAnswer {
     failure: Option<String>,
     created_at: Timestamp,
     finished_at: Option<Timestamp>,
+    #[schema(value_type = Option<Diagnosis>)]
     result: Option<Box<RawValue>>,
+    /// Path of the page, when it is done.
     report: Option<String>,
     extension: Option<ExtensionAnswer>,
 }
 
 /// The extension by a diagnosis.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ExtensionJob)]
 struct ExtensionAnswer {
     state: JobState,
     #[serde(skip_serializing_if = "Option::is_none")]
     failure: Option<String>,
+    #[schema(value_type = Option<ExtensionResult>)]
     result: Option<Box<RawValue>>,
 }
 
 /// One line of the list.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ListedDiagnosis)]
 struct Listed {
     diagnosis: String,
     state: JobState,
@@ -72,6 +96,21 @@ struct Listed {
     verdict: Option<String>,
     summary: Option<String>,
     extension: Option<JobState>,
+}
+
+/// Diagnoses of a structure, newest first.
+#[derive(Debug, Serialize, ToSchema)]
+struct DiagnosisList {
+    structure: StructureId,
+    items: Vec<Listed>,
+}
+
+/// A step back.
+#[derive(Debug, Serialize, ToSchema)]
+struct SteppedBack {
+    structure: StructureId,
+    /// The version that is in use now.
+    structure_digest: Digest,
 }
 
 fn raw(json: Option<String>) -> Result<Option<Box<RawValue>>, ApiError> {
@@ -105,6 +144,18 @@ fn answer(record: DiagnosisRecord, progress: Option<String>) -> Result<Diagnosis
 ///
 /// # Errors
 /// 404 for structure and batches, 422 for the hold-out.
+#[utoipa::path(
+    post, path = "/v1/structures/{id}/diagnoses", tag = "diagnoses", operation_id = "start_diagnosis",
+    summary = "Diagnose the simulation",
+    description = "Looks for what the simulation gets wrong, by batches that are stored; a job that runs on.",
+    params(StructurePath),
+    request_body(content = DiagnosisBody, example = json!({"holdout": "last:0.25"})),
+    responses(
+        (status = 202, description = "The job has begun", body = DiagnosisAnswer,
+         headers(("Location" = String, description = "Path of the diagnosis"))),
+        Unknown, BodyRefused, Conflict, Busy
+    )
+)]
 pub async fn create(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
@@ -125,6 +176,12 @@ pub async fn create(
 ///
 /// # Errors
 /// 404.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/diagnoses", tag = "diagnoses", operation_id = "list_diagnoses",
+    summary = "Diagnoses of a structure", description = "The newest hundred, newest first.",
+    params(StructurePath),
+    responses((status = 200, description = "The diagnoses", body = DiagnosisList), Unknown, Invalid)
+)]
 pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
@@ -141,13 +198,19 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
             extension: record.extension_state,
         });
     }
-    Ok(Json(serde_json::json!({ "structure": id, "items": items })).into_response())
+    Ok(Json(DiagnosisList { structure: id, items }).into_response())
 }
 
 /// `GET /v1/diagnoses/{id}`: state, progress and result.
 ///
 /// # Errors
 /// 404.
+#[utoipa::path(
+    get, path = "/v1/diagnoses/{id}", tag = "diagnoses", operation_id = "read_diagnosis",
+    summary = "A diagnosis", description = "State and progress of the job, and its result when it is done.",
+    params(DiagnosisPath),
+    responses((status = 200, description = "The diagnosis", body = DiagnosisAnswer), Unknown)
+)]
 pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let (record, progress) = shared.monitor.diagnosis(&id).await?;
     Ok(Json(answer(record, progress)?).into_response())
@@ -157,6 +220,12 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 ///
 /// # Errors
 /// 404, 409 while there is none.
+#[utoipa::path(
+    get, path = "/v1/diagnoses/{id}/report", tag = "diagnoses", operation_id = "read_report",
+    summary = "The page of a diagnosis", description = "One page of HTML that needs nothing else.",
+    params(DiagnosisPath),
+    responses((status = 200, description = "The page", body = String, content_type = "text/html"), Unknown, Conflict)
+)]
 pub async fn report(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     shared.monitor.diagnosis(&id).await?;
     let Some(html) = shared.monitor.store().diagnosis_report(&id).await? else {
@@ -171,6 +240,18 @@ pub async fn report(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) 
 ///
 /// # Errors
 /// 404, 409 when it cannot be extended, 422 for the training.
+#[utoipa::path(
+    post, path = "/v1/diagnoses/{id}/extension", tag = "diagnoses", operation_id = "extend_structure",
+    summary = "Extend the structure by a diagnosis",
+    description = "Makes a new version of the structure with the causes as effects, and trains its baseline; a job that runs on.",
+    params(DiagnosisPath),
+    request_body(content = ExtensionBody, example = json!({"samples": 200_000, "epochs": 80})),
+    responses(
+        (status = 202, description = "The job has begun", body = DiagnosisAnswer,
+         headers(("Location" = String, description = "Path of the diagnosis"))),
+        Unknown, BodyRefused, Conflict, Busy
+    )
+)]
 pub async fn extend(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
@@ -186,7 +267,8 @@ pub async fn extend(
         }
     }
     let ExtensionBody { samples, epochs, accept_uncalibrated } = body;
-    let training = ExtensionTraining { samples, epochs, accept_uncalibrated };
+    let size = |number: Option<u64>| number.map(|n| n as usize);
+    let training = ExtensionTraining { samples: size(samples), epochs: size(epochs), accept_uncalibrated };
     let record = shared.monitor.start_extension(&id, training).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{id}"))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
@@ -196,8 +278,14 @@ pub async fn extend(
 ///
 /// # Errors
 /// 404, 409 when the structure extends none.
+#[utoipa::path(
+    delete, path = "/v1/structures/{id}/extension", tag = "diagnoses", operation_id = "step_back",
+    summary = "One step back", description = "Goes back to the version that the present one extends.",
+    params(StructurePath),
+    responses((status = 200, description = "The version in use now", body = SteppedBack), Unknown, Invalid, Conflict)
+)]
 pub async fn step_back(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let digest = shared.monitor.step_back(&id).await?;
-    Ok(Json(serde_json::json!({ "structure": id, "structure_digest": digest })).into_response())
+    Ok(Json(SteppedBack { structure: id, structure_digest: digest }).into_response())
 }

@@ -6,30 +6,81 @@ use axum::http::{header, HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
 use super::answer::{HistoryItem, Undamaged, HISTORY_COLUMNS};
 use super::error::ApiError;
-use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
+use super::openapi::{BodyRefused, Busy, Conflict, Invalid, NotAcceptable, StructurePath, Unknown};
+use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery, Window};
+use super::table::{Cell, Format, TableWriter};
 use super::Shared;
+use crate::monitor::Watched;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::HistoryQuery;
 
 /// p of the damage threshold unless the client gives another (paper §4).
 const DEFAULT_THRESHOLD_PROBABILITY: f64 = 0.05;
 
-/// Query of a page.
-#[derive(Debug, Default, Deserialize)]
+/// Query of the history.
+#[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
-pub struct PageQuery {
+#[into_params(parameter_in = Query)]
+pub struct HistoryParams {
+    /// Batches that begin at this time or later.
+    #[param(value_type = Option<String>, format = DateTime)]
     from: Option<String>,
+    /// Batches that begin before this time.
+    #[param(value_type = Option<String>, format = DateTime)]
     to: Option<String>,
+    /// Only this parameter, spring stiffness or group.
+    #[param(min_length = 1, example = "k1")]
     parameter: Option<String>,
+    /// Most batches of the page; 100 without.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
+    /// `next` of the page before.
+    #[param(pattern = "^[0-9]{1,16}~[0-9a-z-]{1,64}$")]
     cursor: Option<String>,
+    /// Without it, `Accept` decides.
+    #[param(value_type = Option<TableFormat>, inline)]
     format: Option<String>,
 }
 
-#[derive(Debug, Serialize)]
+/// Query of the exceedances.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct ExceedanceParams {
+    /// Batches that begin at this time or later.
+    #[param(value_type = Option<String>, format = DateTime)]
+    from: Option<String>,
+    /// Batches that begin before this time.
+    #[param(value_type = Option<String>, format = DateTime)]
+    to: Option<String>,
+    /// Only this parameter, spring stiffness or group.
+    #[param(min_length = 1, example = "k1")]
+    parameter: Option<String>,
+    /// Most exceedances of the page; 100 without.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
+    limit: Option<String>,
+    /// `next` of the page before.
+    #[param(pattern = "^[0-9]{1,16}~[0-9a-z-]{1,64}~.{1,200}$")]
+    cursor: Option<String>,
+}
+
+/// How a table is written.
+#[derive(ToSchema)]
+#[schema(rename_all = "lowercase")]
+#[expect(dead_code, reason = "only its description is used")]
+enum TableFormat {
+    Json,
+    Csv,
+    #[cfg(feature = "parquet")]
+    Parquet,
+}
+
+/// Batches, oldest first.
+#[derive(Debug, Serialize, ToSchema)]
 struct HistoryPage {
     structure: StructureId,
     items: Vec<HistoryItem>,
@@ -37,15 +88,17 @@ struct HistoryPage {
     next: Option<String>,
 }
 
-#[derive(Debug, Serialize)]
+/// Exceedances, newest first.
+#[derive(Debug, Serialize, ToSchema)]
 struct ExceedancePage {
     structure: StructureId,
     items: Vec<ExceedanceItem>,
+    /// Cursor of the next page; `null` on the last.
     next: Option<String>,
 }
 
 /// A probability of damage above the undamaged threshold.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct ExceedanceItem {
     batch: String,
     measured_from: Timestamp,
@@ -60,46 +113,77 @@ struct ExceedanceItem {
     model_digest: String,
 }
 
-#[derive(Debug, Deserialize)]
+/// The undamaged state.
+#[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = BaselineInput)]
 struct BaselineBody {
+    /// Ids of the batches that it is taken from; ten measurements at least, all together.
+    #[schema(min_items = 1)]
     batches: Vec<String>,
+    /// Probability below the threshold in the undamaged state; also that above which a batch exceeds. 0.05 without.
+    #[schema(exclusive_minimum = 0, maximum = 0.5)]
     threshold_probability: Option<f64>,
 }
 
-/// `GET /v1/structures/{id}/history`: assessed batches, oldest first, as JSON or CSV.
+/// `GET /v1/structures/{id}/history`: assessed batches, oldest first, as JSON, CSV or Parquet.
 ///
 /// # Errors
-/// 404 for the structure, 422 for the query.
+/// 404 for the structure, 406 for Parquet where it is not built in, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/history", tag = "results", operation_id = "read_history",
+    summary = "Batches over time",
+    description = "Batches with their current assessments by the time of their first measurement, a page at a time; the header \
+                   `Link` has the path of the next. As CSV or Parquet one row for each batch and parameter.",
+    params(StructurePath, HistoryParams),
+    responses(
+        (status = 200, description = "A page", content(
+            (HistoryPage = "application/json"), (String = "text/csv"), ("application/vnd.apache.parquet")
+        ), headers(("Link" = String, description = "The next page, `rel=\"next\"`"))),
+        Unknown, Invalid, NotAcceptable
+    )
+)]
 pub async fn history(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<HistoryParams>,
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
-    if let Some(name) = &query.parameter {
-        let mut names: Vec<String> = watched.simulator.space().iter().map(|p| p.name.clone()).collect();
-        names.extend(watched.simulator.derived_stiffnesses().into_iter().map(|s| s.name));
-        names.extend(watched.baseline.iter().flat_map(|b| b.groups()).map(|g| g.name));
-        if !names.contains(name) {
-            let message = format!("{} is none of {}", crate::quantity::shown(name), names.join(", "));
-            return Err(ApiError::invalid_field("query/parameter", message));
-        }
-    }
-    let csv = wants_csv(&query, &headers)?;
-    let page = page(&query)?;
-    let limit = page.limit;
+    check_parameter(query.parameter.as_deref(), &watched)?;
+    let format = Format::of(query.format.as_deref(), &headers, &[Format::Json, Format::Csv, Format::Parquet])?;
+    let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
+    let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
+    let limit = page_limit(query.limit.as_deref())?;
+    let page = HistoryQuery {
+        from: window.from,
+        to: window.to,
+        parameter: query.parameter.clone(),
+        limit,
+        after: after.map(|(time, batch, _)| (time, batch)),
+        after_quantity: None,
+    };
     let entries = shared.monitor.store().history(&id, &page).await?;
     let next = (entries.len() == limit).then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id))).flatten();
     let items: Vec<HistoryItem> = entries.into_iter().map(HistoryItem::from).collect();
-    let mut response = if csv {
-        ([(header::CONTENT_TYPE, "text/csv; charset=utf-8")], to_csv(&items)).into_response()
-    } else {
+    let mut response = if format == Format::Json {
         Json(HistoryPage { structure: id.clone(), items, next: next.clone() }).into_response()
+    } else {
+        let rows: Vec<Vec<Cell>> = items.iter().flat_map(HistoryItem::rows).collect();
+        let mut table = TableWriter::new(format, &HISTORY_COLUMNS)?;
+        let text = table.rows(rows)?;
+        let end = table.end()?;
+        ([(header::CONTENT_TYPE, format.content_type())], [text, end].concat()).into_response()
     };
-    link_next(&mut response, &format!("/v1/structures/{id}/history"), &query, next.as_deref());
+    let given = [
+        ("from", &query.from),
+        ("to", &query.to),
+        ("parameter", &query.parameter),
+        ("limit", &query.limit),
+        ("format", &query.format),
+    ];
+    link_next(&mut response, &format!("/v1/structures/{id}/history"), &given, next.as_deref());
     Ok(response)
 }
 
@@ -107,15 +191,32 @@ pub async fn history(
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/exceedances", tag = "results", operation_id = "list_exceedances",
+    summary = "Exceedances",
+    description = "Probabilities of damage above the threshold probability of the undamaged state, newest first, a page at a \
+                   time; the header `Link` has the path of the next. An exceedance is no alarm.",
+    params(StructurePath, ExceedanceParams),
+    responses(
+        (status = 200, description = "A page", body = ExceedancePage,
+         headers(("Link" = String, description = "The next page, `rel=\"next\"`"))),
+        Unknown, Invalid
+    )
+)]
 pub async fn exceedances(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
-    ApiQuery(query): ApiQuery<PageQuery>,
+    ApiQuery(query): ApiQuery<ExceedanceParams>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    shared.monitor.structure(&id)?;
-    let page = page(&query)?;
-    let limit = page.limit;
+    let watched = shared.monitor.structure(&id)?;
+    check_parameter(query.parameter.as_deref(), &watched)?;
+    let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
+    let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
+    let (after, after_quantity) = after.map_or((None, None), |(time, batch, quantity)| (Some((time, batch)), quantity));
+    let limit = page_limit(query.limit.as_deref())?;
+    let parameter = query.parameter.clone();
+    let page = HistoryQuery { from: window.from, to: window.to, parameter, limit, after, after_quantity };
     let found = shared.monitor.store().exceedances(&id, &page).await?;
     let next = (found.len() == limit)
         .then(|| found.last().map(|e| format!("{}~{}", cursor(e.measured_from, &e.batch_id), e.quantity)))
@@ -135,7 +236,8 @@ pub async fn exceedances(
     };
     let items = found.into_iter().map(item).collect();
     let mut response = Json(ExceedancePage { structure: id.clone(), items, next: next.clone() }).into_response();
-    link_next(&mut response, &format!("/v1/structures/{id}/exceedances"), &query, next.as_deref());
+    let given = [("from", &query.from), ("to", &query.to), ("parameter", &query.parameter), ("limit", &query.limit)];
+    link_next(&mut response, &format!("/v1/structures/{id}/exceedances"), &given, next.as_deref());
     Ok(response)
 }
 
@@ -143,6 +245,17 @@ pub async fn exceedances(
 ///
 /// # Errors
 /// 400, 415, 422 for the body, 404 for structure or batch, 409 without a trained baseline, 503 when the queue is full.
+#[utoipa::path(
+    post, path = "/v1/structures/{id}/baseline", tag = "results", operation_id = "declare_undamaged",
+    summary = "Declare the undamaged state",
+    description = "Takes batches as the undamaged state, in a new version; batches from before are compared with it too.",
+    params(StructurePath),
+    request_body(content = BaselineBody, example = json!({"batches": ["0199a0c6-7d5e-7c3a-a5b1-0d7e6a3f9b10"]})),
+    responses(
+        (status = 201, description = "The new version of the undamaged state", body = Undamaged),
+        Unknown, BodyRefused, Conflict, Busy
+    )
+)]
 pub async fn declare_baseline(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
@@ -160,26 +273,17 @@ pub async fn declare_baseline(
     Ok((StatusCode::CREATED, Json(Undamaged::new(&id, record))).into_response())
 }
 
-fn page(query: &PageQuery) -> Result<HistoryQuery, ApiError> {
-    let time = |name: &str, text: &Option<String>| {
-        let parse = |text: &String| {
-            // A plus sign in a query stands for a blank; in an offset it was meant as a plus.
-            Timestamp::parse(&text.replace(' ', "+"))
-                .map_err(|e| ApiError::invalid_field(format!("query/{name}"), e.to_string()))
-        };
-        text.as_ref().map(parse).transpose()
-    };
-    let limit = page_limit(query.limit.as_deref())?;
-    let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
-    let (after, after_quantity) = after.map_or((None, None), |(time, batch, quantity)| (Some((time, batch)), quantity));
-    Ok(HistoryQuery {
-        from: time("from", &query.from)?,
-        to: time("to", &query.to)?,
-        parameter: query.parameter.clone(),
-        limit,
-        after,
-        after_quantity,
-    })
+/// 422 for a name that this structure does not estimate.
+fn check_parameter(name: Option<&str>, watched: &Watched) -> Result<(), ApiError> {
+    let Some(name) = name else { return Ok(()) };
+    let mut names: Vec<String> = watched.simulator.space().iter().map(|p| p.name.clone()).collect();
+    names.extend(watched.simulator.derived_stiffnesses().into_iter().map(|s| s.name));
+    names.extend(watched.baseline.iter().flat_map(|b| b.groups()).map(|g| g.name));
+    if names.iter().any(|known| known == name) {
+        return Ok(());
+    }
+    let message = format!("{} is none of {}", crate::quantity::shown(name), names.join(", "));
+    Err(ApiError::invalid_field("query/parameter", message))
 }
 
 fn cursor(time: Timestamp, batch: &str) -> String {
@@ -198,38 +302,11 @@ fn parse_cursor(text: &str) -> Result<(Timestamp, String, Option<String>), ApiEr
     }
 }
 
-fn wants_csv(query: &PageQuery, headers: &HeaderMap) -> Result<bool, ApiError> {
-    match query.format.as_deref() {
-        Some("csv") => Ok(true),
-        Some("json") => Ok(false),
-        Some(other) => {
-            let message = format!("{} is neither json nor csv", crate::quantity::shown(other));
-            Err(ApiError::invalid_field("query/format", message))
-        }
-        None => Ok(headers.get(header::ACCEPT).is_some_and(|v| v.as_bytes().starts_with(b"text/csv"))),
-    }
-}
-
-fn to_csv(items: &[HistoryItem]) -> Vec<u8> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    let rows = items.iter().flat_map(HistoryItem::csv_rows);
-    writer.write_record(HISTORY_COLUMNS).expect("writing to memory cannot fail");
-    rows.for_each(|row| writer.write_record(row).expect("rows have as many cells as the header"));
-    writer.into_inner().expect("writing to memory cannot fail")
-}
-
 /// `Link: …; rel="next"` with the query of this page and the cursor of the next.
-fn link_next(response: &mut Response, path: &str, query: &PageQuery, next: Option<&str>) {
+pub fn link_next(response: &mut Response, path: &str, given: &[(&str, &Option<String>)], next: Option<&str>) {
     // Batches arrive all the time: no page is kept.
     response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     let Some(next) = next else { return };
-    let given = [
-        ("from", &query.from),
-        ("to", &query.to),
-        ("parameter", &query.parameter),
-        ("limit", &query.limit),
-        ("format", &query.format),
-    ];
     let given = given.iter().filter_map(|(name, value)| value.as_ref().map(|v| format!("{name}={}&", encoded(v))));
     let link = format!("<{path}?{}cursor={}>; rel=\"next\"", given.collect::<String>(), encoded(next));
     if let Ok(value) = HeaderValue::from_str(&link) {

@@ -11,14 +11,18 @@ use axum::middleware::Next;
 use axum::response::Response;
 use http_body_util::BodyExt as _;
 use serde::de::DeserializeOwned;
+use serde::Deserialize as _;
 use tracing::{info, Instrument as _};
 
 use super::error::ApiError;
 use crate::measurement::check::Problem;
-use crate::quantity::json_pointer;
+use crate::measurement::json::read_object;
+use crate::quantity::Timestamp;
 
 /// Header that carries the request's id both ways.
 pub const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+const KNOWN_METHODS: [&str; 7] = ["GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"];
 
 tokio::task_local! {
     static CURRENT_ID: String;
@@ -29,12 +33,20 @@ pub fn current_id() -> Option<String> {
     CURRENT_ID.try_with(String::clone).ok()
 }
 
-/// Gives each request an id (the client's, if it is short and printable), a log line, and its place in the metrics.
+/// Runs a part of answering a request in another task, under the same id.
+pub async fn with_current_id<F: Future>(id: String, part: F) -> F::Output {
+    CURRENT_ID.scope(id, part).await
+}
+
+/// Gives each request an id (the client's, if it is short, printable and no token), a log line, and its place in the
+/// metrics.
 pub async fn with_id_and_log(request: Request, next: Next) -> Response {
     let given = request.headers().get(REQUEST_ID).and_then(|value| value.to_str().ok());
     let usable = |id: &&str| !id.is_empty() && id.len() <= 64 && id.bytes().all(|b| b.is_ascii_graphic());
+    let usable = |id: &&str| usable(id) && !crate::access::token_like(id);
     let id = given.filter(usable).map_or_else(|| uuid::Uuid::now_v7().to_string(), str::to_owned);
-    let method = request.method().clone();
+    // A client may make up methods: they would grow without bound as well.
+    let method = KNOWN_METHODS.into_iter().find(|known| *known == request.method().as_str()).unwrap_or("other");
     // The route's pattern, not the path: a label for each id in the path would grow without bound.
     let route = request.extensions().get::<MatchedPath>().map_or("unmatched", MatchedPath::as_str).to_owned();
     let span = tracing::info_span!("request", request.id = %id, method = %method, route = %route);
@@ -56,8 +68,10 @@ pub async fn with_id_and_log(request: Request, next: Next) -> Response {
 /// What a body may be.
 #[derive(Debug, Clone, Copy)]
 pub struct BodyLimits {
-    /// Most bytes.
+    /// Most bytes; of NDJSON, those of a line.
     pub bytes: usize,
+    /// Most bytes of NDJSON.
+    pub bulk_bytes: usize,
     /// Longest time from the end of the header to the end of the body.
     pub time: Duration,
 }
@@ -71,21 +85,38 @@ const DRAINED_LIMITS: usize = 8;
 /// # Errors
 /// 415 when it is compressed, 413 when it is larger than the limit, 408 when it is slower, 400 when the connection breaks.
 pub async fn read_body(body: Body, headers: &HeaderMap, limits: BodyLimits) -> Result<Bytes, ApiError> {
+    refuse_encoding(headers)?;
+    let time = limits.time;
+    tokio::time::timeout(time, collect(body, limits.bytes)).await.unwrap_or_else(|_| Err(slow_body(time)))
+}
+
+/// 415 for a compressed body.
+///
+/// # Errors
+/// 415.
+pub fn refuse_encoding(headers: &HeaderMap) -> Result<(), ApiError> {
     if headers.get(header::CONTENT_ENCODING).is_some_and(|encoding| encoding != "identity") {
         let detail = "a compressed body is not decoded: send it without Content-Encoding";
         return Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_encoding", detail));
     }
-    tokio::time::timeout(limits.time, collect(body, limits.bytes)).await.unwrap_or_else(|_| {
-        let detail = format!("the body did not arrive within {} s", limits.time.as_secs());
-        Err(ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail))
-    })
+    Ok(())
+}
+
+/// 408 for a body that does not arrive.
+pub fn slow_body(limit: Duration) -> ApiError {
+    let detail = format!("the body did not arrive within {} s", limit.as_secs());
+    ApiError::new(StatusCode::REQUEST_TIMEOUT, "body_timeout", detail)
+}
+
+/// 400 for a body whose connection broke.
+pub fn broken_body() -> ApiError {
+    ApiError::new(StatusCode::BAD_REQUEST, "body_unreadable", "the body broke off")
 }
 
 async fn collect(mut body: Body, limit: usize) -> Result<Bytes, ApiError> {
     let (mut collected, mut total) = (Vec::new(), 0);
     while let Some(frame) = body.frame().await {
-        let broken = |_| ApiError::new(StatusCode::BAD_REQUEST, "body_unreadable", "the body broke off");
-        let Ok(data) = frame.map_err(broken)?.into_data() else { continue };
+        let Ok(data) = frame.map_err(|_| broken_body())?.into_data() else { continue };
         total += data.len();
         if total <= limit {
             collected.extend_from_slice(&data);
@@ -118,52 +149,7 @@ pub fn unsupported_media_type(found: Option<&str>, allowed: &str) -> ApiError {
 /// 400 when it is no JSON, with line and column; 422 when it is JSON of another shape, or has a number that JSON or f64
 /// cannot hold, with a pointer to it.
 pub fn parse_json<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, ApiError> {
-    // serde would also read an object's fields from a list, by position.
-    if !begins_as_object(bytes) && serde_json::from_slice::<serde::de::IgnoredAny>(bytes).is_ok() {
-        return Err(ApiError::invalid_field("/", "the body must be a JSON object"));
-    }
-    let mut deserializer = serde_json::Deserializer::from_slice(bytes);
-    let value = serde_path_to_error::deserialize(&mut deserializer).map_err(|error| {
-        let pointer = json_pointer(error.path());
-        json_error(bytes, pointer, error.inner())
-    })?;
-    deserializer.end().map_err(|error| json_error(bytes, String::new(), &error))?;
-    Ok(value)
-}
-
-fn json_error(bytes: &[u8], pointer: String, error: &serde_json::Error) -> ApiError {
-    let not_a_number = not_a_number_at(bytes, error.line(), error.column());
-    let message = match not_a_number {
-        Some(word) => format!("{word} is no JSON number: send null for a mode that was not identified"),
-        None => error.to_string(),
-    };
-    let malformed =
-        || ApiError::new(StatusCode::BAD_REQUEST, "malformed_json", format!("the body is no JSON: {message}"));
-    if !begins_as_object(bytes) {
-        return malformed();
-    }
-    // serde_json counts a number beyond f64 as a syntax error; for the client it is a wrong value.
-    let wrong_value = error.is_data() || not_a_number.is_some() || message.starts_with("number out of range");
-    if wrong_value {
-        let pointer = if pointer.is_empty() { "/".to_owned() } else { pointer };
-        return ApiError::invalid_field(pointer, message);
-    }
-    malformed()
-}
-
-fn begins_as_object(bytes: &[u8]) -> bool {
-    bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'{')
-}
-
-/// `NaN` or `Infinity` at the place where the parser stopped.
-fn not_a_number_at(bytes: &[u8], line: usize, column: usize) -> Option<&'static str> {
-    let line = bytes.split(|b| *b == b'\n').nth(line.checked_sub(1)?)?;
-    // The parser stops at or just behind the first character it cannot use.
-    let around = &line[column.saturating_sub(2).min(line.len())..];
-    let around = &around[..around.len().min(12)];
-    ["-Infinity", "Infinity", "NaN"]
-        .into_iter()
-        .find(|word| around.windows(word.len()).take(3).any(|window| window == word.as_bytes()))
+    Ok(read_object(bytes)?)
 }
 
 /// Path parameters, with our own errors.
@@ -230,6 +216,21 @@ pub async fn json_body<T: DeserializeOwned>(
     parse_json(&read_body(body, headers, limits).await?)
 }
 
+/// A whole number of a JSON body; JSON knows no difference between `3` and `3.0`.
+///
+/// # Errors
+/// As serde has it, for anything but a whole number from 0 to 2^53 − 1, the last that every JSON reader keeps.
+pub fn whole_number<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::Error> {
+    let Some(number) = Option::<serde_json::Number>::deserialize(deserializer)? else { return Ok(None) };
+    let from_float = || number.as_f64().filter(|x| x.fract() == 0.0 && (0.0..9e15).contains(x)).map(|x| x as u64);
+    let whole = number.as_u64().or_else(from_float).filter(|n| *n <= LARGEST_WHOLE_NUMBER);
+    let wrong = || format!("{number} must be a whole number from 0 to {LARGEST_WHOLE_NUMBER}");
+    whole.map(Some).ok_or_else(|| serde::de::Error::custom(wrong()))
+}
+
+/// The last whole number that every JSON reader keeps: 2^53 − 1.
+const LARGEST_WHOLE_NUMBER: u64 = 9_007_199_254_740_991;
+
 /// Items of a page unless the client asks for another number.
 const DEFAULT_LIMIT: usize = 100;
 /// Most items of a page.
@@ -245,4 +246,31 @@ pub fn page_limit(text: Option<&str>) -> Result<usize, ApiError> {
         let message = format!("{} must be a whole number from 1 to {MAX_LIMIT}", crate::quantity::shown(text));
         ApiError::invalid_field("query/limit", message)
     })
+}
+
+/// From a time on and before another.
+#[derive(Debug, Clone, Copy)]
+pub struct Window {
+    /// At this time or later.
+    pub from: Option<Timestamp>,
+    /// Before this time.
+    pub to: Option<Timestamp>,
+}
+
+impl Window {
+    /// The `from` and `to` of a query.
+    ///
+    /// # Errors
+    /// 422 for anything but RFC 3339 with an offset.
+    pub fn of(from: Option<&str>, to: Option<&str>) -> Result<Self, ApiError> {
+        let time = |name: &str, text: Option<&str>| {
+            // A plus sign in a query stands for a blank; in an offset it was meant as a plus.
+            let parse = |text: &str| {
+                Timestamp::parse(&text.replace(' ', "+"))
+                    .map_err(|e| ApiError::invalid_field(format!("query/{name}"), e.to_string()))
+            };
+            text.map(parse).transpose()
+        };
+        Ok(Self { from: time("from", from)?, to: time("to", to)? })
+    }
 }

@@ -7,10 +7,13 @@ use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::Serialize;
 use serde_json::Value;
+use utoipa::ToSchema;
 
 use super::error::ApiError;
+use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath};
 use super::Shared;
+use crate::access::Grant;
 use crate::measurement::check::Problem;
 use crate::monitor::Watched;
 use crate::quantity::{StructureId, Timestamp};
@@ -18,22 +21,26 @@ use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::store::PutStructure;
 
 /// A structure with the state of its trained baseline.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Structure)]
 struct StructureBody {
     id: StructureId,
     digest: String,
+    #[schema(value_type = StructureDefinition)]
     definition: Value,
     nominal_frequencies_hz: Vec<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     emulator: Option<EmulatorBody>,
     model: Option<ModelBody>,
+    /// Why there is no model, and the next step.
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
     undamaged: Option<super::answer::Undamaged>,
 }
 
 /// How well the emulator of a table follows its runs; one entry a measured mode.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Emulator)]
 struct EmulatorBody {
     runs: usize,
     /// Root mean square error on runs left out, % of the frequency; added to the noise.
@@ -43,7 +50,8 @@ struct EmulatorBody {
 }
 
 /// The trained baseline in use.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Model)]
 struct ModelBody {
     digest: String,
     program_version: String,
@@ -53,8 +61,14 @@ struct ModelBody {
     calibration: crate::baseline::calibration::CalibrationRecord,
 }
 
+/// All structures.
+#[derive(Debug, Serialize, ToSchema)]
+struct StructureList {
+    items: Vec<ListedStructure>,
+}
+
 /// One line of the list.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, ToSchema)]
 struct ListedStructure {
     id: StructureId,
     digest: String,
@@ -62,18 +76,27 @@ struct ListedStructure {
     batches: u64,
     last_measured_at: Option<Timestamp>,
     model_digest: Option<String>,
+    /// Why this version of the program does not take its stored definition.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    definition_refused: Option<String>,
 }
 
-/// `GET /v1/structures`.
+/// `GET /v1/structures`: those that the token may see.
 ///
 /// # Errors
 /// 500.
-pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
+#[utoipa::path(
+    get, path = "/v1/structures", tag = "structures", operation_id = "list_structures",
+    summary = "All structures", description = "Each with its digest, number of batches and trained baseline.",
+    responses((status = 200, description = "The structures by id", body = StructureList))
+)]
+pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let mut items = Vec::new();
-    for summary in shared.monitor.store().structures().await? {
-        let watched = shared.monitor.structure(&summary.id)?;
+    for summary in shared.monitor.store().structures().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
+        let watched = shared.monitor.structure(&summary.id);
         items.push(ListedStructure {
-            model_digest: watched.baseline.as_ref().ok().map(|b| b.digest().to_string()),
+            model_digest: watched.ok().and_then(|it| Some(it.baseline.as_ref().ok()?.digest().to_string())),
+            definition_refused: shared.monitor.refused_structures().get(&summary.id).cloned(),
             id: summary.id,
             digest: summary.digest.to_string(),
             created_at: summary.created_at,
@@ -81,13 +104,19 @@ pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
             last_measured_at: summary.last_measured_at,
         });
     }
-    Ok(Json(serde_json::json!({ "items": items })).into_response())
+    Ok(Json(StructureList { items }).into_response())
 }
 
 /// `GET /v1/structures/{id}`.
 ///
 /// # Errors
 /// 404, 422.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}", tag = "structures", operation_id = "read_structure",
+    summary = "A structure", description = "Its definition, its trained baseline with the calibration, its undamaged state.",
+    params(StructurePath),
+    responses((status = 200, description = "The structure", body = StructureBody), Unknown, Invalid)
+)]
 pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
@@ -99,6 +128,30 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 ///
 /// # Errors
 /// 400 and 422 with the place in the file; 409 when it has batches under another definition.
+#[utoipa::path(
+    put, path = "/v1/structures/{id}", tag = "structures", operation_id = "put_structure",
+    summary = "Define a structure",
+    description = "JSON or TOML of the same keys; `id` must be that of the path. A structure that has batches cannot be \
+                   defined anew: take another id.",
+    params(StructurePath),
+    request_body(content(
+        (StructureDefinition = "application/json", example = json!({
+            "id": "one-mass", "modes": 1, "mass": [{"name": "m1", "kg": 2.0}],
+            "spring": [{"name": "k1", "from": "ground", "to": "m1", "n_per_m": 50.0}],
+            "parameter": [{"name": "k1", "prior": {"uniform": [30.0, 70.0]}, "sets": [{"spring": "k1"}]}]})),
+        (String = "application/toml", example = json!(
+            "id = \"one-mass\"\nmodes = 1\n[[mass]]\nname = \"m1\"\nkg = 2.0\n[[spring]]\nname = \"k1\"\n\
+             from = \"ground\"\nto = \"m1\"\nn_per_m = 50.0\n[[parameter]]\nname = \"k1\"\n\
+             prior = { uniform = [30.0, 70.0] }\nsets = { spring = \"k1\" }\n"))
+    )),
+    responses(
+        (status = 200, description = "It was there already", body = StructureBody,
+         headers(("Location" = String, description = "Path of the structure"))),
+        (status = 201, description = "It is new", body = StructureBody,
+         headers(("Location" = String, description = "Path of the structure"))),
+        BodyRefused, Conflict
+    )
+)]
 pub async fn put(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,

@@ -1,11 +1,13 @@
 //! Diagnoses as jobs: one at a time, away from the queue of assessments; and the switch to an extended structure.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use tracing::{error, info, warn};
 
+use super::events::{Events, News};
 use super::watched::Watched;
 use super::{Error, Monitor};
 use crate::baseline::observation::DEFAULT_NOISE_RANGE;
@@ -20,7 +22,7 @@ use crate::measurement::ModalMeasurement;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
+use crate::store::{DiagnosisRecord, JobKind, JobRecord, JobState, NewVersion, StoredBaseline};
 
 /// Training of an extension of a structure that had no baseline.
 const SAMPLES: usize = 200_000;
@@ -55,44 +57,86 @@ pub struct ExtensionTraining {
 }
 
 /// What an extension did.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct ExtensionResult {
-    added: Vec<String>,
-    left_out: Vec<String>,
-    structure_digest: String,
-    parent_digest: String,
-    model_digest: String,
-    undamaged_version: Option<u32>,
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct ExtensionResult {
+    /// Effects that were added, by name.
+    pub added: Vec<String>,
+    /// Causes that were left out, and why.
+    pub left_out: Vec<String>,
+    /// The new version.
+    pub structure_digest: String,
+    /// The version that it extends.
+    pub parent_digest: String,
+    /// Its trained baseline.
+    pub model_digest: String,
+    /// The undamaged state taken again with it.
+    pub undamaged_version: Option<u32>,
 }
+
+/// Time between two news of the same job.
+const NEWS_EVERY: Duration = Duration::from_millis(200);
 
 /// Where jobs are, by id.
 #[derive(Clone)]
 pub(super) struct Jobs {
     one_at_a_time: Arc<tokio::sync::Semaphore>,
-    progress: Arc<Mutex<BTreeMap<String, String>>>,
+    running: Arc<Mutex<BTreeMap<String, RunningJob>>>,
+    events: Events,
 }
 
-impl Default for Jobs {
-    fn default() -> Self {
-        Self { one_at_a_time: Arc::new(tokio::sync::Semaphore::new(1)), progress: Arc::default() }
-    }
+/// A job that runs or waits.
+struct RunningJob {
+    structure: StructureId,
+    kind: JobKind,
+    progress: String,
+    told: Option<Instant>,
 }
 
 impl Jobs {
-    fn say(&self, id: &str, what: impl Into<String>) {
-        self.progress.lock().expect("no holder of this lock panics").insert(id.to_owned(), what.into());
+    pub(super) fn new(events: Events) -> Self {
+        Self { one_at_a_time: Arc::new(tokio::sync::Semaphore::new(1)), running: Arc::default(), events }
     }
 
-    fn end(&self, id: &str) {
-        self.progress.lock().expect("no holder of this lock panics").remove(id);
+    fn begin(&self, id: &str, structure: &StructureId, kind: JobKind) {
+        let job = RunningJob { structure: structure.clone(), kind, progress: String::new(), told: None };
+        self.lock().insert(id.to_owned(), job);
+        self.say(id, "waiting");
+    }
+
+    fn say(&self, id: &str, what: impl Into<String>) {
+        let mut running = self.lock();
+        let Some(job) = running.get_mut(id) else { return };
+        job.progress = what.into();
+        // What is left out here is overtaken by the next, or by the end.
+        if job.told.is_none_or(|told| told.elapsed() >= NEWS_EVERY) {
+            job.told = Some(Instant::now());
+            self.events.publish(job.news(id, JobState::Running));
+        }
+    }
+
+    fn end(&self, id: &str, state: JobState) {
+        if let Some(job) = self.lock().remove(id) {
+            self.events.publish(job.news(id, state));
+        }
     }
 
     fn waiting(&self) -> usize {
-        self.progress.lock().expect("no holder of this lock panics").len()
+        self.lock().len()
     }
 
     fn of(&self, id: &str) -> Option<String> {
-        self.progress.lock().expect("no holder of this lock panics").get(id).cloned()
+        self.lock().get(id).map(|job| job.progress.clone())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeMap<String, RunningJob>> {
+        self.running.lock().expect("no holder of this lock panics")
+    }
+}
+
+impl RunningJob {
+    fn news(&self, id: &str, state: JobState) -> News {
+        let progress = (state == JobState::Running).then(|| self.progress.clone());
+        News::Job { job: id.to_owned(), structure: self.structure.clone(), kind: self.kind, state, progress }
     }
 }
 
@@ -141,7 +185,7 @@ impl Monitor {
         let json = serde_json::to_string(&request).expect("a request is plain data");
         let digest = watched.simulator.digest();
         self.store.insert_diagnosis(&id, structure, digest, &json, Timestamp::now()).await?;
-        self.jobs.say(&id, "waiting");
+        self.jobs.begin(&id, structure, JobKind::Diagnosis);
         let (monitor, job, of) = (self.clone(), id.clone(), structure.clone());
         tokio::spawn(async move {
             let outcome = monitor.diagnose_here(&job, &of, &watched.simulator, &request).await;
@@ -152,10 +196,11 @@ impl Monitor {
             let stored = stored.map(|(outcome, html)| {
                 (serde_json::to_string(&outcome.diagnosis).expect("a diagnosis is plain data"), html)
             });
+            let state = if stored.is_ok() { JobState::Done } else { JobState::Failed };
             if let Err(failure) = monitor.store.finish_diagnosis(&job, stored, Timestamp::now()).await {
                 error!(diagnosis = %job, "Could not store the end of diagnosis {job}: {failure}");
             }
-            monitor.jobs.end(&job);
+            monitor.jobs.end(&job, state);
         });
         self.diagnosis(&id).await.map(|(record, _)| record)
     }
@@ -188,6 +233,25 @@ impl Monitor {
         Ok((record, self.jobs.of(id)))
     }
 
+    /// Diagnoses and extensions, newest first, at most `limit`, each with what it does now if it runs.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn jobs(&self, limit: usize) -> Result<Vec<(JobRecord, Option<String>)>, Error> {
+        let records = self.store.jobs(limit).await?;
+        let with_progress = |record: JobRecord| {
+            let running = record.state == JobState::Running;
+            let progress = running.then(|| self.jobs.of(&record.id)).flatten();
+            (record, progress)
+        };
+        Ok(records.into_iter().map(with_progress).collect())
+    }
+
+    /// Jobs that run or wait.
+    pub fn jobs_running(&self) -> usize {
+        self.jobs.waiting()
+    }
+
     /// Begins to extend the structure with the causes of a diagnosis: a new version of the structure, a baseline trained for
     /// it, and all batches assessed again.
     ///
@@ -210,10 +274,10 @@ impl Monitor {
         if record.structure_digest != *watched.simulator.digest() {
             return Err(refuse("the structure is another version now: diagnose that one"));
         }
-        if !self.store.begin_extension(id).await? {
+        if !self.store.begin_extension(id, Timestamp::now()).await? {
             return Err(refuse("it is being extended"));
         }
-        self.jobs.say(id, "waiting");
+        self.jobs.begin(id, &record.structure, JobKind::Extension);
         let (monitor, job) = (self.clone(), id.to_owned());
         let begun = self.diagnosis(id).await?.0;
         tokio::spawn(async move {
@@ -221,10 +285,11 @@ impl Monitor {
             if let Err(failure) = &outcome {
                 warn!(diagnosis = %job, "Extension by diagnosis {job} failed: {failure}");
             }
+            let state = if outcome.is_ok() { JobState::Done } else { JobState::Failed };
             if let Err(failure) = monitor.store.finish_extension(&job, outcome, Timestamp::now()).await {
                 error!(diagnosis = %job, "Could not store the end of the extension by {job}: {failure}");
             }
-            monitor.jobs.end(&job);
+            monitor.jobs.end(&job, state);
         });
         Ok(begun)
     }
@@ -354,6 +419,7 @@ impl Monitor {
         }
         let watched = Arc::new(Watched { simulator, baseline: Ok(baseline) });
         self.watched.write().expect("no holder of this lock panics").insert(structure.clone(), watched);
+        self.tell_structure(structure);
         let taken = self.retake_undamaged(structure).await;
         self.resume_later(structure.clone());
         Ok(taken)

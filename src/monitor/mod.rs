@@ -1,15 +1,25 @@
 //! What happens to a batch: store it, assess it, store the result; declare undamaged states; resume after a restart.
 
+pub mod archive;
 pub mod assess;
 pub mod charts;
 pub mod compute;
+mod detail;
 mod diagnoses;
+pub mod events;
+mod intake;
+mod models;
+pub mod retention;
 mod silence;
+#[cfg(test)]
+mod tests;
 mod undamaged;
+pub mod upkeep;
 mod watched;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, RwLock};
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tracing::{error, info, warn, Instrument as _};
@@ -28,8 +38,14 @@ use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store, StoredCh
 use assess::{Context, Draws};
 use charts::KnownLimits;
 use compute::{Compute, ComputeSettings, QueueFull};
-pub use diagnoses::{DiagnosisRequest, ExtensionTraining};
+pub use detail::{BatchDetail, ModeDetail, ParameterDetail};
+pub use diagnoses::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
+use events::{Events, KnownAlarms};
+pub use models::Reloaded;
 pub use watched::Watched;
+
+/// Pause between two tries to store what could not be stored, such as on a full disk.
+const BETWEEN_TRIES: std::time::Duration = std::time::Duration::from_secs(2);
 
 /// How batches are taken and assessed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -151,6 +167,14 @@ pub enum Error {
         /// Most.
         most: usize,
     },
+    /// A batch without a current assessment.
+    #[error("batch {batch} is not assessed: {reason}")]
+    NotAssessed {
+        /// The batch.
+        batch: String,
+        /// Why.
+        reason: String,
+    },
     /// No such diagnosis.
     #[error("there is no diagnosis {0}")]
     UnknownDiagnosis(String),
@@ -168,9 +192,39 @@ pub enum Error {
     /// A structure whose present version extends none.
     #[error("structure {0} extends no earlier version: there is no step back")]
     NoStepBack(StructureId),
-    /// A stored definition is not readable any more: the database was written by another version.
-    #[error("the stored definition of a structure is refused: {0}")]
-    StoredDefinition(#[from] DefinitionError),
+    /// A baseline that may not take the place of the one in use.
+    #[error("the trained baseline for {structure} is refused, {}: {reason}", match kept {
+        Some(digest) => format!("{digest} stays in use"),
+        None => "there is none in use".to_owned(),
+    })]
+    ModelRefused {
+        /// The structure.
+        structure: StructureId,
+        /// Why.
+        reason: String,
+        /// Digest of the one that stays in use.
+        kept: Option<String>,
+    },
+    /// A backup is being made.
+    #[error("a backup is being made: ask again when it is done")]
+    BackupRunning,
+    /// No backup was made.
+    #[error(transparent)]
+    Backup(#[from] store::backup::Error),
+    /// A definition that does not pass.
+    #[error("the definition of a structure is refused: {0}")]
+    Definition(#[from] DefinitionError),
+    /// A stored definition does not pass any more: the database was written by another version of the program.
+    #[error(
+        "the stored definition of structure {structure} is refused by this version of the program: {reason}; its batches are \
+         kept: run the version that wrote it, or define the structure under another id"
+    )]
+    DefinitionRefused {
+        /// The structure.
+        structure: StructureId,
+        /// Why.
+        reason: String,
+    },
     /// The database failed.
     #[error(transparent)]
     Store(#[from] store::Error),
@@ -203,39 +257,52 @@ pub struct Ingested {
 #[derive(Clone)]
 pub struct Monitor {
     store: Store,
-    library: Arc<Library>,
+    library: Arc<RwLock<Arc<Library>>>,
     watched: Arc<RwLock<BTreeMap<StructureId, Arc<Watched>>>>,
+    /// Stored structures that this version of the program does not take, with the reason.
+    refused: Arc<BTreeMap<StructureId, String>>,
     known_limits: Arc<KnownLimits>,
     /// Alarms that this process has logged.
     reported: Arc<Mutex<BTreeSet<(StructureId, i64)>>>,
     compute: Compute,
+    events: Events,
+    known_alarms: KnownAlarms,
     jobs: diagnoses::Jobs,
     /// Held while unassessed batches of a structure are worked off.
     resuming: Arc<Mutex<BTreeMap<StructureId, Arc<tokio::sync::Mutex<()>>>>>,
+    /// Structures whose unassessed batches are tried again and again.
+    recovering: Arc<Mutex<BTreeSet<StructureId>>>,
     settings: MonitorSettings,
+    upkeep: Arc<upkeep::Upkeep>,
 }
 
 impl Monitor {
     /// Puts the structures of the library into the store, where they are not yet, and takes up those stored.
     ///
     /// # Errors
-    /// [`Error::Store`]; [`Error::StoredDefinition`] for a database of another version.
+    /// [`Error::Store`].
     pub async fn open(store: Store, library: Library, settings: MonitorSettings) -> Result<Self, Error> {
         for refusal in library.refusals() {
             error!(file = %refusal.file, "Refused {}: {}", refusal.file, refusal.reason);
         }
-        let monitor = Self {
+        let events = Events::default();
+        let mut monitor = Self {
             store,
-            library: Arc::new(library),
+            library: Arc::new(RwLock::new(Arc::new(library))),
             watched: Arc::default(),
+            refused: Arc::default(),
             known_limits: Arc::default(),
             reported: Arc::default(),
             compute: Compute::new(settings.compute),
-            jobs: diagnoses::Jobs::default(),
+            jobs: diagnoses::Jobs::new(events.clone()),
+            events,
+            known_alarms: KnownAlarms::default(),
             resuming: Arc::default(),
+            recovering: Arc::default(),
             settings,
+            upkeep: Arc::default(),
         };
-        for (id, entry) in monitor.library.iter() {
+        for (id, entry) in monitor.library().iter() {
             let json = entry.simulator.definition().canonical_json();
             let outcome = monitor.store.put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
             if outcome == PutStructure::Refused {
@@ -246,13 +313,26 @@ impl Monitor {
         if interrupted > 0 {
             warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
         }
+        let mut refused = BTreeMap::new();
         for summary in monitor.store.structures().await? {
             if let Some(record) = monitor.store.structure(&summary.id).await? {
-                let simulator = Simulator::new(StructureDefinition::parse_json(&record.definition_json)?)?;
+                let built = StructureDefinition::parse_json(&record.definition_json).and_then(Simulator::new);
+                let simulator = match built {
+                    Ok(simulator) => simulator,
+                    // One structure must not keep the others from being watched.
+                    Err(reason) => {
+                        error!(structure.id = %summary.id, "Refused the stored definition of {}: {reason}", summary.id);
+                        refused.insert(summary.id, reason.to_string());
+                        continue;
+                    }
+                };
                 let baseline = monitor.baseline_for(&simulator).await?;
                 monitor.watch(simulator, baseline);
+                // Alarms of an earlier run are no news.
+                monitor.look_at_alarms(&summary.id).await;
             }
         }
+        monitor.refused = Arc::new(refused);
         Ok(monitor)
     }
 
@@ -267,8 +347,8 @@ impl Monitor {
     }
 
     /// Files of the library that were refused.
-    pub fn refusals(&self) -> &[Refusal] {
-        self.library.refusals()
+    pub fn refusals(&self) -> Vec<Refusal> {
+        self.library().refusals().to_vec()
     }
 
     /// Places left in the queue.
@@ -296,6 +376,20 @@ impl Monitor {
     /// [`Error::QueueFull`] with nothing stored; the conflicts of [`InsertBatch`]; [`Error::Store`].
     pub async fn ingest(&self, batch: MeasurementBatch) -> Result<Ingested, Error> {
         let place = self.compute.reserve()?;
+        self.ingest_with(batch, place).await
+    }
+
+    /// As [`Self::ingest`], but waits at most `patience` for a place: for many batches in a row, each of which should neither
+    /// crowd others out nor be sent back.
+    ///
+    /// # Errors
+    /// As [`Self::ingest`].
+    pub async fn ingest_in_turn(&self, batch: MeasurementBatch, patience: Duration) -> Result<Ingested, Error> {
+        let place = tokio::time::timeout(patience, self.compute.wait()).await.map_err(|_| QueueFull)?;
+        self.ingest_with(batch, place).await
+    }
+
+    async fn ingest_with(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {
         let monitor = self.clone();
         let task = tokio::spawn(async move { monitor.ingest_here(batch, place).await }.in_current_span());
         task.await.map_err(|_| Error::Panicked)?
@@ -306,7 +400,11 @@ impl Monitor {
         let watched = self.structure(&structure)?;
         let id = uuid::Uuid::now_v7().to_string();
         let (id, replayed) = match self.store.insert_batch(&batch, &id, Timestamp::now()).await? {
-            InsertBatch::Inserted => (id, false),
+            InsertBatch::Inserted => {
+                metrics::counter!("modalwatch_batches_received_total").increment(1);
+                metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
+                (id, false)
+            }
             InsertBatch::Replayed(id) => (id, true),
             InsertBatch::KeyConflict { batch_id } => return Err(Error::KeyConflict { batch: batch_id }),
             InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
@@ -315,7 +413,13 @@ impl Monitor {
         };
         let record = self.stored(&structure, &id).await?;
         if record.state == BatchState::Received && watched.baseline.is_ok() {
-            self.assess_stored(&watched, record, place).await?;
+            if let Err(failure) = self.assess_stored(&watched, record, place).await {
+                // The batch is stored, and whoever sent it may not send it again.
+                self.resume_until_done(structure);
+                return Err(failure);
+            }
+        } else if !replayed {
+            self.tell_batch(&structure, &id, record.state);
         }
         Ok(Ingested { view: self.batch(&structure, &id).await?, replayed })
     }
@@ -377,7 +481,29 @@ impl Monitor {
             monitor.retake_undamaged(&structure).await;
             if let Err(error) = monitor.resume_structure(&structure).await {
                 error!(structure.id = %structure, %error, "Could not go on with unassessed batches of {structure}: {error}");
+                monitor.resume_until_done(structure);
             }
+        });
+    }
+
+    /// Goes on with unassessed batches until none is left: after a full disk nobody may post them again.
+    fn resume_until_done(&self, structure: StructureId) {
+        if !self.recovering.lock().expect("no holder of this lock panics").insert(structure.clone()) {
+            return;
+        }
+        let monitor = self.clone();
+        tokio::spawn(async move {
+            loop {
+                tokio::time::sleep(BETWEEN_TRIES).await;
+                match monitor.resume_structure(&structure).await {
+                    Ok(()) => break,
+                    Err(_) if monitor.store.is_closed() => break,
+                    Err(error) => {
+                        warn!(structure.id = %structure, %error, "Unassessed batches of {structure} still wait: {error}");
+                    }
+                }
+            }
+            monitor.recovering.lock().expect("no holder of this lock panics").remove(&structure);
         });
     }
 
@@ -399,7 +525,16 @@ impl Monitor {
                 if watched.baseline.is_err() {
                     return Ok(());
                 }
-                let record = self.stored(structure, &batch_id).await?;
+                let record = match self.stored(structure, &batch_id).await {
+                    // One damaged row must not keep the batches behind it waiting.
+                    Err(Error::Store(damaged @ store::Error::Row { .. })) => {
+                        error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
+                        let version = watched.simulator.digest();
+                        self.store.mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
+                        continue;
+                    }
+                    record => record?,
+                };
                 if record.state == BatchState::Received {
                     self.assess_stored(&watched, record, place).await?;
                 }
@@ -410,14 +545,14 @@ impl Monitor {
     /// Assesses a stored batch and stores the result, or the reason why there is none.
     async fn assess_stored(&self, watched: &Watched, record: BatchRecord, place: compute::Place) -> Result<(), Error> {
         let structure = record.batch.structure.clone();
-        let baseline = baseline_of(&structure, watched)?;
-        let draws = self.draws(&baseline, &record);
+        let mut baseline = baseline_of(&structure, watched)?;
         let measured = record.batch.time_span();
         let previous = self.store.frequencies_before(&structure, &record.batch.source, measured.0).await?;
         let (record, previous) = (Arc::new(record), Arc::new(previous));
         let mut undamaged = self.comparable(&structure, &record, &baseline).await?;
         loop {
             let started = std::time::Instant::now();
+            let draws = self.draws(&baseline, &record);
             let version = undamaged.as_ref().map(|state| state.version);
             let (baseline_here, record_here) = (Arc::clone(&baseline), Arc::clone(&record));
             let (known, settings, previous) =
@@ -439,11 +574,15 @@ impl Monitor {
                         self.resume_later(structure);
                         return Ok(());
                     }
+                    self.tell_batch(&structure, &record.batch_id, BatchState::Assessed);
                     self.report_episodes(&structure).await;
                     // A state declared while this was computed did not find the batch assessed, and so did not send it
                     // back: it is compared now.
+                    let swapped = self.swapped_since(watched, &baseline);
+                    let same_model = swapped.is_none();
+                    baseline = swapped.unwrap_or(baseline);
                     undamaged = self.comparable(&structure, &record, &baseline).await?;
-                    if undamaged.as_ref().map(|state| state.version) == version {
+                    if same_model && undamaged.as_ref().map(|state| state.version) == version {
                         return Ok(());
                     }
                     continue;
@@ -454,11 +593,21 @@ impl Monitor {
             let id = &record.batch_id;
             metrics::counter!("modalwatch_assessments_failed_total").increment(1);
             warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
-            if !self.store.mark_failed(&structure, id, watched.simulator.digest(), &reason).await? {
+            if self.store.mark_failed(&structure, id, watched.simulator.digest(), &reason).await? {
+                self.tell_batch(&structure, id, BatchState::Failed);
+            } else {
                 self.resume_later(structure);
             }
             return Ok(());
         }
+    }
+
+    /// The baseline that took the place of another for the same version of the structure: a batch that was begun with the old
+    /// one would be compared with nothing.
+    fn swapped_since(&self, watched: &Watched, used: &Baseline) -> Option<Arc<Baseline>> {
+        let present = self.structure(watched.simulator.id()).ok()?;
+        let newer = present.baseline.as_ref().ok().filter(|baseline| baseline.digest() != used.digest())?;
+        (present.simulator.digest() == watched.simulator.digest()).then(|| Arc::clone(newer))
     }
 
     /// The undamaged state a batch is compared with: the newest, if it was taken with this baseline and without this batch.
@@ -482,8 +631,9 @@ impl Monitor {
         }
     }
 
-    /// Logs alarms that were raised since the last look, each once.
+    /// Logs alarms that were raised since the last look, each once, and tells of all that changed.
     async fn report_episodes(&self, structure: &StructureId) {
+        self.tell_alarms(structure).await;
         let episodes = match self.store.episodes(structure, None, true, 20).await {
             Ok(episodes) => episodes,
             Err(failure) => {

@@ -16,16 +16,19 @@ impl Monitor {
     pub fn watch_for_silence(&self) {
         let started = Timestamp::now();
         let monitor = self.clone();
-        tokio::spawn(async move {
-            let mut ticks = tokio::time::interval(EVERY);
-            ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-            loop {
-                ticks.tick().await;
-                if let Err(failure) = monitor.look_for_silence(started).await {
-                    error!(error = %failure, "Could not look for silent structures: {failure}");
-                }
-                if monitor.settings.alarm.silence_after_s == 0 {
-                    return;
+        super::upkeep::supervise("silence", move || {
+            let monitor = monitor.clone();
+            async move {
+                let mut ticks = tokio::time::interval(EVERY);
+                ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+                loop {
+                    ticks.tick().await;
+                    if let Err(failure) = monitor.look_for_silence(started).await {
+                        error!(error = %failure, "Could not look for silent structures: {failure}");
+                    }
+                    if monitor.settings.alarm.silence_after_s == 0 {
+                        return;
+                    }
                 }
             }
         });
@@ -47,6 +50,7 @@ impl Monitor {
                     self.report_episodes(&structure).await;
                 } else {
                     info!(structure.id = %structure, "{structure} is not silent any more");
+                    self.tell_alarms(&structure).await;
                 }
             }
         }

@@ -32,10 +32,7 @@ impl Monitor {
     /// another: after a switch of versions, also one that a stop of the service cut short. Batches that are unfit now are left
     /// out. Version of the new state.
     pub(super) async fn retake_undamaged(&self, structure: &StructureId) -> Option<u32> {
-        let failed = |error: &dyn std::fmt::Display| {
-            warn!(structure.id = %structure, "The undamaged batches of {structure} make no undamaged state under its present version: {error}");
-        };
-        let newest = self.store.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
+        let newest = self.store.undamaged(structure).await.ok()??;
         let watched = self.structure(structure).ok()?;
         let baseline = watched.baseline.as_ref().ok()?;
         let version = self.store.structure_version(structure, watched.simulator.digest()).await.ok()?;
@@ -43,6 +40,15 @@ impl Monitor {
         if newest.model_digest == *baseline.digest() || version.is_none() {
             return None;
         }
+        self.take_again(structure).await
+    }
+
+    /// Takes the batches of the newest undamaged state as undamaged under the baseline in use. Version of the new state.
+    pub(super) async fn take_again(&self, structure: &StructureId) -> Option<u32> {
+        let failed = |error: &dyn std::fmt::Display| {
+            warn!(structure.id = %structure, "The undamaged batches of {structure} make no undamaged state with its present baseline: {error}");
+        };
+        let newest = self.store.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
         let (mut batches, threshold) = (newest.batches, newest.state.threshold_probability);
         loop {
             let place = self.compute.wait().await;
@@ -96,6 +102,8 @@ impl Monitor {
             self.store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
         let batches = batch_ids.len();
         info!(structure.id = %structure, version, "Took {batches} batches as undamaged state {version} of {structure}");
+        self.tell_alarms(structure).await;
+        self.tell_structure(structure);
         self.resume_later(structure.clone());
         let stored = self.store.undamaged(structure).await?;
         Ok(stored.expect("it was stored a moment ago and is never deleted"))

@@ -27,9 +27,17 @@ impl Monitor {
     /// A structure in use.
     ///
     /// # Errors
-    /// [`Error::UnknownStructure`].
+    /// [`Error::UnknownStructure`]; [`Error::DefinitionRefused`] for one whose stored definition does not pass any more.
     pub fn structure(&self, id: &StructureId) -> Result<Arc<Watched>, Error> {
-        self.lock_read().get(id).cloned().ok_or_else(|| Error::UnknownStructure(id.clone()))
+        self.lock_read().get(id).cloned().ok_or_else(|| match self.refused.get(id) {
+            Some(reason) => Error::DefinitionRefused { structure: id.clone(), reason: reason.clone() },
+            None => Error::UnknownStructure(id.clone()),
+        })
+    }
+
+    /// Stored structures that this version of the program does not take, with the reason.
+    pub fn refused_structures(&self) -> &BTreeMap<StructureId, String> {
+        &self.refused
     }
 
     /// Defines a structure.
@@ -46,6 +54,7 @@ impl Monitor {
             PutStructure::Created | PutStructure::Replaced => {
                 let baseline = self.baseline_for(&simulator).await?;
                 self.watch(simulator, baseline);
+                self.tell_structure(&id);
             }
             PutStructure::Unchanged => {}
         }
@@ -71,14 +80,17 @@ impl Monitor {
 
     fn find_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
         let id = simulator.id();
-        let train = "train one with `modalwatch train` into a folder of --models and start the service again";
-        let Some(entry) = self.library.get(id) else {
+        let train =
+            "train one with `modalwatch train` into a folder of --models and start the service again, or POST its \
+                     model/reload";
+        let library = self.library();
+        let Some(entry) = library.get(id) else {
             return Err(format!("no trained baseline: {train}"));
         };
         if entry.simulator.digest() != simulator.digest() {
             return Err(format!("the trained baseline is for another definition of {id}: {train}"));
         }
-        let refused = || self.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
+        let refused = || library.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
         let baseline = entry.baseline.clone().ok_or_else(|| match refused() {
             Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
             None => format!("no trained baseline: {train}"),

@@ -23,6 +23,9 @@ pub const FIT_SERIES: &str = "simulation:fit";
 /// Series of silence.
 pub const SILENCE_SERIES: &str = "structure:silence";
 
+/// Kinds of alarms.
+pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
+
 /// A batch on a chart, to be stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewChartPoint {
@@ -90,6 +93,17 @@ pub struct Episode {
     pub noticed_at: Timestamp,
     /// Who has seen it, when, and what they said.
     pub acknowledgement: Option<Acknowledgement>,
+}
+
+impl Episode {
+    /// `open`, `ended`, or `withdrawn`.
+    pub const fn state(&self) -> &'static str {
+        match (self.withdrawn, self.ended_at) {
+            (true, _) => "withdrawn",
+            (false, Some(_)) => "ended",
+            (false, None) => "open",
+        }
+    }
 }
 
 /// Somebody has seen an alarm.
@@ -515,7 +529,7 @@ fn kind_of(series: &str) -> &'static str {
     }
 }
 
-fn state_of(name: &str) -> Result<State, Error> {
+pub(super) fn state_of(name: &str) -> Result<State, Error> {
     State::ALL.into_iter().find(|state| state.as_str() == name).ok_or_else(|| bad_row("chart point")(&name))
 }
 
@@ -591,6 +605,31 @@ impl Store {
         .bind(before.unwrap_or(i64::MAX))
         .bind(open_only)
         .bind(limit as i64)
+        .fetch_all(&self.reader)
+        .await?;
+        rows.into_iter().map(episode).collect()
+    }
+
+    /// Episodes behind number `newest`, those that last, and those of the given numbers, by number.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn episodes_since(
+        &self,
+        structure: &StructureId,
+        newest: i64,
+        numbers: &[i64],
+    ) -> Result<Vec<Episode>, Error> {
+        let numbers = serde_json::to_string(numbers).map_err(|e| bad_row("alarm episode")(&e))?;
+        let rows: Vec<EpisodeRow> = sqlx::query_as(
+            "select * from alarm_episode where structure_id = ?1
+               and (episode > ?2 or (ended_at_us is null and withdrawn = 0)
+                    or episode in (select value from json_each(?3)))
+             order by episode",
+        )
+        .bind(structure.as_str())
+        .bind(newest)
+        .bind(numbers)
         .fetch_all(&self.reader)
         .await?;
         rows.into_iter().map(episode).collect()

@@ -63,6 +63,13 @@ struct QuantityRow {
 /// Orders the assessments of a batch; the current one comes first.
 pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
 
+/// Holds for the assessment `a` of a batch that [`CURRENT_FIRST`] puts first.
+pub(super) const IS_CURRENT: &str = "not exists (
+    select 1 from assessment n where n.structure_id = a.structure_id and n.batch_id = a.batch_id
+       and (n.assessed_at_us > a.assessed_at_us or n.assessed_at_us = a.assessed_at_us
+            and (n.undamaged_version > a.undamaged_version or n.undamaged_version = a.undamaged_version
+                 and n.model_digest < a.model_digest)))";
+
 impl Store {
     /// Stores an assessment with its points on the alarm charts and marks its batch as assessed; storing it again changes
     /// nothing. An assessment under a version of the structure that is no longer the present one is not stored: the batch
@@ -84,6 +91,8 @@ impl Store {
                     return Ok(false);
                 }
                 let version = a.undamaged_version.unwrap_or(0);
+                let assessed_at_us = place_in_time(connection, &structure, &id, &a, version).await?;
+                let assessed_at = timestamp("assessment", assessed_at_us)?;
                 for table in ["quantity_assessment", "assessment"] {
                     let delete = format!(
                         "delete from {table}
@@ -110,7 +119,7 @@ impl Store {
                     .bind(a.measurements_left_out as i64)
                     .bind(a.measurements_outside as i64)
                     .bind(to_blob(a.misfit_percent.iter().map(|misfit| misfit.unwrap_or(f64::NAN))))
-                    .bind(a.assessed_at.micros())
+                    .bind(assessed_at_us)
                     .bind(a.effective_sample_size)
                     .bind(trust)
                     .execute(&mut *connection)
@@ -154,7 +163,7 @@ impl Store {
                     .execute(&mut *connection)
                     .await?;
                 }
-                chart(connection, &structure, &id, charted, a.assessed_at).await?;
+                chart(connection, &structure, &id, charted, assessed_at).await?;
                 sqlx::query(
                     "update measurement_batch set state = 'assessed', failure = null
                      where structure_id = ? and batch_id = ?",
@@ -232,6 +241,31 @@ impl Store {
     }
 }
 
+/// The time an assessment is stored under, µs: after all others of its batch, also where the clock was set back since, for the
+/// newest is the current one. An assessment that is stored again keeps its place.
+async fn place_in_time(
+    connection: &mut sqlx::SqliteConnection,
+    structure: &str,
+    batch_id: &str,
+    assessment: &Assessment,
+    version: u32,
+) -> Result<i64, Error> {
+    let (same, others): (bool, Option<i64>) = sqlx::query_as(
+        "select coalesce(max(model_digest = ?3 and undamaged_version = ?4 and assessed_at_us = ?5), 0),
+                max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4))
+         from assessment where structure_id = ?1 and batch_id = ?2",
+    )
+    .bind(structure)
+    .bind(batch_id)
+    .bind(assessment.model_digest.as_str())
+    .bind(version)
+    .bind(assessment.assessed_at.micros())
+    .fetch_one(&mut *connection)
+    .await?;
+    let given = assessment.assessed_at.micros();
+    Ok(if same { given } else { others.map_or(given, |latest| given.max(latest + 1)) })
+}
+
 fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
     Ok(Assessment {
         model_digest: Digest::from_stored(row.model_digest),
@@ -303,7 +337,7 @@ fn kind_name(kind: QuantityKind) -> &'static str {
     }
 }
 
-fn kind_of(name: &str) -> Result<QuantityKind, Error> {
+pub(super) fn kind_of(name: &str) -> Result<QuantityKind, Error> {
     let kinds = [QuantityKind::Parameter, QuantityKind::SpringStiffness, QuantityKind::Group];
     kinds.into_iter().find(|kind| kind_name(*kind) == name).ok_or_else(|| bad_row("quantity")(&name))
 }

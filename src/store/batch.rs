@@ -59,7 +59,7 @@ struct BatchRow {
 }
 
 #[derive(FromRow)]
-struct MeasurementRow {
+pub(super) struct MeasurementRow {
     measured_at_us: i64,
     frequency_hz: Vec<u8>,
     std_hz: Option<Vec<u8>>,
@@ -108,6 +108,7 @@ impl Store {
         .fetch_optional(&self.reader)
         .await?;
         let Some(row) = row else { return Ok(None) };
+        fault_point!("store::read", |_| Err(bad_row("batch")(&"a fault")));
         let measurements: Vec<MeasurementRow> = sqlx::query_as(
             "select measured_at_us, frequency_hz, std_hz, covariates, settings
              from measurement where structure_id = ? and batch_id = ? order by ordinal",
@@ -116,15 +117,22 @@ impl Store {
         .bind(batch_id)
         .fetch_all(&self.reader)
         .await?;
+        let batch = MeasurementBatch {
+            structure: structure.clone(),
+            source: row.source,
+            idempotency_key: row.idempotency_key,
+            measurements: measurements.into_iter().map(measurement).collect::<Result<_, _>>()?,
+        };
+        let content_digest = Digest::from_stored(row.content_digest);
+        // SQLite has no checksums: a bit that fell over on the disk would come back as a measurement nobody made.
+        if batch.measurements.is_empty() || batch.content_digest() != content_digest {
+            let detail = "its measurements are not those that its digest was taken of: the database is damaged";
+            return Err(bad_row("batch")(&detail));
+        }
         Ok(Some(BatchRecord {
             batch_id: batch_id.to_owned(),
-            batch: MeasurementBatch {
-                structure: structure.clone(),
-                source: row.source,
-                idempotency_key: row.idempotency_key,
-                measurements: measurements.into_iter().map(measurement).collect::<Result<_, _>>()?,
-            },
-            content_digest: Digest::from_stored(row.content_digest),
+            batch,
+            content_digest,
             received_at: timestamp("batch", row.received_at_us)?,
             state: batch_state(&row.state)?,
             failure: row.failure,
@@ -296,11 +304,42 @@ async fn insert(
             .bind(json(serde_json::to_string(&m.settings))?)
             .execute(&mut *connection)
             .await?;
+        fault_point!("store::measurement", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     }
     Ok(())
 }
 
-fn measurement(row: MeasurementRow) -> Result<ModalMeasurement, Error> {
+/// Stores a batch of an archive under its own id; whether it was new.
+pub(super) async fn import(
+    connection: &mut SqliteConnection,
+    batch_id: &str,
+    batch: &MeasurementBatch,
+    received_at: Timestamp,
+) -> Result<bool, Error> {
+    let digest = batch.content_digest();
+    let other = |there: &str| bad_row("batch of the archive")(&format!("batch {batch_id} is here as {there}"));
+    let holder: Option<(String,)> =
+        sqlx::query_as("select content_digest from measurement_batch where structure_id = ? and batch_id = ?")
+            .bind(batch.structure.as_str())
+            .bind(batch_id)
+            .fetch_optional(&mut *connection)
+            .await?;
+    if let Some((content,)) = holder {
+        return if content == digest.as_str() { Ok(false) } else { Err(other("a batch of other content")) };
+    }
+    match find_stored(connection, batch, &digest).await? {
+        None => insert(connection, batch, &digest, batch_id, received_at).await.map(|()| true),
+        Some(
+            InsertBatch::Replayed(there)
+            | InsertBatch::KeyConflict { batch_id: there }
+            | InsertBatch::MeasurementConflict { batch_id: there, .. },
+        ) => Err(other(&there)),
+        Some(InsertBatch::Inserted) => unreachable!("looking for a batch stores none"),
+    }
+}
+
+/// The measurement of a row.
+pub(super) fn measurement(row: MeasurementRow) -> Result<ModalMeasurement, Error> {
     let what = "measurement";
     let std = row.std_hz.map(|blob| from_blob(what, &blob)).transpose()?;
     Ok(ModalMeasurement {

@@ -8,7 +8,7 @@ use crate::measurement::ModalMeasurement;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// State of a job.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
     /// It runs.
@@ -95,7 +95,7 @@ struct Row {
 const COLUMNS: &str = "diagnosis_id, structure_id, structure_digest, request, state, failure, result, created_at_us, \
                        finished_at_us, extension_state, extension_failure, extension";
 
-fn job_state(text: &str) -> Result<JobState, Error> {
+pub(super) fn job_state(text: &str) -> Result<JobState, Error> {
     match text {
         "running" => Ok(JobState::Running),
         "done" => Ok(JobState::Done),
@@ -194,15 +194,17 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn begin_extension(&self, id: &str) -> Result<bool, Error> {
-        let id = id.to_owned();
+    pub async fn begin_extension(&self, id: &str, now: Timestamp) -> Result<bool, Error> {
+        let (id, now) = (id.to_owned(), now.micros());
         self.write(move |connection| {
             Box::pin(async move {
                 let updated = sqlx::query(
-                    "update diagnosis set extension_state = 'running', extension_failure = null
+                    "update diagnosis set extension_state = 'running', extension_failure = null,
+                         extension_begun_at_us = ?, extended_at_us = null
                      where diagnosis_id = ? and state = 'done'
                        and (extension_state is null or extension_state <> 'running')",
                 )
+                .bind(now)
                 .bind(&id)
                 .execute(&mut *connection)
                 .await?;
@@ -263,9 +265,11 @@ impl Store {
                 .execute(&mut *connection)
                 .await?;
                 let extensions = sqlx::query(
-                    "update diagnosis set extension_state = 'failed', extension_failure = ? where extension_state = 'running'",
+                    "update diagnosis set extension_state = 'failed', extension_failure = ?, extended_at_us = ?
+                     where extension_state = 'running'",
                 )
                 .bind(WHY)
+                .bind(now)
                 .execute(&mut *connection)
                 .await?;
                 Ok(diagnoses.rows_affected() + extensions.rows_affected())
@@ -298,6 +302,18 @@ impl Store {
             .fetch_all(&self.reader)
             .await?;
         rows.into_iter().map(record).collect()
+    }
+
+    /// The structure that a diagnosis is about.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn structure_of_diagnosis(&self, id: &str) -> Result<Option<String>, Error> {
+        let row: Option<(String,)> = sqlx::query_as("select structure_id from diagnosis where diagnosis_id = ?")
+            .bind(id)
+            .fetch_optional(&self.reader)
+            .await?;
+        Ok(row.map(|(structure,)| structure))
     }
 
     /// The report of a diagnosis, HTML.

@@ -4,34 +4,69 @@
 //! write is a task of its own in one `BEGIN IMMEDIATE` transaction, so that a caller who goes away never leaves one open.
 
 mod alarm;
+pub mod archive;
 mod assessment;
+mod audit;
+pub mod backup;
 mod batch;
 mod diagnosis;
+mod failure;
+mod figures;
 mod history;
+pub mod inspect;
+mod jobs;
+mod measurements;
+mod outbox;
+mod overview;
+mod quarantine;
+mod retention;
+mod series;
 mod structure;
 #[cfg(test)]
 mod tests;
+mod token;
 mod undamaged;
+mod webhook;
 
 use std::fs::{File, TryLockError};
 use std::future::Future;
 use std::io::Read as _;
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{
     SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous,
 };
-use sqlx::Connection as _;
+use sqlx::{Connection as _, Sqlite};
+use tokio::sync::Notify;
 
-pub use alarm::{Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, FIT_SERIES};
+use crate::volume;
+use failure::count_failure;
+
+pub use alarm::{
+    Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, ALARM_KINDS, FIT_SERIES,
+};
+pub use audit::{AuditEntry, AuditQuery, NewAuditEntry};
 pub use batch::{BatchRecord, InsertBatch};
 pub use diagnosis::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
+pub use figures::{Figures, FolderFigures};
 pub use history::{Exceedance, HistoryEntry, HistoryQuery};
+pub use jobs::{JobKind, JobRecord};
+pub use measurements::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
+pub use outbox::{Delivery, DeliveryState, OutboxEvent, Settlement, Turns};
+pub use overview::StructureOverview;
+pub use quarantine::QuarantinedMessage;
+pub use retention::{Deleted, Expired};
+pub use series::{ChartMark, ChartSeries, Extent, QuantityMark, QuantitySeries, SeriesWindow, TrustMark};
 pub use structure::{PutStructure, StructureRecord, StructureSummary};
 pub use undamaged::UndamagedRecord;
+pub use webhook::{EventFilter, Secret, WebhookRecord};
 
 /// Name of the database inside the data folder.
 pub const DATABASE_FILE: &str = "modalwatch.sqlite";
@@ -43,10 +78,37 @@ const APPLICATION_ID: i64 = 0x6d64_6c77;
 /// The first SQLite without the WAL-reset corruption that two connections could cause.
 const OLDEST_SQLITE: [u32; 3] = [3, 51, 3];
 
-const READERS: u32 = 4;
+/// Largest database whose indexes are compared with their tables at every start: some five seconds. One flipped bit in a key
+/// hides a batch, which the quick check does not see.
+const FULL_CHECK_BYTES: u64 = 1 << 30;
+
+/// The log is cut to this when it begins anew; without it, one long reader would leave a large file for ever.
+const LOG_LIMIT_BYTES: &str = "67108864";
+
+const READERS: u32 = 8;
+/// Rows that a reader hands over at a time: long series would spend more on handing over than on reading.
+const ROWS_AT_A_TIME: usize = 1_000;
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
 static MIGRATIONS: Migrator = sqlx::migrate!();
+
+/// Where a database may lie, and how much room it needs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StoreSettings {
+    /// Open a database on NFS, SMB and the like all the same.
+    pub allow_network_filesystem: bool,
+    /// Free bytes below which nothing is written any more; 0 = write until the disk is full.
+    pub min_free_bytes: u64,
+    /// Bytes of the write-ahead log above which `/readyz` says so.
+    pub max_wal_bytes: u64,
+}
+
+impl Default for StoreSettings {
+    fn default() -> Self {
+        Self { allow_network_filesystem: false, min_free_bytes: 64 << 20, max_wal_bytes: 256 << 20 }
+    }
+}
 
 /// Why the store cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -62,6 +124,9 @@ pub enum Error {
     /// File or folder may only be read.
     #[error("{0} is read-only: give write permission, or another --data-dir")]
     ReadOnly(PathBuf),
+    /// Deleted or replaced while it was open: what is written now would be lost with the process.
+    #[error("{0} was deleted or replaced while it was open: nothing more is stored; put it back and start the service again")]
+    Gone(PathBuf),
     /// Another process has the folder open.
     #[error("{0} is in use by another modalwatch: stop it, or give another --data-dir")]
     Locked(PathBuf),
@@ -119,12 +184,41 @@ pub enum Error {
     /// A migration failed.
     #[error("the database could not be brought to this version: {0}")]
     Migration(#[from] MigrateError),
+    /// The folder is on a network file system.
+    #[error(
+        "{path} is on a network file system ({file_system}), whose locks cannot keep a database whole: give a --data-dir on a \
+         local disk, or set store.allow_network_filesystem = true"
+    )]
+    NetworkFileSystem {
+        /// The folder.
+        path: PathBuf,
+        /// Its file system.
+        file_system: String,
+    },
+    /// The disk is full, or nearly so; this write was not done, and writing goes on as soon as there is room.
+    #[error("the disk of the data folder is full: {0}")]
+    DiskFull(String),
+    /// The disk did not do what it was asked; this write was not done.
+    #[error("the disk of the data folder failed: {0}")]
+    Disk(String),
+    /// The database may not be written any more.
+    #[error("the database may not be written: {0}")]
+    BecameReadOnly(String),
+    /// Another writer held the database for too long.
+    #[error("the database is busy: {0}")]
+    Busy(String),
     /// SQLite failed.
     #[error("database: {0}")]
-    Sqlite(#[from] sqlx::Error),
+    Sqlite(sqlx::Error),
     /// A task of ours panicked: a bug.
     #[error("a database task panicked")]
     Panicked,
+}
+
+/// Limits that may change while the store is open.
+struct Limits {
+    min_free_bytes: AtomicU64,
+    max_wal_bytes: AtomicU64,
 }
 
 /// The store: a cheap handle.
@@ -132,7 +226,12 @@ pub enum Error {
 pub struct Store {
     writer: SqlitePool,
     reader: SqlitePool,
+    path: Arc<Path>,
     sqlite_version: Arc<str>,
+    /// Told after every write.
+    written: Arc<Notify>,
+    file: Arc<OpenedFile>,
+    limits: Arc<Limits>,
     /// Held as long as the store is open: a second instance on the same folder is refused.
     _lock: Arc<File>,
 }
@@ -143,8 +242,21 @@ impl Store {
     /// # Errors
     /// [`Error`], one variant for each way it can be wrong, with what to do.
     pub async fn open(data_dir: &Path) -> Result<Self, Error> {
+        Self::open_with(data_dir, &StoreSettings::default()).await
+    }
+
+    /// As [`Self::open`], with settings.
+    ///
+    /// # Errors
+    /// [`Error`], one variant for each way it can be wrong, with what to do.
+    pub async fn open_with(data_dir: &Path, settings: &StoreSettings) -> Result<Self, Error> {
         let path = data_dir.join(DATABASE_FILE);
         let lock = prepare_folder(data_dir, &path)?;
+        let volume = volume::of(data_dir).map_err(|source| Error::Folder { path: data_dir.to_owned(), source })?;
+        if volume.network && !settings.allow_network_filesystem {
+            let file_system = volume.file_system;
+            return Err(Error::NetworkFileSystem { path: data_dir.to_owned(), file_system });
+        }
         refuse_foreign(&path).await?;
 
         let options = SqliteConnectOptions::new()
@@ -152,12 +264,13 @@ impl Store {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .foreign_keys(true)
+            .pragma("journal_size_limit", LOG_LIMIT_BYTES)
             .busy_timeout(BUSY_TIMEOUT);
         // The connection lives as long as the store; a pool of one is the queue of writers.
         let writer = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
         let writer = writer.connect_with(options.clone().create_if_missing(true)).await;
         let writer = writer.map_err(|e| not_a_database(e, &path))?;
-        let check: Result<(String,), _> = sqlx::query_as("pragma quick_check(1)").fetch_one(&writer).await;
+        let check: Result<(String,), _> = sqlx::query_as(check_of(&path)).fetch_one(&writer).await;
         let (check,) = check.map_err(|e| not_a_database(e, &path))?;
         if check != "ok" {
             return Err(Error::Corrupt { path, detail: check });
@@ -174,8 +287,63 @@ impl Store {
             MigrateError::VersionMissing(found) => Error::SchemaTooNew { path: path.clone(), found, known: newest() },
             other => Error::Migration(other),
         })?;
-        let reader = SqlitePoolOptions::new().max_connections(READERS).connect_with(options.read_only(true)).await?;
-        Ok(Self { writer, reader, sqlite_version: sqlite_version.into(), _lock: Arc::new(lock) })
+        let reader = SqlitePoolOptions::new()
+            .max_connections(READERS)
+            .connect_with(options.read_only(true).row_buffer_size(ROWS_AT_A_TIME))
+            .await?;
+        let limits = Limits {
+            min_free_bytes: AtomicU64::new(settings.min_free_bytes),
+            max_wal_bytes: AtomicU64::new(settings.max_wal_bytes),
+        };
+        let file = Arc::new(OpenedFile::of(path.clone())?);
+        Ok(Self {
+            writer,
+            reader,
+            path: path.into(),
+            file,
+            sqlite_version: sqlite_version.into(),
+            written: Arc::default(),
+            limits: Arc::new(limits),
+            _lock: Arc::new(lock),
+        })
+    }
+
+    /// The folder of the database.
+    pub fn folder(&self) -> &Path {
+        self.path.parent().unwrap_or(Path::new("."))
+    }
+
+    /// Takes over the limits of changed settings; where the database lies stays as it is.
+    pub fn set_limits(&self, settings: &StoreSettings) {
+        self.limits.min_free_bytes.store(settings.min_free_bytes, Ordering::Relaxed);
+        self.limits.max_wal_bytes.store(settings.max_wal_bytes, Ordering::Relaxed);
+    }
+
+    /// Free bytes below which nothing is written.
+    pub fn min_free_bytes(&self) -> u64 {
+        self.limits.min_free_bytes.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of the write-ahead log above which it counts as large.
+    pub fn max_wal_bytes(&self) -> u64 {
+        self.limits.max_wal_bytes.load(Ordering::Relaxed)
+    }
+
+    /// Refuses while less is free than the floor: the rest of the disk is what the log needs to be written back.
+    ///
+    /// # Errors
+    /// [`Error::DiskFull`].
+    pub fn refuse_without_room(&self) -> Result<(), Error> {
+        let floor = self.min_free_bytes();
+        if floor == 0 {
+            return Ok(());
+        }
+        let folder = self.folder();
+        let free = volume::free_bytes(folder).map_err(|source| Error::Folder { path: folder.to_owned(), source })?;
+        if free >= floor {
+            return Ok(());
+        }
+        Err(Error::DiskFull(format!("{free} bytes are free, store.min_free_bytes asks for {floor}")))
     }
 
     /// Version of the SQLite library.
@@ -198,6 +366,11 @@ impl Store {
         .await
     }
 
+    /// Whether it was closed: whatever still wants to write can give up.
+    pub fn is_closed(&self) -> bool {
+        self.writer.is_closed()
+    }
+
     /// Writes the log back into the database and closes it.
     pub async fn close(&self) {
         self.reader.close().await;
@@ -214,16 +387,95 @@ impl Store {
         T: Send + 'static,
         F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
     {
-        let writer = self.writer.clone();
+        if let Err(error) = self.refuse_without_room() {
+            count_failure(&error);
+            return Err(error);
+        }
+        self.write_without_floor(work).await
+    }
+
+    /// As [`Self::write`], however little is free: for what makes room.
+    async fn write_without_floor<T, F>(&self, work: F) -> Result<T, Error>
+    where
+        T: Send + 'static,
+        F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
+    {
+        let (writer, file) = (self.writer.clone(), Arc::clone(&self.file));
+        let written = Arc::clone(&self.written);
         let task = tokio::spawn(async move {
+            fault_point!("store::begin", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
             let mut connection = writer.acquire().await?;
-            let mut transaction = connection.begin_with("begin immediate").await?;
-            let result = work(&mut transaction).await?;
-            transaction.commit().await?;
+            let result = in_transaction(&mut connection, work).await;
+            if result.is_ok() {
+                written.notify_one();
+            }
+            if result.as_ref().is_err_and(Error::spoils_the_connection) {
+                // SQLite ends a transaction by itself when the disk fails. sqlx still counts it as open and would refuse the
+                // next one for ever; and a handle that failed once is best not trusted. The pool makes a new one.
+                let _ = connection.detach().close_hard().await;
+            }
+            let result = result?;
+            file.check()?;
             Ok(result)
         });
-        task.await.map_err(|_| Error::Panicked)?
+        let result = task.await.map_err(|_| Error::Panicked)?;
+        if let Err(error) = &result {
+            count_failure(error);
+        }
+        result
     }
+}
+
+async fn in_transaction<T, F>(connection: &mut PoolConnection<Sqlite>, work: F) -> Result<T, Error>
+where
+    F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
+{
+    let mut transaction = connection.begin_with("begin immediate").await?;
+    match work(&mut transaction).await {
+        Ok(result) => {
+            fault_point!("store::commit", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
+            transaction.commit().await?;
+            fault_point!("store::committed", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
+            Ok(result)
+        }
+        Err(error) => {
+            // A roll back that fails is the worse news, unless SQLite has rolled back already.
+            match transaction.rollback().await {
+                Err(failed) if !error.spoils_the_connection() => Err(failed.into()),
+                _ => Err(error),
+            }
+        }
+    }
+}
+
+/// The database file as it was opened.
+///
+/// A file that is deleted or replaced lives on under its open handles: SQLite would go on writing into it without an error, and
+/// all of it would be gone with the process.
+struct OpenedFile {
+    path: PathBuf,
+    log: PathBuf,
+    device_and_inode: (u64, u64),
+}
+
+impl OpenedFile {
+    fn of(path: PathBuf) -> Result<Self, Error> {
+        let device_and_inode =
+            device_and_inode(&path).map_err(|source| Error::Folder { path: path.clone(), source })?;
+        let mut log = path.clone().into_os_string();
+        log.push("-wal");
+        Ok(Self { path, log: log.into(), device_and_inode })
+    }
+
+    /// Whether file and log are still there; by name only: closing a second handle on the file would drop SQLite's locks.
+    fn check(&self) -> Result<(), Error> {
+        let same = device_and_inode(&self.path).is_ok_and(|found| found == self.device_and_inode);
+        (same && self.log.exists()).then_some(()).ok_or_else(|| Error::Gone(self.path.clone()))
+    }
+}
+
+fn device_and_inode(path: &Path) -> std::io::Result<(u64, u64)> {
+    std::fs::metadata(path).map(|m| (m.dev(), m.ino()))
 }
 
 /// What runs inside a write transaction.
@@ -242,12 +494,43 @@ fn prepare_folder(data_dir: &Path, database: &Path) -> Result<File, Error> {
             return Err(Error::ReadOnly(path.to_owned()));
         }
     }
+    make_private(database).map_err(failed(database))?;
+    take_lock(data_dir)
+}
+
+/// The lock of a folder that exists.
+fn take_lock(data_dir: &Path) -> Result<File, Error> {
     let lock_path = data_dir.join(LOCK_FILE);
+    let failed = |path: &Path| {
+        let path = path.to_owned();
+        move |source| Error::Folder { path, source }
+    };
     let lock = File::options().create(true).truncate(false).write(true).open(&lock_path).map_err(failed(&lock_path))?;
     match lock.try_lock() {
         Ok(()) => Ok(lock),
         Err(TryLockError::WouldBlock) => Err(Error::Locked(data_dir.to_owned())),
         Err(TryLockError::Error(source)) => Err(Error::Folder { path: lock_path, source }),
+    }
+}
+
+/// Makes the database's file, where there is none, for its owner only: it holds the secrets of webhooks. SQLite gives the
+/// files beside it the same permissions.
+fn make_private(database: &Path) -> std::io::Result<()> {
+    let mut options = File::options();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    match options.open(database) {
+        Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => Err(error),
+        _ => Ok(()),
+    }
+}
+
+/// The check that a start can afford.
+fn check_of(path: &Path) -> &'static str {
+    match std::fs::metadata(path) {
+        Ok(file) if file.len() > FULL_CHECK_BYTES => "pragma quick_check(1)",
+        _ => "pragma integrity_check(1)",
     }
 }
 

@@ -170,7 +170,8 @@ async fn a_newer_schema_is_refused_with_both_versions() {
     let newer =
         "insert into _sqlx_migrations select 9999, 'x', installed_on, true, checksum, 0 from _sqlx_migrations limit 1";
     by_hand(folder.path(), &[newer]).await;
-    assert!(matches!(refusal(folder.path()).await, Error::SchemaTooNew { found: 9999, known: 3, .. }));
+    let newest = super::newest();
+    assert!(matches!(refusal(folder.path()).await, Error::SchemaTooNew { found: 9999, known, .. } if known == newest));
 }
 
 #[tokio::test]

@@ -175,7 +175,10 @@ async fn other_content_types_are_a_415() {
     let (service, _folder) = spawn();
     for kind in ["text/plain", "application/x-www-form-urlencoded", "application/jsonp", "multipart/form-data"] {
         let answer = problem(service.post_text(BATCHES, kind, "{}").await, 415, "unsupported_media_type").await;
-        assert!(answer["detail"].as_str().unwrap().contains("application/json or text/csv"), "{answer}");
+        assert!(
+            answer["detail"].as_str().unwrap().contains("application/json, text/csv or application/x-ndjson"),
+            "{answer}"
+        );
     }
     let compressed = service.request(reqwest::Method::POST, BATCHES).header("content-encoding", "gzip");
     let compressed = compressed.header("content-type", "application/json").body("{}").send().await.unwrap();

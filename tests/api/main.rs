@@ -4,10 +4,14 @@
 
 mod bad_input;
 mod batches;
+mod bulk;
 mod diagnosis;
+mod export;
 mod helpers;
 mod history;
 mod hostile;
+mod openapi;
 mod operations;
 mod restart;
 mod ruler_frame;
+mod views;

@@ -1,0 +1,215 @@
+//! Raw measurements out: pages, files, and the way back in.
+
+use std::collections::BTreeSet;
+
+use serde_json::{json, Value};
+
+use crate::helpers::{created, measurements, problem, spawn, time, Service};
+
+const MEASUREMENTS: &str = "/v1/structures/three-dof/measurements";
+const BATCHES: &str = "/v1/structures/three-dof/batches";
+
+/// Batches whose times overlap: 4 sources of 7 measurements each, and one with all that a measurement can have.
+async fn with_batches() -> (Service, tempfile::TempDir) {
+    let (service, folder) = spawn();
+    for source in 0..4 {
+        let body = json!({
+            "source": format!("s{source}"), "measurements": measurements([4.0, 5.0, 6.0], 7, source * 1_000),
+        });
+        created(service.post(BATCHES, &body).await).await;
+    }
+    let full = json!({ "source": "full", "measurements": [{
+        "measured_at": time(90_000), "frequencies_hz": [0.4949, null, 1.2434], "std_hz": [0.001, null, null],
+        "settings": { "k2": 5.0 },
+    }]});
+    created(service.post(BATCHES, &full).await).await;
+    (service, folder)
+}
+
+async fn text(service: &Service, query: &str, content_type: &str) -> String {
+    let answer = service.get(&format!("{MEASUREMENTS}?{query}")).send().await.unwrap();
+    assert_eq!(answer.status(), 200, "{query}");
+    assert!(answer.headers()["content-type"].to_str().unwrap().starts_with(content_type), "{query}");
+    let ending = content_type.rsplit(['/', '-']).next().unwrap();
+    let disposition = answer.headers()["content-disposition"].to_str().unwrap().to_owned();
+    assert_eq!(disposition, format!("attachment; filename=\"three-dof-measurements.{ending}\""));
+    answer.text().await.unwrap()
+}
+
+#[tokio::test]
+async fn pages_walk_every_measurement_once() {
+    let (service, _folder) = with_batches().await;
+    let all = service.read(&format!("{MEASUREMENTS}?limit=1000")).await;
+    let all = all["items"].as_array().unwrap().clone();
+    assert_eq!(all.len(), 29);
+    let keys: BTreeSet<String> = all.iter().map(|m| format!("{} {}", m["source"], m["measured_at"])).collect();
+    assert_eq!(keys.len(), 29);
+    let full = all.last().unwrap();
+    assert_eq!(full["frequencies_hz"], json!([0.4949, null, 1.2434]));
+    assert_eq!((&full["std_hz"], &full["settings"]), (&json!([0.001, null, null]), &json!({ "k2": 5.0 })));
+    // Pages that end inside batches and at their ends.
+    for limit in [1, 3, 7, 28, 29] {
+        let (mut walked, mut path) = (Vec::new(), format!("{MEASUREMENTS}?limit={limit}"));
+        for _ in 0..40 {
+            let response = service.get(&path).send().await.unwrap();
+            let link = response.headers().get("link").map(|l| l.to_str().unwrap().to_owned());
+            let page: Value = response.json().await.unwrap();
+            walked.extend(page["items"].as_array().unwrap().clone());
+            assert_eq!(link.is_some(), page["next"].is_string());
+            let Some(link) = link else { break };
+            path = link.split(['<', '>']).nth(1).unwrap().to_owned();
+        }
+        assert_eq!(walked, all, "limit {limit}");
+    }
+}
+
+#[tokio::test]
+async fn a_window_cuts_by_the_time_of_the_measurement_not_of_its_batch() {
+    let (service, _folder) = with_batches().await;
+    let (from, to) = (time(1_200), time(3_600));
+    let page = service.read(&format!("{MEASUREMENTS}?from={from}&to={to}&limit=1000")).await;
+    let times: Vec<&str> =
+        page["items"].as_array().unwrap().iter().map(|m| m["measured_at"].as_str().unwrap()).collect();
+    // Four sources with a measurement each 600 s, beginning at 0, 1000, 2000 and 3000 s.
+    assert_eq!(times.len(), 4 + 4 + 3 + 1, "{times:?}");
+    assert!(times.iter().all(|t| (from.as_str()..to.as_str()).contains(t)), "{times:?}");
+}
+
+#[tokio::test]
+async fn the_files_hold_the_same_and_csv_goes_back_in() {
+    let (service, _folder) = with_batches().await;
+    let all = service.read(&format!("{MEASUREMENTS}?limit=1000")).await;
+    let lines = text(&service, "format=ndjson", "application/x-ndjson").await;
+    let lines: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(json!(lines), all["items"]);
+
+    let table = text(&service, "format=csv", "text/csv").await;
+    let header = "measured_at,source,batch,f1_hz,f2_hz,f3_hz,std_f1_hz,std_f2_hz,std_f3_hz,set_k1,set_k2,set_k3";
+    assert_eq!(table.lines().next(), Some(header));
+    assert_eq!(table.lines().count(), 30);
+    let last = table.lines().last().unwrap();
+    assert!(last.starts_with("2026-01-02T01:00:00Z,full,") && last.ends_with(",0.4949,,1.2434,0.001,,,,5,"), "{last}");
+
+    let chosen = service.get(MEASUREMENTS).header("accept", "text/csv").send().await.unwrap().text().await.unwrap();
+    assert_eq!(chosen, table);
+    let limited = text(&service, "format=csv&limit=5", "text/csv").await;
+    assert_eq!(limited.lines().collect::<Vec<_>>(), table.lines().take(6).collect::<Vec<_>>());
+    let none = text(&service, "format=csv&from=2027-01-01T00:00:00Z", "text/csv").await;
+    assert_eq!(none, format!("{header}\n"));
+
+    // One source of the table, posted to a fresh service.
+    let (other, _folder) = spawn();
+    let rows: Vec<&str> = table.lines().filter(|l| l.starts_with("measured_at") || l.contains(",s2,")).collect();
+    let path = format!("{BATCHES}?source=s2&ignore=source,batch");
+    let posted = created(other.post_text(&path, "text/csv", rows.join("\n")).await).await;
+    let original = service.read("/v1/structures/three-dof/history").await;
+    let original = original["items"].as_array().unwrap().iter().find(|b| b["source"] == "s2").unwrap().clone();
+    let original = service.read(&format!("{BATCHES}/{}", original["batch"].as_str().unwrap())).await;
+    assert_eq!(posted["content_digest"], original["content_digest"]);
+}
+
+#[tokio::test]
+async fn a_file_of_many_pages_is_whole() {
+    let (service, _folder) = spawn();
+    let mut sent = BTreeSet::new();
+    for batch in 0..3 {
+        let body =
+            json!({ "source": format!("s{batch}"), "measurements": measurements([4.0, 5.0, 6.0], 1_500, batch * 60) });
+        sent.extend(body["measurements"].as_array().unwrap().iter().map(|m| m["measured_at"].to_string()));
+        created(service.post(BATCHES, &body).await).await;
+    }
+    let lines = text(&service, "format=ndjson", "application/x-ndjson").await;
+    let read: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(read.len(), 4_500);
+    assert_eq!(read.iter().map(|m| m["measured_at"].to_string()).collect::<BTreeSet<_>>(), sent);
+}
+
+#[tokio::test]
+async fn queries_that_make_no_sense_are_named() {
+    let (service, _folder) = spawn();
+    for (query, place) in [
+        ("format=xml", "query/format"),
+        ("limit=0", "query/limit"),
+        ("from=now", "query/from"),
+        ("cursor=1~2", "query/cursor"),
+        ("parameter=k1", "query"),
+    ] {
+        let answer = service.get(&format!("{MEASUREMENTS}?{query}")).send().await.unwrap();
+        assert_eq!(problem(answer, 422, "invalid").await["errors"][0]["pointer"], place, "{query}");
+    }
+    let unknown = service.get("/v1/structures/none/measurements").send().await.unwrap();
+    problem(unknown, 404, "unknown_structure").await;
+}
+
+#[cfg(not(feature = "parquet"))]
+#[tokio::test]
+async fn parquet_that_is_not_built_in_is_a_406() {
+    let (service, _folder) = spawn();
+    for path in [MEASUREMENTS, "/v1/structures/three-dof/history"] {
+        let answer = service.get(&format!("{path}?format=parquet")).send().await.unwrap();
+        let body = problem(answer, 406, "not_acceptable").await;
+        assert!(body["detail"].as_str().unwrap().contains("parquet"), "{body}");
+    }
+}
+
+#[cfg(feature = "parquet")]
+mod parquet_files {
+    use bytes::Bytes;
+    use parquet::file::reader::{FileReader as _, SerializedFileReader};
+    use parquet::record::Field;
+
+    use super::*;
+
+    /// Rows of a Parquet answer as (column, value).
+    async fn rows(service: &Service, path: &str) -> Vec<Vec<(String, Field)>> {
+        let answer = service.get(path).send().await.unwrap();
+        assert_eq!(answer.headers()["content-type"], "application/vnd.apache.parquet");
+        let bytes: Bytes = answer.bytes().await.unwrap();
+        let reader = SerializedFileReader::new(bytes).unwrap();
+        let row = |row: parquet::record::Row| row.into_columns();
+        reader.get_row_iter(None).unwrap().map(|r| row(r.unwrap())).collect()
+    }
+
+    fn cell<'a>(row: &'a [(String, Field)], name: &str) -> &'a Field {
+        &row.iter().find(|(column, _)| column == name).unwrap().1
+    }
+
+    #[tokio::test]
+    async fn measurements_are_read_back() {
+        let (service, _folder) = with_batches().await;
+        let all = service.read(&format!("{MEASUREMENTS}?limit=1000")).await;
+        let all = all["items"].as_array().unwrap();
+        let read = rows(&service, &format!("{MEASUREMENTS}?format=parquet")).await;
+        assert_eq!(read.len(), all.len());
+        for (row, item) in read.iter().zip(all) {
+            let micros =
+                modalwatch::quantity::Timestamp::parse(item["measured_at"].as_str().unwrap()).unwrap().micros();
+            assert_eq!(cell(row, "measured_at"), &Field::TimestampMicros(micros));
+            assert_eq!(cell(row, "source"), &Field::Str(item["source"].as_str().unwrap().to_owned()));
+            for mode in 0..3 {
+                let expected = item["frequencies_hz"][mode].as_f64().map_or(Field::Null, Field::Double);
+                assert_eq!(cell(row, &format!("f{}_hz", mode + 1)), &expected);
+            }
+        }
+        let full = read.last().unwrap();
+        assert_eq!(cell(full, "std_f1_hz"), &Field::Double(0.001));
+        assert_eq!((cell(full, "set_k1"), cell(full, "set_k2")), (&Field::Null, &Field::Double(5.0)));
+    }
+
+    #[tokio::test]
+    async fn the_history_is_read_back() {
+        let (service, _folder) = with_batches().await;
+        let history = service.read("/v1/structures/three-dof/history").await;
+        let history = history["items"].as_array().unwrap();
+        let read = rows(&service, "/v1/structures/three-dof/history?format=parquet").await;
+        assert_eq!(read.len(), 3 * history.len());
+        for (rows, item) in read.chunks(3).zip(history) {
+            for (row, parameter) in rows.iter().zip(item["assessment"]["parameters"].as_array().unwrap()) {
+                assert_eq!(cell(row, "batch"), &Field::Str(item["batch"].as_str().unwrap().to_owned()));
+                assert_eq!(cell(row, "mean"), &Field::Double(parameter["mean"].as_f64().unwrap()));
+                assert_eq!(cell(row, "measurement_count"), &Field::Long(item["measurement_count"].as_i64().unwrap()));
+                assert_eq!(cell(row, "probability_of_damage"), &Field::Null);
+            }
+        }
+    }
+}
