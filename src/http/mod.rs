@@ -1,6 +1,6 @@
 //! The door for programs: routes, and what each request passes on its way.
 //!
-//! [`openapi`] says how a route is added.
+//! `openapi` says how a route is added.
 
 pub mod access;
 mod alarms;
