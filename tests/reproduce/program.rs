@@ -55,19 +55,6 @@ fn a_quick_reproduction_has_every_table_and_finds_what_was_drawn() {
         println!("{state} {parameter}: mean off by {mean:.5}, std by {std:.5} m");
         assert!(mean < 0.001 && std < 0.001, "{state} {parameter}: {mean} {std}");
     }
-    // Of the damaged positions an L: in every measurement one link is at its lowest position. Of samples spread over the prior
-    // three in ten would lie so near to it. After the full training 108 of 110 do (README); this flow was trained for an eighth of
-    // that, and its wider proposals leave too few effective weights for some measurements.
-    let damaged = case2["states"].as_array().unwrap().iter().find(|s| s["name"] == "damaged").unwrap();
-    let samples = |k: usize| -> Vec<f64> {
-        damaged["quantities"][k]["samples"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
-    };
-    let (p12, p23) = (samples(0), samples(1));
-    let near = |p: f64| (p - 0.02).abs() < 0.004;
-    let on_the_l = p12.iter().zip(&p23).filter(|(a, b)| near(**a) || near(**b)).count();
-    println!("{on_the_l} of {} samples lie on the L", p12.len());
-    assert!(on_the_l as f64 > 0.75 * p12.len() as f64, "{on_the_l} of {}", p12.len());
-
     // Figure 17: f1 by p23 more than by p12, f2 by p12, f3 by p23.
     let total = |output: usize, input: usize| {
         case2
@@ -88,6 +75,24 @@ fn a_quick_reproduction_has_every_table_and_finds_what_was_drawn() {
     let again: Value =
         serde_json::from_slice(&std::fs::read(Path::new(out).join("reproduction.json")).unwrap()).unwrap();
     assert_eq!(again["case2"]["table8"], found["case2"]["table8"]);
+}
+
+/// Figure 20b: in every damaged configuration one link is at its lowest position, and so are the samples of a flow that was trained
+/// as long as for the figures of README.
+#[test]
+fn samples_of_the_damaged_rig_lie_on_an_l() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().to_str().unwrap();
+    let found = json(&["reproduce", "--case", "2", "--repetitions", "1", "--out", out, "--json"]);
+    let damaged = found["case2"]["states"].as_array().unwrap().iter().find(|s| s["name"] == "damaged").unwrap();
+    let samples = |k: usize| -> Vec<f64> {
+        damaged["quantities"][k]["samples"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
+    };
+    let (p12, p23) = (samples(0), samples(1));
+    let near = |p: f64| (p - 0.02).abs() < 0.004;
+    let on_the_l = p12.iter().zip(&p23).filter(|(a, b)| near(**a) || near(**b)).count();
+    // Three in ten of samples spread over the prior would lie so near.
+    assert!(on_the_l as f64 > 0.9 * p12.len() as f64, "{on_the_l} of {}", p12.len());
 }
 
 #[test]
