@@ -54,7 +54,6 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     monitor.resume();
     monitor.watch_for_silence();
     monitor.watch_retention();
-    monitor.watch_for_batches_left_behind();
     let metrics = PrometheusBuilder::new()
         .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
         .install_recorder()?;

@@ -390,9 +390,13 @@ impl Monitor {
     }
 
     async fn ingest_with(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {
-        let monitor = self.clone();
+        let (monitor, structure) = (self.clone(), batch.structure.clone());
         let task = tokio::spawn(async move { monitor.ingest_here(batch, place).await }.in_current_span());
-        task.await.map_err(|_| Error::Panicked)?
+        task.await.unwrap_or_else(|_| {
+            // It may have been stored before.
+            self.resume_until_done(structure);
+            Err(Error::Panicked)
+        })
     }
 
     async fn ingest_here(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {

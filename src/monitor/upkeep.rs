@@ -19,12 +19,6 @@ const WRITER_PATIENCE: Duration = Duration::from_secs(5);
 /// Pause before a task that panicked is started again: one that always does would spin.
 const PAUSE_AFTER_PANIC: Duration = Duration::from_secs(1);
 
-/// Time between two looks for batches that were left behind.
-const LEFT_BEHIND_EVERY: Duration = Duration::from_secs(20);
-
-/// A batch that has waited for so long is worked on by nobody, µs.
-const LEFT_BEHIND_MICROS: i64 = 60_000_000;
-
 /// Something a person should know, with a stable code.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
 pub struct Reason {
@@ -152,37 +146,6 @@ impl Monitor {
             findings.extend(source());
         }
         findings
-    }
-
-    /// Takes up batches that were stored but not assessed, because the disk failed in between, for as long as the service runs.
-    pub fn watch_for_batches_left_behind(&self) {
-        let monitor = self.clone();
-        supervise("left_behind", move || {
-            let monitor = monitor.clone();
-            async move {
-                let mut ticks = tokio::time::interval(LEFT_BEHIND_EVERY);
-                ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-                loop {
-                    ticks.tick().await;
-                    // A disk that still fails would only fail again.
-                    if monitor.store.is_writable().await.is_ok() {
-                        monitor.take_up_left_behind().await;
-                    }
-                }
-            }
-        });
-    }
-
-    async fn take_up_left_behind(&self) {
-        let before = Timestamp::from_micros(Timestamp::now().micros() - LEFT_BEHIND_MICROS);
-        let found = match before {
-            Ok(before) => self.store.waiting_since_before(before).await,
-            Err(_) => return,
-        };
-        match found {
-            Ok(structures) => structures.into_iter().for_each(|structure| self.resume_later(structure)),
-            Err(failure) => error!(error = %failure, "Could not look for batches left behind: {failure}"),
-        }
     }
 
     /// True when the writer takes turns at all: a full disk is no reason to restart, a writer that hangs is.
@@ -344,7 +307,7 @@ pub fn declare_metrics(sqlite_version: &str) {
     for cause in ["disk_full", "disk_failed", "read_only", "database_busy"] {
         metrics::counter!("modalwatch_write_failures_total", "cause" => cause).increment(0);
     }
-    for worker in ["silence", "retention", "left_behind"] {
+    for worker in ["silence", "retention"] {
         metrics::counter!("modalwatch_worker_restarts_total", "worker" => worker).increment(0);
     }
     metrics::gauge!("modalwatch_last_backup_timestamp_seconds").set(0.0);

@@ -2,8 +2,7 @@
 
 use std::path::Path;
 
-use super::{bad_row, newest, Error, Store, DATABASE_FILE};
-use crate::quantity::{StructureId, Timestamp};
+use super::{newest, Error, Store, DATABASE_FILE};
 use crate::volume;
 
 /// Sizes of the files of a data folder, and the room beside them.
@@ -47,20 +46,6 @@ impl Store {
     /// The newest schema this program knows: that of every store it has open.
     pub fn schema_version() -> i64 {
         newest()
-    }
-
-    /// Structures with a batch that has waited for its assessment since before a time.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn waiting_since_before(&self, before: Timestamp) -> Result<Vec<StructureId>, Error> {
-        let rows: Vec<(String,)> = sqlx::query_as(
-            "select distinct structure_id from measurement_batch where state = 'received' and received_at_us < ?",
-        )
-        .bind(before.micros())
-        .fetch_all(&self.reader)
-        .await?;
-        rows.into_iter().map(|(id,)| StructureId::parse(&id).map_err(|e| bad_row("structure")(&e))).collect()
     }
 
     /// Counts of what is stored; each is read from an index, so that a scrape costs the same for a year of data.
