@@ -11,7 +11,7 @@ use utoipa::{IntoParams, ToSchema};
 use super::answer::ChartBody;
 use super::error::ApiError;
 use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, Unknown};
-use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
+use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::Shared;
 use crate::baseline::identifiability::ParameterIdentifiability;
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
@@ -199,11 +199,8 @@ pub async fn list(
             return Err(ApiError::invalid_field("query/state", format!("{} is neither open nor any", shown(other))));
         }
     };
-    let before = query.cursor.as_deref().map(|text| {
-        let message = || format!("{} was not given out by this service", shown(text));
-        text.parse::<i64>().map_err(|_| ApiError::invalid_field("query/cursor", message()))
-    });
-    let found = shared.monitor.store().episodes(&id, before.transpose()?, open_only, limit).await?;
+    let before = page_cursor(query.cursor.as_deref())?;
+    let found = shared.monitor.store().episodes(&id, before, open_only, limit).await?;
     let next = (found.len() == limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
     Ok(Json(AlarmPage { structure: id, items: found.into_iter().map(AlarmItem::from).collect(), next }).into_response())
 }

@@ -9,8 +9,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::error::ApiError;
 use super::openapi::{Invalid, MessagePath, Unknown};
-use super::request::{page_limit, ApiPath, ApiQuery};
-use super::webhooks::page_cursor;
+use super::request::{page_cursor, page_limit, ApiPath, ApiQuery};
 use super::Shared;
 use crate::quantity::{shown, Timestamp};
 use crate::store::QuarantinedMessage;

@@ -248,6 +248,18 @@ pub fn page_limit(text: Option<&str>) -> Result<usize, ApiError> {
     })
 }
 
+/// The number that a page begins behind.
+///
+/// # Errors
+/// 422 for anything that was not given out as one.
+pub fn page_cursor(text: Option<&str>) -> Result<Option<i64>, ApiError> {
+    let number = |text: &str| {
+        let message = || format!("{} was not given out by this service", crate::quantity::shown(text));
+        text.parse::<i64>().map_err(|_| ApiError::invalid_field("query/cursor", message()))
+    };
+    text.map(number).transpose()
+}
+
 /// From a time on and before another.
 #[derive(Debug, Clone, Copy)]
 pub struct Window {

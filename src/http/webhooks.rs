@@ -10,7 +10,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, DeliveryPath, Invalid, Unknown, WebhookPath};
-use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery};
+use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::Shared;
 use crate::measurement::check::Problem;
 use crate::notify::{new_secret, EVENT_KINDS};
@@ -380,18 +380,6 @@ pub async fn retry(
         return Err(ApiError::new(StatusCode::CONFLICT, "already_delivered", detail));
     }
     Ok((StatusCode::ACCEPTED, Json(DeliveryItem::from(found))).into_response())
-}
-
-/// The number that a page begins behind.
-///
-/// # Errors
-/// 422 for anything that was not given out as one.
-pub fn page_cursor(text: Option<&str>) -> Result<Option<i64>, ApiError> {
-    let number = |text: &str| {
-        let message = || format!("{} was not given out by this service", shown(text));
-        text.parse::<i64>().map_err(|_| ApiError::invalid_field("query/cursor", message()))
-    };
-    text.map(number).transpose()
 }
 
 async fn webhook(shared: &Shared, id: &str) -> Result<WebhookRecord, ApiError> {

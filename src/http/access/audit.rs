@@ -15,9 +15,9 @@ use super::AccessControl;
 use crate::access::Grant;
 use crate::http::error::ApiError;
 use crate::http::openapi::Invalid;
-use crate::http::request::{current_id, page_limit, with_current_id, ApiQuery, Window};
+use crate::http::request::{current_id, page_cursor, page_limit, with_current_id, ApiQuery, Window};
 use crate::http::Shared;
-use crate::quantity::{shown, Timestamp};
+use crate::quantity::Timestamp;
 use crate::store::{AuditEntry, AuditQuery, NewAuditEntry};
 
 /// Longest path kept.
@@ -164,11 +164,8 @@ pub async fn list(
     ApiQuery(query): ApiQuery<AuditPageQuery>,
 ) -> Result<Response, ApiError> {
     let Window { from, to } = Window::of(query.from.as_deref(), query.to.as_deref())?;
-    let before = query.cursor.as_deref().map(|text| {
-        let message = || format!("{} was not given out by this service", shown(text));
-        text.parse::<i64>().map_err(|_| ApiError::invalid_field("query/cursor", message()))
-    });
-    let asked = AuditQuery { from, to, before: before.transpose()?, limit: page_limit(query.limit.as_deref())? };
+    let before = page_cursor(query.cursor.as_deref())?;
+    let asked = AuditQuery { from, to, before, limit: page_limit(query.limit.as_deref())? };
     let found = shared.monitor.store().audit(&asked).await?;
     let next = (found.len() == asked.limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
     Ok(Json(AuditPage { items: found.into_iter().map(AuditItem::from).collect(), next }).into_response())
