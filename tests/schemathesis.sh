@@ -31,7 +31,11 @@ trap finish EXIT
     cat "$folder/demo.log"
     exit 1
 }
-MODALWATCH__LOG__LEVEL=warn "$program" serve --listen 127.0.0.1:0 --data-dir "$folder/data" \
+# Access is on, with a token outside the database: one that a generated request makes or revokes does not end the run.
+"$program" token file "$folder/admin-token" > /dev/null 2>&1
+TOKEN=$(cat "$folder/admin-token")
+export TOKEN
+MODALWATCH_ADMIN_TOKEN_FILE=$folder/admin-token MODALWATCH__LOG__LEVEL=warn "$program" serve --listen 127.0.0.1:0 --data-dir "$folder/data" \
     > "$folder/address" 2> "$folder/service.log" &
 service=$!
 url=
@@ -46,11 +50,11 @@ if [ -z "$url" ]; then
 fi
 
 # A diagnosis, for the operations that need one; the settings take its id from the environment.
-DIAGNOSIS=$(curl -sS "$url/v1/structures/three-dof/diagnoses" -H 'content-type: application/json' -d '{}' |
+DIAGNOSIS=$(curl -sS -H "authorization: Bearer $TOKEN" "$url/v1/structures/three-dof/diagnoses" -H 'content-type: application/json' -d '{}' |
     sed -n 's/.*"diagnosis":"\([^"]*\)".*/\1/p')
 export DIAGNOSIS
 for _ in $(seq 600); do
-    if ! curl -sS "$url/v1/diagnoses/$DIAGNOSIS" | grep -q '"state":"running"'; then break; fi
+    if ! curl -sS -H "authorization: Bearer $TOKEN" "$url/v1/diagnoses/$DIAGNOSIS" | grep -q '"state":"running"'; then break; fi
     sleep 0.1
 done
 

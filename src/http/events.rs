@@ -11,6 +11,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::stream::{self, Stream};
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
+use utoipa::ToSchema;
 
 use super::access::AccessControl;
 use super::error::ApiError;
@@ -35,6 +36,16 @@ const RETRY_AFTER_STOP_S: u32 = 5;
 /// Asks proxies such as nginx to pass events on at once.
 const NO_BUFFERING: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
 
+/// An event of the stream, as the document describes it.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "written as lines of the event stream, never as JSON")]
+struct StreamedEvent {
+    /// `batch`, `alarm`, `job`, `structure` or `resync`.
+    event: String,
+    /// A line of JSON.
+    data: String,
+}
+
 /// `GET /v1/events`: what happens to the structures that the token may see; a stream that ends with the
 /// token, or when the service stops. A client that is too slow misses events, is told so by an
 /// event `resync`, and goes on with what happens then.
@@ -47,7 +58,10 @@ const NO_BUFFERING: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffe
     description = "Server-sent events of the structures that the token may see: `batch`, `alarm`, `job` and `structure`, each with \
                    a line of JSON, and `resync` for a client that was too slow and missed some. A comment comes every 15 s. \
                    The stream ends with the token, or when the service stops.",
-    responses((status = 200, description = "The events", body = String, content_type = "text/event-stream"), StreamBusy)
+    responses(
+        (status = 200, description = "The events; the schema is that of one", body = StreamedEvent, content_type = "text/event-stream"),
+        StreamBusy
+    )
 )]
 pub async fn events(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let place = Arc::clone(&shared.streams).try_acquire_owned().map_err(|_| {

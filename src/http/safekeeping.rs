@@ -105,7 +105,10 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
     description = "What another installation needs, as lines of JSON. A failure on the way breaks the connection, and the last \
                    line, of kind `end`, is missing.",
     params(StructurePath),
-    responses((status = 200, description = "The archive", body = String, content_type = "application/x-ndjson"), Unknown, Invalid)
+    responses(
+        (status = 200, description = "The archive; the schema is that of a line", body = Object, content_type = "application/x-ndjson"),
+        Unknown, Invalid
+    )
 )]
 pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
@@ -189,7 +192,8 @@ async fn optional_json<T: serde::de::DeserializeOwned + Default>(
     body: Body,
 ) -> Result<T, ApiError> {
     let bytes = read_body(body, headers, shared.limits).await?;
-    if bytes.is_empty() {
+    // `null` says the same as nothing.
+    if bytes.is_empty() || bytes.trim_ascii() == b"null" {
         return Ok(T::default());
     }
     match super::request::media_type(headers).as_deref() {

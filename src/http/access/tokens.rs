@@ -14,7 +14,7 @@ use super::AccessControl;
 use crate::access::{NewToken, Scope, TokenId, TokenRecord, TokenTable, TokenText};
 use crate::http::error::ApiError;
 use crate::http::openapi::{BodyRefused, Conflict, TokenPath, Unknown};
-use crate::http::request::{json_body, ApiPath};
+use crate::http::request::{json_body, whole_number, ApiPath};
 use crate::http::Shared;
 use crate::quantity::{shown, StructureId, Timestamp};
 
@@ -47,7 +47,8 @@ struct TokenBody {
 struct RotationBody {
     /// Seconds that the old secret stays good; 3600 without.
     #[schema(minimum = 0, maximum = 2_592_000)]
-    overlap_s: Option<i64>,
+    #[serde(default, deserialize_with = "whole_number")]
+    overlap_s: Option<u64>,
 }
 
 /// A token without its secret.
@@ -175,8 +176,8 @@ pub async fn rotate(
     body: Body,
 ) -> Result<Response, ApiError> {
     let body: RotationBody = json_body(&headers, body, shared.limits).await?;
-    let overlap_s = body.overlap_s.unwrap_or(DEFAULT_OVERLAP_S);
-    if !(0..=LONGEST_OVERLAP_S).contains(&overlap_s) {
+    let overlap_s = body.overlap_s.map_or(DEFAULT_OVERLAP_S, |seconds| i64::try_from(seconds).unwrap_or(i64::MAX));
+    if overlap_s > LONGEST_OVERLAP_S {
         let message = format!("{overlap_s} must be from 0 to {LONGEST_OVERLAP_S} (30 days)");
         return Err(ApiError::invalid_field("/overlap_s", message));
     }
