@@ -5,7 +5,7 @@
 
 use candle_core::{bail, CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor};
 
-use crate::stats::exp_f32;
+use super::kernel::sigmoid;
 
 /// silu(x) = x / (1 + exp(−x)), by element.
 ///
@@ -71,18 +71,13 @@ fn contiguous<'a, T>(values: &'a [T], layout: &Layout) -> Result<&'a [T]> {
     }
 }
 
-/// silu(x) of each element, in its place.
-pub(super) fn silu_in_place(x: &mut [f32]) {
+fn silu_f32(x: &[f32]) -> Vec<f32> {
+    let mut result = x.to_vec();
     pulp::Arch::new().dispatch(|| {
-        for x in x.iter_mut() {
+        for x in &mut result {
             *x *= sigmoid(*x);
         }
     });
-}
-
-fn silu_f32(x: &[f32]) -> Vec<f32> {
-    let mut result = x.to_vec();
-    silu_in_place(&mut result);
     result
 }
 
@@ -95,13 +90,6 @@ fn silu_gradient_f32(x: &[f32], g: &[f32]) -> Vec<f32> {
         }
     });
     result
-}
-
-/// 1 / (1 + exp(−x)).
-#[inline(always)]
-#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exp_f32(-x))
 }
 
 #[cfg(test)]

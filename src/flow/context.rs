@@ -8,7 +8,7 @@ use super::dense::Dense;
 use super::Architecture;
 
 /// Reach of a convolution: each mode sees itself and its two neighbours.
-const KERNEL: usize = 3;
+pub(super) const KERNEL: usize = 3;
 
 /// Two 1-D convolutions along the modes and a dense layer; the observation itself is passed beside the features.
 ///
@@ -54,7 +54,15 @@ impl ContextNetwork {
         let hidden = silu(&self.first.forward(&by_mode)?)?;
         let hidden = silu(&self.second.forward(&hidden)?)?;
         let features = silu(&self.features.forward(&hidden.flatten_from(1)?)?)?;
-        Tensor::cat(&[features, y.flatten_from(1)?.contiguous()?], 1)
+        Tensor::cat(&[features, self.shortcut(y)?], 1)
+    }
+
+    /// What is passed beside the features, `[n, shortcut]`; no weight that is trained is in it.
+    ///
+    /// # Errors
+    /// A candle error when the shape of `y` is another.
+    pub fn shortcut(&self, y: &Tensor) -> Result<Tensor> {
+        y.flatten_from(1)?.contiguous()
     }
 }
 

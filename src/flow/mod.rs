@@ -13,6 +13,8 @@ pub mod checkpoint;
 pub mod context;
 pub mod coupling;
 pub mod dense;
+pub mod fused;
+mod kernel;
 pub mod permutation;
 pub mod sampler;
 pub mod train;
@@ -20,7 +22,6 @@ pub mod weights;
 
 use candle_core::{DType, Device, Result, Tensor, D};
 use candle_nn::VarBuilder;
-use nalgebra::DMatrix;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
@@ -185,9 +186,9 @@ impl Flow {
         let d = self.architecture.parameters;
         let z = standard_normal(rows * draws, d, stream).to_dtype(self.dtype)?;
         let (x, log_det) = if let Some(sampler) = sampler::Sampler::new(self)? {
-            let context = DMatrix::from_vec(features, rows, context.flatten_all()?.to_vec1()?);
+            let context = context.flatten_all()?.to_vec1()?;
             let mut values = z.flatten_all()?.to_vec1()?;
-            let log_det = Tensor::new(sampler.inverse(&mut values, &context), &Device::Cpu)?;
+            let log_det = Tensor::new(sampler.inverse(&mut values, &context, features), &Device::Cpu)?;
             (Tensor::from_vec(values, (rows * draws, d), &Device::Cpu)?, log_det)
         } else {
             let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?;

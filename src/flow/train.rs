@@ -7,6 +7,7 @@ use candle_nn::{AdamW, Optimizer as _, ParamsAdamW};
 use rand::seq::SliceRandom as _;
 use serde::{Deserialize, Serialize};
 
+use super::fused::{Fused, Rows};
 use super::weights::Weights;
 use super::Flow;
 use crate::stats;
@@ -32,6 +33,7 @@ impl Default for TrainSettings {
 }
 
 /// Pairs of x on the real line and whitened y.
+#[derive(Debug, Clone)]
 pub struct Pairs {
     /// `[n, d]`.
     pub x: Tensor,
@@ -104,6 +106,54 @@ pub fn train(
     flow: &Flow,
     weights: &Weights,
     rows: usize,
+    training: impl FnMut(usize) -> Result<Pairs, candle_core::Error>,
+    validation: &Pairs,
+    settings: &TrainSettings,
+    on_epoch: impl FnMut(EpochReport),
+) -> Result<TrainOutcome, Error> {
+    // The one place that chooses: by hand in single precision on the CPU, by candle for all else.
+    match Fused::new(flow, weights)? {
+        Some(fused) => run(ByHand { flow, weights, fused }, rows, training, validation, settings, on_epoch),
+        None => run(ByCandle::new(flow, weights)?, rows, training, validation, settings, on_epoch),
+    }
+}
+
+/// As [`train`], by candle's own gradients whatever the precision: the reference that the fused way is measured against.
+///
+/// # Errors
+/// As [`train`].
+pub fn train_by_candle(
+    flow: &Flow,
+    weights: &Weights,
+    rows: usize,
+    training: impl FnMut(usize) -> Result<Pairs, candle_core::Error>,
+    validation: &Pairs,
+    settings: &TrainSettings,
+    on_epoch: impl FnMut(EpochReport),
+) -> Result<TrainOutcome, Error> {
+    run(ByCandle::new(flow, weights)?, rows, training, validation, settings, on_epoch)
+}
+
+/// A way to lower the loss.
+trait Descent {
+    /// Pairs as this way reads them.
+    type Data;
+    /// A copy of all weights.
+    type Copy;
+
+    fn read(&self, pairs: &Pairs) -> Result<Self::Data, candle_core::Error>;
+    /// One step on the `chosen` rows; returns their mean loss before it. A loss that is not finite changes nothing.
+    fn step(&mut self, data: &Self::Data, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error>;
+    /// Mean loss of all rows.
+    fn loss(&mut self, data: &Self::Data) -> Result<f64, candle_core::Error>;
+    fn copy(&self) -> Result<Self::Copy, candle_core::Error>;
+    /// Leaves the weights of `copy` in the flow.
+    fn finish(self, copy: &Self::Copy) -> Result<(), candle_core::Error>;
+}
+
+fn run<D: Descent>(
+    mut descent: D,
+    rows: usize,
     mut training: impl FnMut(usize) -> Result<Pairs, candle_core::Error>,
     validation: &Pairs,
     settings: &TrainSettings,
@@ -111,48 +161,119 @@ pub fn train(
 ) -> Result<TrainOutcome, Error> {
     let steps_per_epoch = rows.div_ceil(settings.batch);
     let total_steps = settings.epochs * steps_per_epoch;
-    // Sorted by name, so that the optimiser meets the weights in the same order in every run.
-    let params = ParamsAdamW { lr: settings.learning_rate, weight_decay: 0.0, ..ParamsAdamW::default() };
-    let mut optimiser = AdamW::new(weights.values().cloned().collect(), params)?;
     let mut shuffle = stats::stream(settings.seed, "shuffle");
     let mut order: Vec<u32> = (0..rows as u32).collect();
+    let validation = descent.read(validation)?;
 
-    let mut best: Option<(usize, f64, BTreeMap<&str, Tensor>)> = None;
+    let mut best: Option<(usize, f64, D::Copy)> = None;
     let mut stopped = Stopped::Completed;
     'epochs: for epoch in 1..=settings.epochs {
         order.shuffle(&mut shuffle);
-        let training = training(epoch)?;
+        let training = descent.read(&training(epoch)?)?;
         let mut sum = 0.0;
         for (step, chosen) in order.chunks(settings.batch).enumerate() {
             let progress = ((epoch - 1) * steps_per_epoch + step) as f64 / total_steps as f64;
-            optimiser.set_learning_rate(settings.learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos()));
-            let chosen = Tensor::new(chosen, &Device::Cpu)?;
-            let loss = mean_loss(flow, &training.x.index_select(&chosen, 0)?, &training.y.index_select(&chosen, 0)?)?;
-            let value = scalar(&loss)?;
-            if !value.is_finite() {
+            let learning_rate = settings.learning_rate * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos());
+            let loss = descent.step(&training, chosen, learning_rate)?;
+            if !loss.is_finite() {
                 stopped = Stopped::Diverged { epoch };
                 break 'epochs;
             }
-            optimiser.backward_step(&loss)?;
-            sum += value;
+            sum += loss;
         }
-        let validation_loss = scalar(&mean_loss(flow, &validation.x, &validation.y)?)?;
+        let validation_loss = descent.loss(&validation)?;
         if !validation_loss.is_finite() {
             stopped = Stopped::Diverged { epoch };
             break;
         }
         if best.as_ref().is_none_or(|(_, least, _)| validation_loss < *least) {
-            let copies = weights.iter().map(|(name, var)| Ok((name.as_str(), var.as_tensor().copy()?)));
-            best = Some((epoch, validation_loss, copies.collect::<Result<_, candle_core::Error>>()?));
+            best = Some((epoch, validation_loss, descent.copy()?));
         }
         on_epoch(EpochReport { epoch, loss: sum / steps_per_epoch as f64, validation_loss });
     }
     let diverged_at_once = Error::DivergedAtOnce { learning_rate: settings.learning_rate };
-    let (best_epoch, best_validation_loss, copies) = best.ok_or(diverged_at_once)?;
-    for (name, copy) in &copies {
-        weights[*name].set(copy)?;
-    }
+    let (best_epoch, best_validation_loss, copy) = best.ok_or(diverged_at_once)?;
+    descent.finish(&copy)?;
     Ok(TrainOutcome { best_epoch, best_validation_loss, stopped })
+}
+
+/// By [`Fused`].
+struct ByHand<'a> {
+    flow: &'a Flow,
+    weights: &'a Weights,
+    fused: Fused,
+}
+
+impl Descent for ByHand<'_> {
+    type Data = Rows;
+    type Copy = Vec<f32>;
+
+    fn read(&self, pairs: &Pairs) -> Result<Rows, candle_core::Error> {
+        Fused::rows(self.flow, pairs)
+    }
+
+    fn step(&mut self, data: &Rows, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error> {
+        Ok(self.fused.step(data, chosen, learning_rate))
+    }
+
+    fn loss(&mut self, data: &Rows) -> Result<f64, candle_core::Error> {
+        Ok(self.fused.loss(data))
+    }
+
+    fn copy(&self) -> Result<Vec<f32>, candle_core::Error> {
+        Ok(self.fused.weights().to_vec())
+    }
+
+    fn finish(self, copy: &Vec<f32>) -> Result<(), candle_core::Error> {
+        self.fused.write(copy, self.weights)
+    }
+}
+
+/// By candle's gradients and its AdamW.
+struct ByCandle<'a> {
+    flow: &'a Flow,
+    weights: &'a Weights,
+    optimiser: AdamW,
+}
+
+impl<'a> ByCandle<'a> {
+    fn new(flow: &'a Flow, weights: &'a Weights) -> Result<Self, candle_core::Error> {
+        // Sorted by name, so that the optimiser meets the weights in the same order in every run.
+        let params = ParamsAdamW { weight_decay: 0.0, ..ParamsAdamW::default() };
+        Ok(Self { flow, weights, optimiser: AdamW::new(weights.values().cloned().collect(), params)? })
+    }
+}
+
+impl Descent for ByCandle<'_> {
+    type Data = Pairs;
+    type Copy = BTreeMap<String, Tensor>;
+
+    fn read(&self, pairs: &Pairs) -> Result<Pairs, candle_core::Error> {
+        Ok(pairs.clone())
+    }
+
+    fn step(&mut self, data: &Pairs, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error> {
+        let chosen = Tensor::new(chosen, &Device::Cpu)?;
+        let loss = mean_loss(self.flow, &data.x.index_select(&chosen, 0)?, &data.y.index_select(&chosen, 0)?)?;
+        let value = scalar(&loss)?;
+        if value.is_finite() {
+            self.optimiser.set_learning_rate(learning_rate);
+            self.optimiser.backward_step(&loss)?;
+        }
+        Ok(value)
+    }
+
+    fn loss(&mut self, data: &Pairs) -> Result<f64, candle_core::Error> {
+        scalar(&mean_loss(self.flow, &data.x, &data.y)?)
+    }
+
+    fn copy(&self) -> Result<Self::Copy, candle_core::Error> {
+        self.weights.iter().map(|(name, var)| Ok((name.clone(), var.as_tensor().copy()?))).collect()
+    }
+
+    fn finish(self, copy: &Self::Copy) -> Result<(), candle_core::Error> {
+        copy.iter().try_for_each(|(name, copy)| self.weights[name].set(copy))
+    }
 }
 
 /// Mean of ½|z|² − log|det ∂z/∂x| over the rows.

@@ -1,0 +1,163 @@
+//! The context network on a tile, there and back.
+
+use super::layout::{Layout, Place};
+use super::net::add;
+use crate::flow::context::KERNEL;
+use crate::flow::kernel::{add_bias_and_silu_with_slopes, add_weight_gradient, through_slopes};
+use crate::flow::Architecture;
+
+/// The context network: two convolutions and a dense layer, beside the shortcut.
+pub(super) struct Context {
+    layers: [Place; 3],
+    modes: usize,
+    features: usize,
+    shortcut: usize,
+}
+
+/// What the way back needs of the way there, for one tile, and the gradients on that way.
+pub(super) struct Trace {
+    /// Input of each layer; the first two unfolded into windows.
+    inputs: [Vec<f32>; 3],
+    slopes: [Vec<f32>; 3],
+    /// What each layer gives.
+    outputs: [Vec<f32>; 3],
+    /// Gradients by the input and the output of the layer at hand.
+    of_input: Vec<f32>,
+    of_output: Vec<f32>,
+}
+
+impl Context {
+    pub(super) fn new(layout: &Layout, architecture: &Architecture, shortcut: usize) -> Self {
+        let layers = ["conv1", "conv2", "features"].map(|name| layout.place(&format!("context.{name}")));
+        Self { layers, modes: architecture.modes, features: architecture.context_features, shortcut }
+    }
+
+    /// Entries of S(y).
+    pub(super) fn width(&self) -> usize {
+        self.features + self.shortcut
+    }
+
+    /// Columns that a layer sees for each observation.
+    fn columns(&self, layer: usize) -> usize {
+        if layer < 2 {
+            self.modes
+        } else {
+            1
+        }
+    }
+
+    pub(super) fn trace(&self, tile: usize) -> Trace {
+        let sized = |size: fn(&Place) -> usize| {
+            [0, 1, 2].map(|layer| vec![0.0; size(&self.layers[layer]) * self.columns(layer) * tile])
+        };
+        let (inputs, outputs) = (sized(|place| place.inputs), sized(|place| place.outputs));
+        let largest = |buffers: &[Vec<f32>; 3]| vec![0.0; buffers.iter().map(Vec::len).max().unwrap_or(0)];
+        Trace { slopes: outputs.clone(), of_input: largest(&inputs), of_output: largest(&outputs), inputs, outputs }
+    }
+
+    /// S(y) of `count` observations into `context`. `observation` gives the numbers of each mode one after another and the
+    /// shortcut of row `i`.
+    pub(super) fn forward<'a>(
+        &self,
+        weights: &[f32],
+        observation: impl Fn(usize) -> (&'a [f32], &'a [f32]),
+        count: usize,
+        trace: &mut Trace,
+        context: &mut [f32],
+    ) {
+        let window = self.layers[0].inputs * self.modes;
+        for row in 0..count {
+            unfold(observation(row).0, self.modes, &mut trace.inputs[0][row * window..(row + 1) * window]);
+        }
+        for layer in 0..3 {
+            let place = &self.layers[layer];
+            let dense = place.layer(weights);
+            let columns = self.columns(layer) * count;
+            let output = &mut trace.outputs[layer][..place.outputs * columns];
+            dense.product(&trace.inputs[layer][..place.inputs * columns], output, false);
+            add_bias_and_silu_with_slopes(output, dense.bias, &mut trace.slopes[layer][..place.outputs * columns]);
+            match layer {
+                0 => {
+                    let next = self.layers[1].inputs * self.modes;
+                    let windows = trace.inputs[1].chunks_exact_mut(next);
+                    for (output, windows) in output.chunks_exact(place.outputs * self.modes).zip(windows) {
+                        unfold(output, self.modes, windows);
+                    }
+                }
+                // The features of all modes of an observation lie one after another already.
+                1 => trace.inputs[2][..output.len()].copy_from_slice(output),
+                _ => {
+                    let columns = context.chunks_exact_mut(self.width()).zip(output.chunks_exact(self.features));
+                    for (row, (own, features)) in columns.enumerate() {
+                        own[..self.features].copy_from_slice(features);
+                        own[self.features..].copy_from_slice(observation(row).1);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Adds the gradients by the weights to `gradient`, from that by S(y).
+    pub(super) fn backward(
+        &self,
+        weights: &[f32],
+        context_gradient: &[f32],
+        gradient: &mut [f32],
+        count: usize,
+        trace: &mut Trace,
+    ) {
+        let of_features = trace.of_output.chunks_exact_mut(self.features);
+        for (own, column) in of_features.zip(context_gradient.chunks_exact(self.width())) {
+            own.copy_from_slice(&column[..self.features]);
+        }
+        for layer in [2, 1, 0] {
+            let place = &self.layers[layer];
+            let columns = self.columns(layer) * count;
+            let of_output = &mut trace.of_output[..place.outputs * columns];
+            let slopes = &trace.slopes[layer][..place.outputs * columns];
+            through_slopes(of_output, slopes, &mut gradient[place.bias.clone()]);
+            let input = &trace.inputs[layer][..place.inputs * columns];
+            add_weight_gradient(&mut gradient[place.weight.clone()], input, of_output, columns);
+            if layer == 0 {
+                return;
+            }
+            let of_input = &mut trace.of_input[..place.inputs * columns];
+            place.layer(weights).input_gradient(of_output, of_input);
+            let of_previous = &mut trace.of_output[..self.layers[layer - 1].outputs * self.modes * count];
+            if layer == 2 {
+                of_previous.copy_from_slice(of_input);
+            } else {
+                let windows = of_input.chunks_exact(place.inputs * self.modes);
+                for (own, windows) in of_previous.chunks_exact_mut(place.inputs / KERNEL * self.modes).zip(windows) {
+                    fold(windows, self.modes, own);
+                }
+            }
+        }
+    }
+}
+
+/// The neighbours of each mode: column k of an observation becomes (y_{k−1}, y_k, y_{k+1}), zeros beyond the ends.
+fn unfold(values: &[f32], modes: usize, windows: &mut [f32]) {
+    let channels = values.len() / modes;
+    for (mode, window) in windows.chunks_exact_mut(KERNEL * channels).enumerate() {
+        for (place, part) in window.chunks_exact_mut(channels).enumerate() {
+            match (mode + place).checked_sub(KERNEL / 2).filter(|from| *from < modes) {
+                Some(from) => part.copy_from_slice(&values[from * channels..(from + 1) * channels]),
+                None => part.fill(0.0),
+            }
+        }
+    }
+}
+
+/// The gradient that goes with [`unfold`].
+fn fold(windows: &[f32], modes: usize, values: &mut [f32]) {
+    let channels = values.len() / modes;
+    values.fill(0.0);
+    for (mode, window) in windows.chunks_exact(KERNEL * channels).enumerate() {
+        for (place, part) in window.chunks_exact(channels).enumerate() {
+            if let Some(to) = (mode + place).checked_sub(KERNEL / 2).filter(|to| *to < modes) {
+                add(&mut values[to * channels..(to + 1) * channels], part);
+            }
+        }
+    }
+}

@@ -1,0 +1,240 @@
+//! Training on the CPU without candle: loss, gradient and optimiser by hand, in single precision.
+//!
+//! candle makes a tensor of every step forward and another of every step back, and adds the gradients of shared inputs one by
+//! one. Here a tile of the batch passes the whole flow, there and back, in buffers made once, and all weights lie in one long
+//! vector. `Flow::forward` with candle's gradient remains the readable form, and the oracle of the tests.
+//!
+//! ```text
+//!  loss = 1/M Σ ( ½|z|² − Σ s ),   ∂loss/∂z = z/M,   ∂loss/∂s = −1/M beside what comes through exp(s)
+//! ```
+
+mod context;
+mod layout;
+mod net;
+mod optimiser;
+#[cfg(test)]
+mod tests;
+
+use candle_core::{DType, Result, Tensor};
+use rayon::prelude::*;
+
+use super::train::Pairs;
+use super::weights::Weights;
+use super::Flow;
+use context::Context;
+use layout::Layout;
+use net::Net;
+use optimiser::AdamW;
+
+/// Rows that pass the flow together: with width 64, what a tile leaves for the way back stays in the second-level cache.
+const TILE: usize = 64;
+
+/// Sums of gradients that are made side by side and then added in order: the same bits whatever the number of threads.
+const LANES: usize = 8;
+
+/// A flow whose weights are being trained.
+pub struct Fused {
+    layout: Layout,
+    weights: Vec<f32>,
+    dimensions: usize,
+    context: Context,
+    units: Vec<Unit>,
+    lanes: Vec<Lane>,
+    optimiser: AdamW,
+}
+
+/// A coupling unit with the permutation in front of it.
+struct Unit {
+    /// Column j of the unit's input is parameter `order[j]`.
+    order: Vec<usize>,
+    nets: Vec<Net>,
+}
+
+/// Memory of one sum of gradients.
+struct Lane {
+    gradient: Vec<f32>,
+    loss: f64,
+    context: Vec<f32>,
+    context_gradient: Vec<f32>,
+    state: Vec<f32>,
+    context_trace: context::Trace,
+    /// One for each net, in the order of the way there.
+    traces: Vec<net::Trace>,
+    scratch: net::Scratch,
+}
+
+/// Training pairs as plain numbers, row by row.
+pub struct Rows {
+    count: usize,
+    x: Vec<f32>,
+    /// The numbers of each mode one after another.
+    y: Vec<f32>,
+    shortcut: Vec<f32>,
+}
+
+impl Fused {
+    /// The flow with its present weights; `None` where its numbers are not single precision on the CPU.
+    ///
+    /// # Errors
+    /// A candle error when the weights cannot be read.
+    pub fn new(flow: &Flow, weights: &Weights) -> Result<Option<Self>> {
+        let on_cpu = weights.values().all(|var| var.device().is_cpu());
+        if flow.dtype != DType::F32 || !on_cpu {
+            return Ok(None);
+        }
+        let (layout, values) = Layout::read(weights)?;
+        let architecture = flow.architecture();
+        let dimensions = architecture.parameters;
+        let first = dimensions / 2;
+        let context =
+            Context::new(&layout, architecture, flow.context.width() - architecture.context_features);
+        let clamp = architecture.clamp_tenths as f32 / 10.0;
+        let unit = |(index, order): (usize, &Vec<u32>)| {
+            let net = |name: &str, passive, active| {
+                Net::new(&layout, &format!("unit{index}.{name}"), passive, active, clamp)
+            };
+            let mut nets = vec![net("on_second", 0..first, first..dimensions)];
+            if first > 0 {
+                nets.push(net("on_first", first..dimensions, 0..first));
+            }
+            Unit { order: order.iter().map(|&from| from as usize).collect(), nets }
+        };
+        let units: Vec<Unit> = architecture.permutations.iter().enumerate().map(unit).collect();
+        let optimiser = AdamW::new(values.len());
+        Ok(Some(Self { layout, weights: values, dimensions, context, units, lanes: Vec::new(), optimiser }))
+    }
+
+    /// `pairs` as this flow reads them.
+    ///
+    /// # Errors
+    /// A candle error when shapes do not fit.
+    pub fn rows(flow: &Flow, pairs: &Pairs) -> Result<Rows> {
+        let plain = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
+        Ok(Rows {
+            count: pairs.x.dim(0)?,
+            x: plain(&pairs.x)?,
+            y: plain(&pairs.y.transpose(1, 2)?.contiguous()?)?,
+            shortcut: plain(&flow.context.shortcut(&pairs.y)?)?,
+        })
+    }
+
+    /// Mean loss over all rows, nats.
+    pub fn loss(&mut self, rows: &Rows) -> f64 {
+        let all: Vec<u32> = (0..rows.count as u32).collect();
+        self.pass(rows, &all, false)
+    }
+
+    /// One step of the optimiser on the `chosen` rows; returns their mean loss before it, nats. Where that is not finite,
+    /// nothing is changed.
+    pub fn step(&mut self, rows: &Rows, chosen: &[u32], learning_rate: f64) -> f64 {
+        let loss = self.pass(rows, chosen, true);
+        if loss.is_finite() {
+            let gradients: Vec<&[f32]> = self.lanes[..lanes(chosen.len())].iter().map(|lane| &*lane.gradient).collect();
+            self.optimiser.step(&mut self.weights, &gradients, learning_rate);
+        }
+        loss
+    }
+
+    /// The present weights.
+    pub fn weights(&self) -> &[f32] {
+        &self.weights
+    }
+
+    /// Writes `values`, as [`Self::weights`] gave them, into the variables of the flow.
+    ///
+    /// # Errors
+    /// A candle error when `weights` are those of another flow.
+    pub fn write(&self, values: &[f32], weights: &Weights) -> Result<()> {
+        self.layout.write(values, weights)
+    }
+
+    /// Mean loss of the `chosen` rows; with `back`, its gradient lies in the lanes, one addend in each.
+    fn pass(&mut self, rows: &Rows, chosen: &[u32], back: bool) -> f64 {
+        let mut own = std::mem::take(&mut self.lanes);
+        while own.len() < lanes(chosen.len()) {
+            own.push(self.lane());
+        }
+        let tiles: Vec<&[u32]> = chosen.chunks(TILE).collect();
+        let share = 1.0 / chosen.len() as f32;
+        let count = lanes(chosen.len());
+        own[..count].par_iter_mut().enumerate().for_each(|(index, lane)| {
+            lane.loss = 0.0;
+            lane.gradient.fill(0.0);
+            for tile in tiles.iter().skip(index).step_by(count) {
+                self.tile(rows, tile, back.then_some(share), lane);
+            }
+        });
+        let sum: f64 = own[..count].iter().map(|lane| lane.loss).sum();
+        self.lanes = own;
+        sum / chosen.len() as f64
+    }
+
+    /// One tile, there and, where `share` is given, back.
+    fn tile(&self, rows: &Rows, tile: &[u32], share: Option<f32>, lane: &mut Lane) {
+        let (d, count, weights) = (self.dimensions, tile.len(), &self.weights);
+        let (of_y, of_shortcut) = (rows.y.len() / rows.count, rows.shortcut.len() / rows.count);
+        let observation = |index: usize| {
+            let row = tile[index] as usize;
+            (&rows.y[row * of_y..][..of_y], &rows.shortcut[row * of_shortcut..][..of_shortcut])
+        };
+        let context = &mut lane.context[..self.context.width() * count];
+        self.context.forward(weights, observation, count, &mut lane.context_trace, context);
+
+        let state = &mut lane.state[..d * count];
+        for (own, &row) in state.chunks_exact_mut(d).zip(tile) {
+            own.copy_from_slice(&rows.x[row as usize * d..][..d]);
+        }
+        let mut permuted = vec![0.0; d];
+        let mut traces = lane.traces.iter_mut();
+        let mut log_det = 0.0;
+        for unit in &self.units {
+            for column in state.chunks_exact_mut(d) {
+                permuted.copy_from_slice(column);
+                column.iter_mut().zip(&unit.order).for_each(|(to, &from)| *to = permuted[from]);
+            }
+            for net in &unit.nets {
+                let trace = traces.next().expect("there is a trace for each net");
+                log_det += net.forward(weights, state, context, count, trace);
+            }
+        }
+        lane.loss += 0.5 * state.iter().map(|z| f64::from(*z).powi(2)).sum::<f64>() - log_det;
+
+        let Some(share) = share else { return };
+        let context_gradient = &mut lane.context_gradient[..self.context.width() * count];
+        context_gradient.fill(0.0);
+        // ∂loss/∂z = z/M.
+        state.iter_mut().for_each(|z| *z *= share);
+        let mut traces = lane.traces.iter().rev();
+        for unit in self.units.iter().rev() {
+            for net in unit.nets.iter().rev() {
+                let trace = traces.next().expect("there is a trace for each net");
+                let (gradient, scratch) = (&mut lane.gradient, &mut lane.scratch);
+                net.backward(weights, state, context_gradient, gradient, share, count, trace, scratch);
+            }
+            for column in state.chunks_exact_mut(d) {
+                permuted.copy_from_slice(column);
+                unit.order.iter().zip(&permuted).for_each(|(&to, &value)| column[to] = value);
+            }
+        }
+        self.context.backward(weights, context_gradient, &mut lane.gradient, count, &mut lane.context_trace);
+    }
+
+    fn lane(&self) -> Lane {
+        let nets = self.units.iter().flat_map(|unit| &unit.nets);
+        Lane {
+            gradient: vec![0.0; self.weights.len()],
+            loss: 0.0,
+            context: vec![0.0; self.context.width() * TILE],
+            context_gradient: vec![0.0; self.context.width() * TILE],
+            state: vec![0.0; self.dimensions * TILE],
+            context_trace: self.context.trace(TILE),
+            traces: nets.clone().map(|net| net.trace(TILE)).collect(),
+            scratch: Net::scratch(nets, TILE),
+        }
+    }
+}
+
+/// Sums that a batch of `rows` is split into.
+fn lanes(rows: usize) -> usize {
+    rows.div_ceil(TILE).min(LANES)
+}

@@ -1,0 +1,184 @@
+//! One half of a coupling unit on a tile, there and back.
+
+use std::ops::Range;
+
+use super::layout::{Layout, Place};
+use crate::flow::kernel::{
+    add_bias_and_silu_with_slopes, add_bias_gradient, add_weight_gradient, tanh, through_slopes,
+};
+use crate::stats::exp_f32;
+
+/// A subnet and what it does to the state: the rows `active` are scaled and shifted by functions of the rows `passive` and
+/// of the context.
+///
+/// ```text
+///  (s̃, t) = W₃ silu(W₂ silu(W₁ u + b₁) + b₂) + b₃,   u = (passive, context),   s = α·tanh(s̃/α)
+///  active ← active ⊙ exp(s) + t
+/// ```
+pub(super) struct Net {
+    input: Place,
+    hidden: Place,
+    output: Place,
+    passive: Range<usize>,
+    active: Range<usize>,
+    clamp: f32,
+}
+
+/// What the way back needs of the way there, for one tile.
+pub(super) struct Trace {
+    /// u, and after it both hidden layers, with the derivatives of their activations.
+    inputs: Vec<f32>,
+    first: Vec<f32>,
+    first_slopes: Vec<f32>,
+    second: Vec<f32>,
+    second_slopes: Vec<f32>,
+    /// s̃ over t, then s over t.
+    output: Vec<f32>,
+    /// The active rows before, exp(s), and ds/ds̃.
+    before: Vec<f32>,
+    scales: Vec<f32>,
+    clamp_slopes: Vec<f32>,
+}
+
+/// Gradients on their way through a net, for one tile; shared by all nets.
+pub(super) struct Scratch {
+    output: Vec<f32>,
+    hidden: Vec<f32>,
+    other_hidden: Vec<f32>,
+    inputs: Vec<f32>,
+}
+
+impl Net {
+    pub(super) fn new(layout: &Layout, name: &str, passive: Range<usize>, active: Range<usize>, clamp: f32) -> Self {
+        let place = |layer: &str| layout.place(&format!("{name}.{layer}"));
+        Self { input: place("input"), hidden: place("hidden"), output: place("output"), passive, active, clamp }
+    }
+
+    pub(super) fn trace(&self, tile: usize) -> Trace {
+        let (width, active) = (self.hidden.outputs, self.active.len());
+        let buffer = |rows: usize| vec![0.0; rows * tile];
+        Trace {
+            inputs: buffer(self.input.inputs),
+            first: buffer(width),
+            first_slopes: buffer(width),
+            second: buffer(width),
+            second_slopes: buffer(width),
+            output: buffer(2 * active),
+            before: buffer(active),
+            scales: buffer(active),
+            clamp_slopes: buffer(active),
+        }
+    }
+
+    /// Scratch that also a net of the other sizes can use.
+    pub(super) fn scratch<'a>(nets: impl Iterator<Item = &'a Net> + Clone, tile: usize) -> Scratch {
+        let largest = |size: fn(&Net) -> usize| vec![0.0; tile * nets.clone().map(size).max().unwrap_or(0)];
+        Scratch {
+            output: largest(|net| net.output.outputs),
+            hidden: largest(|net| net.hidden.outputs),
+            other_hidden: largest(|net| net.hidden.outputs),
+            inputs: largest(|net| net.input.inputs),
+        }
+    }
+
+    /// Transforms `state` (`dimensions` numbers a column, `count` columns) and returns Σ s.
+    pub(super) fn forward(&self, weights: &[f32], state: &mut [f32], context: &[f32], count: usize, trace: &mut Trace) -> f64 {
+        let dimensions = state.len() / count;
+        let (passive, features, active) = (self.passive.len(), context.len() / count, self.active.len());
+        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|place| place.layer(weights));
+        let width = input.outputs();
+
+        let inputs = &mut trace.inputs[..(passive + features) * count];
+        let columns = inputs.chunks_exact_mut(passive + features).zip(state.chunks_exact(dimensions));
+        for ((own, state), context) in columns.zip(context.chunks_exact(features)) {
+            own[..passive].copy_from_slice(&state[self.passive.clone()]);
+            own[passive..].copy_from_slice(context);
+        }
+        let first = &mut trace.first[..width * count];
+        input.product(inputs, first, false);
+        add_bias_and_silu_with_slopes(first, input.bias, &mut trace.first_slopes[..width * count]);
+        let second = &mut trace.second[..width * count];
+        hidden.product(first, second, false);
+        add_bias_and_silu_with_slopes(second, hidden.bias, &mut trace.second_slopes[..width * count]);
+        let scale_and_shift = &mut trace.output[..2 * active * count];
+        output.product(second, scale_and_shift, false);
+
+        let (before, scales) = (&mut trace.before[..active * count], &mut trace.scales[..active * count]);
+        let clamp_slopes = &mut trace.clamp_slopes[..active * count];
+        let mut log_det = 0.0;
+        for (column, own) in scale_and_shift.chunks_exact_mut(2 * active).enumerate() {
+            let state = &mut state[column * dimensions..][self.active.clone()];
+            let at = column * active..(column + 1) * active;
+            let (before, scales) = (&mut before[at.clone()], &mut scales[at.clone()]);
+            let slopes = &mut clamp_slopes[at];
+            let mut sum = 0.0;
+            for row in 0..active {
+                let bounded = tanh((own[row] + output.bias[row]) / self.clamp);
+                let scale = self.clamp * bounded;
+                before[row] = state[row];
+                scales[row] = exp_f32(scale);
+                slopes[row] = 1.0 - bounded * bounded;
+                state[row] = state[row] * scales[row] + own[active + row] + output.bias[active + row];
+                sum += scale;
+            }
+            log_det += f64::from(sum);
+        }
+        log_det
+    }
+
+    /// The gradient of the loss by the state after this net becomes that by the state before; the gradient by the context is
+    /// added to `context_gradient`, those by the weights to `gradient`. `share` is 1/M, the weight of a row in the mean.
+    #[expect(clippy::too_many_arguments, reason = "two ends of the net, its weights, its memory and its gradients")]
+    pub(super) fn backward(
+        &self,
+        weights: &[f32],
+        state_gradient: &mut [f32],
+        context_gradient: &mut [f32],
+        gradient: &mut [f32],
+        share: f32,
+        count: usize,
+        trace: &Trace,
+        scratch: &mut Scratch,
+    ) {
+        let dimensions = state_gradient.len() / count;
+        let (passive, features, active) = (self.passive.len(), context_gradient.len() / count, self.active.len());
+        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|place| place.layer(weights));
+        let width = input.outputs();
+
+        let of_output = &mut scratch.output[..2 * active * count];
+        for (column, own) in of_output.chunks_exact_mut(2 * active).enumerate() {
+            let state = &mut state_gradient[column * dimensions..][self.active.clone()];
+            for row in 0..active {
+                let at = column * active + row;
+                let scaled = state[row] * trace.scales[at];
+                own[active + row] = state[row];
+                own[row] = (scaled * trace.before[at] - share) * trace.clamp_slopes[at];
+                state[row] = scaled;
+            }
+        }
+        let hidden_size = width * count;
+        add_bias_gradient(of_output, &mut gradient[self.output.bias.clone()]);
+        add_weight_gradient(&mut gradient[self.output.weight.clone()], &trace.second[..hidden_size], of_output, count);
+        let of_second = &mut scratch.hidden[..hidden_size];
+        output.input_gradient(of_output, of_second);
+        through_slopes(of_second, &trace.second_slopes[..hidden_size], &mut gradient[self.hidden.bias.clone()]);
+        add_weight_gradient(&mut gradient[self.hidden.weight.clone()], &trace.first[..hidden_size], of_second, count);
+        let of_first = &mut scratch.other_hidden[..hidden_size];
+        hidden.input_gradient(of_second, of_first);
+        through_slopes(of_first, &trace.first_slopes[..hidden_size], &mut gradient[self.input.bias.clone()]);
+        let inputs = &trace.inputs[..(passive + features) * count];
+        add_weight_gradient(&mut gradient[self.input.weight.clone()], inputs, of_first, count);
+        let of_inputs = &mut scratch.inputs[..(passive + features) * count];
+        input.input_gradient(of_first, of_inputs);
+        let columns = of_inputs.chunks_exact(passive + features).zip(state_gradient.chunks_exact_mut(dimensions));
+        for ((own, state), context) in columns.zip(context_gradient.chunks_exact_mut(features)) {
+            add(&mut state[self.passive.clone()], &own[..passive]);
+            add(context, &own[passive..]);
+        }
+    }
+}
+
+/// a ← a + b.
+pub(super) fn add(a: &mut [f32], b: &[f32]) {
+    a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+}

@@ -1,0 +1,50 @@
+//! AdamW on one long vector.
+
+use rayon::prelude::*;
+
+/// Weights that are updated by one task.
+const AT_A_TIME: usize = 16_384;
+const BETA_1: f32 = 0.9;
+const BETA_2: f32 = 0.999;
+const EPSILON: f32 = 1e-8;
+
+/// Adam with the settings of candle's `AdamW` and no weight decay.
+///
+/// ```text
+///  m ← β₁m + (1 − β₁)g,   v ← β₂v + (1 − β₂)g²,   w ← w − η · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε)
+/// ```
+pub(super) struct AdamW {
+    first: Vec<f32>,
+    second: Vec<f32>,
+    steps: i32,
+}
+
+impl AdamW {
+    pub(super) fn new(weights: usize) -> Self {
+        Self { first: vec![0.0; weights], second: vec![0.0; weights], steps: 0 }
+    }
+
+    /// One step; the gradient is the sum of `gradients`, added in their order.
+    pub(super) fn step(&mut self, weights: &mut [f32], gradients: &[&[f32]], learning_rate: f64) {
+        self.steps += 1;
+        let correction = |beta: f32| 1.0 / (1.0 - f64::from(beta).powi(self.steps));
+        let (of_first, of_second) = (correction(BETA_1) * learning_rate, correction(BETA_2) as f32);
+        let of_first = of_first as f32;
+        let moments = self.first.par_chunks_mut(AT_A_TIME).zip(self.second.par_chunks_mut(AT_A_TIME));
+        weights.par_chunks_mut(AT_A_TIME).zip(moments).enumerate().for_each(|(chunk, (weights, (first, second)))| {
+            let place = chunk * AT_A_TIME..chunk * AT_A_TIME + weights.len();
+            let mut sum = [0.0; AT_A_TIME];
+            let sum = &mut sum[..weights.len()];
+            pulp::Arch::new().dispatch(|| {
+                for gradient in gradients {
+                    sum.iter_mut().zip(&gradient[place.clone()]).for_each(|(sum, own)| *sum += own);
+                }
+                for (((weight, gradient), first), second) in weights.iter_mut().zip(&*sum).zip(first).zip(second) {
+                    *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
+                    *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
+                    *weight -= of_first * *first / ((*second * of_second).sqrt() + EPSILON);
+                }
+            });
+        });
+    }
+}

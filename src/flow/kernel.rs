@@ -1,0 +1,146 @@
+//! What fused training and sampling are made of: products of a layer with a tile, and loops over its elements.
+//!
+//! A tile is a slice of single-precision numbers, column by column; a column is one row of the batch, or one draw. Weights
+//! lie row by row, as in candle's tensors and in the weight files.
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, MatMut, MatRef, Par};
+
+use crate::stats::exp_f32;
+
+/// W and b of a dense layer where they lie.
+#[derive(Clone, Copy)]
+pub(super) struct Layer<'a> {
+    /// W, `outputs × inputs`, row by row.
+    pub weight: &'a [f32],
+    /// b.
+    pub bias: &'a [f32],
+}
+
+impl Layer<'_> {
+    pub(super) fn outputs(&self) -> usize {
+        self.bias.len()
+    }
+
+    pub(super) fn inputs(&self) -> usize {
+        self.weight.len() / self.bias.len()
+    }
+
+    /// y = W·x, or y + W·x; the bias is left to the loop over the elements that follows.
+    pub(super) fn product(&self, x: &[f32], y: &mut [f32], add: bool) {
+        self.product_of_columns(0..self.inputs(), x, y, add);
+    }
+
+    /// As [`Self::product`] with some columns of W only.
+    pub(super) fn product_of_columns(&self, columns: std::ops::Range<usize>, x: &[f32], y: &mut [f32], add: bool) {
+        if columns.is_empty() {
+            if !add {
+                y.fill(0.0);
+            }
+            return;
+        }
+        let count = y.len() / self.outputs();
+        let weight = MatRef::from_row_major_slice(self.weight, self.outputs(), self.inputs());
+        let x = MatRef::from_column_major_slice(x, columns.len(), count);
+        let y = MatMut::from_column_major_slice_mut(y, self.outputs(), count);
+        matmul(y, accumulation(add), weight.subcols(columns.start, columns.len()), x, 1.0, Par::Seq);
+    }
+
+    /// Gradient of the layer's input from that of its product: dx = Wᵀ·dy.
+    pub(super) fn input_gradient(&self, dy: &[f32], dx: &mut [f32]) {
+        let count = dy.len() / self.outputs();
+        let transposed = MatRef::from_column_major_slice(self.weight, self.inputs(), self.outputs());
+        let dy = MatRef::from_column_major_slice(dy, self.outputs(), count);
+        let dx = MatMut::from_column_major_slice_mut(dx, self.inputs(), count);
+        matmul(dx, Accum::Replace, transposed, dy, 1.0, Par::Seq);
+    }
+}
+
+/// Gradient of a layer's weights, added to what is there: dW += dy·xᵀ.
+pub(super) fn add_weight_gradient(gradient: &mut [f32], x: &[f32], dy: &[f32], count: usize) {
+    let (inputs, outputs) = (x.len() / count, dy.len() / count);
+    let x = MatRef::from_column_major_slice(x, inputs, count);
+    let dy = MatRef::from_column_major_slice(dy, outputs, count);
+    // dW row by row is dWᵀ column by column.
+    let transposed = MatMut::from_column_major_slice_mut(gradient, inputs, outputs);
+    matmul(transposed, Accum::Add, x, dy.transpose(), 1.0, Par::Seq);
+}
+
+fn accumulation(add: bool) -> Accum {
+    if add {
+        Accum::Add
+    } else {
+        Accum::Replace
+    }
+}
+
+/// v ← silu(v + b), column by column.
+pub(super) fn add_bias_and_silu(values: &mut [f32], bias: &[f32]) {
+    pulp::Arch::new().dispatch(|| {
+        for column in values.chunks_exact_mut(bias.len()) {
+            for (value, bias) in column.iter_mut().zip(bias) {
+                let x = *value + bias;
+                *value = x * sigmoid(x);
+            }
+        }
+    });
+}
+
+/// As [`add_bias_and_silu`], with the derivative silu′(v + b) into `slopes`.
+pub(super) fn add_bias_and_silu_with_slopes(values: &mut [f32], bias: &[f32], slopes: &mut [f32]) {
+    pulp::Arch::new().dispatch(|| {
+        let width = bias.len();
+        for (column, slopes) in values.chunks_exact_mut(width).zip(slopes.chunks_exact_mut(width)) {
+            for ((value, slope), bias) in column.iter_mut().zip(slopes).zip(bias) {
+                let x = *value + bias;
+                let sigmoid = sigmoid(x);
+                *value = x * sigmoid;
+                *slope = sigmoid * (1.0 + x * (1.0 - sigmoid));
+            }
+        }
+    });
+}
+
+/// d ← d ⊙ slope; the sum of the columns is added to the gradient of the bias.
+pub(super) fn through_slopes(gradient: &mut [f32], slopes: &[f32], bias_gradient: &mut [f32]) {
+    pulp::Arch::new().dispatch(|| {
+        let width = bias_gradient.len();
+        for (column, slopes) in gradient.chunks_exact_mut(width).zip(slopes.chunks_exact(width)) {
+            for ((value, slope), sum) in column.iter_mut().zip(slopes).zip(bias_gradient.iter_mut()) {
+                *value *= slope;
+                *sum += *value;
+            }
+        }
+    });
+}
+
+/// Adds the sum of the columns of `gradient` to that of the bias.
+pub(super) fn add_bias_gradient(gradient: &[f32], bias_gradient: &mut [f32]) {
+    for column in gradient.chunks_exact(bias_gradient.len()) {
+        for (sum, value) in bias_gradient.iter_mut().zip(column) {
+            *sum += value;
+        }
+    }
+}
+
+/// 1 / (1 + exp(−x)).
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
+pub(super) fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp_f32(-x))
+}
+
+/// tanh x = (1 − e^(−2|x|)) / (1 + e^(−2|x|)) with the sign of x; the odd series below 0.1, where the difference loses digits.
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
+pub(super) fn tanh(x: f32) -> f32 {
+    let square = x * x;
+    let series = x * (1.0 - square * (1.0 / 3.0 - square * (2.0 / 15.0 - square * (17.0 / 315.0))));
+    let decay = exp_f32(-2.0 * x.abs());
+    let quotient = ((1.0 - decay) / (1.0 + decay)).copysign(x);
+    if square < 0.01 {
+        series
+    } else {
+        quotient
+    }
+}
