@@ -86,13 +86,11 @@ impl Fused {
         let architecture = flow.architecture();
         let dimensions = architecture.parameters;
         let first = dimensions / 2;
-        let context =
-            Context::new(&layout, architecture, flow.context.width() - architecture.context_features);
+        let context = Context::new(&layout, architecture, flow.context.width() - architecture.context_features);
         let clamp = architecture.clamp_tenths as f32 / 10.0;
         let unit = |(index, order): (usize, &Vec<u32>)| {
-            let net = |name: &str, passive, active| {
-                Net::new(&layout, &format!("unit{index}.{name}"), passive, active, clamp)
-            };
+            let net =
+                |name: &str, passive, active| Net::new(&layout, &format!("unit{index}.{name}"), passive, active, clamp);
             let mut nets = vec![net("on_second", 0..first, first..dimensions)];
             if first > 0 {
                 nets.push(net("on_first", first..dimensions, 0..first));

@@ -82,7 +82,14 @@ impl Net {
     }
 
     /// Transforms `state` (`dimensions` numbers a column, `count` columns) and returns Σ s.
-    pub(super) fn forward(&self, weights: &[f32], state: &mut [f32], context: &[f32], count: usize, trace: &mut Trace) -> f64 {
+    pub(super) fn forward(
+        &self,
+        weights: &[f32],
+        state: &mut [f32],
+        context: &[f32],
+        count: usize,
+        trace: &mut Trace,
+    ) -> f64 {
         let dimensions = state.len() / count;
         let (passive, features, active) = (self.passive.len(), context.len() / count, self.active.len());
         let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|place| place.layer(weights));

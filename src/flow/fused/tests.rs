@@ -34,7 +34,8 @@ fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
         Tensor::from_vec(draws, shape, &Device::Cpu).unwrap()
     };
     let (x, y) = (normal(vec![rows, parameters]), normal(vec![rows, channels, modes]));
-    let pairs = [DType::F32, DType::F64].map(|dtype| Pairs { x: x.to_dtype(dtype).unwrap(), y: y.to_dtype(dtype).unwrap() });
+    let pairs =
+        [DType::F32, DType::F64].map(|dtype| Pairs { x: x.to_dtype(dtype).unwrap(), y: y.to_dtype(dtype).unwrap() });
     Case { single, double, pairs }
 }
 
@@ -54,7 +55,10 @@ fn loss_and_gradient_are_those_of_candle() {
         let expected = ((z.sqr().unwrap().sum(D::Minus1).unwrap() * 0.5).unwrap() - log_det).unwrap().mean(0).unwrap();
         let gradients = expected.backward().unwrap();
         let expected: f64 = expected.to_scalar().unwrap();
-        assert!((loss - expected).abs() < 1e-5 * expected.abs(), "{parameters} parameters: loss {loss}, expected {expected}");
+        assert!(
+            (loss - expected).abs() < 1e-5 * expected.abs(),
+            "{parameters} parameters: loss {loss}, expected {expected}"
+        );
         for (name, var) in &case.double.1 {
             let exact = gradients.get(var).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
             let place = fused.layout.place(name.rsplit_once('.').unwrap().0);

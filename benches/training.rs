@@ -1,0 +1,240 @@
+//! Speed of the flow against the arithmetic limit of the machine and against PyTorch, and accuracy against training time, in
+//! one run. `cargo bench --bench training`
+//!
+//! PyTorch is timed by `benches/peers/flow.py` where the Python named by `MODALWATCH_PYTHON` (`python3` without it) has it.
+
+use std::collections::BTreeMap;
+use std::process::Command;
+use std::time::Instant;
+
+use candle_core::{DType, Device, Tensor};
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Mat, Par};
+use modalwatch::baseline::library::Library;
+use modalwatch::baseline::observation::{Observation, DEFAULT_NOISE_RANGE};
+use modalwatch::baseline::train::train;
+use modalwatch::baseline::Baseline;
+use modalwatch::flow::fused::Fused;
+use modalwatch::flow::train::{train_by_candle, Pairs, TrainSettings};
+use modalwatch::flow::weights::untrained_flow;
+use modalwatch::flow::{Architecture, FlowSettings};
+use modalwatch::quantity::StructureId;
+use modalwatch::stats;
+use nalgebra::DMatrix;
+use rand::Rng as _;
+use rand_distr::StandardNormal;
+
+const BATCH: usize = 256;
+/// Steps in one reading of the clock, and readings; the middle one counts.
+const STEPS: usize = 50;
+const READINGS: usize = 21;
+/// Measurements and draws of each in the bulk.
+const BULK: [usize; 2] = [50, 1_000];
+/// Repetitions of fifty structures that the hyperparameters are estimated from.
+const REPETITIONS: u64 = 30;
+const STRUCTURES: usize = 50;
+const DRAWS: usize = 10;
+
+fn main() {
+    // As the program does at its start: candle on one thread, see `main.rs`.
+    let _ = rayon::ThreadPoolBuilder::new().build_global();
+    std::env::set_var("RAYON_NUM_THREADS", "1");
+    speed();
+    accuracy();
+}
+
+/// Runs `work` on a pool of so many threads.
+fn on<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads start").install(work)
+}
+
+/// Middle reading of the seconds that one of `count` goes of `work` takes.
+fn seconds(count: usize, mut work: impl FnMut()) -> f64 {
+    work();
+    let mut reading = || {
+        let start = Instant::now();
+        (0..count).for_each(|_| work());
+        start.elapsed().as_secs_f64() / count as f64
+    };
+    let readings: Vec<f64> = (0..READINGS).map(|_| reading()).collect();
+    stats::quantile(&readings, 0.5)
+}
+
+/// Floating-point operations a second of one product of two square matrices.
+fn product_rate(threads: usize) -> f64 {
+    const SIDE: usize = 768;
+    let [a, b] = [1, 2].map(|seed| Mat::<f32>::from_fn(SIDE, SIDE, |i, j| ((i * seed + j) % 7) as f32));
+    let mut c = Mat::<f32>::zeros(SIDE, SIDE);
+    // Each thread its own product: what so many cores reach when nothing is shared.
+    let mut results = vec![c.clone(); threads];
+    let took = on(threads, || {
+        seconds(1, || {
+            rayon::scope(|scope| {
+                for c in &mut results {
+                    scope.spawn(|_| matmul(c, Accum::Replace, &a, &b, 1.0, Par::Seq));
+                }
+            });
+        })
+    });
+    matmul(&mut c, Accum::Replace, &a, &b, 1.0, Par::Seq);
+    2.0 * (threads * SIDE.pow(3)) as f64 / took
+}
+
+/// Multiplications and additions of the products of one training step.
+fn operations(a: &Architecture) -> f64 {
+    let context = a.context_features + a.modes * a.channels;
+    let (first, second) = (a.parameters / 2, a.parameters - a.parameters / 2);
+    let net = |passive: usize, active: usize| (passive + context) * a.width + a.width * a.width + a.width * 2 * active;
+    let nets = a.units * (net(first, second) + net(second, first));
+    let unfolded = a.modes * 3 * a.context_channels * (a.channels + a.context_channels);
+    let features = a.modes * a.context_channels * a.context_features;
+    // There, the gradient of the weights, and that of the inputs (which the first convolution does not need).
+    2.0 * (BATCH * (3 * (nets + unfolded + features) - a.modes * 3 * a.channels * a.context_channels)) as f64
+}
+
+fn random_pairs(architecture: &Architecture, rows: usize) -> Pairs {
+    let mut stream = stats::stream(1, "pairs");
+    let mut normal = |shape: Vec<usize>| {
+        let draws: Vec<f32> = (0..shape.iter().product()).map(|_| stream.sample(StandardNormal)).collect();
+        Tensor::from_vec(draws, shape, &Device::Cpu).expect("as many draws as places")
+    };
+    let x = normal(vec![rows, architecture.parameters]);
+    Pairs { x, y: normal(vec![rows, architecture.channels, architecture.modes]) }
+}
+
+fn speed() {
+    let architecture = FlowSettings::default().architecture(3, 3, 1, &mut stats::stream(1, "permutations"));
+    let (flow, weights) = untrained_flow(&architecture, DType::F32, 1).expect("a flow of these sizes");
+    let pairs = random_pairs(&architecture, 10 * BATCH);
+    let chosen: Vec<u32> = (0..BATCH as u32).map(|row| row * 7).collect();
+    let operations = operations(&architecture);
+    println!("training step, batch {BATCH}, width 64, 4 units: {:.1} MFLOP in products", operations / 1e6);
+    let mut step_ms = [0.0; 2];
+    for threads in [1, 2] {
+        let rate = product_rate(threads);
+        let limit_ms = 1e3 * operations / rate;
+        let mut fused = Fused::new(&flow, &weights).expect("weights are readable").expect("single precision");
+        let rows = Fused::rows(&flow, &pairs).expect("shapes fit");
+        let ms = 1e3 * on(threads, || seconds(STEPS, || _ = std::hint::black_box(fused.step(&rows, &chosen, 1e-5))));
+        step_ms[threads - 1] = ms;
+        println!(
+            "  {threads} thread(s): products {:.0} GFLOP/s, limit {limit_ms:.3} ms; fused {ms:.3} ms, {:.2} times the limit",
+            rate / 1e9,
+            ms / limit_ms
+        );
+    }
+    println!("  two threads are {:.2} times one", step_ms[0] / step_ms[1]);
+    let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
+    let start = Instant::now();
+    train_by_candle(&flow, &weights, 10 * BATCH, |_| Ok(pairs.clone()), &pairs, &settings, |_| {}).expect("it trains");
+    // Forty steps, and four validations of ten batches each without a way back: a third of a step each.
+    println!("  candle about {:.1} ms (one thread)", start.elapsed().as_secs_f64() / (40.0 + 40.0 / 3.0) * 1e3);
+
+    let context = flow.summarise(&pairs.y.narrow(0, 0, BULK[0]).expect("so many rows")).expect("shapes fit");
+    let mut rates = [0.0; 2];
+    for threads in [1, 2] {
+        let mut stream = stats::stream(1, "draws");
+        let took = on(threads, || seconds(1, || _ = flow.sample(&context, BULK[1], &mut stream).expect("it samples")));
+        rates[threads - 1] = BULK.iter().product::<usize>() as f64 / took / 1e6;
+        println!("bulk draws, {threads} thread(s): {:.2} million/s", rates[threads - 1]);
+    }
+    for threads in [1, 2] {
+        let Some(peer) = peer(threads) else {
+            println!("PyTorch: not here (see benches/README.md)");
+            return;
+        };
+        let own = step_ms[threads - 1];
+        for (name, value) in &peer {
+            let ratio = match name.as_str() {
+                "bulk_million_per_s" => format!("; ours is {:.2} of it", rates[threads - 1] / value),
+                name if name.starts_with("step") => format!("; ours is {:.2} of it", own / value),
+                _ => String::new(),
+            };
+            println!("PyTorch, {threads} thread(s): {name} {value}{ratio}");
+        }
+    }
+}
+
+/// What the script of the peer prints; `None` where there is no PyTorch.
+fn peer(threads: usize) -> Option<BTreeMap<String, f64>> {
+    let python = std::env::var("MODALWATCH_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/peers/flow.py");
+    let output = Command::new(python).args([script, &threads.to_string()]).output().ok()?;
+    let text = String::from_utf8(output.stdout).ok()?;
+    let pairs = text.lines().filter_map(|line| line.split_once(' '));
+    let found: BTreeMap<String, f64> =
+        pairs.filter_map(|(name, value)| Some((name.to_owned(), value.parse().ok()?))).collect();
+    (!found.is_empty()).then_some(found)
+}
+
+/// Case 1 of the paper: time of the whole training, its record included, and what it reaches.
+fn accuracy() {
+    let library = Library::open(None).expect("no folder is read");
+    let id = StructureId::parse("three-dof").expect("it is an id");
+    let shipped = library.get(&id).and_then(|entry| entry.baseline.clone()).expect("it is shipped");
+    println!("case 1, 10,000 samples: training with its record, held out, gross outliers, hyperparameters");
+    for (threads, epochs) in [(1, 40), (1, 60), (2, 200)] {
+        let settings = TrainSettings { epochs, ..TrainSettings::default() };
+        let start = Instant::now();
+        let trained = on(threads, || {
+            train(shipped.simulator(), 10_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {})
+        });
+        let took = start.elapsed().as_secs_f64();
+        let trained = trained.expect("it trains").baseline;
+        let held_out = &trained.manifest().validation;
+        let (outliers, draws) = gross_outliers(&trained);
+        println!(
+            "  {threads} thread(s), {epochs} epochs: {took:.1} s; {:.2} ± {:.2} nats; {outliers} of {draws} draws further than \
+             0.1 N/m from the truth; errors of mean and std {:.3} times those of the exact posterior",
+            held_out.negative_log_likelihood,
+            held_out.negative_log_likelihood_error,
+            hyperparameter_error_ratio(&trained)
+        );
+    }
+}
+
+fn observations(set: &modalwatch::simulator::TrainingSet) -> Vec<Observation> {
+    let row =
+        |index: usize| Observation::complete(&set.frequencies_hz.row(index).iter().copied().collect::<Vec<f64>>());
+    (0..set.frequencies_hz.nrows()).map(row).collect()
+}
+
+/// Single draws of noise-free measurements that lie further than 0.1 N/m from the truth in any parameter.
+fn gross_outliers(baseline: &Baseline) -> (usize, usize) {
+    let set = baseline.simulator().training_set(20_000, 99).expect("the prior holds no mechanism");
+    let samples = baseline.infer(&observations(&set), 1, 99).expect("all draws are finite, or this says which is not");
+    let far = |row: usize| {
+        (0..set.theta.ncols()).any(|column| (samples.column(column)[row] - set.theta[(row, column)]).abs() > 0.1)
+    };
+    ((0..set.theta.nrows()).filter(|row| far(*row)).count(), set.theta.nrows())
+}
+
+/// Root mean square error of the means and standard deviations of populations, over that of the true stiffnesses of the same
+/// structures: what the exact posterior of noise-free measurements gives.
+fn hyperparameter_error_ratio(baseline: &Baseline) -> f64 {
+    let [mut own, mut exact] = [0.0; 2];
+    for repetition in 0..REPETITIONS {
+        let mut stream = stats::stream(repetition, "population");
+        let space = baseline.space();
+        let (middle, spread): (Vec<f64>, Vec<f64>) =
+            space.iter().map(|p| (0.5 * (p.lower + p.upper), 0.08 * (p.upper - p.lower))).unzip();
+        let draw = |_: usize, column: usize| middle[column] + spread[column] * stream.sample::<f64, _>(StandardNormal);
+        let theta = DMatrix::from_fn(STRUCTURES, middle.len(), draw);
+        let frequencies = |row: nalgebra::RowDVector<f64>| {
+            baseline.simulator().frequencies_hz(row.as_slice()).expect("inside the prior")
+        };
+        let rows: Vec<Observation> =
+            theta.row_iter().map(|row| Observation::complete(&frequencies(row.into_owned()))).collect();
+        let samples = baseline.infer(&rows, DRAWS, repetition).expect("it infers");
+        for column in 0..middle.len() {
+            let width = space.iter().nth(column).map_or(1.0, |p| p.upper - p.lower);
+            let error = |values: &[f64]| {
+                let std = stats::sample_std(values).expect("fifty values");
+                ((stats::mean(values) - middle[column]) / width).powi(2) + ((std - spread[column]) / width).powi(2)
+            };
+            own += error(&samples.column(column));
+            exact += error(theta.column(column).as_slice());
+        }
+    }
+    (own / exact).sqrt()
+}
