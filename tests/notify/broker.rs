@@ -20,10 +20,17 @@ pub struct Broker {
 impl Broker {
     /// A broker on a free port; `None`, with a line, where there is no mosquitto.
     pub fn start() -> Option<Self> {
+        Self::start_with("")
+    }
+
+    /// As [`Broker::start`], with more lines of configuration.
+    pub fn start_with(more: &str) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let config =
-            format!("listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nmax_queued_messages 0\n");
+        let config = format!(
+            "per_listener_settings true\npersistence false\nmax_queued_messages 0\nlistener {port} 127.0.0.1\n\
+             allow_anonymous true\n{more}"
+        );
         std::fs::write(folder.path().join("broker.conf"), config).unwrap();
         let Some(child) = run(&folder.path().join("broker.conf")) else {
             eprintln!("skipped: there is no mosquitto here (apt-get install mosquitto)");

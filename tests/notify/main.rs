@@ -9,6 +9,7 @@ mod filters;
 mod helpers;
 mod mqtt;
 mod receiver;
+mod tls;
 mod webhooks;
 
 use std::time::Duration;

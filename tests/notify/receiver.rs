@@ -7,6 +7,7 @@ use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::{HeaderMap, StatusCode, Uri};
 use axum::response::{IntoResponse as _, Response};
+use axum::serve::Listener;
 use axum::Router;
 use serde_json::Value;
 use tokio::net::TcpListener;
@@ -60,11 +61,12 @@ impl Received {
 impl Receiver {
     pub async fn start(answer: Answer) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let receiver = Self {
-            address: listener.local_addr().unwrap(),
-            received: Arc::default(),
-            answer: Arc::new(Mutex::new(answer)),
-        };
+        let address = listener.local_addr().unwrap();
+        Self::serve(listener, address, answer)
+    }
+
+    pub fn serve<L: Listener<Addr: std::fmt::Debug>>(listener: L, address: SocketAddr, answer: Answer) -> Self {
+        let receiver = Self { address, received: Arc::default(), answer: Arc::new(Mutex::new(answer)) };
         let router = Router::new().fallback(take).with_state(receiver.clone());
         tokio::spawn(async move { axum::serve(listener, router).await });
         receiver

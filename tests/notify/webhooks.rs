@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use serde_json::{json, Value};
@@ -16,11 +17,16 @@ const DAMAGED: [f64; 3] = [4.0, 4.4, 6.0];
 
 /// A service that may reach this machine and retries every second.
 pub fn start(data_dir: &Path, settings: &[(&str, &str)]) -> Service {
+    Service::spawn(&mut prepared(data_dir, settings))
+}
+
+/// The command line of such a service.
+pub fn prepared(data_dir: &Path, settings: &[(&str, &str)]) -> Command {
     let mut command = command(data_dir);
     command.env("MODALWATCH__NOTIFY__ALLOW_PRIVATE_TARGETS", "[\"127.0.0.0/8\", \"::1\"]");
     command.env("MODALWATCH__NOTIFY__FIRST_RETRY_S", "1").env("MODALWATCH__NOTIFY__LONGEST_RETRY_S", "1");
     command.envs(settings.iter().map(|(key, value)| (format!("MODALWATCH__NOTIFY__{key}"), *value)));
-    Service::spawn(&mut command)
+    command
 }
 
 pub async fn webhook(service: &Service, url: &str) -> Value {
