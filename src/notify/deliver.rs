@@ -1,4 +1,9 @@
 //! The round: who has a message due, and sending it, each webhook in its own task.
+//!
+//! A webhook gets one request at a time. Each message is tried again on its own schedule; but after a failure, whichever message
+//! it was, the webhook gets none for the shortest pause between attempts. So a receiver that fails gets at most one
+//! request in that pause, however many messages wait for it, and one that refuses some messages gets the others that
+//! much later at most: those that were never tried go first.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -34,7 +39,7 @@ impl Notifier {
         let mut busy: BTreeMap<Id, String> = BTreeMap::new();
         let mut prune = tokio::time::interval(PRUNE_EVERY);
         loop {
-            let wait = match self.start_turns(&mut turns, &mut busy).await {
+            let wait = match self.start_turns(&mut turns, &mut busy, &stop).await {
                 Ok(wait) => wait,
                 Err(failure) => {
                     error!(error = %failure, "Could not look for messages to send: {failure}");
@@ -59,7 +64,12 @@ impl Notifier {
     }
 
     /// Starts a task for each webhook that has a message due and none under way; the time until the next one has.
-    async fn start_turns(&self, turns: &mut JoinSet<()>, busy: &mut BTreeMap<Id, String>) -> Result<Duration, Error> {
+    async fn start_turns(
+        &self,
+        turns: &mut JoinSet<()>,
+        busy: &mut BTreeMap<Id, String>,
+        stop: &watch::Receiver<bool>,
+    ) -> Result<Duration, Error> {
         let now = Timestamp::now();
         let found = self.store.webhook_turns(now, self.latest(now)).await?;
         metrics::gauge!("modalwatch_webhook_pending").set(found.pending as f64);
@@ -67,8 +77,8 @@ impl Notifier {
         *self.trouble.lock().expect("no holder of this lock panics") = (found.failing, found.dead);
         for webhook in found.due {
             if !busy.values().any(|id| *id == webhook) {
-                let (notifier, id) = (self.clone(), webhook.clone());
-                let task = turns.spawn(async move { notifier.take_turn(&id).await });
+                let (notifier, id, stop) = (self.clone(), webhook.clone(), stop.clone());
+                let task = turns.spawn(async move { notifier.take_turn(&id, stop).await });
                 busy.insert(task.id(), webhook);
             }
         }
@@ -76,34 +86,38 @@ impl Notifier {
         Ok(found.next_at.map_or(LONGEST_WAIT, until).clamp(SHORTEST_WAIT, LONGEST_WAIT))
     }
 
-    /// Sends the messages of a webhook in their order, until one fails or none is left.
-    async fn take_turn(&self, webhook: &str) {
+    /// Sends the messages of a webhook that are due, until none is left.
+    async fn take_turn(&self, webhook: &str, mut stop: watch::Receiver<bool>) {
         loop {
-            match self.send_oldest(webhook).await {
-                Ok(true) => {}
-                Ok(false) => return,
+            let pause = match self.send_due(webhook).await {
+                Ok(None) => return,
+                Ok(Some(DeliveryState::Delivered)) => Duration::ZERO,
+                Ok(Some(DeliveryState::Pending | DeliveryState::Dead)) => {
+                    Duration::from_secs(self.settings.first_retry_s)
+                }
                 Err(failure) => {
                     error!(webhook.id = %webhook, error = %failure, "Could not read or note a message: {failure}");
-                    tokio::time::sleep(PAUSE_AFTER_FAILURE).await;
-                    return;
+                    PAUSE_AFTER_FAILURE
                 }
+            };
+            if tokio::time::timeout(pause, stopped(&mut stop)).await.is_ok() {
+                return;
             }
         }
     }
 
-    /// Sends the oldest message of a webhook, if it is due. Whether the next one may follow.
-    async fn send_oldest(&self, webhook: &str) -> Result<bool, Error> {
-        let Some((hook, delivery)) = self.store.oldest_delivery(webhook).await? else { return Ok(false) };
+    /// Sends the message of a webhook whose turn it is; what came of it, or `None` when none is due.
+    async fn send_due(&self, webhook: &str) -> Result<Option<DeliveryState>, Error> {
         let now = Timestamp::now();
-        if delivery.next_at > now && delivery.next_at <= self.latest(now) {
-            return Ok(false);
-        }
+        let Some((hook, delivery)) = self.store.due_delivery(webhook, now, self.latest(now)).await? else {
+            return Ok(None);
+        };
         let attempt = self.send(&hook, &delivery.event).await;
         let settlement = self.settlement(&delivery, &attempt, Timestamp::now());
         report(&hook, &delivery, &attempt, settlement.state);
         let state = settlement.state;
         self.store.settle_delivery(delivery.id, settlement).await?;
-        Ok(state != DeliveryState::Pending)
+        Ok(Some(state))
     }
 
     fn settlement(&self, delivery: &Delivery, attempt: &Attempt, now: Timestamp) -> Settlement {

@@ -2,7 +2,8 @@
 //!
 //! The store's triggers write what there is to tell, in the transaction that changes the alarm. From there on a message is
 //! sent at least once: until its receiver takes it, or until it has been tried for days and becomes a dead letter. A receiver
-//! that is slow or down delays nobody else, and gets its messages in their order.
+//! that is slow or down delays nobody else. The messages of an alarm come in their order; one that is refused holds back those
+//! of its own alarm only.
 
 pub mod address;
 mod backoff;
@@ -39,7 +40,8 @@ pub struct NotifySettings {
     pub public_url: String,
     /// Longest time for a receiver's answer, seconds.
     pub timeout_s: u64,
-    /// Pause before the second attempt, seconds; each further one is three times as long.
+    /// Pause before the second attempt, seconds; each further one is three times as long. A receiver gets no other message in
+    /// the time after a failure either.
     pub first_retry_s: u64,
     /// Longest pause between attempts, seconds.
     pub longest_retry_s: u64,

@@ -1,4 +1,7 @@
 //! The outbox: messages to webhooks, one row for each webhook that wants one. SQL triggers fill it (migration 0005).
+//!
+//! A message may be sent when no older one of the same alarm waits for the same webhook: the messages of an alarm keep
+//! their order, and one that is refused holds back none of another alarm.
 
 use sqlx::FromRow;
 
@@ -89,11 +92,11 @@ pub struct Settlement {
 /// Whose turn it is.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Turns {
-    /// Webhooks whose oldest waiting message is due.
+    /// Webhooks with a message that is due.
     pub due: Vec<String>,
-    /// When the next of the others is.
+    /// When a message of the others is.
     pub next_at: Option<Timestamp>,
-    /// Webhooks whose oldest waiting message has failed before.
+    /// Webhooks with a waiting message that has failed before.
     pub failing: u64,
     /// Messages that wait.
     pub pending: u64,
@@ -122,6 +125,15 @@ struct DeliveryRow {
 const DELIVERY_COLUMNS: &str =
     "d.delivery_id, d.state, d.attempts, d.started_at_us, d.next_at_us, d.last_at_us, d.last_status, d.last_error,
      e.message_id, e.kind, e.structure_id, e.episode, e.facts, e.created_at_us";
+
+/// Of a delivery `d`: it is due at ?1, or was planned before the clock was set back, since it waits until after ?2.
+const DUE: &str = "d.state = 'pending' and (d.next_at_us <= ?1 or d.next_at_us > ?2)";
+
+/// Of a delivery `d` of an event `e`: no older message of its alarm waits for the same webhook.
+const FIRST_OF_ITS_ALARM: &str =
+    "not exists (select 1 from outbox_event older join webhook_delivery waiting using (event_id)
+         where older.structure_id = e.structure_id and older.episode = e.episode and older.event_id < e.event_id
+           and waiting.webhook_id = d.webhook_id and waiting.state = 'pending')";
 
 fn delivery(row: DeliveryRow) -> Result<Delivery, Error> {
     let what = "webhook delivery";
@@ -152,20 +164,27 @@ impl Store {
         self.written.notified().await;
     }
 
-    /// Webhooks whose oldest waiting message is due, that is neither later than `now` nor, after the clock was set back, later
-    /// than `latest`.
+    /// Webhooks with a message that may be sent and is due, that is neither later than `now` nor, after the clock was set
+    /// back, later than `latest`.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn webhook_turns(&self, now: Timestamp, latest: Timestamp) -> Result<Turns, Error> {
-        let heads: Vec<(String, i64, i64)> = sqlx::query_as(
-            "select w.webhook_id, d.next_at_us, d.attempts from webhook w
-             join webhook_delivery d on d.delivery_id = (select min(delivery_id) from webhook_delivery
-                 where webhook_id = w.webhook_id and state = 'pending')
-             where w.enabled = 1",
-        )
-        .fetch_all(&self.reader)
-        .await?;
+        let select = format!(
+            "select w.webhook_id,
+                    exists (select 1 from webhook_delivery d join outbox_event e using (event_id)
+                        where d.webhook_id = w.webhook_id and {DUE} and {FIRST_OF_ITS_ALARM}),
+                    exists (select 1 from webhook_delivery d
+                        where d.webhook_id = w.webhook_id and d.state = 'pending' and d.attempts > 0),
+                    (select min(d.next_at_us) from webhook_delivery d
+                        where d.webhook_id = w.webhook_id and d.state = 'pending' and d.next_at_us > ?1)
+             from webhook w where w.enabled = 1"
+        );
+        let webhooks: Vec<(String, bool, bool, Option<i64>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(now.micros())
+            .bind(latest.micros())
+            .fetch_all(&self.reader)
+            .await?;
         let (pending, dead): (i64, i64) = sqlx::query_as(
             "select (select count(*) from webhook_delivery where state = 'pending'),
                     (select count(*) from webhook_delivery where state = 'dead')",
@@ -173,35 +192,51 @@ impl Store {
         .fetch_one(&self.reader)
         .await?;
         let mut turns = Turns { pending: pending.unsigned_abs(), dead: dead.unsigned_abs(), ..Turns::default() };
-        for (webhook, next_at_us, attempts) in heads {
-            turns.failing += u64::from(attempts > 0);
-            let next_at = timestamp("webhook delivery", next_at_us)?;
-            if next_at <= now || next_at > latest {
+        for (webhook, due, failing, next_at_us) in webhooks {
+            turns.failing += u64::from(failing);
+            if due {
                 turns.due.push(webhook);
-            } else {
+            } else if let Some(next_at) = next_at_us.map(|at| timestamp("webhook delivery", at)).transpose()? {
                 turns.next_at = Some(turns.next_at.map_or(next_at, |soonest| soonest.min(next_at)));
             }
         }
         Ok(turns)
     }
 
-    /// The oldest waiting message of a webhook, due or not; `None` when none waits or it is switched off.
+    /// The message of a webhook whose turn it is: one that was never tried before those that failed, then the one that has
+    /// been due for longest; due as in [`Store::webhook_turns`]. `None` when none is due or the webhook is switched off.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn oldest_delivery(&self, webhook: &str) -> Result<Option<(WebhookRecord, Delivery)>, Error> {
+    pub async fn due_delivery(
+        &self,
+        webhook: &str,
+        now: Timestamp,
+        latest: Timestamp,
+    ) -> Result<Option<(WebhookRecord, Delivery)>, Error> {
         let mut reader = self.reader.acquire().await?;
         let hook: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = ? and enabled = 1")
             .bind(webhook)
             .fetch_optional(&mut *reader)
             .await?;
-        let oldest = format!(
-            "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
-             where d.webhook_id = ? and d.state = 'pending' order by d.delivery_id limit 1"
-        );
-        let row: Option<DeliveryRow> =
-            sqlx::query_as(sqlx::AssertSqlSafe(oldest)).bind(webhook).fetch_optional(&mut *reader).await?;
-        hook.zip(row).map(|(hook, row)| Ok((hook.into_record()?, delivery(row)?))).transpose()
+        let Some(hook) = hook else { return Ok(None) };
+        // Two queries, each in the order of an index: with thousands waiting, none of them sorts.
+        for rest in ["and d.attempts = 0 order by d.delivery_id", "order by d.next_at_us, d.delivery_id"] {
+            let select = format!(
+                "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
+                 where {DUE} and {FIRST_OF_ITS_ALARM} and d.webhook_id = ?3 {rest} limit 1"
+            );
+            let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+                .bind(now.micros())
+                .bind(latest.micros())
+                .bind(webhook)
+                .fetch_optional(&mut *reader)
+                .await?;
+            if let Some(row) = row {
+                return Ok(Some((hook.into_record()?, delivery(row)?)));
+            }
+        }
+        Ok(None)
     }
 
     /// Notes what an attempt has come to.

@@ -7,6 +7,7 @@ mod filters;
 #[allow(dead_code, reason = "shared with the tests of the API, which use all of it")]
 #[path = "../api/helpers.rs"]
 mod helpers;
+mod hostile;
 mod mqtt;
 mod receiver;
 mod tls;

@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
+use std::time::Instant;
 
 use axum::body::Bytes;
 use axum::extract::State;
@@ -18,6 +19,8 @@ use crate::eventually;
 #[derive(Debug, Clone)]
 pub enum Answer {
     Status(u16),
+    /// 500 to a body that has this text in it, 200 to others.
+    Refusing(String),
     RedirectTo(String),
     Never,
 }
@@ -25,6 +28,7 @@ pub enum Answer {
 /// A message as it came.
 #[derive(Debug, Clone)]
 pub struct Received {
+    pub at: Instant,
     pub path: String,
     pub headers: HeaderMap,
     pub body: Bytes,
@@ -45,6 +49,11 @@ impl Received {
 
     pub fn id(&self) -> &str {
         self.headers["webhook-id"].to_str().unwrap()
+    }
+
+    /// Such as `structures/three-dof/alarms/1`.
+    pub fn subject(&self) -> String {
+        self.json()["subject"].as_str().unwrap().to_owned()
     }
 
     pub fn kind(&self) -> String {
@@ -98,12 +107,15 @@ async fn take(State(receiver): State<Receiver>, uri: Uri, headers: HeaderMap, bo
     let answer = receiver.answer.lock().unwrap().clone();
     let answered = match &answer {
         Answer::Status(status) => *status,
+        Answer::Refusing(text) if String::from_utf8_lossy(&body).contains(text) => 500,
+        Answer::Refusing(_) => 200,
         Answer::RedirectTo(_) => 307,
         Answer::Never => 0,
     };
-    receiver.received.lock().unwrap().push(Received { path: uri.path().to_owned(), headers, body, answered });
+    let received = Received { at: Instant::now(), path: uri.path().to_owned(), headers, body, answered };
+    receiver.received.lock().unwrap().push(received);
     match answer {
-        Answer::Status(status) => StatusCode::from_u16(status).unwrap().into_response(),
+        Answer::Status(_) | Answer::Refusing(_) => StatusCode::from_u16(answered).unwrap().into_response(),
         Answer::RedirectTo(location) => (StatusCode::TEMPORARY_REDIRECT, [("location", location)]).into_response(),
         Answer::Never => std::future::pending().await,
     }

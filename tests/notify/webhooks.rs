@@ -12,7 +12,7 @@ use crate::helpers::{command, created, measurements, problem, Service};
 use crate::receiver::{Answer, Received, Receiver};
 use crate::{eventually, metric};
 
-const HEALTHY: [f64; 3] = [4.0, 5.0, 6.0];
+pub const HEALTHY: [f64; 3] = [4.0, 5.0, 6.0];
 const DAMAGED: [f64; 3] = [4.0, 4.4, 6.0];
 
 /// A service that may reach this machine and retries every second.
@@ -47,18 +47,18 @@ pub async fn damage(service: &Service) -> Value {
     answer
 }
 
-async fn acknowledge(service: &Service) {
+pub async fn acknowledge(service: &Service) {
     let path = "/v1/structures/three-dof/alarms/1/acknowledgement";
     assert_eq!(service.post(path, &json!({ "by": "A. Engineer", "note": "seen" })).await.status(), 200);
 }
 
-async fn deliveries(service: &Service, webhook: &Value, state: &str) -> Vec<Value> {
+pub async fn deliveries(service: &Service, webhook: &Value, state: &str) -> Vec<Value> {
     let path = format!("/v1/webhooks/{}/deliveries?state={state}", webhook["webhook"].as_str().unwrap());
     service.read(&path).await["items"].as_array().unwrap().clone()
 }
 
 /// Waits until so many deliveries of a webhook are in a state.
-async fn settled(service: &Service, webhook: &Value, state: &str, count: usize) -> Vec<Value> {
+pub async fn settled(service: &Service, webhook: &Value, state: &str, count: usize) -> Vec<Value> {
     eventually(state, async || Some(deliveries(service, webhook, state).await).filter(|found| found.len() == count))
         .await
 }
