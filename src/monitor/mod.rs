@@ -9,6 +9,7 @@ mod diagnoses;
 pub mod events;
 mod intake;
 mod models;
+mod probe;
 pub mod retention;
 mod silence;
 #[cfg(test)]
@@ -274,6 +275,7 @@ pub struct Monitor {
     recovering: Arc<Mutex<BTreeSet<StructureId>>>,
     settings: MonitorSettings,
     upkeep: Arc<upkeep::Upkeep>,
+    probe: probe::WriterProbe,
 }
 
 impl Monitor {
@@ -287,6 +289,7 @@ impl Monitor {
         }
         let events = Events::default();
         let mut monitor = Self {
+            probe: probe::WriterProbe::new(store.clone()),
             store,
             library: Arc::new(RwLock::new(Arc::new(library))),
             watched: Arc::default(),

@@ -13,9 +13,6 @@ use super::{Error, Monitor};
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{self, backup, FolderFigures};
 
-/// Longest time the writer gets to answer a question of `/readyz`.
-const WRITER_PATIENCE: Duration = Duration::from_secs(5);
-
 /// Pause before a task that panicked is started again: one that always does would spin.
 const PAUSE_AFTER_PANIC: Duration = Duration::from_secs(1);
 
@@ -82,20 +79,9 @@ impl Monitor {
         self.upkeep.sources.lock().expect("no holder of this lock panics").push(Box::new(source));
     }
 
-    /// Looks at everything that a batch needs.
+    /// Looks at everything that a batch needs; whether anything can be written is known as of a second ago at most.
     pub async fn health(&self) -> Health {
-        let mut reasons = Vec::new();
-        match tokio::time::timeout(WRITER_PATIENCE, self.store.is_writable()).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => {
-                let code = error.disk_cause().unwrap_or("database_failed");
-                reasons.push(Reason::new(code, format!("nothing can be stored: {error}")));
-            }
-            Err(_) => {
-                let message = format!("the writer has not answered for {} s", WRITER_PATIENCE.as_secs());
-                reasons.push(Reason::new("writer_stuck", message));
-            }
-        }
+        let mut reasons: Vec<Reason> = self.probe.finding().await.into_iter().collect();
         if self.baselines_in_use() == 0 {
             reasons.push(Reason::new("no_model", "no trained baseline is in use"));
         }
@@ -150,7 +136,7 @@ impl Monitor {
 
     /// True when the writer takes turns at all: a full disk is no reason to restart, a writer that hangs is.
     pub async fn writer_takes_turns(&self) -> bool {
-        tokio::time::timeout(WRITER_PATIENCE, self.store.is_writable()).await.is_ok()
+        self.probe.takes_turns().await
     }
 
     /// Makes a backup under a name, or under one made of the time.

@@ -1,6 +1,8 @@
 //! Failures of the disk: told apart from bugs, counted, and survived.
 
-use super::Error;
+use std::sync::atomic::Ordering;
+
+use super::{Error, Store};
 
 impl From<sqlx::Error> for Error {
     /// Failures of the disk get names of their own: they are no bugs, and they pass.
@@ -42,10 +44,18 @@ impl Error {
     }
 }
 
-/// Counts a write that the disk refused.
-pub(super) fn count_failure(error: &Error) {
-    if let Some(cause) = error.disk_cause() {
-        metrics::counter!("modalwatch_write_failures_total", "cause" => cause).increment(1);
+impl Store {
+    /// Counts a write that the disk refused.
+    pub(super) fn count_failure(&self, error: &Error) {
+        if let Some(cause) = error.disk_cause() {
+            metrics::counter!("modalwatch_write_failures_total", "cause" => cause).increment(1);
+            self.refused_writes.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// How many writes the disk has refused since the store was opened: what was known before of the disk is old when it grows.
+    pub fn refused_writes(&self) -> u64 {
+        self.refused_writes.load(Ordering::Relaxed)
     }
 }
 

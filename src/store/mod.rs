@@ -47,7 +47,6 @@ use sqlx::{Connection as _, Sqlite};
 use tokio::sync::Notify;
 
 use crate::volume;
-use failure::count_failure;
 
 pub use alarm::{
     Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, ALARM_KINDS, FIT_SERIES,
@@ -231,6 +230,7 @@ pub struct Store {
     /// Told after every write.
     written: Arc<Notify>,
     file: Arc<OpenedFile>,
+    refused_writes: Arc<AtomicU64>,
     limits: Arc<Limits>,
     /// Held as long as the store is open: a second instance on the same folder is refused.
     _lock: Arc<File>,
@@ -304,6 +304,7 @@ impl Store {
             sqlite_version: sqlite_version.into(),
             written: Arc::default(),
             limits: Arc::new(limits),
+            refused_writes: Arc::default(),
             _lock: Arc::new(lock),
         })
     }
@@ -388,7 +389,7 @@ impl Store {
         F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
     {
         if let Err(error) = self.refuse_without_room() {
-            count_failure(&error);
+            self.count_failure(&error);
             return Err(error);
         }
         self.write_without_floor(work).await
@@ -420,7 +421,7 @@ impl Store {
         });
         let result = task.await.map_err(|_| Error::Panicked)?;
         if let Err(error) = &result {
-            count_failure(error);
+            self.count_failure(error);
         }
         result
     }

@@ -29,6 +29,22 @@ async fn health_readiness_version_and_metrics_are_answered() {
     }
 }
 
+/// Every transaction adds a page at least to the log, so the log counts them.
+#[tokio::test]
+async fn whoever_asks_for_readiness_makes_the_writer_work_once_a_second_at_most() {
+    const PAGE_BYTES: u64 = 4_096;
+    let (service, folder) = spawn();
+    let log = folder.path().join("modalwatch.sqlite-wal");
+    service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 2, 0)).await;
+    let (started, before) = (Instant::now(), std::fs::metadata(&log).unwrap().len());
+    for path in ["/readyz", "/metrics"].repeat(150) {
+        assert!(service.get(path).send().await.unwrap().status().is_success());
+    }
+    let pages = (std::fs::metadata(&log).unwrap().len() - before) / PAGE_BYTES;
+    let most = 1 + started.elapsed().as_secs();
+    assert!((1..=most).contains(&pages), "{pages} pages were written, {most} would be right");
+}
+
 #[tokio::test]
 async fn the_clients_request_id_comes_back_and_a_strange_one_is_replaced() {
     let (service, _folder) = spawn();

@@ -1,0 +1,127 @@
+//! Whether the writer writes, asked of it at most once a second.
+//!
+//! `/readyz` needs no token: whoever reaches the service can ask as often as they like, and each look is a transaction.
+
+use std::future::Future;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tokio::sync::Mutex;
+
+use super::upkeep::Reason;
+use crate::store::Store;
+
+/// An answer is good for so long.
+const FRESH_FOR: Duration = Duration::from_secs(1);
+
+/// Longest time the writer gets to answer.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// What the writer answered, and when.
+struct Answer {
+    at: Instant,
+    finding: Option<Reason>,
+    /// Of the store, afterwards: when another write was refused, the answer is old.
+    refused_writes: u64,
+}
+
+/// The last answer of the writer of a store.
+#[derive(Clone)]
+pub(super) struct WriterProbe {
+    store: Store,
+    last: Arc<Mutex<Option<Answer>>>,
+}
+
+impl WriterProbe {
+    pub(super) fn new(store: Store) -> Self {
+        Self { store, last: Arc::default() }
+    }
+
+    /// Why nothing can be written, or `None`, as it was a second ago at most. Those who come meanwhile wait for the same
+    /// answer.
+    pub(super) async fn finding(&self) -> Option<Reason> {
+        self.finding_of(ask(self.store.clone())).await
+    }
+
+    async fn finding_of(&self, question: impl Future<Output = Option<Reason>> + Send + 'static) -> Option<Reason> {
+        let probe = self.clone();
+        // In a task of its own: a client that goes away before the answer would else make the next one ask again.
+        let task = tokio::spawn(async move {
+            let mut last = probe.last.lock().await;
+            let refused_writes = probe.store.refused_writes();
+            let fresh = |a: &&Answer| a.at.elapsed() < FRESH_FOR && a.refused_writes == refused_writes;
+            if let Some(answer) = last.as_ref().filter(fresh) {
+                return answer.finding.clone();
+            }
+            let finding = question.await;
+            let refused_writes = probe.store.refused_writes();
+            *last = Some(Answer { at: Instant::now(), finding: finding.clone(), refused_writes });
+            finding
+        });
+        task.await.unwrap_or_else(|_| Some(Reason::new("internal", "the look at the writer ended by a panic: a bug")))
+    }
+
+    /// True when the writer takes turns at all: a full disk is no reason to restart, a writer that hangs is.
+    pub(super) async fn takes_turns(&self) -> bool {
+        self.finding().await.is_none_or(|reason| reason.code != STUCK)
+    }
+}
+
+const STUCK: &str = "writer_stuck";
+
+async fn ask(store: Store) -> Option<Reason> {
+    match tokio::time::timeout(PATIENCE, store.is_writable()).await {
+        Ok(Ok(())) => None,
+        Ok(Err(error)) => {
+            let code = error.disk_cause().unwrap_or("database_failed");
+            Some(Reason::new(code, format!("nothing can be stored: {error}")))
+        }
+        Err(_) => Some(Reason::new(STUCK, format!("the writer has not answered for {} s", PATIENCE.as_secs()))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::StoreSettings;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    #[tokio::test]
+    async fn many_who_ask_are_answered_by_one_question_a_second_even_when_they_do_not_wait() {
+        let folder = tempfile::tempdir().unwrap();
+        let probe = WriterProbe::new(Store::open(folder.path()).await.unwrap());
+        let asked = Arc::new(AtomicU64::new(0));
+        let question = || {
+            let asked = Arc::clone(&asked);
+            async move {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+                Some(Reason::new("test", asked.fetch_add(1, Ordering::SeqCst).to_string()))
+            }
+        };
+        let started = Instant::now();
+        for _ in 0..300 {
+            // Goes away before the answer.
+            let _ = tokio::time::timeout(Duration::from_millis(1), probe.finding_of(question())).await;
+            assert_eq!(probe.finding_of(question()).await.unwrap().code, "test");
+        }
+        let most = 1 + started.elapsed().as_secs();
+        let times = asked.load(Ordering::SeqCst);
+        assert!((1..=most).contains(&times), "{times} questions, {most} would be right");
+
+        // An answer gets old.
+        tokio::time::sleep(FRESH_FOR).await;
+        assert_eq!(probe.finding_of(question()).await.unwrap().message, times.to_string());
+    }
+
+    #[tokio::test]
+    async fn a_write_that_was_refused_makes_the_answer_old_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).await.unwrap();
+        let probe = WriterProbe::new(store.clone());
+        assert_eq!(probe.finding().await, None);
+        store.set_limits(&StoreSettings { min_free_bytes: u64::MAX, ..StoreSettings::default() });
+        assert!(store.is_writable().await.is_err());
+        assert_eq!(probe.finding().await.unwrap().code, "disk_full");
+        assert!(probe.takes_turns().await);
+    }
+}
