@@ -31,6 +31,7 @@ const MOST_DAYS: u32 = 36_500;
 #[schema(as = BackupInput)]
 struct BackupBody {
     /// Name of its folder; one made of the time without.
+    #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     name: Option<String>,
 }
 
@@ -103,7 +104,7 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
     get, path = "/v1/structures/{id}/export", tag = "operations", operation_id = "export_structure",
     summary = "Everything of a structure",
     description = "What another installation needs, as lines of JSON. A failure on the way breaks the connection, and the last \
-                   line, of kind `end`, is missing.",
+                   line, whose `record` is `end`, is missing.",
     params(StructurePath),
     responses(
         (status = 200, description = "The archive; the schema is that of a line", body = Object, content_type = "application/x-ndjson"),

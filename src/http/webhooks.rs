@@ -6,6 +6,7 @@ use axum::http::{header, HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::{Deserialize, Serialize};
+use utoipa::openapi::schema::{Array, ArrayBuilder, ObjectBuilder, Type};
 use utoipa::{IntoParams, ToSchema};
 
 use super::error::ApiError;
@@ -41,14 +42,17 @@ pub struct DeliveryQuery {
 #[serde(deny_unknown_fields)]
 #[schema(as = WebhookInput)]
 struct WebhookBody {
-    /// Where messages are posted to: `https`, of an address that can be reached and is allowed.
-    #[schema(min_length = 1, examples("https://example.com/alarms"))]
+    /// Where messages are posted to: `http` or `https`, without user name and password. An address that is not on the open
+    /// internet is refused, unless the setting `notify.allow_private_targets` has it.
+    #[schema(max_length = 2000, pattern = "^https?://[^/?#@]+([/?#].*)?$", examples("https://example.com/alarms"))]
     url: String,
-    /// Kinds of events, such as `alarm.opened`; all without.
+    /// Kinds of events; all without.
     #[serde(default)]
+    #[schema(schema_with = event_kinds)]
     events: Vec<String>,
-    /// Kinds of alarms, such as `damage`; all without.
+    /// Kinds of alarms; all without.
     #[serde(default)]
+    #[schema(schema_with = alarm_kinds)]
     alarm_kinds: Vec<String>,
     /// Ids of structures; all without.
     #[serde(default)]
@@ -61,6 +65,20 @@ struct WebhookBody {
 
 fn yes() -> bool {
     true
+}
+
+/// A list of some of these words.
+fn list_of(words: &[&'static str]) -> Array {
+    let word = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(words.iter().copied())).build();
+    ArrayBuilder::new().items(word).build()
+}
+
+fn event_kinds() -> Array {
+    list_of(&EVENT_KINDS)
+}
+
+fn alarm_kinds() -> Array {
+    list_of(&ALARM_KINDS)
 }
 
 /// Webhooks, oldest first.

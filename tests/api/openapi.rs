@@ -351,6 +351,84 @@ async fn a_structure_as_the_schema_has_it_is_what_the_service_gives() {
     assert!(!validator.is_valid(&json!({ "modes": 1 })));
 }
 
+/// What the document allows the service takes, and what it forbids the service refuses.
+#[tokio::test]
+async fn bodies_are_valid_by_the_document_exactly_when_the_service_takes_them() {
+    let (service, _folder) = spawn();
+    let document = service.read("/openapi.json").await;
+    let long = |length: usize| "a".repeat(length);
+    let url = |length: usize| json!({ "url": format!("https://receiver.invalid/{}", long(length - 25)) });
+    let to = |url: &str| json!({ "url": url });
+    let of = |field: &str, word: &str| json!({ "url": "https://receiver.invalid/", field: [word] });
+    let named = |name: &str| json!({ "name": name, "scopes": ["admin"] });
+    let webhooks = [
+        to("https://receiver.invalid/"),
+        to("http://receiver.invalid:8080/a?b=c"),
+        to("ftp://receiver.invalid/"),
+        to("receiver.invalid"),
+        to("https://me:secret@receiver.invalid/"),
+        to(""),
+        url(2_000),
+        url(2_001),
+        of("events", "alarm.opened"),
+        of("events", "alarm.reopened"),
+        of("events", "alarm.ended"),
+        of("events", "alarm.withdrawn"),
+        of("events", "alarm.acknowledged"),
+        of("events", "alarm.closed"),
+        of("events", "org.modalwatch.alarm.opened"),
+        of("alarm_kinds", "damage"),
+        of("alarm_kinds", "simulation_does_not_fit"),
+        of("alarm_kinds", "silence"),
+        of("alarm_kinds", "fire"),
+    ];
+    let backups = ["a", "A1._-", &long(64), &long(65), "", ".hidden", "-a", "a/b", "ä"];
+    let backups = backups.map(|name| json!({ "name": name }));
+    let limited = |structures: Value| json!({ "name": "gateway", "scopes": ["ingest"], "structures": structures });
+    let tokens = [
+        named("a"),
+        named(&long(100)),
+        named(&"ä".repeat(100)),
+        named(&long(101)),
+        named(""),
+        named("two\nlines"),
+        json!({ "name": "gateway", "scopes": [] }),
+        json!({ "name": "gateway", "scopes": ["write"] }),
+        limited(json!(["three-dof"])),
+        limited(json!([])),
+        limited(json!((0..1_001).map(|i| format!("s{i}")).collect::<Vec<_>>())),
+    ];
+    let mut bearer = String::new();
+    // Tokens last: the first closes the service to those without.
+    for (path, bodies) in [("/v1/webhooks", &webhooks[..]), ("/v1/backups", &backups), ("/v1/tokens", &tokens)] {
+        let schema = &document["paths"][path]["post"]["requestBody"]["content"]["application/json"]["schema"];
+        let validator = validator(&document, schema);
+        for body in bodies {
+            let request = service.request(reqwest::Method::POST, path).json(body).bearer_auth(&bearer);
+            let answer = if bearer.is_empty() { service.post(path, body).await } else { request.send().await.unwrap() };
+            let (status, text) = (answer.status().as_u16(), answer.text().await.unwrap());
+            assert!(status == 201 || status == 422, "{path} {body}: {status} {text}");
+            assert_eq!(validator.is_valid(body), status == 201, "{path} {body}: {status} {text}");
+            if path == "/v1/tokens" && bearer.is_empty() {
+                let made: Value = serde_json::from_str(&text).unwrap();
+                made["token"].as_str().unwrap().clone_into(&mut bearer);
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn the_last_line_of_an_archive_is_the_one_that_the_document_names() {
+    let (service, _folder) = spawn();
+    let document = service.read("/openapi.json").await;
+    let said = document["paths"]["/v1/structures/{id}/export"]["get"]["description"].as_str().unwrap().to_owned();
+    let archive = service.get("/v1/structures/three-dof/export").send().await.unwrap().text().await.unwrap();
+    let records: Vec<Value> = archive.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let (last, before) = records.split_last().unwrap();
+    let named = |record: &Value| said.contains(&format!("`record` is `{}`", record["record"].as_str().unwrap()));
+    assert!(named(last) && !before.iter().any(named), "{said}: {last}");
+}
+
 #[tokio::test]
 async fn the_docs_page_needs_nothing_from_elsewhere() {
     let folder = tempfile::tempdir().unwrap();

@@ -28,14 +28,15 @@ const LONGEST_OVERLAP_S: i64 = 30 * 86_400;
 #[serde(deny_unknown_fields)]
 #[schema(as = TokenInput)]
 struct TokenBody {
-    /// For people: who or what has it.
-    #[schema(min_length = 1, max_length = 64)]
+    /// For people: who or what has it. It is shown in lists, logs and the audit.
+    #[schema(min_length = 1, max_length = 100, pattern = "^[^\\x00-\\x1f\\x7f-\\x9f]+$")]
     name: String,
     #[schema(min_items = 1)]
     scopes: Vec<Scope>,
     /// The only structures it is for; all without.
+    #[schema(min_items = 1, max_items = 1000)]
     structures: Option<Vec<String>>,
-    /// Until when it is good: RFC 3339 with an offset; for ever without.
+    /// Until when it is good, in the future: RFC 3339 with an offset; for ever without.
     #[schema(value_type = Option<String>, format = DateTime)]
     expires_at: Option<String>,
 }
