@@ -134,11 +134,6 @@ impl Page {
         self.wait_for("Boolean(document.querySelector('main .view'))");
     }
 
-    /// Runs a script before every page.
-    pub fn prepare(&mut self, script: &str) {
-        self.call("Page.addScriptToEvaluateOnNewDocument", &json!({ "source": script }));
-    }
-
     /// Presses a key.
     pub fn press(&mut self, key: &str) {
         let code = match key {

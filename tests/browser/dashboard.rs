@@ -15,7 +15,7 @@ const DAY_S: usize = 86_400;
 const PER_BATCH: usize = 20;
 
 /// One browser at a time: each takes a core.
-async fn turn() -> Option<MutexGuard<'static, ()>> {
+pub async fn turn() -> Option<MutexGuard<'static, ()>> {
     static TURN: OnceLock<Mutex<()>> = OnceLock::new();
     if is_installed() {
         return Some(TURN.get_or_init(Mutex::default).lock().await);
@@ -50,7 +50,7 @@ async fn watched_bridge(service: &Service) {
     assert_eq!(alarms["items"][0]["parameter"], "k1", "{alarms}");
 }
 
-fn at(service: &Service, view: &str) -> String {
+pub fn at(service: &Service, view: &str) -> String {
     format!("http://{}/{view}", service.address())
 }
 
@@ -278,38 +278,6 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     let windows = service.read("/v1/structures/three-dof/maintenance").await;
     assert_eq!(windows["items"][0]["reason"], "new bearings", "{windows}");
     assert_eq!(page.complaints(), Vec::<String>::new());
-}
-
-/// A service that wants a token, as the page sees it.
-const WANTS_TOKEN: &str = "
-    const send = window.fetch;
-    window.fetch = (path, options) => {
-        const given = new Headers(options?.headers).get('authorization');
-        if (given === 'Bearer mw_right') return send(path, options);
-        const body = JSON.stringify({ title: 'Unauthorized', status: 401, code: 'unauthorized', detail: 'a token is needed', request_id: 'id-1' });
-        return Promise.resolve(new Response(body, { status: 401, headers: { 'content-type': 'application/problem+json' } }));
-    };";
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_token_is_asked_for_once_and_a_wrong_one_again() {
-    let Some(_turn) = turn().await else { return };
-    let (service, _folder) = spawn();
-    let mut page = Page::open();
-    page.prepare(WANTS_TOKEN);
-    page.call("Page.navigate", &json!({ "url": at(&service, "") }));
-    for (attempt, token) in ["mw_wrong", "mw_right"].into_iter().enumerate() {
-        page.wait_for("document.querySelectorAll('dialog[open] input[name=token]').length === 1");
-        let told = page.evaluate("document.querySelector('dialog').textContent.includes('did not take the token')");
-        assert_eq!(told, json!(attempt > 0));
-        page.evaluate("document.querySelector('input[name=token]').focus()");
-        page.type_text(token);
-        page.press("Enter");
-        page.wait_for(&format!("sessionStorage.getItem('modalwatch.token') === '{token}'"));
-    }
-    page.wait_for("document.querySelectorAll('table.fleet tbody tr').length === 3");
-    page.wait_for("document.getElementById('live').textContent === 'Live'");
-    assert_eq!(page.evaluate("document.querySelector('dialog')"), Value::Null);
-    assert_eq!(page.evaluate("localStorage.getItem('modalwatch.token')"), Value::Null, "the token outlives the tab");
 }
 
 #[tokio::test(flavor = "multi_thread")]

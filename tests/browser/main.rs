@@ -7,6 +7,8 @@
 
 mod chromium;
 mod dashboard;
+mod extension;
 #[allow(dead_code, reason = "of the helpers of tests/api some are enough here")]
 #[path = "../api/helpers.rs"]
 mod helpers;
+mod sign_in;

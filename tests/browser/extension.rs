@@ -1,0 +1,137 @@
+//! A model that lacks something, from the diagnosis over its extension to the step back: all from the page.
+
+use std::f64::consts::TAU;
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+use rand::{Rng, SeedableRng as _};
+use rand_distr::StandardNormal;
+use serde_json::{json, Value};
+
+use crate::chromium::Page;
+use crate::dashboard::{at, turn};
+use crate::helpers::{command, created, time, Service};
+
+/// Two masses on two springs; the simulation knows nothing of temperature. Small, so that its flow is trained in seconds.
+const STRUCTURE: &str = r#"
+id = "tiny"
+modes = 2
+measurement_noise = { relative = 0.002 }
+mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 0.8 }]
+spring = [
+    { name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 },
+    { name = "k2", from = "m1", to = "m2", n_per_m = 1400.0 },
+]
+parameter = [
+    { name = "k1", prior = { uniform = [500.0, 1500.0] }, sets = { spring = "k1" } },
+    { name = "k2", prior = { uniform = [700.0, 2100.0] }, sets = { spring = "k2" } },
+]
+covariate = [{ name = "temperature_c" }]
+"#;
+
+/// Relative change of k2 per °C.
+const SOFTENING: f64 = -0.004;
+
+fn train(folder: &Path) {
+    std::fs::create_dir_all(folder).unwrap();
+    let structure = folder.join("structure.toml");
+    std::fs::write(&structure, STRUCTURE).unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    command.args(["train", "--samples", "10000", "--epochs", "20", "--noise-range", "0.5,2", "--structure"]);
+    let trained = command.arg(&structure).arg("--out").arg(folder).output().unwrap();
+    assert!(trained.status.success(), "{}", String::from_utf8_lossy(&trained.stderr));
+}
+
+/// det(K − λM) = 0.8 λ² − (k₂ + 0.8(k₁ + k₂)) λ + k₁k₂ = 0, f = √λ / 2π.
+fn frequencies_hz(k1: f64, k2: f64) -> [f64; 2] {
+    let b = k2 + 0.8 * (k1 + k2);
+    let root = (b * b - 3.2 * k1 * k2).sqrt();
+    [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / TAU)
+}
+
+/// Ten measurements of a day of the year 2026; k2 softens with the temperature.
+fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
+    let mut one = |i: usize| {
+        let mut normal = || rng.sample::<f64, _>(StandardNormal);
+        let temperature_c = 10.0 - 13.0 * (TAU * day as f64 / 365.0).cos() + 2.0 * normal();
+        let k1 = 1000.0 * (1.0 + 0.006 * normal());
+        let k2 = 1400.0 * (1.0 + SOFTENING * (temperature_c - 10.0)) * (1.0 + 0.006 * normal());
+        let f = frequencies_hz(k1, k2).map(|f| f * (1.0 + 0.002 * normal()));
+        let covariates = json!({ "temperature_c": temperature_c });
+        json!({ "measured_at": time(86_400 * day + 600 * i), "frequencies_hz": f, "covariates": covariates })
+    };
+    (0..10).map(&mut one).collect()
+}
+
+/// Waits until the extension of the newest diagnosis has ended.
+async fn extension_ended(service: &Service) -> Value {
+    for _ in 0..900 {
+        let listed = service.read("/v1/structures/tiny/diagnoses").await;
+        let path = format!("/v1/diagnoses/{}", listed["items"][0]["diagnosis"].as_str().unwrap());
+        let diagnosis = service.read(&path).await;
+        if diagnosis["extension"]["state"] != "running" {
+            return diagnosis;
+        }
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    panic!("the extension is still running after three minutes");
+}
+
+/// Presses a button of the diagnosis and confirms what the dialog asks.
+fn press_and_confirm(page: &mut Page, button: &str) {
+    let find = format!(
+        "[...document.querySelectorAll('#diagnosis button')].find((b) => b.textContent === '{button}' && !b.hidden)"
+    );
+    page.wait_for(&format!("Boolean({find})"));
+    page.evaluate(&format!("{find}.click()"));
+    page.wait_for("document.querySelector('dialog[open]') !== null");
+    page.evaluate("document.querySelector('dialog button[type=submit]').click()");
+    page.wait_for("document.querySelector('dialog') === null");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undoes_it() {
+    let Some(_turn) = turn().await else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let models = folder.path().join("models");
+    train(&models.join("tiny"));
+    let service = Service::spawn(command(&folder.path().join("data")).arg("--models").arg(&models));
+    let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(7);
+    let mut batches = Vec::new();
+    for number in 0..40 {
+        batches.push(service.post_batch("tiny", &batch(9 * number, &mut rng)).await["batch"].clone());
+    }
+    created(service.post("/v1/structures/tiny/baseline", &json!({ "batches": &batches[..6] })).await).await;
+    let before = service.read("/v1/structures/tiny").await;
+
+    let mut page = Page::open();
+    page.visit(&at(&service, "#/structures/tiny"));
+    page.evaluate("window.sameLoad = true");
+    press_and_confirm(&mut page, "Diagnose");
+    page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('k2 falls by')");
+    press_and_confirm(&mut page, "Extend the model");
+
+    // The bar of the job grows while one looks at it.
+    page.evaluate("location.hash = '#/jobs'");
+    let job = "[...document.querySelectorAll('[data-job]')].find((row) => row.textContent.includes('Extension of the model'))";
+    let bar = format!("{job}?.querySelector('progress')?.value");
+    let first = page.wait_for(&format!("{job}?.textContent.includes('epoch') && {bar}")).as_f64().unwrap();
+    page.wait_for(&format!("({bar} ?? 1) > {first}"));
+    let extended = extension_ended(&service).await;
+    assert_eq!(extended["extension"]["state"], "done", "{extended}");
+    page.wait_for(&format!("{job}.textContent.includes('Done')"));
+
+    page.evaluate("location.hash = '#/structures/tiny'");
+    page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('The model was extended by it')");
+    let after = service.read("/v1/structures/tiny").await;
+    assert_eq!(after["digest"], extended["extension"]["result"]["structure_digest"]);
+    assert_ne!(after["digest"], before["digest"]);
+
+    press_and_confirm(&mut page, "Step back");
+    page.wait_for("document.getElementById('notices').textContent.includes('Went back to the version before')");
+    let back = service.read("/v1/structures/tiny").await;
+    assert_eq!((&back["digest"], &back["model"]["digest"]), (&before["digest"], &before["model"]["digest"]));
+    assert_eq!(page.evaluate("window.sameLoad"), json!(true), "the page was loaded again");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
