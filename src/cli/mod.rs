@@ -135,9 +135,11 @@ pub fn run() -> anyhow::Result<()> {
     match Cli::parse().command {
         Command::Serve(args) => {
             let config = args.read()?;
-            let log = telemetry::start(&config.log).map_err(anyhow::Error::msg)?;
+            let (log, traces) = telemetry::start(&config.log).map_err(anyhow::Error::msg)?;
             let reloading = reload::Reloading { file: args.config.clone(), flags: args.flags(), log };
-            block_on(serve::serve(config, reloading))
+            let served = block_on(serve::serve(config, reloading));
+            traces.end();
+            served
         }
         Command::Demo(args) => block_on(demo::demo(args)),
         Command::Train(args) => train::train(&args),

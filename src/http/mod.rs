@@ -27,6 +27,8 @@ mod structures;
 mod table;
 #[cfg(test)]
 mod tests;
+#[cfg(feature = "otel")]
+mod traceparent;
 mod views;
 mod webhooks;
 

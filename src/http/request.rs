@@ -50,10 +50,18 @@ pub async fn with_id_and_log(request: Request, next: Next) -> Response {
     // The route's pattern, not the path: a label for each id in the path would grow without bound.
     let route = request.extensions().get::<MatchedPath>().map_or("unmatched", MatchedPath::as_str).to_owned();
     let span = tracing::info_span!("request", request.id = %id, method = %method, route = %route);
+    let trace = trace(&id, method, &route);
+    #[cfg(feature = "otel")]
+    super::traceparent::continue_in(&trace, request.headers());
     let started = Instant::now();
-    let mut response = CURRENT_ID.scope(id.clone(), next.run(request)).instrument(span.clone()).await;
+    let answer = CURRENT_ID.scope(id.clone(), next.run(request)).instrument(span.clone()).instrument(trace.clone());
+    let mut response = answer.await;
 
     let (status, seconds) = (response.status().as_u16(), started.elapsed().as_secs_f64());
+    trace.record("http.response.status_code", status);
+    if status >= 500 {
+        trace.record("otel.status_code", "ERROR");
+    }
     let labels = [("method", method.to_string()), ("route", route.clone()), ("status", status.to_string())];
     metrics::counter!("modalwatch_http_requests_total", &labels).increment(1);
     metrics::histogram!("modalwatch_http_request_seconds", "route" => route.clone()).record(seconds);
@@ -63,6 +71,15 @@ pub async fn with_id_and_log(request: Request, next: Next) -> Response {
         response.headers_mut().insert(REQUEST_ID, value);
     }
     response
+}
+
+/// The request in a trace, under the names of OpenTelemetry's conventions.
+fn trace(id: &str, method: &str, route: &str) -> tracing::Span {
+    tracing::info_span!(
+        target: "modalwatch::spans", "request", otel.name = format!("{method} {route}"), otel.kind = "server",
+        http.request.method = method, http.route = route, request.id = id,
+        http.response.status_code = tracing::field::Empty, otel.status_code = tracing::field::Empty
+    )
 }
 
 /// What a body may be.

@@ -23,7 +23,7 @@ use std::sync::{Arc, Mutex, RwLock};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use tracing::{error, info, warn, Instrument as _};
+use tracing::{error, info, info_span, warn, Instrument as _};
 
 use crate::alarm::AlarmSettings;
 use crate::assessment::{Assessment, BatchState};
@@ -571,7 +571,10 @@ impl Monitor {
                 let points = charts::points(&baseline_here, &assessment, state, measured, &settings, &known);
                 Ok::<_, assess::Error>((assessment, points))
             };
-            let reason = match place.run(work).await {
+            let (structure_id, batch_id) = (structure.as_str(), &record.batch_id);
+            let trace =
+                info_span!(target: "modalwatch::spans", "assess", structure.id = structure_id, batch.id = batch_id);
+            let reason = match place.run(work).instrument(trace).await {
                 Ok(Ok((assessment, points))) => {
                     let seconds = started.elapsed().as_secs_f64();
                     metrics::histogram!("modalwatch_assessment_seconds").record(seconds);

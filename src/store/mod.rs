@@ -45,6 +45,7 @@ use sqlx::sqlite::{
 };
 use sqlx::{Connection as _, Sqlite};
 use tokio::sync::Notify;
+use tracing::{info_span, Instrument as _};
 
 use crate::volume;
 
@@ -229,8 +230,8 @@ pub struct Store {
     sqlite_version: Arc<str>,
     /// Told after every write.
     written: Arc<Notify>,
-    file: Arc<OpenedFile>,
     refused_writes: Arc<AtomicU64>,
+    file: Arc<OpenedFile>,
     limits: Arc<Limits>,
     /// Held as long as the store is open: a second instance on the same folder is refused.
     _lock: Arc<File>,
@@ -303,8 +304,8 @@ impl Store {
             file,
             sqlite_version: sqlite_version.into(),
             written: Arc::default(),
-            limits: Arc::new(limits),
             refused_writes: Arc::default(),
+            limits: Arc::new(limits),
             _lock: Arc::new(lock),
         })
     }
@@ -403,7 +404,7 @@ impl Store {
     {
         let (writer, file) = (self.writer.clone(), Arc::clone(&self.file));
         let written = Arc::clone(&self.written);
-        let task = tokio::spawn(async move {
+        let transaction = async move {
             fault_point!("store::begin", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
             let mut connection = writer.acquire().await?;
             let result = in_transaction(&mut connection, work).await;
@@ -418,8 +419,9 @@ impl Store {
             let result = result?;
             file.check()?;
             Ok(result)
-        });
-        let result = task.await.map_err(|_| Error::Panicked)?;
+        };
+        let trace = info_span!(target: "modalwatch::spans", "store transaction");
+        let result = tokio::spawn(transaction.instrument(trace)).await.map_err(|_| Error::Panicked)?;
         if let Err(error) = &result {
             self.count_failure(error);
         }

@@ -1,0 +1,28 @@
+//! `traceparent`: the trace that a client began goes on here.
+//!
+//! Source: W3C (2021), Trace Context – Level 1.
+
+use axum::http::HeaderMap;
+use opentelemetry::propagation::{Extractor, TextMapPropagator as _};
+use opentelemetry::Context;
+use opentelemetry_sdk::propagation::TraceContextPropagator;
+use tracing_opentelemetry::OpenTelemetrySpanExt as _;
+
+struct Headers<'a>(&'a HeaderMap);
+
+impl Extractor for Headers<'_> {
+    fn get(&self, key: &str) -> Option<&str> {
+        self.0.get(key)?.to_str().ok()
+    }
+
+    fn keys(&self) -> Vec<&str> {
+        self.0.keys().map(axum::http::HeaderName::as_str).collect()
+    }
+}
+
+/// Makes the span of the headers the parent of one that has not begun yet; what is no `traceparent` begins a new trace.
+pub fn continue_in(span: &tracing::Span, headers: &HeaderMap) {
+    let parent = TraceContextPropagator::new().extract_with_context(&Context::new(), &Headers(headers));
+    // An error says that nobody takes this span.
+    let _ = span.set_parent(parent);
+}

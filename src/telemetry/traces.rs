@@ -1,0 +1,77 @@
+//! Traces by OpenTelemetry: spans are sent as protobuf over HTTP, by a thread of their own.
+//!
+//! What is on its way is bounded: while the collector is away, spans are dropped and nothing waits. How many may wait, how
+//! often they are sent, which are taken and how the service is called are set by the standard variables `OTEL_…`.
+
+use std::time::Duration;
+
+use opentelemetry::trace::TracerProvider as _;
+use opentelemetry_otlp::{SpanExporter, WithExportConfig as _, WithHttpConfig as _};
+use opentelemetry_sdk::trace::SdkTracerProvider;
+use opentelemetry_sdk::Resource;
+use reqwest::Certificate;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::Layer;
+use tracing_subscriber::Registry;
+
+/// Any of them stands for a wish to send traces; the exporter reads them.
+const STANDARD_VARIABLES: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT"];
+
+/// Time that the last spans get when the service stops.
+const LAST_WORDS: Duration = Duration::from_secs(5);
+
+/// What sends traces, if they are wanted.
+#[derive(Default)]
+pub struct Traces(Option<SdkTracerProvider>);
+
+impl Traces {
+    /// Sends to `endpoint`, or to where the standard variables say; nowhere when there is neither.
+    pub(super) fn start(endpoint: &str) -> Result<Self, String> {
+        let wanted = |name: &&str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+        if endpoint.is_empty() && !STANDARD_VARIABLES.iter().any(wanted) {
+            return Ok(Self::default());
+        }
+        let wrong =
+            |e: &dyn std::fmt::Display| format!("traces cannot be sent (log.otlp_endpoint, OTEL_EXPORTER_OTLP_…): {e}");
+        // Mozilla's certificates too: without any there would be no client, as in small container images.
+        let mozilla = webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter().filter_map(|der| Certificate::from_der(der).ok());
+        let client = reqwest::blocking::Client::builder().tls_certs_merge(mozilla);
+        // A blocking client cannot be made on an async thread.
+        let client = std::thread::spawn(|| client.build()).join().map_err(|_| wrong(&"the client panicked"))?;
+        let client = client.map_err(|e| wrong(&e))?;
+        let mut exporter = SpanExporter::builder().with_http().with_http_client(client);
+        if !endpoint.is_empty() {
+            if !reqwest::Url::parse(endpoint).is_ok_and(|url| ["http", "https"].contains(&url.scheme())) {
+                return Err(format!("log.otlp_endpoint is {endpoint:?}: it must be a URL with http or https"));
+            }
+            exporter = exporter.with_endpoint(format!("{}/v1/traces", endpoint.trim_end_matches('/')));
+        }
+        let exporter = exporter.build().map_err(|e| wrong(&e))?;
+        // The variables of the service's name go over this one.
+        let resource = match std::env::var_os("OTEL_SERVICE_NAME") {
+            Some(_) => Resource::builder().build(),
+            None => Resource::builder().with_service_name(env!("CARGO_PKG_NAME")).build(),
+        };
+        Ok(Self(Some(SdkTracerProvider::builder().with_resource(resource).with_batch_exporter(exporter).build())))
+    }
+
+    /// Takes the spans that are meant for traces.
+    pub(super) fn layer(&self) -> impl Layer<Registry> {
+        self.0.as_ref().map(|provider| {
+            tracing_opentelemetry::layer()
+                .with_tracer(provider.tracer(env!("CARGO_PKG_NAME")))
+                .with_location(false)
+                .with_threads(false)
+                .with_target(false)
+                .with_tracked_inactivity(false)
+                .with_filter(Targets::new().with_target("modalwatch::spans", tracing::Level::INFO))
+        })
+    }
+
+    /// Sends what is left, for five seconds at most.
+    pub fn end(self) {
+        if let Some(Err(failure)) = self.0.map(|provider| provider.shutdown_with_timeout(LAST_WORDS)) {
+            tracing::warn!(error = %failure, "Could not send the last spans: {failure}");
+        }
+    }
+}
