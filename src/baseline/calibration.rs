@@ -6,12 +6,17 @@ use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
 use rand::Rng as _;
 
-use super::observation::measure;
+use super::observation::{measure, measure_shapes, Observation};
 use super::{Baseline, InferenceError};
-use crate::stats;
+use crate::simulator::TrainingSet;
+use crate::stats::{self, Stream};
 
 /// Simulated measurements in each cell.
 pub const SIMULATIONS: usize = 1_000;
+
+/// The same where each is fitted first, see [`super::start`]; modes are then left out of none: what is missing widens the
+/// fit, not the flow.
+pub const SIMULATIONS_FITTED: usize = 200;
 
 /// Posterior draws for each; a rank is one of `DRAWS` + 1 values.
 pub const DRAWS: usize = 99;
@@ -52,6 +57,9 @@ pub struct Cell {
     pub noise_multiple: f64,
     /// The mode that is missing, from 1; `None` for complete measurements.
     pub missing_mode: Option<usize>,
+    /// Whether mode shapes are missing, of a structure that has some.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub without_shapes: Option<bool>,
     /// p-value of uniform TARP coverage, all parameters together.
     pub tarp_p_value: f64,
     /// One entry a parameter.
@@ -92,9 +100,14 @@ impl CalibrationRecord {
         self.failures.is_empty()
     }
 
-    /// Factor for the 90 % interval of parameter `column` of one measurement, from the nearest cell.
-    pub fn interval_scale(&self, column: usize, noise_multiple: f64, complete: bool) -> f64 {
-        let fitting = self.cells.iter().filter(|cell| cell.missing_mode.is_none() == complete);
+    /// Factor for the 90 % interval of parameter `column` of one measurement, with mode shapes or without, from the nearest
+    /// cell.
+    pub fn interval_scale(&self, column: usize, noise_multiple: f64, complete: bool, shapes: bool) -> f64 {
+        // Where a flow starts at the best fit, what is missing widens the fit: the complete cells hold for all.
+        let all_complete = self.cells.iter().all(|cell| cell.missing_mode.is_none());
+        let fitting = self.cells.iter().filter(|cell| {
+            (all_complete || cell.missing_mode.is_none() == complete) && cell.without_shapes != Some(shapes)
+        });
         let distance = |cell: &&Cell| (cell.noise_multiple / noise_multiple).ln().abs();
         let nearest = fitting.min_by(|a, b| distance(a).total_cmp(&distance(b)));
         nearest.map_or(1.0, |cell| cell.parameters[column].interval_scale)
@@ -126,66 +139,113 @@ pub fn calibrate(baseline: &Baseline, seed: u64) -> Result<(CalibrationRecord, V
     };
     let modes = baseline.simulator().modes();
     let mut masks = vec![None];
-    if modes > 1 {
+    if modes > 1 && !baseline.starts_at_fit() {
         masks.extend((0..modes).map(Some));
     }
-    let (mut cells, mut ranks, mut places) = (Vec::new(), Vec::new(), Vec::new());
     let mut noises =
         vec![(2.0 * range.lowest).min(range.highest), 1.0_f64.clamp(range.lowest, range.highest), range.highest];
     noises.dedup();
-    for noise in noises {
-        for missing in &masks {
-            let purpose = format!("calibration: noise {noise}, missing {missing:?}");
-            let (cell, cell_ranks) = measure_cell(baseline, noise, *missing, seed, &purpose)?;
-            cells.push(cell);
-            ranks.push(cell_ranks);
-            places.push((noise, *missing, purpose));
-        }
+    let shaped = baseline.simulator().shape_points() > 0;
+    let mut situations = Vec::new();
+    for noise_multiple in noises {
+        let without_shapes = shaped.then_some(false);
+        situations.extend(masks.iter().map(|&missing| Situation { noise_multiple, missing, without_shapes }));
+    }
+    if shaped {
+        situations.push(Situation { noise_multiple: 1.0, missing: None, without_shapes: Some(true) });
+    }
+    let (mut cells, mut ranks) = (Vec::new(), Vec::new());
+    for situation in &situations {
+        let (cell, cell_ranks) = measure_cell(baseline, situation, seed, &situation.purpose())?;
+        cells.push(cell);
+        ranks.push(cell_ranks);
     }
     // Of a hundred flows that are right, one fails somewhere by chance. What fails is looked at once more, with other
     // simulations, and judged by these.
-    for (index, (noise, missing, purpose)) in places.into_iter().enumerate() {
-        if !failures_of(&cells, index).is_empty() {
-            (cells[index], ranks[index]) =
-                measure_cell(baseline, noise, missing, seed, &format!("{purpose}, second look"))?;
+    for (index, situation) in situations.iter().enumerate() {
+        if !failures_of(&cells, index, simulations(baseline)).is_empty() {
+            let purpose = format!("{}, second look", situation.purpose());
+            (cells[index], ranks[index]) = measure_cell(baseline, situation, seed, &purpose)?;
         }
     }
-    let failures = (0..cells.len()).flat_map(|index| failures_of(&cells, index)).collect();
-    Ok((CalibrationRecord { simulations: SIMULATIONS, draws: DRAWS, failures, cells }, ranks))
+    let failures = (0..cells.len()).flat_map(|index| failures_of(&cells, index, simulations(baseline))).collect();
+    Ok((CalibrationRecord { simulations: simulations(baseline), draws: DRAWS, failures, cells }, ranks))
+}
+
+/// Simulated measurements in each cell.
+fn simulations(baseline: &Baseline) -> usize {
+    if baseline.starts_at_fit() {
+        SIMULATIONS_FITTED
+    } else {
+        SIMULATIONS
+    }
+}
+
+/// What the measurements of a cell are like.
+struct Situation {
+    noise_multiple: f64,
+    missing: Option<usize>,
+    without_shapes: Option<bool>,
+}
+
+impl Situation {
+    fn purpose(&self) -> String {
+        let Self { noise_multiple, missing, without_shapes } = self;
+        let shapes = if *without_shapes == Some(true) { ", without shapes" } else { "" };
+        format!("calibration: noise {noise_multiple}, missing {missing:?}{shapes}")
+    }
+}
+
+/// A cell in words.
+pub fn place(noise_multiple: f64, missing_mode: Option<usize>, without_shapes: Option<bool>) -> String {
+    let what = match (missing_mode, without_shapes) {
+        (Some(mode), _) => format!("without mode {mode}"),
+        (None, Some(true)) => "without shapes".to_owned(),
+        (None, _) => "complete".to_owned(),
+    };
+    format!("noise × {noise_multiple:.3}, {what}")
+}
+
+/// A simulated measurement of each pair of a set.
+fn observe(baseline: &Baseline, set: &TrainingSet, situation: &Situation, stream: &mut Stream) -> Vec<Observation> {
+    let simulator = baseline.simulator();
+    let one =
+        |(index, (row, sizes)): (usize, (nalgebra::MatrixView1xX<'_, f64, nalgebra::U1, nalgebra::Dyn>, &Vec<f64>))| {
+            let exact: Vec<f64> = row.iter().copied().collect();
+            let multiples: Vec<Option<f64>> = (0..exact.len())
+                .map(|mode| (Some(mode) != situation.missing).then_some(situation.noise_multiple))
+                .collect();
+            let mut observation = measure(simulator, &exact, sizes, &multiples, stream);
+            if situation.without_shapes == Some(false) {
+                measure_shapes(simulator, &mut observation, &set.shapes[index], &vec![false; exact.len()], stream);
+            }
+            observation
+        };
+    set.frequencies_hz.row_iter().zip(&set.effect_sizes).enumerate().map(one).collect()
 }
 
 fn measure_cell(
     baseline: &Baseline,
-    noise_multiple: f64,
-    missing: Option<usize>,
+    situation: &Situation,
     seed: u64,
     purpose: &str,
 ) -> Result<(Cell, CellRanks), InferenceError> {
     use rand::RngCore as _;
     let mut stream = stats::stream(seed, purpose);
-    let simulator = baseline.simulator();
-    let set = simulator
-        .training_set(SIMULATIONS, stream.next_u64())
+    let simulations = simulations(baseline);
+    let set = baseline
+        .simulator()
+        .training_set(simulations, stream.next_u64())
         .map_err(|e| InferenceError::Simulation(e.to_string()))?;
-    let observations: Vec<_> = set
-        .frequencies_hz
-        .row_iter()
-        .zip(&set.effect_sizes)
-        .map(|(row, sizes)| {
-            let exact: Vec<f64> = row.iter().copied().collect();
-            let multiples: Vec<Option<f64>> =
-                (0..exact.len()).map(|mode| (Some(mode) != missing).then_some(noise_multiple)).collect();
-            measure(simulator, &exact, sizes, &multiples, &mut stream)
-        })
-        .collect();
+    let observations = observe(baseline, &set, situation, &mut stream);
     let samples = baseline.infer(&observations, DRAWS, stream.next_u64())?;
     let space = baseline.space();
     let unit = |row: usize, column: usize| space.as_slice()[column].to_unit(samples.theta()[(row, column)]);
     let truth = |simulation: usize, column: usize| space.as_slice()[column].to_unit(set.theta[(simulation, column)]);
-    let mut ranks = vec![Vec::with_capacity(SIMULATIONS); space.len()];
-    let mut tarp_ranks = Vec::with_capacity(SIMULATIONS);
+    let mut ranks = vec![Vec::with_capacity(simulations); space.len()];
+    let mut tarp_ranks = Vec::with_capacity(simulations);
     let mut parameters = Vec::new();
-    for simulation in 0..SIMULATIONS {
+    for simulation in 0..simulations {
         let reference: Vec<f64> = (0..space.len()).map(|_| stream.random::<f64>()).collect();
         let distance = |point: &dyn Fn(usize) -> f64| -> f64 {
             reference.iter().enumerate().map(|(column, r)| (point(column) - r).powi(2)).sum()
@@ -198,8 +258,8 @@ fn measure_cell(
         }
     }
     for (column, parameter) in space.iter().enumerate() {
-        let (mut inside_50, mut inside_90, mut needed) = (0, 0, Vec::with_capacity(SIMULATIONS));
-        for simulation in 0..SIMULATIONS {
+        let (mut inside_50, mut inside_90, mut needed) = (0, 0, Vec::with_capacity(simulations));
+        for simulation in 0..simulations {
             let draws: Vec<f64> = (simulation * DRAWS..(simulation + 1) * DRAWS).map(|row| unit(row, column)).collect();
             let x = truth(simulation, column);
             let [low, q25, median, q75, high] =
@@ -209,24 +269,25 @@ fn measure_cell(
             let half = if x < median { median - low } else { high - median };
             needed.push((x - median).abs() / half.max(1e-12));
         }
-        let coverage_90 = inside_90 as f64 / SIMULATIONS as f64;
+        let coverage_90 = inside_90 as f64 / simulations as f64;
         let good = (GOOD_COVERAGE[0]..=GOOD_COVERAGE[1]).contains(&coverage_90);
         parameters.push(CellParameter {
             name: parameter.name.clone(),
             rank_p_value: uniform_p_value(&ranks[column]),
-            coverage_50: inside_50 as f64 / SIMULATIONS as f64,
+            coverage_50: inside_50 as f64 / simulations as f64,
             coverage_90,
             interval_scale: if good { 1.0 } else { stats::quantile(&needed, 0.9) },
         });
     }
     let cell = Cell {
-        noise_multiple,
-        missing_mode: missing.map(|mode| mode + 1),
+        noise_multiple: situation.noise_multiple,
+        missing_mode: situation.missing.map(|mode| mode + 1),
+        without_shapes: situation.without_shapes,
         tarp_p_value: uniform_p_value(&tarp_ranks),
         parameters,
     };
-    let what = missing.map_or("complete".to_owned(), |mode| format!("without mode {}", mode + 1));
-    Ok((cell, CellRanks { title: format!("noise × {noise_multiple:.3}, {what}"), ranks, tarp_ranks }))
+    let title = place(cell.noise_multiple, cell.missing_mode, cell.without_shapes);
+    Ok((cell, CellRanks { title, ranks, tarp_ranks }))
 }
 
 /// Quantile of few draws without the bias of interpolating between order statistics: the k-th of L draws stands at
@@ -252,15 +313,14 @@ pub fn uniform_p_value(ranks: &[usize]) -> f64 {
 }
 
 /// What fails in a cell; the levels are shared out over all cells.
-fn failures_of(cells: &[Cell], index: usize) -> Vec<String> {
+fn failures_of(cells: &[Cell], index: usize, simulations: usize) -> Vec<String> {
     let cell = &cells[index];
     let parameters: usize = cells.iter().map(|cell| cell.parameters.len()).sum();
     let chance =
-        -stats::normal_quantile(0.5 * LEVEL / parameters.max(1) as f64) * (0.9 * 0.1 / SIMULATIONS as f64).sqrt();
+        -stats::normal_quantile(0.5 * LEVEL / parameters.max(1) as f64) * (0.9 * 0.1 / simulations as f64).sqrt();
     let tolerance = COVERAGE_TOLERANCE.max(chance);
     let mut failures = Vec::new();
-    let what = cell.missing_mode.map_or("complete".to_owned(), |mode| format!("without mode {mode}"));
-    let place = format!("noise × {:.3}, {what}", cell.noise_multiple);
+    let place = place(cell.noise_multiple, cell.missing_mode, cell.without_shapes);
     for p in &cell.parameters {
         if (p.coverage_90 - 0.9).abs() > tolerance {
             failures.push(format!("{place}: 90 % intervals of {} cover {:.3}", p.name, p.coverage_90));

@@ -3,8 +3,9 @@
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
-use super::observation::{measure, Observation};
+use super::observation::{measure, measure_shapes, Observation};
 use super::{Baseline, InferenceError};
+use crate::physics::eigen::transposed_product;
 use crate::simulator::Simulator;
 use crate::stats;
 
@@ -60,7 +61,7 @@ pub struct Group {
 /// Measures what can be told apart, from the Fisher information and from the flow's posterior.
 ///
 /// ```text
-///  F = Jᵀ R⁻¹ J,    J = ∂ ln f/∂u over the prior's width,    C = (F + 12·1)⁻¹    (1/12: variance of a uniform prior)
+///  F = Jᵀ R⁻¹ J,    J = ∂ ln f/∂u, ∂φ/∂u over the prior's width,    C = (F + 12·1)⁻¹    (1/12: variance of a uniform prior)
 /// ```
 ///
 /// # Errors
@@ -79,7 +80,13 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
         let there = simulator.under(sizes);
         fisher.push(local_covariance(&there, &theta, &exact).map_err(|e| failed(&e))?);
         observations.push(match baseline.manifest().conditions.noise_range {
-            Some(_) => measure(simulator, &exact, sizes, &vec![Some(1.0); exact.len()], &mut stream),
+            Some(_) => {
+                let mut one = measure(simulator, &exact, sizes, &vec![Some(1.0); exact.len()], &mut stream);
+                if let Some(shapes) = set.shapes.get(row) {
+                    measure_shapes(simulator, &mut one, shapes, &vec![false; exact.len()], &mut stream);
+                }
+                one
+            }
             None => Observation {
                 noise_multiple: vec![0.0; exact.len()],
                 effect_sizes: sizes.clone(),
@@ -144,20 +151,29 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
 }
 
 /// Covariance of one measurement's parameters in the unit box, by the Fisher information and the prior's variance.
-fn local_covariance(
+///
+/// # Errors
+/// [`crate::physics::Error`] where the simulation fails.
+pub fn local_covariance(
     simulator: &Simulator,
     theta: &[f64],
     exact_hz: &[f64],
 ) -> Result<DMatrix<f64>, crate::physics::Error> {
-    let jacobian = simulator.jacobian(theta)?;
+    let there = simulator.linearise(theta, simulator.modes(), simulator.shape_points() > 0)?;
     let parameters = simulator.space().as_slice();
-    let scaled = DMatrix::from_fn(jacobian.nrows(), jacobian.ncols(), |mode, k| {
+    let width = |k: usize| parameters[k].upper - parameters[k].lower;
+    let scaled = DMatrix::from_fn(exact_hz.len(), parameters.len(), |mode, k| {
         // A structure without noise is looked at with that of a very good test.
         let std_hz = simulator.std_hz(mode, exact_hz[mode]).max(1e-5 * exact_hz[mode]);
-        jacobian[(mode, k)] * (parameters[k].upper - parameters[k].lower) / std_hz
+        there.frequency_slopes[(mode, k)] * width(k) / std_hz
     });
     let d = parameters.len();
-    let precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * 12.0;
+    let mut precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * 12.0;
+    for slopes in there.shape_slopes {
+        let scaled =
+            DMatrix::from_fn(slopes.nrows(), d, |point, k| slopes[(point, k)] * width(k) / simulator.shape_std());
+        precision += transposed_product(&scaled, &scaled);
+    }
     Ok(precision.cholesky().map_or_else(|| DMatrix::identity(d, d) / 12.0, |c| c.inverse()))
 }
 

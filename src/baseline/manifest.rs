@@ -63,9 +63,17 @@ pub struct Conditions {
     pub training_box: Vec<[f64; 2]>,
     /// Noise of the frequencies; `None` for a structure without noise, whose measurements must be complete and exact.
     pub noise_range: Option<NoiseRange>,
+    /// Whether the flow starts at the best fit of each measurement, see [`super::start`].
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub starts_at_fit: bool,
     /// Effects that a covariate moves: the flow is told their sizes.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub effects: Vec<EffectRange>,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// Sizes of one effect that a flow was trained for.
@@ -142,6 +150,9 @@ pub struct ParameterValidation {
 pub struct SelfTest {
     /// One complete measurement, Hz.
     pub frequencies_hz: Vec<f64>,
+    /// Its mode shapes, where the structure has instrumented points.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub shapes: Vec<Vec<f64>>,
     /// Seed of the draws.
     pub seed: u64,
     /// The draws, one row each, in parameter units.

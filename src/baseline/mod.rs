@@ -7,6 +7,7 @@ pub mod manifest;
 pub mod nearest;
 pub mod observation;
 mod resample;
+pub mod start;
 pub mod train;
 
 use candle_core::{DType, Device, Tensor};
@@ -196,6 +197,7 @@ impl Baseline {
             ("whitening.mean", manifest.whitening.mean.len(), m),
             ("whitening.factor", manifest.whitening.factor.len(), m),
             ("self_test.frequencies_hz", manifest.self_test.frequencies_hz.len(), m),
+            ("architecture.fixed_context", manifest.architecture.fixed_context, manifest.conditions.fixed_context(d)),
         ];
         if let Some(&(what, found, expected)) = shapes.iter().find(|(_, found, expected)| found != expected) {
             return Err(LoadError::Shape { what, found, expected });
@@ -277,6 +279,9 @@ impl Baseline {
         draws: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
+        if self.starts_at_fit() {
+            return Ok(PosteriorSamples::new(self.propose_from_fit(observations, draws, seed)?.theta, draws));
+        }
         if !self.is_weighed() {
             return Ok(PosteriorSamples::new(self.propose(observations, draws, seed)?.theta, draws));
         }
@@ -286,11 +291,13 @@ impl Baseline {
     }
 
     /// Whether the simulation weighs the flow's draws: not without noise; not where it depends on numbers of effects that are
-    /// themselves uncertain, over which the flow has learnt to average; not where it would take longer than anybody waits.
+    /// themselves uncertain, over which the flow has learnt to average; not where it would take longer than anybody waits; and not
+    /// where the flow starts at the best fit, which the simulation has had its say in: of a hundred parameters, weights would
+    /// leave a single draw.
     fn is_weighed(&self) -> bool {
         let certain = self.simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));
         let quick = self.simulator.structure().is_none_or(|structure| structure.freedoms() <= MOST_FREEDOMS_WEIGHED);
-        self.manifest.conditions.noise_range.is_some() && certain && quick
+        self.manifest.conditions.noise_range.is_some() && certain && quick && !self.starts_at_fit()
     }
 
     /// Logarithm of the posterior density of `draws` rows of `theta` for each observation, in the unit box of the prior and up
@@ -314,6 +321,9 @@ impl Baseline {
     /// # Errors
     /// [`InferenceError`] for another number of modes or a draw that is not finite.
     fn propose(&self, observations: &[Observation], draws: usize, seed: u64) -> Result<Proposals, InferenceError> {
+        if self.starts_at_fit() {
+            return self.propose_from_fit(observations, draws, seed);
+        }
         let d = self.space().len();
         let context = self.flow.summarise(&self.condition(observations)?)?;
         let mut stream = stats::stream(seed, "latent");
@@ -400,7 +410,13 @@ impl Baseline {
         let sizes = self.simulator.effect_sizes(&measurement.covariates);
         let possible_sizes =
             if sizes.missing.is_empty() { Vec::new() } else { self.simulator.possible_sizes(&measurement.covariates) };
-        let observation = Observation { frequencies_hz, noise_multiple, effect_sizes: sizes.values, possible_sizes };
+        let observation = Observation {
+            frequencies_hz,
+            noise_multiple,
+            shapes: Vec::new(),
+            effect_sizes: sizes.values,
+            possible_sizes,
+        };
         Admitted {
             observation: (observation.modes_present() > 0).then_some(observation),
             below_range,
@@ -417,7 +433,8 @@ impl Baseline {
     ///  ℓ = logit v,    v = (θ − lower)/width of the training box
     /// ```
     ///
-    /// The share inside the prior is estimated by drawing.
+    /// The share inside the prior is estimated by drawing; where the flow starts at the best fit it counts as 1, so that what
+    /// the flow has beyond the prior makes the density too low.
     ///
     /// `theta`: `[n, d]` inside the prior box; `observations`: n.
     ///
@@ -428,6 +445,9 @@ impl Baseline {
         theta: &DMatrix<f64>,
         observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
+        if self.starts_at_fit() {
+            return self.log_density_from_fit(theta, observations);
+        }
         let context = self.flow.summarise(&self.condition(observations)?)?;
         let (drawn, _) = self.flow.sample(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
         let drawn = drawn.to_dtype(DType::F64)?.to_vec2::<f64>()?;
@@ -453,6 +473,9 @@ impl Baseline {
         theta: &DMatrix<f64>,
         observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
+        if self.starts_at_fit() && observations.iter().all(|o| o.possible_sizes.is_empty()) {
+            return self.log_density_from_fit(theta, observations);
+        }
         let draws = theta.nrows() / observations.len().max(1);
         if observations.iter().any(|o| !o.possible_sizes.is_empty()) {
             return self.log_density_of_blind_draws(theta, observations, draws);
@@ -540,8 +563,9 @@ impl Baseline {
     }
 
     fn self_test(&self) -> Result<(), LoadError> {
-        let SelfTest { frequencies_hz, seed, expected } = &self.manifest.self_test;
-        let observation = Observation::complete(frequencies_hz);
+        let SelfTest { frequencies_hz, shapes, seed, expected } = &self.manifest.self_test;
+        let shapes = shapes.iter().cloned().map(Some).collect();
+        let observation = Observation { shapes, ..Observation::complete(frequencies_hz) };
         let samples = self.propose(&[observation], expected.len().max(1), *seed)?;
         let width = |column: usize| self.space().as_slice()[column].upper - self.space().as_slice()[column].lower;
         let mut difference = 0.0_f64;

@@ -6,6 +6,7 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 use super::manifest::{Conditions, EffectRange, NoiseRange, Whitening};
+use crate::physics::shapes::unit_shape;
 use crate::simulator::Simulator;
 use crate::stats::Stream;
 
@@ -14,6 +15,10 @@ pub const DEFAULT_NOISE_RANGE: NoiseRange = NoiseRange { lowest: 0.1, highest: 5
 
 /// Share of the training measurements that have all modes.
 const SHARE_COMPLETE: f64 = 0.6;
+/// Share of the training measurements without any mode shape, of a structure with instrumented points.
+const SHARE_WITHOUT_SHAPES: f64 = 0.1;
+/// Share of the shapes that are missing in the others.
+const SHARE_SHAPE_MISSING: f64 = 0.02;
 /// Share of the training measurements whose modes all have the same noise, as a multiple of the structure's.
 const SHARE_COMMON_NOISE: f64 = 0.6;
 
@@ -24,6 +29,8 @@ pub struct Observation {
     pub frequencies_hz: Vec<Option<f64>>,
     /// Standard deviation of each frequency as a multiple of the structure's own; 1 where a mode is missing.
     pub noise_multiple: Vec<f64>,
+    /// Shape of each mode at the instrumented points, of unit norm; `None` where it was not identified. Empty without any.
+    pub shapes: Vec<Option<Vec<f64>>>,
     /// Sizes of the structure's effects under the covariates of the measurement; empty where nothing is known of them, or
     /// there are none.
     pub effect_sizes: Vec<f64>,
@@ -37,6 +44,7 @@ impl Observation {
         Self {
             frequencies_hz: frequencies_hz.iter().copied().map(Some).collect(),
             noise_multiple: vec![1.0; frequencies_hz.len()],
+            shapes: Vec::new(),
             effect_sizes: Vec::new(),
             possible_sizes: Vec::new(),
         }
@@ -54,6 +62,17 @@ impl Observation {
     /// Modes that are there.
     pub fn modes_present(&self) -> usize {
         self.frequencies_hz.iter().flatten().count()
+    }
+
+    /// Shape of mode `mode`, where the mode is there and its shape is known.
+    pub fn shape(&self, mode: usize) -> Option<&[f64]> {
+        self.frequencies_hz[mode]?;
+        self.shapes.get(mode)?.as_deref()
+    }
+
+    /// True when some mode has a shape.
+    pub fn has_shapes(&self) -> bool {
+        (0..self.frequencies_hz.len()).any(|mode| self.shape(mode).is_some())
     }
 
     /// Standard deviation of mode `mode`, Hz; `None` where it is missing.
@@ -83,6 +102,21 @@ impl Conditions {
     pub fn channels(&self) -> usize {
         let own = if self.noise_range.is_some() { 3 } else { 1 };
         own + self.effects.len()
+    }
+
+    /// Which shapes of one simulated measurement are missing.
+    pub fn draw_shapes(modes: usize, stream: &mut Stream) -> Vec<bool> {
+        let without = stream.random::<f64>() < SHARE_WITHOUT_SHAPES;
+        (0..modes).map(|_| stream.random::<f64>() < SHARE_SHAPE_MISSING || without).collect()
+    }
+
+    /// Numbers that a flow of `parameters` parameters is told of a best fit; 0 where it does not start there.
+    pub fn fixed_context(&self, parameters: usize) -> usize {
+        if self.starts_at_fit {
+            super::start::features(parameters)
+        } else {
+            0
+        }
     }
 
     /// Noise multiples and a mask for one simulated measurement: `None` where a mode is missing.
@@ -134,9 +168,31 @@ pub fn measure(
     Observation {
         frequencies_hz: exact_hz.iter().zip(multiples).enumerate().map(one).collect(),
         noise_multiple: multiples.iter().map(|m| m.unwrap_or(1.0)).collect(),
+        shapes: Vec::new(),
         effect_sizes: effect_sizes.to_vec(),
         possible_sizes: Vec::new(),
     }
+}
+
+/// Gives a simulated measurement the shapes of its modes, with noise; those of `exact` where they are not missing.
+///
+/// ```text
+///  φ̃ = (φ + s·N(0, 1))/|…|,    s: standard deviation of each number of a shape of unit norm
+/// ```
+pub fn measure_shapes(
+    simulator: &Simulator,
+    observation: &mut Observation,
+    exact: &DMatrix<f64>,
+    missing: &[bool],
+    stream: &mut Stream,
+) {
+    let std = simulator.shape_std();
+    let one = |(shape, missing): (nalgebra::DVectorView<'_, f64>, &bool)| {
+        // Drawn for missing ones too, as above.
+        let noisy: Vec<f64> = shape.iter().map(|x| x + std * stream.sample::<f64, _>(StandardNormal)).collect();
+        unit_shape(&noisy).filter(|_| !missing)
+    };
+    observation.shapes = exact.column_iter().zip(missing).map(one).collect();
 }
 
 /// Turns observations into the input of the flow.

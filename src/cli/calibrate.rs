@@ -6,7 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::write_whole;
-use crate::baseline::calibration::{calibrate as measure, CalibrationRecord, CellRanks, DRAWS};
+use crate::baseline::calibration::{calibrate as measure, place, CalibrationRecord, CellRanks, DRAWS};
 use crate::baseline::library::{find_structure, Library};
 use crate::baseline::train::renew;
 use crate::baseline::Baseline;
@@ -73,11 +73,6 @@ pub(super) fn load(structure: &str, model: Option<&Path>) -> anyhow::Result<std:
     Ok(loaded.with_context(|| format!("{} is refused", weights.display()))?.into())
 }
 
-fn place(noise_multiple: f64, missing_mode: Option<usize>) -> String {
-    let what = missing_mode.map_or("complete".to_owned(), |mode| format!("without mode {mode}"));
-    format!("noise × {noise_multiple:.3}, {what}")
-}
-
 const HEADER: [&str; 6] =
     ["noise and modes", "parameter", "90 % covers", "50 % covers", "ranks uniform, p", "TARP uniform, p"];
 
@@ -85,7 +80,7 @@ fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
     let cell_rows = record.cells.iter().flat_map(|cell| {
         cell.parameters.iter().map(move |p| {
             vec![
-                place(cell.noise_multiple, cell.missing_mode),
+                place(cell.noise_multiple, cell.missing_mode, cell.without_shapes),
                 p.name.clone(),
                 format!("{:.3}", p.coverage_90),
                 format!("{:.3}", p.coverage_50),

@@ -18,11 +18,17 @@ pub(super) const KERNEL: usize = 3;
 ///
 /// Source: Wang et al. (2025), §3.2.2 and §5.2 (a 1-D CNN as conditional network). The shortcut of y is not in the
 /// paper: without it the narrow posteriors of noise-free data would have to pass through the features.
+///
+/// With `architecture.fixed_context` there is no network: what is known of a measurement comes ready, S(y) = y.
 pub struct ContextNetwork {
+    layers: Option<Layers>,
+    width: usize,
+}
+
+struct Layers {
     first: Convolution,
     second: Convolution,
     features: Dense,
-    width: usize,
 }
 
 impl ContextNetwork {
@@ -31,13 +37,17 @@ impl ContextNetwork {
     /// # Errors
     /// A candle error when a weight is missing or of another shape.
     pub fn new(architecture: &Architecture, vb: &VarBuilder<'_>) -> Result<Self> {
+        if architecture.fixed_context > 0 {
+            return Ok(Self { layers: None, width: architecture.fixed_context });
+        }
         let (modes, channels) = (architecture.modes, architecture.context_channels);
-        Ok(Self {
+        let layers = Layers {
             first: Convolution::new(architecture.channels, channels, &vb.pp("conv1"))?,
             second: Convolution::new(channels, channels, &vb.pp("conv2"))?,
             features: Dense::new(modes * channels, architecture.context_features, &vb.pp("features"))?,
-            width: architecture.context_features + modes * architecture.channels,
-        })
+        };
+        let width = architecture.context_features + modes * architecture.channels;
+        Ok(Self { layers: Some(layers), width })
     }
 
     /// Number of entries of S(y).
@@ -45,19 +55,25 @@ impl ContextNetwork {
         self.width
     }
 
-    /// `y`: `[n, channels, modes]`; returns S(y) `[n, width]`.
+    /// Numbers of [`Self::shortcut`].
+    pub fn shortcut_width(&self) -> usize {
+        self.width - self.layers.as_ref().map_or(0, |layers| layers.features.outputs())
+    }
+
+    /// `y`: `[n, channels, modes]`, or `[n, fixed_context]` without a network; returns S(y) `[n, width]`.
     ///
     /// # Errors
     /// A candle error when the shape of `y` is another.
     pub fn forward(&self, y: &Tensor) -> Result<Tensor> {
+        let Some(layers) = &self.layers else { return Ok(y.clone()) };
         let by_mode = y.transpose(1, 2)?.contiguous()?;
-        let hidden = silu(&self.first.forward(&by_mode)?)?;
-        let hidden = silu(&self.second.forward(&hidden)?)?;
-        let features = silu(&self.features.forward(&hidden.flatten_from(1)?)?)?;
+        let hidden = silu(&layers.first.forward(&by_mode)?)?;
+        let hidden = silu(&layers.second.forward(&hidden)?)?;
+        let features = silu(&layers.features.forward(&hidden.flatten_from(1)?)?)?;
         Tensor::cat(&[features, self.shortcut(y)?], 1)
     }
 
-    /// What is passed beside the features, `[n, shortcut]`; no weight that is trained is in it.
+    /// What is passed beside the features, `[n, shortcut]`: no weight is in it. Without a network it is all there is.
     ///
     /// # Errors
     /// A candle error when the shape of `y` is another.

@@ -42,6 +42,11 @@ impl Dense {
         &self.weight
     }
 
+    /// Number of outputs.
+    pub fn outputs(&self) -> usize {
+        self.bias.elem_count()
+    }
+
     /// b, `[outputs]`.
     pub fn bias(&self) -> &Tensor {
         &self.bias

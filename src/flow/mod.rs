@@ -49,10 +49,19 @@ pub struct Architecture {
     pub context_channels: usize,
     /// Features the context network gives besides the observation itself.
     pub context_features: usize,
+    /// Numbers that the units are conditioned on directly, where the context network is none: y is then `[n, fixed_context]` and
+    /// S(y) = y. 0 for a context network.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub fixed_context: usize,
     /// Bound α of each log-scale, in tenths (an integer, so that architectures compare exactly).
     pub clamp_tenths: u32,
     /// The fixed permutation in front of each unit.
     pub permutations: Vec<Vec<u32>>,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
+fn is_zero(value: &usize) -> bool {
+    *value == 0
 }
 
 /// Size of a flow before the structure is known.
@@ -89,6 +98,7 @@ impl FlowSettings {
             width: self.width,
             context_channels: self.context_channels,
             context_features: self.context_features,
+            fixed_context: 0,
             clamp_tenths: self.clamp_tenths,
             permutations,
         }
@@ -129,7 +139,7 @@ impl Flow {
         self.dtype
     }
 
-    /// Summary S(y) the units are conditioned on. `y`: `[n, channels, modes]`; returns `[n, context]`.
+    /// Summary S(y) the units are conditioned on. `y`: `[n, channels, modes]`, or `[n, fixed_context]`; returns `[n, context]`.
     ///
     /// # Errors
     /// A candle error when the shape of `y` is another.

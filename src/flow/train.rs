@@ -209,7 +209,7 @@ impl Descent for ByHand<'_> {
     type Copy = Vec<f32>;
 
     fn read(&self, pairs: &Pairs) -> Result<Rows, candle_core::Error> {
-        Fused::rows(self.flow, pairs)
+        self.fused.rows(self.flow, pairs)
     }
 
     fn step(&mut self, data: &Rows, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error> {

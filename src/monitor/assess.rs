@@ -185,7 +185,7 @@ fn conform(baseline: &Baseline, column: usize, observation: &Observation, draws:
     let present = observation.frequencies_hz.iter().zip(&observation.noise_multiple).filter(|(f, _)| f.is_some());
     let noise = (present.map(|(_, multiple)| multiple.ln()).sum::<f64>() / modes as f64).exp();
     let complete = modes == baseline.simulator().modes();
-    let scale = baseline.manifest().calibration.interval_scale(column, noise, complete);
+    let scale = baseline.manifest().calibration.interval_scale(column, noise, complete, observation.has_shapes());
     let (median, prior) = (stats::quantile(draws, 0.5), &baseline.space().as_slice()[column]);
     for draw in draws {
         *draw = (median + scale * (*draw - median)).clamp(prior.lower, prior.upper);

@@ -3,7 +3,9 @@
 pub mod assembly;
 pub mod beam;
 pub mod effect;
+pub mod eigen;
 pub mod modes;
+pub mod shapes;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;

@@ -2,16 +2,17 @@
 
 use std::f64::consts::PI;
 
-use nalgebra::{DMatrix, DVector, SymmetricEigen};
+use nalgebra::{DMatrix, DVector};
 
 use super::assembly::{mass_matrix, stiffness_matrix_with};
+use super::eigen::{eigen, eigenvalues};
 use super::{Error, Form, Structure};
 
 /// Below this share of the largest eigenvalue, the smallest is rounding: the structure is a mechanism.
 const SINGULAR: f64 = 1e-12;
 
 /// Relative gap below which two eigenvalues count as one: rounding moves them by some 1e-13.
-const REPEATED: f64 = 1e-8;
+pub(super) const REPEATED: f64 = 1e-8;
 
 /// All modes of a structure; `count` of them were asked for.
 #[derive(Debug, Clone)]
@@ -19,9 +20,9 @@ pub struct Modes {
     /// Natural frequencies asked for, Hz, ascending.
     pub frequencies_hz: Vec<f64>,
     /// All eigenvalues λ = (2πf)², rad²/s², ascending.
-    eigenvalues: Vec<f64>,
+    pub(super) eigenvalues: Vec<f64>,
     /// All mode shapes by columns, mass-normalised: φᵀMφ = 1, kg^-½.
-    all_shapes: DMatrix<f64>,
+    pub(super) all_shapes: DMatrix<f64>,
 }
 
 impl Modes {
@@ -64,10 +65,7 @@ pub fn natural_frequencies_with(
 ) -> Result<Vec<f64>, Error> {
     structure.check_changes(changes)?;
     let scaled = Scaled::new(structure, changes)?;
-    let mut eigenvalues: Vec<f64> = scaled.stiffness.symmetric_eigenvalues().iter().copied().collect();
-    // nalgebra gives them unsorted.
-    eigenvalues.sort_by(f64::total_cmp);
-    frequencies(&eigenvalues, count)
+    frequencies(&eigenvalues(&scaled.stiffness), count)
 }
 
 /// The lowest `count` modes with their shapes.
@@ -76,13 +74,9 @@ pub fn natural_frequencies_with(
 /// [`Error::TooFewModes`], [`Error::NearMechanism`].
 pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
     let Scaled { stiffness, mass_root } = Scaled::new(structure, &[])?;
-    let SymmetricEigen { eigenvalues, eigenvectors } = stiffness.symmetric_eigen();
-    let mut order: Vec<usize> = (0..eigenvalues.len()).collect();
-    order.sort_by(|a, b| eigenvalues[*a].total_cmp(&eigenvalues[*b]));
-    let sorted: Vec<f64> = order.iter().map(|i| eigenvalues[*i]).collect();
-    let n = order.len();
-    let all_shapes = mass_root.shapes(&DMatrix::from_fn(n, n, |row, column| eigenvectors[(row, order[column])]));
-    Ok(Modes { frequencies_hz: frequencies(&sorted, count)?, eigenvalues: sorted, all_shapes })
+    let (eigenvalues, eigenvectors) = eigen(stiffness);
+    let all_shapes = mass_root.shapes(&eigenvectors);
+    Ok(Modes { frequencies_hz: frequencies(&eigenvalues, count)?, eigenvalues, all_shapes })
 }
 
 /// Derivatives of the frequencies with respect to every spring and every mass.

@@ -6,6 +6,7 @@ use super::definition::{
     DefinitionProblem, Law, MeasurementNoise, ParameterDefinition, Prior, Sets, SimulationKind, StructureDefinition,
 };
 use super::effect::{self, Effect};
+use super::shapes::{self, Instrumented};
 use super::{beam, table, Binding, Model};
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
@@ -24,6 +25,7 @@ pub(super) struct Checked {
     pub space: ParameterSpace,
     pub covariates: Vec<Covariate>,
     pub effects: Vec<Effect>,
+    pub instrumented: Option<Instrumented>,
 }
 
 pub(super) type Problems = Vec<DefinitionProblem>;
@@ -61,10 +63,11 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
         definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
+    let instrumented = shapes::check(definition, &model, &mut problems);
     if !problems.is_empty() {
         return Err(problems);
     }
-    Ok(Checked { id, model, nominal_frequencies_hz, space, covariates, effects })
+    Ok(Checked { id, model, nominal_frequencies_hz, space, covariates, effects, instrumented })
 }
 
 /// Degrees of freedom, places and masses of a structure, and the forms of its stiffnesses: springs, then spans.

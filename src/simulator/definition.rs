@@ -11,6 +11,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::check;
 use super::law::LawKind;
+use super::shapes::ModeShapesDefinition;
 use crate::measurement::CovariateKind;
 use crate::parameter::DamageDirection;
 use crate::quantity::{json_pointer, shown, Digest};
@@ -29,6 +30,9 @@ pub struct StructureDefinition {
     /// Standard deviation of one measured frequency.
     #[serde(default)]
     pub measurement_noise: MeasurementNoise,
+    /// Where mode shapes are measured, if they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mode_shapes: Option<ModeShapesDefinition>,
     /// What kind of simulation it is.
     #[serde(default, skip_serializing_if = "is_default")]
     pub simulation: SimulationKind,

@@ -9,6 +9,7 @@ pub mod definition;
 pub mod effect;
 pub mod law;
 pub mod population;
+pub mod shapes;
 pub mod table;
 
 use std::collections::BTreeMap;
@@ -27,6 +28,7 @@ use crate::quantity::{Digest, StructureId};
 use crate::stats;
 use definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
 use effect::Effect;
+pub use shapes::Linearised;
 use table::Table;
 
 /// How far outside its simulated range a frequency may lie before it is taken for a mistake of unit or place.
@@ -129,6 +131,8 @@ pub struct TrainingSet {
     pub theta: DMatrix<f64>,
     /// `[n, m]`, Hz, without noise.
     pub frequencies_hz: DMatrix<f64>,
+    /// Mode shapes at the instrumented points of each row, unit norm, `[points, m]`; empty where there are no such points.
+    pub shapes: Vec<DMatrix<f64>>,
     /// Sizes of the structure's effects under the covariates of each row, as their laws' mean numbers give them, `[n]`; the
     /// frequencies have sizes by numbers drawn from what is known of them.
     pub effect_sizes: Vec<Vec<f64>>,
@@ -534,7 +538,17 @@ impl Simulator {
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
         let mut stream = stats::stream(seed, "covariates");
         let mut effect_sizes = vec![Vec::new(); samples];
-        let exact = if self.effects().is_empty() {
+        let mut shapes = Vec::new();
+        let exact = if self.shape_points() > 0 {
+            let simulate = |theta: &Vec<f64>| {
+                let failed = |source| Error::Physics { parameters: theta.clone(), source };
+                self.frequencies_and_shapes(theta).map_err(failed)
+            };
+            let both = rows.par_iter().map(simulate).collect::<Result<Vec<_>, _>>()?;
+            let (frequencies, of_rows): (Vec<_>, _) = both.into_iter().unzip();
+            shapes = of_rows;
+            frequencies
+        } else if self.effects().is_empty() {
             self.exact(&rows)?
         } else {
             let mut drawn = Vec::with_capacity(samples);
@@ -550,7 +564,7 @@ impl Simulator {
             rows.par_iter().zip(&drawn).map(simulate).collect::<Result<Vec<_>, _>>()?
         };
         let frequencies_hz = DMatrix::from_fn(samples, self.modes(), |row, mode| exact[row][mode]);
-        Ok(TrainingSet { theta, frequencies_hz, effect_sizes, seed })
+        Ok(TrainingSet { theta, frequencies_hz, shapes, effect_sizes, seed })
     }
 
     /// Exact frequencies of each row of parameters, Hz.

@@ -6,9 +6,9 @@ use crate::flow::context::KERNEL;
 use crate::flow::kernel::{add_bias_and_silu_with_slopes, add_weight_gradient, through_slopes};
 use crate::flow::Architecture;
 
-/// The context network: two convolutions and a dense layer, beside the shortcut.
+/// The context network: two convolutions and a dense layer, beside the shortcut; or the shortcut alone.
 pub(super) struct Context {
-    layers: [Place; 3],
+    layers: Option<[Place; 3]>,
     modes: usize,
     features: usize,
     shortcut: usize,
@@ -28,8 +28,15 @@ pub(super) struct Trace {
 
 impl Context {
     pub(super) fn new(layout: &Layout, architecture: &Architecture, shortcut: usize) -> Self {
-        let layers = ["conv1", "conv2", "features"].map(|name| layout.place(&format!("context.{name}")));
-        Self { layers, modes: architecture.modes, features: architecture.context_features, shortcut }
+        let place = |name| layout.place(&format!("context.{name}"));
+        let layers = (architecture.fixed_context == 0).then(|| ["conv1", "conv2", "features"].map(place));
+        let features = if layers.is_some() { architecture.context_features } else { 0 };
+        Self { layers, modes: architecture.modes, features, shortcut }
+    }
+
+    /// Whether anything but the shortcut is read of an observation.
+    pub(super) fn has_network(&self) -> bool {
+        self.layers.is_some()
     }
 
     /// Entries of S(y).
@@ -48,7 +55,8 @@ impl Context {
 
     pub(super) fn trace(&self, tile: usize) -> Trace {
         let sized = |size: fn(&Place) -> usize| {
-            [0, 1, 2].map(|layer| vec![0.0; size(&self.layers[layer]) * self.columns(layer) * tile])
+            let buffer = |layer: usize, place: &Place| vec![0.0; size(place) * self.columns(layer) * tile];
+            self.layers.as_ref().map_or_else(Default::default, |all| [0, 1, 2].map(|layer| buffer(layer, &all[layer])))
         };
         let (inputs, outputs) = (sized(|place| place.inputs), sized(|place| place.outputs));
         let largest = |buffers: &[Vec<f32>; 3]| vec![0.0; buffers.iter().map(Vec::len).max().unwrap_or(0)];
@@ -65,12 +73,18 @@ impl Context {
         trace: &mut Trace,
         context: &mut [f32],
     ) {
-        let window = self.layers[0].inputs * self.modes;
+        let Some(layers) = &self.layers else {
+            for (row, own) in context.chunks_exact_mut(self.shortcut).enumerate() {
+                own.copy_from_slice(observation(row).1);
+            }
+            return;
+        };
+        let window = layers[0].inputs * self.modes;
         for row in 0..count {
             unfold(observation(row).0, self.modes, &mut trace.inputs[0][row * window..(row + 1) * window]);
         }
         for layer in 0..3 {
-            let place = &self.layers[layer];
+            let place = &layers[layer];
             let dense = place.layer(weights);
             let columns = self.columns(layer) * count;
             let output = &mut trace.outputs[layer][..place.outputs * columns];
@@ -78,7 +92,7 @@ impl Context {
             add_bias_and_silu_with_slopes(output, dense.bias, &mut trace.slopes[layer][..place.outputs * columns]);
             match layer {
                 0 => {
-                    let next = self.layers[1].inputs * self.modes;
+                    let next = layers[1].inputs * self.modes;
                     let windows = trace.inputs[1].chunks_exact_mut(next);
                     for (output, windows) in output.chunks_exact(place.outputs * self.modes).zip(windows) {
                         unfold(output, self.modes, windows);
@@ -106,12 +120,13 @@ impl Context {
         count: usize,
         trace: &mut Trace,
     ) {
+        let Some(layers) = &self.layers else { return };
         let of_features = trace.of_output.chunks_exact_mut(self.features);
         for (own, column) in of_features.zip(context_gradient.chunks_exact(self.width())) {
             own.copy_from_slice(&column[..self.features]);
         }
         for layer in [2, 1, 0] {
-            let place = &self.layers[layer];
+            let place = &layers[layer];
             let columns = self.columns(layer) * count;
             let of_output = &mut trace.of_output[..place.outputs * columns];
             let slopes = &trace.slopes[layer][..place.outputs * columns];
@@ -123,7 +138,7 @@ impl Context {
             }
             let of_input = &mut trace.of_input[..place.inputs * columns];
             place.layer(weights).input_gradient(of_output, of_input);
-            let of_previous = &mut trace.of_output[..self.layers[layer - 1].outputs * self.modes * count];
+            let of_previous = &mut trace.of_output[..layers[layer - 1].outputs * self.modes * count];
             if layer == 2 {
                 of_previous.copy_from_slice(of_input);
             } else {

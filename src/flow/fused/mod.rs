@@ -106,12 +106,12 @@ impl Fused {
     ///
     /// # Errors
     /// A candle error when shapes do not fit.
-    pub fn rows(flow: &Flow, pairs: &Pairs) -> Result<Rows> {
+    pub fn rows(&self, flow: &Flow, pairs: &Pairs) -> Result<Rows> {
         let plain = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
         Ok(Rows {
             count: pairs.x.dim(0)?,
             x: plain(&pairs.x)?,
-            y: plain(&pairs.y.transpose(1, 2)?.contiguous()?)?,
+            y: if self.context.has_network() { plain(&pairs.y.transpose(1, 2)?.contiguous()?)? } else { Vec::new() },
             shortcut: plain(&flow.context.shortcut(&pairs.y)?)?,
         })
     }

@@ -18,7 +18,11 @@ struct Case {
 
 fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
     let settings = FlowSettings { units: 3, width: 24, context_channels: 4, context_features: 8, clamp_tenths: 20 };
-    let architecture = settings.architecture(parameters, modes, channels, &mut stats::stream(1, "permutations"));
+    let mut architecture = settings.architecture(parameters, modes, channels, &mut stats::stream(1, "permutations"));
+    // No channel stands for no context network.
+    if channels == 0 {
+        architecture.fixed_context = modes;
+    }
     let single = untrained_flow(&architecture, DType::F32, 1).unwrap();
     let double = untrained_flow(&architecture, DType::F64, 1).unwrap();
     let mut stream = stats::stream(2, "case");
@@ -33,7 +37,10 @@ fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
         let draws: Vec<f32> = (0..shape.iter().product()).map(|_| stream.sample(StandardNormal)).collect();
         Tensor::from_vec(draws, shape, &Device::Cpu).unwrap()
     };
-    let (x, y) = (normal(vec![rows, parameters]), normal(vec![rows, channels, modes]));
+    let (x, y) = (
+        normal(vec![rows, parameters]),
+        normal(if channels == 0 { vec![rows, modes] } else { vec![rows, channels, modes] }),
+    );
     let pairs =
         [DType::F32, DType::F64].map(|dtype| Pairs { x: x.to_dtype(dtype).unwrap(), y: y.to_dtype(dtype).unwrap() });
     Case { single, double, pairs }
@@ -41,12 +48,15 @@ fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
 
 #[test]
 fn loss_and_gradient_are_those_of_candle() {
-    // One parameter (an empty half), odd and even numbers, several channels, batches of a part of a tile and of many tiles.
-    for (parameters, modes, channels, rows) in [(1, 2, 1, 7), (3, 3, 1, 64), (4, 5, 3, 150), (5, 1, 2, 700)] {
+    // One parameter (an empty half), odd and even numbers, several channels and no context network, batches of a part of a tile
+    // and of many tiles.
+    for (parameters, modes, channels, rows) in
+        [(1, 2, 1, 7), (3, 3, 1, 64), (4, 5, 3, 150), (5, 1, 2, 700), (6, 9, 0, 65)]
+    {
         let case = case(parameters, modes, channels, rows);
         let [single, double] = &case.pairs;
         let mut fused = Fused::new(&case.single.0, &case.single.1).unwrap().unwrap();
-        let data = Fused::rows(&case.single.0, single).unwrap();
+        let data = fused.rows(&case.single.0, single).unwrap();
         let chosen: Vec<u32> = (0..rows as u32).collect();
         let loss = fused.pass(&data, &chosen, true);
 
@@ -81,7 +91,7 @@ fn the_optimiser_takes_the_steps_of_candles() {
     let case = case(3, 3, 1, 96);
     let [single, double] = &case.pairs;
     let mut fused = Fused::new(&case.single.0, &case.single.1).unwrap().unwrap();
-    let data = Fused::rows(&case.single.0, single).unwrap();
+    let data = fused.rows(&case.single.0, single).unwrap();
     let params = ParamsAdamW { lr: 1e-3, weight_decay: 0.0, ..ParamsAdamW::default() };
     let mut reference = Reference::new(case.double.1.values().cloned().collect(), params).unwrap();
     let chosen: Vec<u32> = (0..96).collect();
@@ -103,7 +113,7 @@ fn the_number_of_threads_changes_no_bit() {
         let case = case(4, 3, 1, 300);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let mut fused = Fused::new(&case.single.0, &case.single.1).unwrap().unwrap();
-        let data = Fused::rows(&case.single.0, &case.pairs[0]).unwrap();
+        let data = fused.rows(&case.single.0, &case.pairs[0]).unwrap();
         let chosen: Vec<u32> = (0..300).rev().collect();
         pool.install(|| {
             for _ in 0..5 {

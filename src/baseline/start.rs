@@ -1,0 +1,405 @@
+//! Where a flow of many parameters starts: the best fit of each measurement and the normal distribution about it.
+//!
+//! A flow of a hundred parameters would spend its training on finding out what Newton's method knows: which parameters come
+//! nearest to a measurement. Here each measurement is fitted first, by the simulation and its derivatives, and the flow
+//! learns only what the posterior has beyond the normal distribution at the fit:
+//!
+//! ```text
+//!  û    = argmin ½ |r(u)|² + 6 |u − ½|²          r: residuals in standard deviations, u: position in the prior box
+//!  R Rᵀ = JᵀJ/a² + 12·1                          12: one over the variance of a uniform prior,  J = −∂r/∂u at û
+//!  x    = Rᵀ (u − û),    flow:  x ⟷ z | û, ln std of each parameter, ln a
+//! ```
+//!
+//! a² is the misfit at û beyond what the noise explains, 1 for one that fits: where the search stops in a false valley, the
+//! start is wide rather than sure of a wrong place. Modes are paired anew at each step, by MAC and frequency, so that a
+//! measurement may have modes in another order than the simulation, or lack some, or lack shapes.
+
+use candle_core::{DType, Device, Tensor};
+use nalgebra::{DMatrix, DVector};
+use rand::Rng as _;
+use rayon::prelude::*;
+
+use super::observation::Observation;
+use super::resample::Proposals;
+use super::{Baseline, InferenceError};
+use crate::parameter::Parameter;
+use crate::physics;
+use crate::physics::eigen::transposed_product;
+use crate::physics::shapes::pair_modes;
+use crate::simulator::{Linearised, Simulator};
+use crate::stats::{self, normal_cdf, normal_quantile, Stream};
+
+/// Parameters from which a flow starts at the best fit.
+pub const MANY_PARAMETERS: usize = 17;
+
+/// Precision of the uniform prior of a position in the box: one over its variance 1/12.
+const PRIOR_PRECISION: f64 = 12.0;
+
+/// Most steps of the search; it takes five or six where the noise is small.
+const STEPS: usize = 20;
+
+/// Far off, the noise counts as this share of the root mean square residual: full steps on sharp residuals overshoot.
+const CAUTION: f64 = 0.8;
+
+/// The search ends with a step that is expected to gain less than this, nats: 2 is less than a standard deviation in a single
+/// of a hundred directions, and the step itself is still made.
+const LEAST_GAIN: f64 = 2.0;
+
+/// Standard deviations of χ² that the misfit may exceed its mean by without widening the start.
+const MISFIT_ALLOWED: f64 = 3.0;
+
+/// Rounds over the parameters of a draw that lie beyond the prior.
+const ROUNDS: usize = 2;
+
+/// Whether the flow of a structure starts at the best fit: where its parameters are many or its mode shapes are measured. It
+/// needs noise to weigh residuals by.
+pub fn starts_at_fit(simulator: &Simulator) -> bool {
+    simulator.is_noisy() && (simulator.space().len() >= MANY_PARAMETERS || simulator.shape_points() > 0)
+}
+
+/// Numbers that a flow is told of the fit of a measurement to a structure with `parameters` parameters.
+pub fn features(parameters: usize) -> usize {
+    2 * parameters + 1
+}
+
+/// The best fit of a measurement.
+#[derive(Debug, Clone)]
+pub struct Located {
+    /// û: position of the parameters in the prior box, `[d]`; may lie a little beyond it.
+    pub unit: DVector<f64>,
+    /// Precision R Rᵀ of the normal distribution about û, `[d, d]`.
+    pub precision: DMatrix<f64>,
+    /// Its lower triangular factor R.
+    pub factor: DMatrix<f64>,
+    /// Standard deviation of each position under that distribution.
+    pub std: DVector<f64>,
+    /// Sum of the squared residuals, in standard deviations of the noise.
+    pub chi_squared: f64,
+    /// Residuals less the directions in which parameters absorb them.
+    pub degrees_of_freedom: f64,
+    /// a² − 1 ≥ 0: the misfit beyond what noise explains.
+    pub excess: f64,
+    /// Simulated frequency of each mode of the measurement, Hz.
+    pub frequencies_hz: Vec<f64>,
+}
+
+/// Residuals of a measurement at one point and their derivatives.
+struct Residuals {
+    /// (measured − simulated)/std: frequencies by their logarithms, shapes by their numbers.
+    values: DVector<f64>,
+    /// Derivatives of what is simulated, over the standard deviations, per width of the prior, `[rows, d]`.
+    slopes: DMatrix<f64>,
+    /// Rows less one for each shape, whose norm is no measurement.
+    free: f64,
+    frequencies_hz: Vec<f64>,
+}
+
+/// Fits each measurement; in parallel, the same bits for any number of threads.
+///
+/// # Errors
+/// [`physics::Error`], which a checked prior rules out.
+pub fn locate_all(simulator: &Simulator, observations: &[Observation]) -> Result<Vec<Located>, physics::Error> {
+    observations.par_iter().map(|observation| locate(simulator, observation)).collect()
+}
+
+/// Fits one measurement, see the module.
+///
+/// # Errors
+/// [`physics::Error`], which a checked prior rules out.
+pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Located, physics::Error> {
+    let simulator = &observation.simulator(simulator);
+    let prior = simulator.space().as_slice();
+    // As far beyond the prior as a flow is trained: the simulation is sound there.
+    let wide = simulator.training_space();
+    let limits: Vec<(f64, f64)> =
+        prior.iter().zip(wide.iter()).map(|(p, w)| (p.to_unit(w.lower), p.to_unit(w.upper))).collect();
+    let mut u = DVector::from_element(prior.len(), 0.5);
+    let (mut residuals, mut step);
+    let mut taken = 0;
+    loop {
+        residuals = residuals_at(simulator, observation, prior, &u)?;
+        taken += 1;
+        let rms = (residuals.values.norm_squared() / residuals.values.len() as f64).sqrt();
+        let tempering = (CAUTION * rms).max(1.0).powi(-2);
+        let descent = residuals.slopes.tr_mul(&residuals.values) * tempering - (&u).add_scalar(-0.5) * PRIOR_PRECISION;
+        let normal = transposed_product(&residuals.slopes, &residuals.slopes);
+        let (_, factor) = precision(&normal, tempering);
+        step = solve(&factor, &descent);
+        let gain = descent.dot(&step);
+        for (position, (change, (lowest, highest))) in u.iter_mut().zip(step.iter().zip(&limits)) {
+            *position = (*position + change).clamp(*lowest, *highest);
+        }
+        // Not `>=`: NaN must end it too.
+        let goes_on = gain >= LEAST_GAIN || tempering < 1.0;
+        if taken == STEPS || !goes_on {
+            return Ok(located(u, residuals, &normal, &step));
+        }
+    }
+}
+
+/// The normal distribution at the end of the search, whose last step was small enough for its derivatives to hold.
+fn located(unit: DVector<f64>, residuals: Residuals, normal: &DMatrix<f64>, step: &DVector<f64>) -> Located {
+    let left = residuals.values - &residuals.slopes * step;
+    let chi_squared = left.norm_squared();
+    let (_, full) = precision(normal, 1.0);
+    // Share of each direction that is known from the data rather than from the prior, summed.
+    let absorbed = unit.len() as f64 - PRIOR_PRECISION * inverse(&full).norm_squared();
+    let degrees_of_freedom = (residuals.free - absorbed).max(0.0);
+    let expected = degrees_of_freedom + MISFIT_ALLOWED * (2.0 * degrees_of_freedom.max(1.0)).sqrt();
+    let excess = (chi_squared / expected - 1.0).max(0.0);
+    let (precision, factor) = precision(normal, 1.0 / (1.0 + excess));
+    let inverse = inverse(&factor);
+    let std = DVector::from_iterator(unit.len(), inverse.column_iter().map(|column| column.norm()));
+    let frequencies_hz = residuals.frequencies_hz;
+    Located { unit, precision, factor, std, chi_squared, degrees_of_freedom, excess, frequencies_hz }
+}
+
+/// JᵀJ·weight + 12·1 and its lower triangular factor.
+fn precision(normal: &DMatrix<f64>, weight: f64) -> (DMatrix<f64>, DMatrix<f64>) {
+    let mut precision = normal * weight;
+    for i in 0..precision.nrows() {
+        precision[(i, i)] += PRIOR_PRECISION;
+    }
+    let factor = precision.clone().cholesky().expect("squares plus a positive diagonal are positive definite").unpack();
+    (precision, factor)
+}
+
+/// Solves R Rᵀ s = b.
+fn solve(factor: &DMatrix<f64>, right: &DVector<f64>) -> DVector<f64> {
+    let regular = "a Cholesky factor has no zero on its diagonal";
+    factor.tr_solve_lower_triangular(&factor.solve_lower_triangular(right).expect(regular)).expect(regular)
+}
+
+/// R⁻¹; the squared norms of its columns are the variances.
+fn inverse(factor: &DMatrix<f64>) -> DMatrix<f64> {
+    let identity = DMatrix::identity(factor.nrows(), factor.nrows());
+    factor.solve_lower_triangular(&identity).expect("a Cholesky factor has no zero on its diagonal")
+}
+
+fn residuals_at(
+    simulator: &Simulator,
+    observation: &Observation,
+    prior: &[Parameter],
+    u: &DVector<f64>,
+) -> Result<Residuals, physics::Error> {
+    let theta: Vec<f64> = prior.iter().zip(u).map(|(p, u)| p.from_unit(*u)).collect();
+    let with_shapes = observation.has_shapes();
+    let count = if with_shapes { simulator.modes_to_pair() } else { simulator.modes() };
+    let there = simulator.linearise(&theta, count, with_shapes)?;
+    let present: Vec<(usize, f64)> =
+        observation.frequencies_hz.iter().enumerate().filter_map(|(mode, f)| Some((mode, (*f)?))).collect();
+    let pairs: Vec<usize> = if with_shapes {
+        let measured: Vec<_> = present.iter().map(|&(mode, f)| (f, observation.shape(mode))).collect();
+        pair_modes(&measured, &there.frequencies_hz, &there.shapes)
+    } else {
+        present.iter().map(|(mode, _)| *mode).collect()
+    };
+    let shaped = present.iter().filter(|(mode, _)| observation.shape(*mode).is_some()).count();
+    let points = simulator.shape_points();
+    let rows = present.len() + shaped * points;
+    let mut values = DVector::zeros(rows);
+    let mut slopes = DMatrix::zeros(rows, u.len());
+    let mut frequencies_hz: Vec<f64> = simulator.nominal_frequencies_hz();
+    let mut row = 0;
+    for (&(mode, measured_hz), &own) in present.iter().zip(&pairs) {
+        let Linearised { frequencies_hz: simulated, frequency_slopes, shapes, shape_slopes } = &there;
+        frequencies_hz[mode] = simulated[own];
+        let std = observation.std_hz(simulator, mode).unwrap_or(measured_hz) / measured_hz;
+        values[row] = (measured_hz / simulated[own]).ln() / std;
+        for (column, parameter) in prior.iter().enumerate() {
+            let width = parameter.upper - parameter.lower;
+            slopes[(row, column)] = frequency_slopes[(own, column)] * width / (simulated[own] * std);
+        }
+        row += 1;
+        let Some(measured) = observation.shape(mode) else { continue };
+        let along: f64 = measured.iter().zip(shapes.column(own).iter()).map(|(a, b)| a * b).sum();
+        let sign = if along < 0.0 { -1.0 } else { 1.0 } / simulator.shape_std();
+        for (point, value) in measured.iter().enumerate() {
+            values[row + point] = value / simulator.shape_std() - sign * shapes[(point, own)];
+        }
+        for (column, parameter) in prior.iter().enumerate() {
+            let scale = sign * (parameter.upper - parameter.lower);
+            let mut target = slopes.view_mut((row, column), (points, 1));
+            target.copy_from(&shape_slopes[own].column(column));
+            target *= scale;
+        }
+        row += points;
+    }
+    Ok(Residuals { values, slopes, free: (rows - shaped) as f64, frequencies_hz })
+}
+
+impl Located {
+    /// What the flow is told: û and the standard deviations, both in those of the prior, and the misfit.
+    fn features(&self) -> impl Iterator<Item = f64> + '_ {
+        let wide = PRIOR_PRECISION.sqrt();
+        let place = self.unit.iter().map(move |u| wide * (u - 0.5));
+        let std = self.std.iter().map(move |std| (wide * std).ln());
+        place.chain(std).chain(std::iter::once(0.5 * self.excess.ln_1p()))
+    }
+
+    /// x = Rᵀ (u − û) of positions in the prior box, one column each.
+    pub fn to_flow(&self, unit: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut deviation = unit.clone();
+        for mut column in deviation.column_iter_mut() {
+            column -= &self.unit;
+        }
+        transposed_product(&self.factor, &deviation)
+    }
+
+    /// Positions in the prior box of x, one column each; the inverse of [`Self::to_flow`]. They may lie beyond the box.
+    pub fn from_flow(&self, x: &DMatrix<f64>) -> DMatrix<f64> {
+        let solvable = "a Cholesky factor has no zero on its diagonal";
+        let mut unit = self.factor.tr_solve_lower_triangular(x).expect(solvable);
+        for mut column in unit.column_iter_mut() {
+            column += &self.unit;
+        }
+        unit
+    }
+
+    /// ln|det ∂x/∂u|.
+    pub fn log_det(&self) -> f64 {
+        self.factor.diagonal().iter().map(|r| r.ln()).sum()
+    }
+
+    /// Draws the positions of `draw` (`[d]`) that lie beyond the prior anew, each given all others, under the normal
+    /// distribution cut off at the prior; true when there were some.
+    ///
+    /// ```text
+    ///  u_i | others ~ N(u_i − (P(u − û))_i/P_ii, 1/P_ii) on [0, 1],    P = R Rᵀ
+    /// ```
+    ///
+    /// Of a hundred parameters some lie beyond the prior in nearly every draw: drawing all anew would go on for ever.
+    pub fn draw_back(&self, draw: &mut [f64], stream: &mut Stream) -> bool {
+        let beyond: Vec<usize> = (0..draw.len()).filter(|&i| !(0.0..=1.0).contains(&draw[i])).collect();
+        for _ in 0..ROUNDS {
+            for &i in &beyond {
+                let pull: f64 = self
+                    .precision
+                    .column(i)
+                    .iter()
+                    .zip(draw.iter().zip(&self.unit))
+                    .map(|(p, (u, c))| p * (u - c))
+                    .sum();
+                let own = self.precision[(i, i)];
+                let (mean, std) = (draw[i] - pull / own, own.sqrt().recip());
+                let (low, high) = (normal_cdf(-mean / std), normal_cdf((1.0 - mean) / std));
+                let level = low + (high - low) * stream.random::<f64>();
+                // Far beyond, both levels are 0 or 1: the edge it is.
+                let level = level.clamp(f64::MIN_POSITIVE, 1.0 - f64::EPSILON);
+                draw[i] = (mean + std * normal_quantile(level)).clamp(0.0, 1.0);
+            }
+        }
+        !beyond.is_empty()
+    }
+}
+
+/// Measurements fitted at a time: the precision of each has d² numbers.
+const AT_A_TIME: usize = 64;
+
+impl Baseline {
+    pub(super) fn starts_at_fit(&self) -> bool {
+        self.manifest.conditions.starts_at_fit
+    }
+
+    pub(super) fn locate(&self, observations: &[Observation]) -> Result<Vec<Located>, InferenceError> {
+        let expected = self.simulator.modes();
+        if let Some(o) = observations.iter().find(|o| o.frequencies_hz.len() != expected) {
+            return Err(InferenceError::Modes { found: o.frequencies_hz.len(), expected });
+        }
+        locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))
+    }
+
+    /// The flow's draws about the best fits, inside the prior.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes or a draw that is not finite.
+    pub(super) fn propose_from_fit(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        seed: u64,
+    ) -> Result<Proposals, InferenceError> {
+        let prior = self.space().as_slice();
+        let d = prior.len();
+        let mut stream = stats::stream(seed, "latent");
+        let mut theta = DMatrix::zeros(observations.len() * draws, d);
+        let mut log_density = Vec::with_capacity(theta.nrows());
+        let mut moved = vec![false; observations.len()];
+        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
+            let located = self.locate(part)?;
+            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
+            let (x, own) = self.flow.sample(&context, draws, &mut stream)?;
+            let x = x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?;
+            log_density.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
+            let drawn = x.chunks_exact(d * draws).zip(&located).enumerate();
+            // Each measurement has a stream of its own: the same draws for any number of threads.
+            let placed: Vec<(DMatrix<f64>, bool)> = drawn
+                .collect::<Vec<_>>()
+                .into_par_iter()
+                .map(|(row, (x, fit))| {
+                    let mut unit = fit.from_flow(&DMatrix::from_column_slice(d, draws, x));
+                    let mut stream =
+                        stats::stream(seed, &format!("draws beyond the prior {}", chunk * AT_A_TIME + row));
+                    let mut beyond = false;
+                    for draw in unit.as_mut_slice().chunks_exact_mut(d) {
+                        beyond |= fit.draw_back(draw, &mut stream);
+                    }
+                    (unit, beyond)
+                })
+                .collect();
+            for (row, (unit, beyond)) in placed.into_iter().enumerate() {
+                let row = chunk * AT_A_TIME + row;
+                moved[row] = beyond;
+                for (draw, position) in unit.column_iter().enumerate() {
+                    for (column, parameter) in prior.iter().enumerate() {
+                        let value = parameter.from_unit(position[column]);
+                        if !value.is_finite() {
+                            return Err(InferenceError::NotFinite { row, parameter: parameter.name.clone() });
+                        }
+                        theta[(row * draws + draw, column)] = value;
+                    }
+                }
+            }
+        }
+        Ok(Proposals { theta, log_density, moved })
+    }
+
+    /// Log-density in the unit box of the prior of each row of `theta`, the same number of rows for each observation, nats.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes.
+    pub(super) fn log_density_from_fit(
+        &self,
+        theta: &DMatrix<f64>,
+        observations: &[Observation],
+    ) -> Result<Vec<f64>, InferenceError> {
+        let prior = self.space().as_slice();
+        let (d, each) = (prior.len(), theta.nrows() / observations.len().max(1));
+        let mut all = Vec::with_capacity(theta.nrows());
+        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
+            let located = self.locate(part)?;
+            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
+            let mut x = Vec::with_capacity(part.len() * each * d);
+            for (row, fit) in located.iter().enumerate() {
+                let first = (chunk * AT_A_TIME + row) * each;
+                let unit = DMatrix::from_fn(d, each, |k, draw| prior[k].to_unit(theta[(first + draw, k)]));
+                x.extend_from_slice(fit.to_flow(&unit).as_slice());
+            }
+            let x = Tensor::from_vec(x, (part.len() * each, d), &Device::Cpu)?.to_dtype(self.flow.dtype())?;
+            let shape = (part.len(), each, features(d));
+            let repeated = context.unsqueeze(1)?.expand(shape)?.reshape((part.len() * each, features(d)))?;
+            let log_q = self.flow.log_prob(&x, &repeated)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
+            all.extend(log_q.into_iter().enumerate().map(|(row, log_q)| log_q + located[row / each].log_det()));
+        }
+        Ok(all)
+    }
+}
+
+/// What the flow is told of each fit, `[n, features]`, f64.
+///
+/// # Errors
+/// A candle error, which would be a bug.
+pub fn condition(located: &[Located], parameters: usize) -> Result<Tensor, candle_core::Error> {
+    let values: Vec<f64> = located.iter().flat_map(Located::features).collect();
+    Tensor::from_vec(values, (located.len(), features(parameters)), &Device::Cpu)
+}
