@@ -52,6 +52,7 @@ fn data(simulator: &Simulator, rows: usize) -> Data {
             frequencies_hz: exact.frequencies_hz.iter().map(hertz).collect(),
             measured_at: Timestamp::from_micros((day * 86_400e6) as i64).expect("a time"),
             std_hz: None,
+            mode_shapes: None,
             covariates: [
                 ("temperature_c".to_owned(), CovariateValue::Number(celsius)),
                 ("humidity_percent".to_owned(), CovariateValue::Number(60.0 - celsius + 5.0 * normal())),

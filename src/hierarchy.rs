@@ -13,6 +13,7 @@
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::{ChiSquared, Gamma, StandardNormal};
+use rayon::prelude::*;
 
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
@@ -199,6 +200,30 @@ pub fn populations(
     };
     let parameters = means.into_iter().zip(stds).enumerate().map(one).collect();
     Populations { parameters, effective_sample_size }
+}
+
+/// The population of each parameter by itself, those of all others flat over the prior: for many parameters, of which the
+/// samples are too few to be weighed by all populations at once.
+///
+/// ```text
+///  L_k(μ_k, σ_k) ∝ Π_j 1/S Σ_s N(x_jsk; μ_k, σ_k²)
+/// ```
+pub fn populations_of_each(samples: &PosteriorSamples, space: &ParameterSpace, seed: u64) -> Populations {
+    use rand::RngCore as _;
+    let one = |(column, parameter): (usize, &crate::parameter::Parameter)| {
+        let own = DMatrix::from_iterator(samples.theta().nrows(), 1, samples.theta().column(column).iter().copied());
+        let seed = stats::stream(seed, &format!("population of {}", parameter.name)).next_u64();
+        populations(
+            &PosteriorSamples::new(own, samples.draws()),
+            None,
+            &ParameterSpace::new(vec![parameter.clone()]),
+            seed,
+        )
+    };
+    let each: Vec<Populations> = space.as_slice().par_iter().enumerate().map(one).collect();
+    // The least tells whether some parameter stands on few samples.
+    let effective_sample_size = each.iter().map(|p| p.effective_sample_size).fold(f64::INFINITY, f64::min);
+    Populations { parameters: each.into_iter().flat_map(|p| p.parameters).collect(), effective_sample_size }
 }
 
 /// The point estimate of [`populations`] alone, without draws, and its effective sample size.

@@ -81,6 +81,8 @@
 //! - J. Ching, Y.-C. Chen (2007), Transitional Markov chain Monte Carlo method for Bayesian model updating, Journal of
 //!   Engineering Mechanics 133, 816–832. A. Bhattacharyya (1943), On a measure of divergence between two statistical
 //!   populations, Bull. Calcutta Math. Soc. 35, 99–109. Stochastic updating.
+//! - R. L. Fox, M. P. Kapoor (1968), Rates of change of eigenvalues and eigenvectors, AIAA Journal 6, 2426–2429. Derivatives of
+//!   shapes. R. J. Allemang, D. L. Brown (1982), A correlation coefficient for modal vector analysis, IMAC 1, 110–116. MAC.
 //! - M. J. W. Jansen (1999), Analysis of variance designs for model output, Computer Physics Communications 117, 35–43;
 //!   A. Saltelli et al. (2010), Variance based sensitivity analysis of model output, ibid. 181, 259–270. Sobol' indices.
 //! - G. Blatman, B. Sudret (2011), Adaptive sparse polynomial chaos expansion based on least angle regression, Journal of

@@ -37,6 +37,24 @@ pub fn exp_f32(x: f32) -> f32 {
     polynomial * f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
 }
 
+/// Squared cosine of the angle between two vectors: 1 for the same up to sign and size, 0 for orthogonal ones or where one is
+/// zero. Of two mode shapes it is the modal assurance criterion (MAC).
+///
+/// ```text
+///  (aᵀb)²/(aᵀa · bᵀb)
+/// ```
+///
+/// Source: R. J. Allemang, D. L. Brown (1982), A correlation coefficient for modal vector analysis, IMAC 1, 110–116.
+pub fn squared_cosine(a: &[f64], b: &[f64]) -> f64 {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+    let scale = dot(a, a) * dot(b, b);
+    if scale > 0.0 {
+        dot(a, b).powi(2) / scale
+    } else {
+        0.0
+    }
+}
+
 /// Arithmetic mean; NaN for an empty slice.
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64

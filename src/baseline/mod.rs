@@ -15,6 +15,7 @@ use nalgebra::{DMatrix, DVector};
 use rand::RngCore as _;
 
 use crate::flow::{checkpoint, Flow};
+use crate::measurement::shape::unit_shape;
 use crate::measurement::ModalMeasurement;
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::posterior::PosteriorSamples;
@@ -407,16 +408,12 @@ impl Baseline {
             None if frequencies_hz.iter().any(Option::is_none) => frequencies_hz.fill(None),
             None => noise_multiple.fill(0.0),
         }
+        let shapes = measurement.mode_shapes.iter().flatten().map(|shape| unit_shape(shape.as_ref()?)).collect();
         let sizes = self.simulator.effect_sizes(&measurement.covariates);
         let possible_sizes =
             if sizes.missing.is_empty() { Vec::new() } else { self.simulator.possible_sizes(&measurement.covariates) };
-        let observation = Observation {
-            frequencies_hz,
-            noise_multiple,
-            shapes: Vec::new(),
-            effect_sizes: sizes.values,
-            possible_sizes,
-        };
+        let observation =
+            Observation { frequencies_hz, noise_multiple, shapes, effect_sizes: sizes.values, possible_sizes };
         Admitted {
             observation: (observation.modes_present() > 0).then_some(observation),
             below_range,

@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::observation::Observation;
+use super::start::{locate, Located};
 use crate::physics;
 use crate::simulator::Simulator;
 
@@ -39,6 +40,18 @@ pub struct Nearest {
     pub projector: DMatrix<f64>,
 }
 
+/// The nearest point where mode shapes are measured too: the fit that the flow starts at. Its residuals are of both kinds, and
+/// are judged for each measurement by their sum alone.
+fn of_fit(fit: Located, modes: usize) -> Nearest {
+    Nearest {
+        frequencies_hz: fit.frequencies_hz,
+        chi_squared: fit.chi_squared,
+        degrees_of_freedom: fit.degrees_of_freedom.round() as usize,
+        standardised_residuals: DVector::zeros(modes),
+        projector: DMatrix::zeros(modes, modes),
+    }
+}
+
 /// Looks for the nearest point of the prior box, beginning at `start` (`[d]`, parameter units).
 ///
 /// ```text
@@ -51,6 +64,9 @@ pub struct Nearest {
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
 pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) -> Result<Nearest, physics::Error> {
+    if observation.has_shapes() {
+        return locate(simulator, observation).map(|fit| of_fit(fit, simulator.modes()));
+    }
     let simulator = &observation.simulator(simulator);
     let parameters = simulator.space().as_slice();
     let present: Vec<usize> = (0..simulator.modes()).filter(|&i| observation.frequencies_hz[i].is_some()).collect();

@@ -6,7 +6,7 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 use super::manifest::{Conditions, EffectRange, NoiseRange, Whitening};
-use crate::physics::shapes::unit_shape;
+use crate::measurement::shape::unit_shape;
 use crate::simulator::Simulator;
 use crate::stats::Stream;
 

@@ -297,7 +297,8 @@ impl Located {
 const AT_A_TIME: usize = 64;
 
 impl Baseline {
-    pub(super) fn starts_at_fit(&self) -> bool {
+    /// Whether the flow starts at the best fit of each measurement: many parameters, or mode shapes.
+    pub fn starts_at_fit(&self) -> bool {
         self.manifest.conditions.starts_at_fit
     }
 

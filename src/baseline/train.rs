@@ -35,6 +35,25 @@ const SELF_TEST_DRAWS: usize = 4;
 /// Fewest training samples: below, the covariance of the frequencies itself is uncertain.
 pub const MINIMUM_SAMPLES: usize = 100;
 
+/// Training samples unless asked otherwise. A measurement that is fitted first costs milliseconds, and the flow has little left
+/// to learn: fewer of them, and the fewer the more parameters.
+pub fn default_samples(simulator: &Simulator) -> usize {
+    match (starts_at_fit(simulator), simulator.is_noisy()) {
+        (true, _) => (1_000_000 / simulator.space().len()).clamp(3_000, 10_000),
+        (false, true) => 200_000,
+        (false, false) => 10_000,
+    }
+}
+
+/// Passes over the training samples unless asked otherwise.
+pub fn default_epochs(simulator: &Simulator) -> usize {
+    match (starts_at_fit(simulator), simulator.is_noisy()) {
+        (true, _) => 30,
+        (false, true) => 80,
+        (false, false) => 200,
+    }
+}
+
 /// Why no baseline came of a training.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

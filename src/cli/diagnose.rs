@@ -276,6 +276,7 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         modes: simulator.modes(),
         frequency_limits_hz: simulator.frequency_limits_hz(),
         covariates: &tables.covariates,
+        instrumented: simulator.instrumented_points(),
         space: simulator.space(),
         now: Timestamp::now(),
         max_measurements: usize::MAX,

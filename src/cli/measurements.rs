@@ -25,6 +25,7 @@ pub fn read_measurements(
         modes: simulator.modes(),
         frequency_limits_hz: simulator.frequency_limits_hz(),
         covariates: simulator.covariates(),
+        instrumented: simulator.instrumented_points(),
         space: simulator.space(),
         now: Timestamp::now(),
         max_measurements: usize::MAX,

@@ -10,7 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::write_whole;
 use crate::baseline::library::{find_structure, read_structure_file};
 use crate::baseline::manifest::{Manifest, NoiseRange, ValidationRecord};
-use crate::baseline::train::{diverged, train as train_baseline, Trained};
+use crate::baseline::train::{default_epochs, default_samples, diverged, train as train_baseline, Trained};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
 use crate::simulator::Simulator;
@@ -24,10 +24,12 @@ pub struct TrainArgs {
     /// Folder for structure.toml, baseline.safetensors and baseline.json [default: models/<structure>]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Simulated training samples [default: 200000; 10000 for a structure without measurement noise]
+    /// Simulated training samples [default: 200000; 10000 for a structure without measurement noise; 3000 to 10000 for one of many
+    /// parameters or with mode shapes]
     #[arg(long)]
     samples: Option<usize>,
-    /// Passes over the training samples [default: 80; 200 for a structure without measurement noise]
+    /// Passes over the training samples [default: 80; 200 for a structure without measurement noise; 30 for one of many
+    /// parameters or with mode shapes]
     #[arg(long)]
     epochs: Option<usize>,
     /// Coupling units of the flow; more bend more and cost more [default: 4]
@@ -126,9 +128,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
 
 /// Samples and epochs of a training, where they are not given.
 pub(super) fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize>) -> (usize, usize) {
-    let noisy = simulator.is_noisy();
-    let (usual_samples, usual_epochs) = if noisy { (200_000, 80) } else { (10_000, 200) };
-    (samples.unwrap_or(usual_samples), epochs.unwrap_or(usual_epochs))
+    (samples.unwrap_or_else(|| default_samples(simulator)), epochs.unwrap_or_else(|| default_epochs(simulator)))
 }
 
 /// Trains with a progress bar and writes the two files of the baseline into a folder.

@@ -63,7 +63,7 @@ struct PostHeaders {
     params(StructurePath, PostQuery, PostHeaders),
     request_body(
         description = "CSV: a header with `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, covariates by name and \
-                       `set_<parameter>`; separator `,`, `;` or tab, decimal comma with the last two.",
+                       `set_<parameter>`; separator `,`, `;` or tab, decimal comma with the last two. Mode shapes come as JSON only.",
         content(
             (PostBody = "application/json", example = json!({"source": "tower-1", "measurements": [
                 {"measured_at": "2026-03-01T12:00:00Z", "frequencies_hz": [0.4949, 0.9250, 1.2434]}]})),

@@ -97,7 +97,7 @@ impl From<StoredMeasurement> for MeasurementItem {
     description = "What was measured, in the order of the history: batches by their first measurement, in a batch as they came. \
                    JSON comes a page at a time, the header `Link` has the path of the next; CSV, NDJSON and Parquet come as \
                    one file for the whole window. A table has the columns `measured_at`, `source`, `batch`, `f1_hz` …, \
-                   `std_f1_hz` …, the declared covariates, `set_<parameter>`; posted again with `ignore=source,batch` it is \
+                   `std_f1_hz` …, the declared covariates, `set_<parameter>` (mode shapes in JSON and NDJSON only); posted again with `ignore=source,batch` it is \
                    the same batch.",
     params(StructurePath, MeasurementParams),
     responses(

@@ -64,6 +64,10 @@ struct MeasurementBody {
     frequencies_hz: Vec<Option<f64>>,
     /// Standard deviation of each frequency, Hz, where it is known.
     std_hz: Option<Vec<Option<f64>>>,
+    /// Mode shapes, where the structure has instrumented points: one entry for each mode, in the order of `frequencies_hz`; a
+    /// list with a number for each point of `mode_shapes.points` of the structure file, in that order, of any norm and sign;
+    /// `null` for a shape that was not identified. Modes are paired with those of the simulation by MAC and frequency.
+    mode_shapes: Option<Vec<Option<Vec<f64>>>>,
     /// Values of covariates that the structure declares, by name.
     #[serde(default)]
     covariates: BTreeMap<String, CovariateValue>,
@@ -98,6 +102,7 @@ fn raw(measurements: Vec<MeasurementBody>) -> Vec<RawMeasurement> {
         measured_at: m.measured_at,
         frequencies_hz: m.frequencies_hz,
         std_hz: m.std_hz,
+        mode_shapes: m.mode_shapes,
         covariates: m.covariates,
         settings: m.settings,
     };

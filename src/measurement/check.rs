@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
+use super::shape::InstrumentedPoints;
 use super::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use crate::parameter::ParameterSpace;
 use crate::quantity::{shown, Hertz, Timestamp};
@@ -43,6 +44,8 @@ pub struct RawMeasurement {
     pub frequencies_hz: Vec<Option<f64>>,
     /// Standard deviation of each frequency, Hz.
     pub std_hz: Option<Vec<Option<f64>>>,
+    /// Shape of each mode.
+    pub mode_shapes: Option<Vec<Option<Vec<f64>>>>,
     /// Values of covariates.
     pub covariates: BTreeMap<String, CovariateValue>,
     /// Parameters the experimenter set.
@@ -75,6 +78,8 @@ pub struct Expectation<'a> {
     pub frequency_limits_hz: (f64, f64),
     /// Declared covariates.
     pub covariates: &'a [Covariate],
+    /// Points whose motion gives mode shapes; `None` where none are measured.
+    pub instrumented: Option<&'a InstrumentedPoints>,
     /// Parameters, whose priors bound the settings.
     pub space: &'a ParameterSpace,
     /// The time now.
@@ -90,6 +95,8 @@ enum Field<'a> {
     Frequency(usize),
     Stds,
     Std(usize),
+    Shapes,
+    Shape(usize),
     Covariate(&'a str),
     Setting(&'a str),
 }
@@ -109,13 +116,15 @@ impl Place {
                     Field::Frequency(mode) => format!("/frequencies_hz/{mode}"),
                     Field::Stds => "/std_hz".to_owned(),
                     Field::Std(mode) => format!("/std_hz/{mode}"),
+                    Field::Shapes => "/mode_shapes".to_owned(),
+                    Field::Shape(mode) => format!("/mode_shapes/{mode}"),
                     Field::Covariate(name) => format!("/covariates/{}", escaped(name)),
                     Field::Setting(name) => format!("/settings/{}", escaped(name)),
                 };
                 format!("/measurements/{index}{path}")
             }
             Self::Csv { line } => match field {
-                Field::Frequencies | Field::Stds => format!("line {line}"),
+                Field::Frequencies | Field::Stds | Field::Shapes | Field::Shape(_) => format!("line {line}"),
                 Field::Time => format!("line {line}, column measured_at"),
                 Field::Frequency(mode) => format!("line {line}, column f{}_hz", mode + 1),
                 Field::Std(mode) => format!("line {line}, column std_f{}_hz", mode + 1),
@@ -185,6 +194,7 @@ pub fn check_measurements(
         }
         let frequencies_hz = check_frequencies(&measurement, expectation, &mut problems);
         check_std(&measurement, expectation.modes, &mut problems);
+        check_shapes(&measurement, expectation, &mut problems);
         check_covariates(&measurement, expectation.covariates, &mut problems);
         check_settings(&measurement, expectation.space, &mut problems);
         if let Some(measured_at) = measured_at {
@@ -192,6 +202,7 @@ pub fn check_measurements(
                 measured_at,
                 frequencies_hz,
                 std_hz: measurement.std_hz,
+                mode_shapes: measurement.mode_shapes,
                 covariates: measurement.covariates,
                 settings: measurement.settings,
             });
@@ -261,6 +272,29 @@ fn check_std(raw: &RawMeasurement, modes: usize, problems: &mut Problems) {
         if let Some(std) = std.filter(|s| !(s.is_finite() && *s > 0.0)) {
             let message = format!("a standard deviation of {std} Hz: it must be finite and above 0");
             problems.add(raw.place.of(&Field::Std(mode)), message);
+        }
+    }
+}
+
+fn check_shapes(raw: &RawMeasurement, expectation: &Expectation<'_>, problems: &mut Problems) {
+    let Some(shapes) = &raw.mode_shapes else { return };
+    let Some(instrumented) = expectation.instrumented else {
+        let message = "this structure has no instrumented points: declare mode_shapes in its file, or leave them out";
+        problems.add(raw.place.of(&Field::Shapes), message);
+        return;
+    };
+    if shapes.len() != expectation.modes {
+        let (found, modes) = (shapes.len(), expectation.modes);
+        let message = format!("{found} shapes, expected {modes}, one for each mode or null");
+        problems.add(raw.place.of(&Field::Shapes), message);
+    }
+    for (mode, shape) in shapes.iter().enumerate() {
+        let Some(shape) = shape else { continue };
+        if let Some(mistake) = instrumented.mistake(shape) {
+            problems.add(raw.place.of(&Field::Shape(mode)), mistake);
+        } else if raw.frequencies_hz.get(mode).is_some_and(Option::is_none) {
+            let message = "a shape of a mode without a frequency: send its frequency too, or null for both";
+            problems.add(raw.place.of(&Field::Shape(mode)), message);
         }
     }
 }

@@ -282,6 +282,7 @@ fn row(
         measured_at: None,
         frequencies_hz: vec![None; modes],
         std_hz: columns.iter().any(|c| matches!(c, Column::Std(_))).then(|| vec![None; modes]),
+        mode_shapes: None,
         covariates: BTreeMap::new(),
         settings: BTreeMap::new(),
     };

@@ -6,6 +6,7 @@ pub mod body;
 pub mod check;
 pub mod csv;
 pub mod json;
+pub mod shape;
 
 use std::collections::BTreeMap;
 
@@ -53,6 +54,10 @@ pub struct ModalMeasurement {
     /// Standard deviation of each frequency, Hz, where the identification gives it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub std_hz: Option<Vec<Option<f64>>>,
+    /// Shape of each mode at the instrumented points of the structure, of any norm and sign; `None` for one that was not
+    /// identified.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mode_shapes: Option<Vec<Option<Vec<f64>>>>,
     /// Values of declared covariates.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub covariates: BTreeMap<String, CovariateValue>,
@@ -112,6 +117,7 @@ pub fn at_intervals(
             measured_at: Timestamp::from_micros(micros)?,
             frequencies_hz: row.iter().map(|f| Hertz::new(*f).map(Some)).collect::<Result<_, _>>()?,
             std_hz: relative_std.map(|share| row.iter().map(|f| Some(share * f)).collect()),
+            mode_shapes: None,
             covariates: BTreeMap::new(),
             settings: BTreeMap::new(),
         })

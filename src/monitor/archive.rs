@@ -346,6 +346,7 @@ fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBat
         measured_at: Some(m.measured_at.clone()),
         frequencies_hz: m.frequencies_hz.clone(),
         std_hz: m.std_hz.clone(),
+        mode_shapes: m.mode_shapes.clone(),
         covariates: m.covariates.clone(),
         settings: m.settings.clone(),
     };
@@ -353,6 +354,7 @@ fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBat
         modes: simulator.modes(),
         frequency_limits_hz: simulator.frequency_limits_hz(),
         covariates: simulator.covariates(),
+        instrumented: simulator.instrumented_points(),
         space: simulator.space(),
         now: Timestamp::now(),
         max_measurements: usize::MAX,

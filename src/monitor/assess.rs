@@ -6,7 +6,7 @@ use crate::assessment::Assessment;
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
 use crate::damage::{self, QuantityKind, QuantitySamples, SeenCovariate, UndamagedState};
-use crate::hierarchy::{estimate, populations, proposals, PopulationEstimate, Populations};
+use crate::hierarchy::{estimate, populations, populations_of_each, proposals, PopulationEstimate, Populations};
 use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::parameter::DamageDirection;
 use crate::posterior::PosteriorSamples;
@@ -167,6 +167,9 @@ fn population_behind(
             conform(baseline, column, &observations[0], &mut estimate.mean_draws);
         }
         return Ok(one);
+    }
+    if baseline.starts_at_fit() {
+        return Ok(populations_of_each(posterior, space, seed));
     }
     let found = estimate(posterior, None, space);
     if found.effective_sample_size >= FEW_EFFECTIVE {

@@ -365,6 +365,7 @@ impl Monitor {
             modes: watched.simulator.modes(),
             frequency_limits_hz: watched.simulator.frequency_limits_hz(),
             covariates: watched.simulator.covariates(),
+            instrumented: watched.simulator.instrumented_points(),
             space: watched.simulator.space(),
             now: Timestamp::now(),
             max_measurements: self.settings.max_measurements,

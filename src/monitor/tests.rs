@@ -32,6 +32,7 @@ fn batch(number: usize) -> MeasurementBatch {
         measured_at: Timestamp::from_micros(1_767_225_600_000_000 + (3 * number + i) as i64 * 1_000_000).unwrap(),
         frequencies_hz: measured_hz(3 * number + i),
         std_hz: None,
+        mode_shapes: None,
         covariates: BTreeMap::new(),
         settings: BTreeMap::new(),
     };

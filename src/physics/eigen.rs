@@ -4,7 +4,7 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par, Side};
 use nalgebra::{DMatrix, SymmetricEigen};
 
-/// Degrees of freedom from which faer is faster; `benches/size.rs` measures both.
+/// Degrees of freedom from which faer is faster; `cargo bench --bench size -- --eigen` measures both.
 const MANY: usize = 32;
 
 /// Eigenvalues of a symmetric matrix, ascending; NaN where the iteration does not converge.

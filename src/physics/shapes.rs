@@ -1,10 +1,11 @@
 //! Mode shapes at instrumented degrees of freedom, and their derivatives.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
 use super::eigen::product;
 use super::modes::{Modes, REPEATED};
 use super::Structure;
+use crate::stats::squared_cosine;
 
 /// Shapes of the modes asked for at `points`, `[points, modes]`, each of unit norm over the points; the sign of each is
 /// arbitrary. A mode that does not move any of the points has a shape of zeros.
@@ -75,23 +76,6 @@ pub fn shape_sensitivity(
     (0..modes.frequencies_hz.len()).map(of_mode).collect()
 }
 
-/// Modal assurance criterion of two shapes: 1 for the same up to sign and size, 0 for orthogonal ones or where one is zero.
-///
-/// ```text
-///  MAC = (aᵀb)²/(aᵀa · bᵀb)
-/// ```
-///
-/// Source: Allemang & Brown (1982), A correlation coefficient for modal vector analysis, IMAC 1, 110–116.
-pub fn mac(a: &[f64], b: &[f64]) -> f64 {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-    let scale = dot(a, a) * dot(b, b);
-    if scale > 0.0 {
-        dot(a, b).powi(2) / scale
-    } else {
-        0.0
-    }
-}
-
 /// The simulated mode of each measured one, no mode twice: greedily by the greatest score.
 ///
 /// ```text
@@ -107,7 +91,7 @@ pub fn pair_modes(measured: &[(f64, Option<&[f64]>)], simulated_hz: &[f64], simu
     for (row, (hz, shape)) in measured.iter().enumerate() {
         for (column, simulated_hz) in simulated_hz.iter().enumerate() {
             let distance = (hz / simulated_hz).ln().abs();
-            let alike = shape.map(|shape| mac(shape, simulated.column(column).as_slice()));
+            let alike = shape.map(|shape| squared_cosine(shape, simulated.column(column).as_slice()));
             scores.push((alike.is_some(), alike.unwrap_or(0.0) - distance, row, column));
         }
     }
@@ -121,10 +105,4 @@ pub fn pair_modes(measured: &[(f64, Option<&[f64]>)], simulated_hz: &[f64], simu
         }
     }
     pairs
-}
-
-/// A shape of unit norm; `None` for zeros.
-pub fn unit_shape(shape: &[f64]) -> Option<Vec<f64>> {
-    let norm = DVector::from_column_slice(shape).norm();
-    (norm > 0.0 && norm.is_finite()).then(|| shape.iter().map(|x| x / norm).collect())
 }

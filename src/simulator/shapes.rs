@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 use super::check::Problems;
 use super::definition::{DefinitionProblem, StructureDefinition};
 use super::{chained, structure_at, Model, Simulator};
-use crate::physics::shapes::{mac, shape_sensitivity, shapes_at, unit_shape};
+use crate::measurement::shape::InstrumentedPoints;
+use crate::physics::shapes::{shape_sensitivity, shapes_at};
 use crate::physics::{self, frequency_sensitivity, modes, Structure};
 use crate::quantity::shown;
 
@@ -17,10 +18,6 @@ const FEWEST_POINTS: usize = 2;
 
 /// Largest noise of a shape: with more, shapes of neighbouring modes cannot be told apart.
 const MOST_NOISE: f64 = 0.5;
-
-/// Least MAC of a measured shape with some mode of the nominal structure: below, it is another structure's, or its points are
-/// in another order.
-const LEAST_MAC: f64 = 0.1;
 
 /// Points whose motion gives the mode shapes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -39,8 +36,8 @@ pub struct Instrumented {
     pub(super) freedoms: Vec<usize>,
     /// Standard deviation of each number of a shape of unit norm.
     pub(super) std: f64,
-    /// Shapes of the nominal structure, unit norm, `[points, modes]`.
-    pub(super) nominal: DMatrix<f64>,
+    /// Their names, with the shapes of the nominal structure.
+    pub(super) points: InstrumentedPoints,
 }
 
 /// Frequencies and shapes at one set of parameters, and their derivatives.
@@ -97,13 +94,20 @@ pub(super) fn check(definition: &StructureDefinition, model: &Model, problems: &
             return None;
         }
     };
-    Some(Instrumented { std: noise / (freedoms.len() as f64).sqrt(), freedoms, nominal })
+    let nominal = nominal.column_iter().map(|shape| shape.iter().copied().collect()).collect();
+    let points = InstrumentedPoints { names: given.points.clone(), nominal };
+    Some(Instrumented { std: noise / (freedoms.len() as f64).sqrt(), freedoms, points })
 }
 
 impl Simulator {
     /// Number of points whose motion gives the mode shapes; 0 where none are measured.
     pub fn shape_points(&self) -> usize {
         self.instrumented().map_or(0, |i| i.freedoms.len())
+    }
+
+    /// The points whose motion gives the mode shapes, if they are measured.
+    pub fn instrumented_points(&self) -> Option<&InstrumentedPoints> {
+        self.instrumented().map(|i| &i.points)
     }
 
     /// Standard deviation of each number of a measured shape of unit norm.
@@ -113,44 +117,6 @@ impl Simulator {
 
     fn instrumented(&self) -> Option<&Instrumented> {
         self.parts.checked.instrumented.as_ref()
-    }
-
-    /// The mode of the nominal structure that a shape resembles most, from 0, and their MAC; `None` without instrumented points.
-    pub fn nearest_nominal_shape(&self, shape: &[f64]) -> Option<(usize, f64)> {
-        let nominal = &self.instrumented()?.nominal;
-        let alike = nominal.column_iter().map(|own| mac(own.into_owned().as_slice(), shape)).enumerate();
-        alike.max_by(|a, b| a.1.total_cmp(&b.1))
-    }
-
-    /// What is wrong with a measured shape and what would be right; `None` where nothing is.
-    pub fn shape_mistake(&self, shape: &[f64]) -> Option<String> {
-        let points = self.shape_points();
-        let names = || {
-            let given = self.definition().mode_shapes.as_ref().map_or(&[][..], |s| &s.points);
-            let shown = given.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
-            format!("{shown}{}", if given.len() > 3 { ", …" } else { "" })
-        };
-        if points == 0 {
-            return Some("this structure has no instrumented points: declare mode_shapes in its file".to_owned());
-        }
-        if shape.len() != points {
-            return Some(format!("{} numbers, expected {points}: one for each of {}", shape.len(), names()));
-        }
-        if let Some((place, value)) = shape.iter().enumerate().find(|(_, x)| !x.is_finite()) {
-            return Some(format!("{value} at place {place} is not finite"));
-        }
-        if unit_shape(shape).is_none() {
-            return Some("all its numbers are 0: send null for a shape that was not identified".to_owned());
-        }
-        let (mode, alike) = self.nearest_nominal_shape(shape)?;
-        (alike < LEAST_MAC).then(|| {
-            format!(
-                "it resembles no mode of this structure: its MAC is at most {alike:.3}, with mode {}, and at least \
-                 {LEAST_MAC} is expected; are its points in the order {}?",
-                mode + 1,
-                names()
-            )
-        })
     }
 
     /// Frequencies, Hz, and shapes `[points, modes]` of unit norm at `theta`, without noise.

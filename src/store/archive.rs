@@ -151,6 +151,9 @@ pub struct Measurement {
     /// Their standard deviations.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub std_hz: Option<Vec<Option<f64>>>,
+    /// Their shapes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mode_shapes: Option<Vec<Option<Vec<f64>>>>,
     /// Conditions.
     pub covariates: BTreeMap<String, CovariateValue>,
     /// Known parameters.
@@ -291,6 +294,7 @@ struct MeasurementRow {
     measured_at_us: i64,
     frequency_hz: Vec<u8>,
     std_hz: Option<Vec<u8>>,
+    mode_shapes: Option<String>,
     covariates: String,
     settings: String,
 }
@@ -366,7 +370,8 @@ impl Store {
             let ids: Vec<&String> = rows.iter().map(|row| &row.0).collect();
             let ids = serde_json::to_string(&ids).map_err(|e| bad_row("batch")(&e))?;
             let measured: Vec<MeasurementRow> = sqlx::query_as(
-                "select batch_id, measured_at_us, frequency_hz, std_hz, covariates, settings from measurement
+                "select batch_id, measured_at_us, frequency_hz, std_hz, mode_shapes, covariates, settings
+                 from measurement
                  where structure_id = ? and batch_id in (select value from json_each(?)) order by batch_id, ordinal",
             )
             .bind(structure.as_str())
@@ -689,6 +694,7 @@ fn measurement(row: MeasurementRow) -> Result<Measurement, Error> {
         measured_at: timestamp(what, row.measured_at_us)?.to_string(),
         frequencies_hz: present(from_blob(what, &row.frequency_hz)?),
         std_hz: row.std_hz.map(|blob| from_blob(what, &blob)).transpose()?.map(present),
+        mode_shapes: super::batch::mode_shapes(row.mode_shapes.as_deref())?,
         covariates: serde_json::from_str(&row.covariates).map_err(|e| bad_row(what)(&e))?,
         settings: serde_json::from_str(&row.settings).map_err(|e| bad_row(what)(&e))?,
     })

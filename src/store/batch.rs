@@ -63,6 +63,7 @@ pub(super) struct MeasurementRow {
     measured_at_us: i64,
     frequency_hz: Vec<u8>,
     std_hz: Option<Vec<u8>>,
+    mode_shapes: Option<String>,
     covariates: String,
     settings: String,
 }
@@ -110,7 +111,7 @@ impl Store {
         let Some(row) = row else { return Ok(None) };
         fault_point!("store::read", |_| Err(bad_row("batch")(&"a fault")));
         let measurements: Vec<MeasurementRow> = sqlx::query_as(
-            "select measured_at_us, frequency_hz, std_hz, covariates, settings
+            "select measured_at_us, frequency_hz, std_hz, mode_shapes, covariates, settings
              from measurement where structure_id = ? and batch_id = ? order by ordinal",
         )
         .bind(structure.as_str())
@@ -292,7 +293,7 @@ async fn insert(
     for (ordinal, m) in batch.measurements.iter().enumerate() {
         let frequencies = m.frequencies_hz.iter().map(|f| f.map_or(f64::NAN, Hertz::get));
         let std = m.std_hz.as_ref().map(|stds| to_blob(stds.iter().map(|s| s.unwrap_or(f64::NAN))));
-        sqlx::query("insert into measurement values (?, ?, ?, ?, ?, ?, ?, ?, ?)")
+        sqlx::query("insert into measurement values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
             .bind(batch.structure.as_str())
             .bind(batch_id)
             .bind(ordinal as i64)
@@ -302,6 +303,7 @@ async fn insert(
             .bind(std)
             .bind(json(serde_json::to_string(&m.covariates))?)
             .bind(json(serde_json::to_string(&m.settings))?)
+            .bind(m.mode_shapes.as_ref().map(|s| json(serde_json::to_string(s))).transpose()?)
             .execute(&mut *connection)
             .await?;
         fault_point!("store::measurement", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
@@ -346,9 +348,15 @@ pub(super) fn measurement(row: MeasurementRow) -> Result<ModalMeasurement, Error
         measured_at: timestamp(what, row.measured_at_us)?,
         frequencies_hz: frequencies(what, &row.frequency_hz)?,
         std_hz: std.map(|values| values.into_iter().map(|s| Some(s).filter(|s| !s.is_nan())).collect()),
+        mode_shapes: mode_shapes(row.mode_shapes.as_deref())?,
         covariates: serde_json::from_str(&row.covariates).map_err(|e| bad_row(what)(&e))?,
         settings: serde_json::from_str(&row.settings).map_err(|e| bad_row(what)(&e))?,
     })
+}
+
+/// The mode shapes of a row.
+pub(super) fn mode_shapes(json: Option<&str>) -> Result<Option<Vec<Option<Vec<f64>>>>, Error> {
+    json.map(|text| serde_json::from_str(text).map_err(|e| bad_row("mode shapes")(&e))).transpose()
 }
 
 fn frequencies(what: &'static str, blob: &[u8]) -> Result<Vec<Option<Hertz>>, Error> {

@@ -66,7 +66,7 @@ impl Store {
         let after = query.after.as_ref();
         let rows: Vec<Row> = sqlx::query_as(
             "select b.batch_id, b.measured_from_us, m.ordinal, m.source, m.measured_at_us, m.frequency_hz, m.std_hz,
-                    m.covariates, m.settings
+                    m.mode_shapes, m.covariates, m.settings
              from measurement_batch b
              join measurement m using (structure_id, batch_id)
              where b.structure_id = ?1 and b.measured_from_us >= ?2 and b.measured_from_us < ?3

@@ -27,6 +27,7 @@ fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementBatch {
         measured_at: at(start + i),
         frequencies_hz: vec![None, Some(Hertz::new(1.5).unwrap())],
         std_hz: None,
+        mode_shapes: None,
         covariates: [("operator".to_owned(), CovariateValue::Category("é \"x\"".to_owned()))]
             .into_iter()
             .chain([("temperature_c".to_owned(), CovariateValue::Number(0.1 + 0.2))])

@@ -65,7 +65,7 @@ pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f6
                 |(mode, f): (usize, &Option<f64>)| f.map_or(0.0, |f| (f / point.frequencies_hz[mode]).ln().abs());
             let largest = observation.frequencies_hz.iter().enumerate().map(misfit).fold(0.0, f64::max);
             if largest > GROSS { &mut gross } else { &mut outside }.push(row);
-        } else if observation.modes_present() > simulator.space().len() {
+        } else if observation.has_shapes() || observation.modes_present() > simulator.space().len() {
             chi_squared += point.chi_squared;
             degrees_of_freedom += point.degrees_of_freedom;
             sum += &point.standardised_residuals;

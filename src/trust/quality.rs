@@ -63,6 +63,9 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
             if let (Some(now), Some(then)) = (&mut measurement.std_hz, &before.std_hz) {
                 now[to] = then[from];
             }
+            if let (Some(now), Some(then)) = (&mut measurement.mode_shapes, &before.mode_shapes) {
+                now[to].clone_from(&then[from]);
+            }
         }
     }
     if !swapped.is_empty() {

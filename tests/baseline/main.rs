@@ -44,6 +44,7 @@ fn measurements(drawn: &SimulatedMeasurements) -> Vec<ModalMeasurement> {
         measured_at: Timestamp::from_micros(i as i64).unwrap(),
         frequencies_hz: row.iter().map(|f| Some(Hertz::new(*f).unwrap())).collect(),
         std_hz: Some(row.iter().map(|f| Some(EXACT * f)).collect()),
+        mode_shapes: None,
         covariates: std::collections::BTreeMap::new(),
         settings: std::collections::BTreeMap::new(),
     };

@@ -40,6 +40,7 @@ pub fn batch(source: &str, number: usize, count: usize) -> MeasurementBatch {
             measured_at: Timestamp::from_micros(EPOCH_MICROS + 10_000_000 * row as i64).unwrap(),
             frequencies_hz: bank()[row % 32].iter().map(|f| Some(Hertz::new(f * jitter).unwrap())).collect(),
             std_hz: None,
+            mode_shapes: None,
             covariates: BTreeMap::new(),
             settings: BTreeMap::new(),
         }

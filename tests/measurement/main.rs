@@ -56,6 +56,7 @@ prop_compose! {
             measured_at: Timestamp::from_micros(micros).unwrap(),
             frequencies_hz: frequencies.collect(),
             std_hz: std.map(|s| vec![Some(s), None, Some(2.0 * s)]),
+            mode_shapes: None,
             covariates: covariates.into_iter().flatten().collect(),
             settings: k1.map(|k| BTreeMap::from([("k1".to_owned(), k)])).unwrap_or_default(),
         }
@@ -72,6 +73,7 @@ proptest! {
             modes: 3,
             frequency_limits_hz: (0.01, 100.0),
             covariates: &covariates,
+            instrumented: None,
             space: &space,
             now: Timestamp::now(),
             max_measurements: 100,
@@ -99,6 +101,7 @@ fn the_ways_a_table_is_written_are_read_alike() {
         modes: 3,
         frequency_limits_hz: (0.01, 100.0),
         covariates: &covariates,
+        instrumented: None,
         space: &space,
         now: Timestamp::now(),
         max_measurements: 100,

@@ -36,6 +36,7 @@ pub fn batch(
             measured_at: Timestamp::from_micros(row as i64 * 1_000_000).unwrap(),
             frequencies_hz: f.iter().map(|f| Some(Hertz::new(*f).unwrap())).collect(),
             std_hz: Some(f.iter().map(|f| Some(stated * f)).collect()),
+            mode_shapes: None,
             covariates: BTreeMap::new(),
             settings: BTreeMap::new(),
         }

@@ -29,6 +29,7 @@ fn batch(source: &str, start: i64, count: i64) -> MeasurementBatch {
         measured_at: at(start + i),
         frequencies_hz: vec![Some(Hertz::new(1.0 + 0.01 * i as f64).unwrap()), None],
         std_hz: Some(vec![Some(0.01), None]),
+        mode_shapes: None,
         covariates: BTreeMap::new(),
         settings: BTreeMap::from([("k".to_owned(), 4.0)]),
     };

@@ -40,6 +40,7 @@ fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
         modes: 3,
         frequency_limits_hz: (0.001, 1_000.0),
         covariates: &covariates,
+        instrumented: None,
         space: space(),
         now: Timestamp::from_micros(1_800_000_000_000_000).unwrap(),
         max_measurements: 5_000,

@@ -28,6 +28,7 @@ fn checked(raw: RawBatch) -> Option<MeasurementBatch> {
         modes: s.modes(),
         frequency_limits_hz: s.frequency_limits_hz(),
         covariates: s.covariates(),
+        instrumented: s.instrumented_points(),
         space: s.space(),
         now: Timestamp::from_micros(1_800_000_000_000_000).unwrap(),
         max_measurements: 5_000,
