@@ -209,19 +209,18 @@ pub fn place(noise_multiple: f64, missing_mode: Option<usize>, without_shapes: O
 /// A simulated measurement of each pair of a set.
 fn observe(baseline: &Baseline, set: &TrainingSet, situation: &Situation, stream: &mut Stream) -> Vec<Observation> {
     let simulator = baseline.simulator();
-    let one =
-        |(index, (row, sizes)): (usize, (nalgebra::MatrixView1xX<'_, f64, nalgebra::U1, nalgebra::Dyn>, &Vec<f64>))| {
-            let exact: Vec<f64> = row.iter().copied().collect();
-            let multiples: Vec<Option<f64>> = (0..exact.len())
-                .map(|mode| (Some(mode) != situation.missing).then_some(situation.noise_multiple))
-                .collect();
-            let mut observation = measure(simulator, &exact, sizes, &multiples, stream);
-            if situation.without_shapes == Some(false) {
-                measure_shapes(simulator, &mut observation, &set.shapes[index], &vec![false; exact.len()], stream);
-            }
-            observation
-        };
-    set.frequencies_hz.row_iter().zip(&set.effect_sizes).enumerate().map(one).collect()
+    let one = |(index, sizes): (usize, &Vec<f64>)| {
+        let exact: Vec<f64> = set.frequencies_hz.row(index).iter().copied().collect();
+        let multiples: Vec<Option<f64>> = (0..exact.len())
+            .map(|mode| (Some(mode) != situation.missing).then_some(situation.noise_multiple))
+            .collect();
+        let mut observation = measure(simulator, &exact, sizes, &multiples, stream);
+        if situation.without_shapes == Some(false) {
+            measure_shapes(simulator, &mut observation, &set.shapes[index], &vec![false; exact.len()], stream);
+        }
+        observation
+    };
+    set.effect_sizes.iter().enumerate().map(one).collect()
 }
 
 fn measure_cell(

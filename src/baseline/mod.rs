@@ -1,6 +1,7 @@
 //! A trained baseline: the flow of one structure, with everything needed to use it and to trust it.
 
 pub mod calibration;
+mod fitted;
 pub mod identifiability;
 pub mod library;
 pub mod manifest;

@@ -65,8 +65,17 @@ fn of_fit(fit: Located, modes: usize) -> Nearest {
 /// [`physics::Error`], which a checked prior rules out.
 pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) -> Result<Nearest, physics::Error> {
     if observation.has_shapes() {
-        return locate(simulator, observation).map(|fit| of_fit(fit, simulator.modes()));
+        locate(simulator, observation).map(|fit| of_fit(fit, simulator.modes()))
+    } else {
+        nearest_by_frequencies(simulator, observation, start)
     }
+}
+
+fn nearest_by_frequencies(
+    simulator: &Simulator,
+    observation: &Observation,
+    start: &[f64],
+) -> Result<Nearest, physics::Error> {
     let simulator = &observation.simulator(simulator);
     let parameters = simulator.space().as_slice();
     let present: Vec<usize> = (0..simulator.modes()).filter(|&i| observation.frequencies_hz[i].is_some()).collect();

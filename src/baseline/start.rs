@@ -14,20 +14,17 @@
 //! start is wide rather than sure of a wrong place. Modes are paired anew at each step, by MAC and frequency, so that a
 //! measurement may have modes in another order than the simulation, or lack some, or lack shapes.
 
-use candle_core::{DType, Device, Tensor};
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rayon::prelude::*;
 
 use super::observation::Observation;
-use super::resample::Proposals;
-use super::{Baseline, InferenceError};
 use crate::parameter::Parameter;
 use crate::physics;
 use crate::physics::eigen::transposed_product;
 use crate::physics::shapes::pair_modes;
 use crate::simulator::{Linearised, Simulator};
-use crate::stats::{self, normal_cdf, normal_quantile, Stream};
+use crate::stats::{normal_cdf, normal_quantile, Stream};
 
 /// Parameters from which a flow starts at the best fit.
 pub const MANY_PARAMETERS: usize = 17;
@@ -121,7 +118,7 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
         taken += 1;
         let rms = (residuals.values.norm_squared() / residuals.values.len() as f64).sqrt();
         let tempering = (CAUTION * rms).max(1.0).powi(-2);
-        let descent = residuals.slopes.tr_mul(&residuals.values) * tempering - (&u).add_scalar(-0.5) * PRIOR_PRECISION;
+        let descent = residuals.slopes.tr_mul(&residuals.values) * tempering - u.add_scalar(-0.5) * PRIOR_PRECISION;
         let normal = transposed_product(&residuals.slopes, &residuals.slopes);
         let (_, factor) = precision(&normal, tempering);
         step = solve(&factor, &descent);
@@ -230,7 +227,7 @@ fn residuals_at(
 
 impl Located {
     /// What the flow is told: û and the standard deviations, both in those of the prior, and the misfit.
-    fn features(&self) -> impl Iterator<Item = f64> + '_ {
+    pub(super) fn features(&self) -> impl Iterator<Item = f64> + '_ {
         let wide = PRIOR_PRECISION.sqrt();
         let place = self.unit.iter().map(move |u| wide * (u - 0.5));
         let std = self.std.iter().map(move |std| (wide * std).ln());
@@ -291,116 +288,4 @@ impl Located {
         }
         !beyond.is_empty()
     }
-}
-
-/// Measurements fitted at a time: the precision of each has d² numbers.
-const AT_A_TIME: usize = 64;
-
-impl Baseline {
-    /// Whether the flow starts at the best fit of each measurement: many parameters, or mode shapes.
-    pub fn starts_at_fit(&self) -> bool {
-        self.manifest.conditions.starts_at_fit
-    }
-
-    pub(super) fn locate(&self, observations: &[Observation]) -> Result<Vec<Located>, InferenceError> {
-        let expected = self.simulator.modes();
-        if let Some(o) = observations.iter().find(|o| o.frequencies_hz.len() != expected) {
-            return Err(InferenceError::Modes { found: o.frequencies_hz.len(), expected });
-        }
-        locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))
-    }
-
-    /// The flow's draws about the best fits, inside the prior.
-    ///
-    /// # Errors
-    /// [`InferenceError`] for another number of modes or a draw that is not finite.
-    pub(super) fn propose_from_fit(
-        &self,
-        observations: &[Observation],
-        draws: usize,
-        seed: u64,
-    ) -> Result<Proposals, InferenceError> {
-        let prior = self.space().as_slice();
-        let d = prior.len();
-        let mut stream = stats::stream(seed, "latent");
-        let mut theta = DMatrix::zeros(observations.len() * draws, d);
-        let mut log_density = Vec::with_capacity(theta.nrows());
-        let mut moved = vec![false; observations.len()];
-        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
-            let located = self.locate(part)?;
-            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
-            let (x, own) = self.flow.sample(&context, draws, &mut stream)?;
-            let x = x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?;
-            log_density.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
-            let drawn = x.chunks_exact(d * draws).zip(&located).enumerate();
-            // Each measurement has a stream of its own: the same draws for any number of threads.
-            let placed: Vec<(DMatrix<f64>, bool)> = drawn
-                .collect::<Vec<_>>()
-                .into_par_iter()
-                .map(|(row, (x, fit))| {
-                    let mut unit = fit.from_flow(&DMatrix::from_column_slice(d, draws, x));
-                    let mut stream =
-                        stats::stream(seed, &format!("draws beyond the prior {}", chunk * AT_A_TIME + row));
-                    let mut beyond = false;
-                    for draw in unit.as_mut_slice().chunks_exact_mut(d) {
-                        beyond |= fit.draw_back(draw, &mut stream);
-                    }
-                    (unit, beyond)
-                })
-                .collect();
-            for (row, (unit, beyond)) in placed.into_iter().enumerate() {
-                let row = chunk * AT_A_TIME + row;
-                moved[row] = beyond;
-                for (draw, position) in unit.column_iter().enumerate() {
-                    for (column, parameter) in prior.iter().enumerate() {
-                        let value = parameter.from_unit(position[column]);
-                        if !value.is_finite() {
-                            return Err(InferenceError::NotFinite { row, parameter: parameter.name.clone() });
-                        }
-                        theta[(row * draws + draw, column)] = value;
-                    }
-                }
-            }
-        }
-        Ok(Proposals { theta, log_density, moved })
-    }
-
-    /// Log-density in the unit box of the prior of each row of `theta`, the same number of rows for each observation, nats.
-    ///
-    /// # Errors
-    /// [`InferenceError`] for another number of modes.
-    pub(super) fn log_density_from_fit(
-        &self,
-        theta: &DMatrix<f64>,
-        observations: &[Observation],
-    ) -> Result<Vec<f64>, InferenceError> {
-        let prior = self.space().as_slice();
-        let (d, each) = (prior.len(), theta.nrows() / observations.len().max(1));
-        let mut all = Vec::with_capacity(theta.nrows());
-        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
-            let located = self.locate(part)?;
-            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
-            let mut x = Vec::with_capacity(part.len() * each * d);
-            for (row, fit) in located.iter().enumerate() {
-                let first = (chunk * AT_A_TIME + row) * each;
-                let unit = DMatrix::from_fn(d, each, |k, draw| prior[k].to_unit(theta[(first + draw, k)]));
-                x.extend_from_slice(fit.to_flow(&unit).as_slice());
-            }
-            let x = Tensor::from_vec(x, (part.len() * each, d), &Device::Cpu)?.to_dtype(self.flow.dtype())?;
-            let shape = (part.len(), each, features(d));
-            let repeated = context.unsqueeze(1)?.expand(shape)?.reshape((part.len() * each, features(d)))?;
-            let log_q = self.flow.log_prob(&x, &repeated)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
-            all.extend(log_q.into_iter().enumerate().map(|(row, log_q)| log_q + located[row / each].log_det()));
-        }
-        Ok(all)
-    }
-}
-
-/// What the flow is told of each fit, `[n, features]`, f64.
-///
-/// # Errors
-/// A candle error, which would be a bug.
-pub fn condition(located: &[Located], parameters: usize) -> Result<Tensor, candle_core::Error> {
-    let values: Vec<f64> = located.iter().flat_map(Located::features).collect();
-    Tensor::from_vec(values, (located.len(), features(parameters)), &Device::Cpu)
 }

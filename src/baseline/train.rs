@@ -4,14 +4,15 @@ use candle_core::{DType, Tensor};
 use nalgebra::DMatrix;
 
 use super::calibration::{calibrate, CalibrationRecord};
+use super::fitted::{fitted_pairs, inverse_error_from_fit};
 use super::identifiability::{identifiability, IdentifiabilityRecord};
 use super::manifest::{
     Conditions, EffectRange, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord,
     Whitening, FORMAT,
 };
 use super::observation::{measure, measure_shapes, Encoder, Observation};
-use super::start::{locate_all, starts_at_fit};
-use super::{start, to_real_line, Baseline, InferenceError};
+use super::start::starts_at_fit;
+use super::{to_real_line, Baseline, InferenceError};
 use crate::flow::train::{EpochReport, Pairs, Stopped, TrainSettings};
 use crate::flow::{checkpoint, weights, FlowSettings};
 use crate::quantity::Digest;
@@ -28,8 +29,6 @@ const HELD_OUT_FITTED: usize = 300;
 const VALIDATION_FITTED: usize = 500;
 /// Draws for each held-out pair.
 const HELD_OUT_DRAWS: usize = 10;
-/// Fits held at a time: the precision of each has d² numbers.
-const FITTED_AT_A_TIME: usize = 256;
 /// Draws of the self-test.
 const SELF_TEST_DRAWS: usize = 4;
 /// Fewest training samples: below, the covariance of the frequencies itself is uncertain.
@@ -327,24 +326,6 @@ pub fn observe(
     rows(&set.frequencies_hz).into_iter().zip(&set.effect_sizes).enumerate().map(one).collect()
 }
 
-/// What lies beyond the best fits of the measurements of a set, and what the flow is told of each.
-fn fitted_pairs(simulator: &Simulator, set: &TrainingSet, observations: &[Observation]) -> Result<Pairs, Error> {
-    let prior = simulator.space().as_slice();
-    let d = prior.len();
-    let (mut x, mut y) = (Vec::with_capacity(set.theta.len()), Vec::new());
-    for (chunk, part) in observations.chunks(FITTED_AT_A_TIME).enumerate() {
-        let located = locate_all(simulator, part).map_err(|e| InferenceError::Simulation(e.to_string()))?;
-        for (row, fit) in located.iter().enumerate() {
-            let row = chunk * FITTED_AT_A_TIME + row;
-            let unit = DMatrix::from_fn(d, 1, |k, _| prior[k].to_unit(set.theta[(row, k)]));
-            x.extend(fit.to_flow(&unit).iter().map(|x| *x as f32));
-        }
-        y.push(start::condition(&located, d)?.to_dtype(DType::F32)?);
-    }
-    let x = Tensor::from_vec(x, (observations.len(), d), &candle_core::Device::Cpu)?;
-    Ok(Pairs { x, y: Tensor::cat(&y, 0)? })
-}
-
 /// Measures a baseline on pairs it has not seen: likelihood, R² (paper Fig. 8), inverse error.
 ///
 /// # Errors
@@ -388,22 +369,7 @@ fn inverse_error(
     observations: &[Observation],
 ) -> Result<f64, InferenceError> {
     if baseline.starts_at_fit() {
-        let prior = baseline.space().as_slice();
-        let located = baseline.locate(observations)?;
-        let context = start::condition(&located, prior.len())?.to_dtype(DType::F32)?;
-        let unit = |row: usize| DMatrix::from_fn(prior.len(), 1, |k, _| prior[k].to_unit(theta[(row, k)]));
-        let x: Vec<f32> = located
-            .iter()
-            .enumerate()
-            .flat_map(|(row, fit)| fit.to_flow(&unit(row)).iter().map(|x| *x as f32).collect::<Vec<_>>())
-            .collect();
-        let x = Tensor::from_vec(x, (located.len(), prior.len()), &candle_core::Device::Cpu)?;
-        let (z, _) = baseline.flow.forward(&x, &context)?;
-        let back = baseline.flow.inverse(&z, &context)?.0.to_dtype(DType::F64)?.to_vec2::<f64>()?;
-        let error = |(row, (x, fit)): (usize, (Vec<f64>, &start::Located))| {
-            (fit.from_flow(&DMatrix::from_column_slice(x.len(), 1, &x)) - unit(row)).amax()
-        };
-        return Ok(back.into_iter().zip(&located).enumerate().map(error).fold(0.0, f64::max));
+        return inverse_error_from_fit(baseline, theta, observations);
     }
     let x = to_real_line(theta, &baseline.training_space)?.to_dtype(DType::F32)?;
     let context = baseline.flow.summarise(&baseline.condition(observations)?)?;

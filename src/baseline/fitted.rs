@@ -1,0 +1,177 @@
+//! Draws and densities of a flow that starts at the best fit, and what it is trained on; see [`super::start`].
+
+use candle_core::{DType, Device, Tensor};
+use nalgebra::DMatrix;
+use rayon::prelude::*;
+
+use super::observation::Observation;
+use super::resample::Proposals;
+use super::start::{features, locate_all, Located};
+use super::{Baseline, InferenceError};
+use crate::flow::train::Pairs;
+use crate::simulator::{Simulator, TrainingSet};
+use crate::stats;
+
+/// Measurements fitted at a time: the precision of each has d² numbers.
+const AT_A_TIME: usize = 64;
+
+impl Baseline {
+    /// Whether the flow starts at the best fit of each measurement: many parameters, or mode shapes.
+    pub fn starts_at_fit(&self) -> bool {
+        self.manifest.conditions.starts_at_fit
+    }
+
+    pub(super) fn locate(&self, observations: &[Observation]) -> Result<Vec<Located>, InferenceError> {
+        let expected = self.simulator.modes();
+        if let Some(o) = observations.iter().find(|o| o.frequencies_hz.len() != expected) {
+            return Err(InferenceError::Modes { found: o.frequencies_hz.len(), expected });
+        }
+        locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))
+    }
+
+    /// The flow's draws about the best fits, inside the prior.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes or a draw that is not finite.
+    pub(super) fn propose_from_fit(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        seed: u64,
+    ) -> Result<Proposals, InferenceError> {
+        let prior = self.space().as_slice();
+        let d = prior.len();
+        let mut stream = stats::stream(seed, "latent");
+        let mut theta = DMatrix::zeros(observations.len() * draws, d);
+        let mut log_density = Vec::with_capacity(theta.nrows());
+        let mut moved = vec![false; observations.len()];
+        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
+            let located = self.locate(part)?;
+            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
+            let (x, own) = self.flow.sample(&context, draws, &mut stream)?;
+            let x = x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?;
+            log_density.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
+            let drawn = x.chunks_exact(d * draws).zip(&located).enumerate();
+            // Each measurement has a stream of its own: the same draws for any number of threads.
+            let placed: Vec<(DMatrix<f64>, bool)> = drawn
+                .collect::<Vec<_>>()
+                .into_par_iter()
+                .map(|(row, (x, fit))| {
+                    let mut unit = fit.from_flow(&DMatrix::from_column_slice(d, draws, x));
+                    let mut stream =
+                        stats::stream(seed, &format!("draws beyond the prior {}", chunk * AT_A_TIME + row));
+                    let mut beyond = false;
+                    for draw in unit.as_mut_slice().chunks_exact_mut(d) {
+                        beyond |= fit.draw_back(draw, &mut stream);
+                    }
+                    (unit, beyond)
+                })
+                .collect();
+            for (row, (unit, beyond)) in placed.into_iter().enumerate() {
+                let row = chunk * AT_A_TIME + row;
+                moved[row] = beyond;
+                for (draw, position) in unit.column_iter().enumerate() {
+                    for (column, parameter) in prior.iter().enumerate() {
+                        let value = parameter.from_unit(position[column]);
+                        if !value.is_finite() {
+                            return Err(InferenceError::NotFinite { row, parameter: parameter.name.clone() });
+                        }
+                        theta[(row * draws + draw, column)] = value;
+                    }
+                }
+            }
+        }
+        Ok(Proposals { theta, log_density, moved })
+    }
+
+    /// Log-density in the unit box of the prior of each row of `theta`, the same number of rows for each observation, nats.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes.
+    pub(super) fn log_density_from_fit(
+        &self,
+        theta: &DMatrix<f64>,
+        observations: &[Observation],
+    ) -> Result<Vec<f64>, InferenceError> {
+        let prior = self.space().as_slice();
+        let (d, each) = (prior.len(), theta.nrows() / observations.len().max(1));
+        let mut all = Vec::with_capacity(theta.nrows());
+        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
+            let located = self.locate(part)?;
+            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
+            let mut x = Vec::with_capacity(part.len() * each * d);
+            for (row, fit) in located.iter().enumerate() {
+                let first = (chunk * AT_A_TIME + row) * each;
+                let unit = DMatrix::from_fn(d, each, |k, draw| prior[k].to_unit(theta[(first + draw, k)]));
+                x.extend_from_slice(fit.to_flow(&unit).as_slice());
+            }
+            let x = Tensor::from_vec(x, (part.len() * each, d), &Device::Cpu)?.to_dtype(self.flow.dtype())?;
+            let shape = (part.len(), each, features(d));
+            let repeated = context.unsqueeze(1)?.expand(shape)?.reshape((part.len() * each, features(d)))?;
+            let log_q = self.flow.log_prob(&x, &repeated)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
+            all.extend(log_q.into_iter().enumerate().map(|(row, log_q)| log_q + located[row / each].log_det()));
+        }
+        Ok(all)
+    }
+}
+
+/// What lies beyond the best fits of the measurements of a set, and what the flow is told of each.
+///
+/// # Errors
+/// [`InferenceError::Simulation`], which a checked prior rules out.
+pub(super) fn fitted_pairs(
+    simulator: &Simulator,
+    set: &TrainingSet,
+    observations: &[Observation],
+) -> Result<Pairs, InferenceError> {
+    let prior = simulator.space().as_slice();
+    let d = prior.len();
+    let (mut x, mut y) = (Vec::with_capacity(set.theta.len()), Vec::new());
+    for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
+        let located = locate_all(simulator, part).map_err(|e| InferenceError::Simulation(e.to_string()))?;
+        for (row, fit) in located.iter().enumerate() {
+            let row = chunk * AT_A_TIME + row;
+            let unit = DMatrix::from_fn(d, 1, |k, _| prior[k].to_unit(set.theta[(row, k)]));
+            x.extend(fit.to_flow(&unit).iter().map(|x| *x as f32));
+        }
+        y.push(condition(&located, d)?.to_dtype(DType::F32)?);
+    }
+    let x = Tensor::from_vec(x, (observations.len(), d), &Device::Cpu)?;
+    Ok(Pairs { x, y: Tensor::cat(&y, 0)? })
+}
+
+/// Largest |u − u'| after x → z → x', u the position in the prior box.
+///
+/// # Errors
+/// [`InferenceError`] for another number of modes.
+pub(super) fn inverse_error_from_fit(
+    baseline: &Baseline,
+    theta: &DMatrix<f64>,
+    observations: &[Observation],
+) -> Result<f64, InferenceError> {
+    let prior = baseline.space().as_slice();
+    let located = baseline.locate(observations)?;
+    let context = condition(&located, prior.len())?.to_dtype(DType::F32)?;
+    let unit = |row: usize| DMatrix::from_fn(prior.len(), 1, |k, _| prior[k].to_unit(theta[(row, k)]));
+    let x: Vec<f32> = located
+        .iter()
+        .enumerate()
+        .flat_map(|(row, fit)| fit.to_flow(&unit(row)).iter().map(|x| *x as f32).collect::<Vec<_>>())
+        .collect();
+    let x = Tensor::from_vec(x, (located.len(), prior.len()), &Device::Cpu)?;
+    let (z, _) = baseline.flow.forward(&x, &context)?;
+    let back = baseline.flow.inverse(&z, &context)?.0.to_dtype(DType::F64)?.to_vec2::<f64>()?;
+    let error = |(row, (x, fit)): (usize, (Vec<f64>, &Located))| {
+        (fit.from_flow(&DMatrix::from_column_slice(x.len(), 1, &x)) - unit(row)).amax()
+    };
+    Ok(back.into_iter().zip(&located).enumerate().map(error).fold(0.0, f64::max))
+}
+
+/// What the flow is told of each fit, `[n, features]`, f64.
+///
+/// # Errors
+/// A candle error, which would be a bug.
+pub(super) fn condition(located: &[Located], parameters: usize) -> Result<Tensor, candle_core::Error> {
+    let values: Vec<f64> = located.iter().flat_map(Located::features).collect();
+    Tensor::from_vec(values, (located.len(), features(parameters)), &Device::Cpu)
+}
