@@ -157,7 +157,7 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
     let settings = TrainSettings { epochs: default_epochs(&simulator), ..TrainSettings::default() };
     let started = Instant::now();
     let trained = train(&simulator, samples, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |epoch| {
-        if epoch.epoch % 5 == 0 || epoch.epoch == 1 {
+        if epoch.epoch % 2 == 0 || epoch.epoch == 1 {
             let seconds = started.elapsed().as_secs();
             eprintln!("{parameters}: epoch {} {:.2} {:.2} {seconds} s", epoch.epoch, epoch.loss, epoch.validation_loss);
         }

@@ -16,7 +16,7 @@ pub const DEFAULT_NOISE_RANGE: NoiseRange = NoiseRange { lowest: 0.1, highest: 5
 /// Share of the training measurements that have all modes.
 const SHARE_COMPLETE: f64 = 0.6;
 /// Share of the training measurements without any mode shape, of a structure with instrumented points.
-const SHARE_WITHOUT_SHAPES: f64 = 0.1;
+const SHARE_WITHOUT_SHAPES: f64 = 0.2;
 /// Share of the shapes that are missing in the others.
 const SHARE_SHAPE_MISSING: f64 = 0.02;
 /// Share of the training measurements whose modes all have the same noise, as a multiple of the structure's.

@@ -38,16 +38,16 @@ pub const MINIMUM_SAMPLES: usize = 100;
 /// to learn: fewer of them, and the fewer the more parameters.
 pub fn default_samples(simulator: &Simulator) -> usize {
     match (starts_at_fit(simulator), simulator.is_noisy()) {
-        (true, _) => (1_000_000 / simulator.space().len()).clamp(3_000, 10_000),
+        (true, _) => (1_000_000 / simulator.space().len()).clamp(3_000, 40_000),
         (false, true) => 200_000,
         (false, false) => 10_000,
     }
 }
 
-/// Passes over the training samples unless asked otherwise.
+/// Passes over the training samples unless asked otherwise. Where noise is drawn once, more of them learn the noise by heart.
 pub fn default_epochs(simulator: &Simulator) -> usize {
     match (starts_at_fit(simulator), simulator.is_noisy()) {
-        (true, _) => 30,
+        (true, _) => 8,
         (false, true) => 80,
         (false, false) => 200,
     }

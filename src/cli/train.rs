@@ -24,11 +24,11 @@ pub struct TrainArgs {
     /// Folder for structure.toml, baseline.safetensors and baseline.json [default: models/<structure>]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Simulated training samples [default: 200000; 10000 for a structure without measurement noise; 3000 to 10000 for one of many
+    /// Simulated training samples [default: 200000; 10000 for a structure without measurement noise; 3000 to 40000 for one of many
     /// parameters or with mode shapes]
     #[arg(long)]
     samples: Option<usize>,
-    /// Passes over the training samples [default: 80; 200 for a structure without measurement noise; 30 for one of many
+    /// Passes over the training samples [default: 80; 200 for a structure without measurement noise; 8 for one of many
     /// parameters or with mode shapes]
     #[arg(long)]
     epochs: Option<usize>,

@@ -12,6 +12,7 @@ use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use rand::Rng as _;
 
+#[allow(dead_code, reason = "shared with the tests of the API, which use all of it")]
 #[path = "../api/helpers.rs"]
 mod helpers;
 mod service;
@@ -53,6 +54,7 @@ pub fn chain_file(count: usize, modes: usize) -> String {
     text
 }
 
+/// The simulator of such a chain.
 pub fn chain_simulator(count: usize, modes: usize) -> Simulator {
     Simulator::new(StructureDefinition::parse_toml(&chain_file(count, modes)).unwrap()).unwrap()
 }
@@ -130,6 +132,19 @@ fn shapes_turned_around_and_in_another_order_are_paired_back() {
 }
 
 #[test]
+fn a_shape_unlike_every_mode_is_named_with_the_mode_it_is_least_unlike() {
+    let simulator = chain_simulator(30, 3);
+    let points = simulator.instrumented_points().unwrap();
+    for (mode, shape) in points.nominal.iter().enumerate() {
+        assert_eq!(points.mistake(shape), None);
+        assert_eq!(points.nearest(shape).map(|(nearest, _)| nearest), Some(mode));
+    }
+    let alternating: Vec<f64> = (0..15).map(|i| if i % 2 == 0 { 1.0 } else { -1.0 }).collect();
+    let mistake = points.mistake(&alternating).unwrap();
+    assert!(mistake.contains("its MAC is at most 0.0") && mistake.contains("those of m2, m4, m6, …"), "{mistake}");
+}
+
+#[test]
 fn what_is_wrong_with_instrumented_points_is_said() {
     let right = chain_file(6, 3);
     let wrong = |from: &str, to: &str| {
@@ -138,8 +153,8 @@ fn what_is_wrong_with_instrumented_points_is_said() {
         StructureDefinition::parse_toml(&text).unwrap_err().to_string()
     };
     let table = [
-        (wrong("\"m4\"", "\"m9\""), "/mode_shapes/points/1: \"m9\" is no mass or node that moves"),
-        (wrong("\"m4\"", "\"m2\""), "/mode_shapes/points/1: \"m2\" is there twice"),
+        (wrong("\"m4\", ", "\"m9\", "), "/mode_shapes/points/1: \"m9\" is no mass or node that moves"),
+        (wrong("\"m4\", ", "\"m2\", "), "/mode_shapes/points/1: \"m2\" is there twice"),
         (wrong("[\"m2\", \"m4\", \"m6\"]", "[\"m2\"]"), "/mode_shapes/points: 1 points: a shape has at least 2"),
         (wrong("noise = 0.005", "noise = 0.0"), "/mode_shapes/noise: 0 is no share of a shape's root mean square"),
     ];

@@ -66,13 +66,12 @@ async fn what_is_wrong_with_a_shape_is_said_with_its_place() {
         (json!([[1.0, 2.0], null, null, null, null]), "/0", "2 numbers, expected 5: one for each of m2, m4, m6"),
         (json!([vec![0.0; points], null, null, null, null]), "/0", "its numbers are all 0"),
         (json!([null, null]), "", "2 shapes, expected 5"),
-        (json!([[1.0, -1.0, 1.0, -1.0, 1.0], null, null, null, null]), "/0", "it resembles no mode of this structure"),
     ];
     for (shapes, place, message) in cases {
         let mut measurement = right.clone();
-        measurement["mode_shapes"] = shapes;
+        measurement["mode_shapes"] = shapes.clone();
         let refused = service.post(BATCHES, &json!({ "measurements": [measurement] })).await;
-        assert_eq!(refused.status(), 422);
+        assert_eq!(refused.status(), 422, "{shapes}");
         let body: Value = refused.json().await.unwrap();
         let text = body.to_string();
         assert!(text.contains(&format!("/measurements/0/mode_shapes{place}\"")) && text.contains(message), "{text}");

@@ -16,9 +16,9 @@ use crate::chain_simulator;
 
 /// Ten stiffnesses, five modes, five points: seconds of training.
 pub static CHAIN: LazyLock<Trained> = LazyLock::new(|| {
-    let settings = TrainSettings { epochs: 12, ..TrainSettings::default() };
+    let settings = TrainSettings { epochs: 8, ..TrainSettings::default() };
     let simulator = chain_simulator(10, 5);
-    train(&simulator, 4_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap()
+    train(&simulator, 10_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap()
 });
 
 fn exact(set: &TrainingSet, row: usize) -> Observation {
@@ -73,7 +73,8 @@ fn fits_of_noisy_measurements_scatter_as_they_say() {
     println!("mean of whitened squares {whitened:.3}, of χ² over its degrees of freedom {misfit:.3}");
     // 3,000 squares have a standard error of 0.026; a prior of finite width and a bent map add to it.
     assert!((0.9..1.2).contains(&whitened), "{whitened}");
-    assert!((0.95..1.05).contains(&misfit), "{misfit}");
+    // Fifteen degrees of freedom, 300 times: standard error 0.021.
+    assert!((misfit - 1.0).abs() < 0.07, "{misfit}");
 }
 
 #[test]
