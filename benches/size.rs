@@ -185,7 +185,7 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
     let (mut covered, mut error, mut fit_error, mut bound) = (vec![0.0; parameters], 0.0, 0.0, 0.0);
     let space = simulator.space().as_slice();
     let share = 1.0 / (MEASUREMENTS * parameters) as f64;
-    for row in 0..MEASUREMENTS {
+    for (row, fit) in fits.iter().enumerate() {
         let theta: Vec<f64> = set.theta.row(row).iter().copied().collect();
         let exact: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
         bound += local_covariance(&simulator, &theta, &exact).expect("a covariance").trace() * share;
@@ -196,7 +196,7 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
             let inside = stats::quantile(&draws, 0.05) <= truth && truth <= stats::quantile(&draws, 0.95);
             covered[column] += f64::from(u8::from(inside)) / MEASUREMENTS as f64;
             error += (stats::mean(&draws) - truth).powi(2) * share;
-            fit_error += (fits[row].unit[column] - truth).powi(2) * share;
+            fit_error += (fit.unit[column] - truth).powi(2) * share;
         }
     }
     let manifest = trained.baseline.manifest();

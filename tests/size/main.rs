@@ -102,9 +102,9 @@ fn derivatives_of_shapes_are_those_of_differences() {
                 shapes
             };
             let difference = (moved(1.0) - moved(-1.0)) / (2.0 * step);
-            for mode in 0..5 {
-                let error = (difference.column(mode) - slopes[mode].column(spring)).amax();
-                let scale = slopes[mode].amax();
+            for (mode, slopes) in slopes.iter().enumerate() {
+                let error = (difference.column(mode) - slopes.column(spring)).amax();
+                let scale = slopes.amax();
                 assert!(
                     error < 1e-5 * scale,
                     "{count} masses, mode {mode}, spring {spring}: {error:.1e} of {scale:.1e}"

@@ -48,7 +48,9 @@ fn the_fit_is_the_same_for_shapes_turned_around_and_modes_in_another_order() {
         other.noise_multiple.reverse();
         other.shapes.reverse();
         for shape in other.shapes.iter_mut().flatten() {
-            shape.iter_mut().for_each(|x| *x = -*x);
+            for x in shape {
+                *x = -*x;
+            }
         }
         let turned = locate(&simulator, &other).unwrap();
         assert!((&turned.unit - &fit.unit).amax() < 1e-9, "row {row}");
