@@ -50,7 +50,7 @@ fn frequencies_hz(k1: f64, k2: f64) -> [f64; 2] {
     [(b - root) / 1.6, (b + root) / 1.6].map(|lambda: f64| lambda.sqrt() / TAU)
 }
 
-/// Ten measurements of a day of the year 2026; k2 softens with the temperature.
+/// Ten measurements of a day of 2026; k2 softens with the temperature.
 fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
     let mut one = |i: usize| {
         let mut normal = || rng.sample::<f64, _>(StandardNormal);
@@ -100,7 +100,7 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undo
     let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(7);
     let mut batches = Vec::new();
     for number in 0..40 {
-        batches.push(service.post_batch("tiny", &batch(9 * number, &mut rng)).await["batch"].clone());
+        batches.push(service.post_batch("tiny", &batch(6 * number, &mut rng)).await["batch"].clone());
     }
     created(service.post("/v1/structures/tiny/baseline", &json!({ "batches": &batches[..6] })).await).await;
     let before = service.read("/v1/structures/tiny").await;
