@@ -46,11 +46,9 @@ struct WebhookBody {
     /// internet is refused, unless the setting `notify.allow_private_targets` has it.
     #[schema(max_length = 2000, pattern = "^https?://[^/?#@]+([/?#].*)?$", examples("https://example.com/alarms"))]
     url: String,
-    /// Kinds of events; all without.
     #[serde(default)]
     #[schema(schema_with = event_kinds)]
     events: Vec<String>,
-    /// Kinds of alarms; all without.
     #[serde(default)]
     #[schema(schema_with = alarm_kinds)]
     alarm_kinds: Vec<String>,
@@ -68,17 +66,17 @@ fn yes() -> bool {
 }
 
 /// A list of some of these words.
-fn list_of(words: &[&'static str]) -> Array {
+fn list_of(words: &[&'static str], description: &str) -> Array {
     let word = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(words.iter().copied())).build();
-    ArrayBuilder::new().items(word).build()
+    ArrayBuilder::new().items(word).description(Some(description)).build()
 }
 
 fn event_kinds() -> Array {
-    list_of(&EVENT_KINDS)
+    list_of(&EVENT_KINDS, "Kinds of events; all without.")
 }
 
 fn alarm_kinds() -> Array {
-    list_of(&ALARM_KINDS)
+    list_of(&ALARM_KINDS, "Kinds of alarms; all without.")
 }
 
 /// Webhooks, oldest first.
