@@ -346,7 +346,7 @@ pub struct Undamaged {
 
 impl Undamaged {
     /// The answer for an undamaged state.
-    pub fn new(structure: &crate::quantity::StructureId, record: UndamagedRecord) -> Self {
+    pub fn new(structure: &crate::quantity::StructureId, record: &UndamagedRecord) -> Self {
         Self {
             structure: structure.to_string(),
             version: record.state.version,
@@ -354,10 +354,10 @@ impl Undamaged {
             model_digest: record.model_digest.to_string(),
             threshold_probability: record.state.threshold_probability,
             measurement_count: record.state.measurements,
-            batches: record.batches,
-            conditions: record.state.conditions,
-            doubts: record.state.doubts,
-            parameters: record.state.quantities,
+            batches: record.batches.clone(),
+            conditions: record.state.conditions.clone(),
+            doubts: record.state.doubts.clone(),
+            parameters: record.state.quantities.clone(),
         }
     }
 }

@@ -270,7 +270,7 @@ pub async fn declare_baseline(
     }
     let probability = body.threshold_probability.unwrap_or(DEFAULT_THRESHOLD_PROBABILITY);
     let record = shared.monitor.declare_undamaged(&id, body.batches, probability).await?;
-    Ok((StatusCode::CREATED, Json(Undamaged::new(&id, record))).into_response())
+    Ok((StatusCode::CREATED, Json(Undamaged::new(&id, &record))).into_response())
 }
 
 /// 422 for a name that this structure does not estimate.

@@ -178,13 +178,10 @@ pub async fn series(
 
     let (modes, declared) = (watched.simulator.modes(), watched.simulator.covariates().iter());
     let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
-    let (measured, quantities, (charts, trust)) = tokio::try_join!(
+    let (measured, (quantities, trust), charts) = tokio::try_join!(
         store.frequency_series(&id, window, &extent, modes, &names),
-        store.quantity_series(&id, window, &extent),
-        async {
-            let charts = store.chart_series(&id, window, &extent).await?;
-            Ok((charts, store.trust_series(&id, window, &extent).await?))
-        },
+        store.assessed_series(&id, window, &extent),
+        store.chart_series(&id, window, &extent),
     )?;
     let reduced = measured.reduced
         || trust.reduced
@@ -194,7 +191,7 @@ pub async fn series(
 
     // Its levels are drawn where batches are compared with it.
     let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
-    let undamaged = store.undamaged(&id).await?.filter(|u| in_use == Some(&u.model_digest)).map(|u| u.state);
+    let undamaged = store.undamaged(&id).await?.filter(|u| in_use == Some(&u.model_digest));
     let within = |begin: Timestamp, end: Option<Timestamp>| {
         to.is_none_or(|to| begin <= to) && from.is_none_or(|from| end.is_none_or(|end| end >= from))
     };
@@ -208,7 +205,10 @@ pub async fn series(
         reduced,
         thinned_to_every: Some(extent.stride()).filter(|stride| *stride > 1),
         frequencies: frequencies(measured, watched.simulator.nominal_frequencies_hz(), &names)?,
-        parameters: quantities.into_iter().map(|q| track(q, undamaged.as_ref())).collect::<Result<_, _>>()?,
+        parameters: quantities
+            .into_iter()
+            .map(|q| track(q, undamaged.as_ref().map(|u| &u.state)))
+            .collect::<Result<_, _>>()?,
         charts: charts.into_iter().map(chart).collect::<Result<_, _>>()?,
         trust: trust.rows.into_iter().map(trust_point).collect::<Result<_, _>>()?,
         alarms: episodes.into_iter().filter(|e| !e.withdrawn && within(e.opened_at, e.ended_at)).map(alarm).collect(),

@@ -121,7 +121,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
     let undamaged = shared.monitor.store().undamaged(&id).await?;
-    Ok(Json(body(&id, &watched, undamaged.map(|u| super::answer::Undamaged::new(&id, u)))).into_response())
+    Ok(Json(body(&id, &watched, undamaged.map(|u| super::answer::Undamaged::new(&id, &u)))).into_response())
 }
 
 /// `PUT /v1/structures/{id}`: a structure as JSON or TOML; 201 when it is new, 200 when it was there already.
@@ -176,7 +176,7 @@ pub async fn put(
     let outcome = shared.monitor.put_structure(definition).await?;
     let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
     let watched = shared.monitor.structure(&id)?;
-    let undamaged = shared.monitor.store().undamaged(&id).await?.map(|u| super::answer::Undamaged::new(&id, u));
+    let undamaged = shared.monitor.store().undamaged(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
     let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
     Ok((status, location, Json(self::body(&id, &watched, undamaged))).into_response())
 }

@@ -14,10 +14,9 @@ use super::request::{structure_id, ApiPath};
 use super::Shared;
 use crate::access::Grant;
 use crate::alarm::machine::State as AlarmState;
-use crate::assessment::Assessment;
 use crate::monitor::{BatchDetail, ModeDetail, ParameterDetail, Watched};
 use crate::quantity::{Hertz, StructureId, Timestamp};
-use crate::store::{JobKind, JobRecord, JobState, StructureOverview};
+use crate::store::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
 use crate::trust::Verdict;
 
 /// Jobs listed.
@@ -151,24 +150,16 @@ struct ModeBody {
 )]
 pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let store = shared.monitor.store();
-    let mut items = Vec::new();
-    for found in store.overview().await?.into_iter().filter(|found| grant.may_see(&found.id)) {
+    let item = |found: StructureOverview| {
         let watched = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
-        let assessment = match &found.latest_assessed {
-            Some(batch) => store.assessment(&found.id, batch).await?,
-            None => None,
-        };
-        items.push(item(found, watched, assessment));
-    }
+        item(found, watched)
+    };
+    let items = store.overview().await?.into_iter().filter(|found| grant.may_see(&found.id)).map(item).collect();
     let jobs_running = shared.monitor.jobs_running();
     Ok(Json(Overview { items, jobs_running }).into_response())
 }
 
-fn item(
-    found: StructureOverview,
-    watched: Result<Arc<Watched>, String>,
-    assessment: Option<Assessment>,
-) -> OverviewItem {
+fn item(found: StructureOverview, watched: Result<Arc<Watched>, String>) -> OverviewItem {
     let baseline = watched.and_then(|watched| watched.baseline.clone());
     let (baseline, model_missing) = (baseline.as_ref().ok(), baseline.as_ref().err());
     OverviewItem {
@@ -176,7 +167,7 @@ fn item(
         model_digest: baseline.map(|b| b.digest().to_string()),
         model_missing: model_missing.cloned(),
         calibration_passed: baseline.map(|b| b.manifest().calibration.passed()),
-        latest: found.latest_assessed.zip(assessment).map(|(batch, assessment)| latest(batch, &assessment)),
+        latest: found.latest.map(latest),
         id: found.id,
         open_alarms: found.open_alarms,
         unacknowledged_alarms: found.unacknowledged_alarms,
@@ -198,7 +189,7 @@ fn state(found: &StructureOverview, has_model: bool) -> &'static str {
         AlarmState::Silent.as_str()
     } else if !has_model {
         "no_model"
-    } else if found.latest_assessed.is_none() {
+    } else if found.latest.is_none() {
         "unassessed"
     } else if on_a_chart(AlarmState::Pending) {
         AlarmState::Pending.as_str()
@@ -207,16 +198,15 @@ fn state(found: &StructureOverview, has_model: bool) -> &'static str {
     }
 }
 
-fn latest(batch: String, assessment: &Assessment) -> Latest {
-    let damages = assessment.quantities.iter().filter_map(|q| Some((q, q.damage.as_ref()?)));
-    let worst = damages.clone().max_by(|(_, a), (_, b)| a.probability_of_damage.total_cmp(&b.probability_of_damage));
+fn latest(found: LatestAssessment) -> Latest {
+    let (max_probability_of_damage, max_parameter) = found.worst.unzip();
     Latest {
-        batch,
-        trust: assessment.trust.verdict,
-        exceeds: damages.clone().any(|(_, damage)| damage.exceeds),
-        max_probability_of_damage: worst.map(|(_, damage)| damage.probability_of_damage),
-        max_parameter: worst.map(|(quantity, _)| quantity.name.clone()),
-        findings: assessment.trust.findings.len(),
+        batch: found.batch_id,
+        trust: found.verdict,
+        exceeds: found.exceeds,
+        max_probability_of_damage,
+        max_parameter,
+        findings: found.findings,
     }
 }
 

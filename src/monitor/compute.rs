@@ -36,11 +36,16 @@ pub struct Panicked;
 pub struct Compute {
     places: Arc<Semaphore>,
     threads: Arc<Semaphore>,
+    /// Places that work behind all other may hold together: enough to keep the threads busy, and few enough that what comes in
+    /// meanwhile soon gets a thread.
+    behind: Arc<Semaphore>,
+    places_behind: usize,
 }
 
 /// A place in the queue; given back when dropped.
 pub struct Place {
     _place: OwnedSemaphorePermit,
+    _behind: Option<OwnedSemaphorePermit>,
     threads: Arc<Semaphore>,
 }
 
@@ -49,7 +54,14 @@ impl Compute {
     pub fn new(settings: ComputeSettings) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = if settings.threads == 0 { cores } else { settings.threads };
-        Self { places: Arc::new(Semaphore::new(settings.queue)), threads: Arc::new(Semaphore::new(threads)) }
+        // A batch that is computed keeps its place until it is stored: twice as many as there are threads.
+        let places_behind = (2 * threads).min(settings.queue / 2).max(1);
+        Self {
+            places: Arc::new(Semaphore::new(settings.queue)),
+            threads: Arc::new(Semaphore::new(threads)),
+            behind: Arc::new(Semaphore::new(places_behind)),
+            places_behind,
+        }
     }
 
     /// Takes a place at once.
@@ -58,13 +70,24 @@ impl Compute {
     /// [`QueueFull`] when none is free.
     pub fn reserve(&self) -> Result<Place, QueueFull> {
         let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| QueueFull)?;
-        Ok(Place { _place: place, threads: Arc::clone(&self.threads) })
+        Ok(Place { _place: place, _behind: None, threads: Arc::clone(&self.threads) })
     }
 
-    /// Takes a place, waiting for one: for work that nobody waits for, such as what a restart left over.
+    /// Takes a place, waiting for one: for work whose sender cannot be told to come again.
     pub async fn wait(&self) -> Place {
         let place = Arc::clone(&self.places).acquire_owned().await.expect("the semaphore is never closed");
-        Place { _place: place, threads: Arc::clone(&self.threads) }
+        Place { _place: place, _behind: None, threads: Arc::clone(&self.threads) }
+    }
+
+    /// Takes one of the places for work that nobody waits for, such as what a restart left over.
+    pub async fn wait_behind(&self) -> Place {
+        let behind = Arc::clone(&self.behind).acquire_owned().await.expect("the semaphore is never closed");
+        Place { _behind: Some(behind), ..self.wait().await }
+    }
+
+    /// How many such places there are.
+    pub fn places_behind(&self) -> usize {
+        self.places_behind
     }
 
     /// Places free now.

@@ -97,12 +97,12 @@ impl Monitor {
         let (source, from) = (&record.batch.source, record.batch.time_span().0);
         let previous = self.store.frequencies_before(structure, source, from).await?;
         let undamaged = self.store.undamaged(structure).await?;
-        let undamaged = undamaged.filter(|u| u.model_digest == *baseline.digest()).map(|u| u.state);
+        let undamaged = undamaged.filter(|u| u.model_digest == *baseline.digest());
         let drawn = Arc::clone(&baseline);
         let work = move || {
             let BatchRecord { batch, .. } = record;
             let samples = assess::draw(&drawn, &batch.measurements, previous.as_deref(), draws)?;
-            detail(&drawn, &batch.measurements, &samples, draws.per_measurement, undamaged.as_ref())
+            detail(&drawn, &batch.measurements, &samples, draws.per_measurement, undamaged.as_ref().map(|u| &u.state))
         };
         let done = place.run(work).await.map_err(|_| Error::Panicked)?;
         done.map_err(|error| not_assessed(error.to_string()))

@@ -10,8 +10,10 @@ pub mod events;
 mod intake;
 mod models;
 mod probe;
+mod replay;
 pub mod retention;
 mod silence;
+mod task;
 #[cfg(test)]
 mod tests;
 mod undamaged;
@@ -23,20 +25,19 @@ use std::sync::{Arc, Mutex, RwLock};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use tracing::{error, info, info_span, warn, Instrument as _};
+use tracing::{error, warn, Instrument as _};
 
 use crate::alarm::AlarmSettings;
 use crate::assessment::{Assessment, BatchState};
 use crate::baseline::library::{Library, Refusal};
-use crate::baseline::{assessment_seed, Baseline};
-use crate::damage::{self, UndamagedState};
+use crate::baseline::Baseline;
+use crate::damage;
 use crate::measurement::check::Expectation;
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::simulator::Simulator;
 use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store, StoredChartPoint};
-use assess::{Context, Draws};
 use charts::KnownLimits;
 use compute::{Compute, ComputeSettings, QueueFull};
 pub use detail::{BatchDetail, ModeDetail, ParameterDetail};
@@ -44,9 +45,6 @@ pub use diagnoses::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
 use events::{Events, KnownAlarms};
 pub use models::Reloaded;
 pub use watched::Watched;
-
-/// Pause between two tries to store what could not be stored, such as on a full disk.
-const BETWEEN_TRIES: std::time::Duration = std::time::Duration::from_secs(2);
 
 /// How batches are taken and assessed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -421,7 +419,7 @@ impl Monitor {
         };
         let record = self.stored(&structure, &id).await?;
         if record.state == BatchState::Received && watched.baseline.is_ok() {
-            if let Err(failure) = self.assess_stored(&watched, record, place).await {
+            if let Err(failure) = self.assess_stored(watched, record, place).await {
                 // The batch is stored, and whoever sent it may not send it again.
                 self.resume_until_done(structure);
                 return Err(failure);
@@ -475,173 +473,6 @@ impl Monitor {
         })
     }
 
-    /// Assesses what an earlier run left unassessed, in the background.
-    pub fn resume(&self) {
-        let structures: Vec<StructureId> = self.lock_read().keys().cloned().collect();
-        for structure in structures {
-            self.resume_later(structure);
-        }
-    }
-
-    fn resume_later(&self, structure: StructureId) {
-        let monitor = self.clone();
-        tokio::spawn(async move {
-            monitor.retake_undamaged(&structure).await;
-            if let Err(error) = monitor.resume_structure(&structure).await {
-                error!(structure.id = %structure, %error, "Could not go on with unassessed batches of {structure}: {error}");
-                monitor.resume_until_done(structure);
-            }
-        });
-    }
-
-    /// Goes on with unassessed batches until none is left: after a full disk nobody may post them again.
-    fn resume_until_done(&self, structure: StructureId) {
-        if !self.recovering.lock().expect("no holder of this lock panics").insert(structure.clone()) {
-            return;
-        }
-        let monitor = self.clone();
-        tokio::spawn(async move {
-            loop {
-                tokio::time::sleep(BETWEEN_TRIES).await;
-                match monitor.resume_structure(&structure).await {
-                    Ok(()) => break,
-                    Err(_) if monitor.store.is_closed() => break,
-                    Err(error) => {
-                        warn!(structure.id = %structure, %error, "Unassessed batches of {structure} still wait: {error}");
-                    }
-                }
-            }
-            monitor.recovering.lock().expect("no holder of this lock panics").remove(&structure);
-        });
-    }
-
-    async fn resume_structure(&self, structure: &StructureId) -> Result<(), Error> {
-        // One at a time for each structure: two would assess the same batches.
-        let turn = Arc::clone(
-            self.resuming.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default(),
-        );
-        let _turn = turn.lock().await;
-        loop {
-            let pending = self.store.pending(structure, 100).await?;
-            if pending.is_empty() {
-                return Ok(());
-            }
-            for batch_id in pending {
-                let place = self.compute.wait().await;
-                // The version may change at any time: each batch is taken under the present one.
-                let watched = self.structure(structure)?;
-                if watched.baseline.is_err() {
-                    return Ok(());
-                }
-                let record = match self.stored(structure, &batch_id).await {
-                    // One damaged row must not keep the batches behind it waiting.
-                    Err(Error::Store(damaged @ store::Error::Row { .. })) => {
-                        error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
-                        let version = watched.simulator.digest();
-                        self.store.mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
-                        continue;
-                    }
-                    record => record?,
-                };
-                if record.state == BatchState::Received {
-                    self.assess_stored(&watched, record, place).await?;
-                }
-            }
-        }
-    }
-
-    /// Assesses a stored batch and stores the result, or the reason why there is none.
-    async fn assess_stored(&self, watched: &Watched, record: BatchRecord, place: compute::Place) -> Result<(), Error> {
-        let structure = record.batch.structure.clone();
-        let mut baseline = baseline_of(&structure, watched)?;
-        let measured = record.batch.time_span();
-        let previous = self.store.frequencies_before(&structure, &record.batch.source, measured.0).await?;
-        let (record, previous) = (Arc::new(record), Arc::new(previous));
-        let mut undamaged = self.comparable(&structure, &record, &baseline).await?;
-        loop {
-            let started = std::time::Instant::now();
-            let draws = self.draws(&baseline, &record);
-            let version = undamaged.as_ref().map(|state| state.version);
-            let (baseline_here, record_here) = (Arc::clone(&baseline), Arc::clone(&record));
-            let (known, settings, previous) =
-                (Arc::clone(&self.known_limits), self.settings.alarm, Arc::clone(&previous));
-            let work = move || {
-                let context = Context { undamaged: undamaged.as_ref(), previous: previous.as_deref() };
-                let assessment = assess::assess(&baseline_here, &record_here.batch.measurements, context, draws)?;
-                let state = undamaged.as_ref();
-                let points = charts::points(&baseline_here, &assessment, state, measured, &settings, &known);
-                Ok::<_, assess::Error>((assessment, points))
-            };
-            let (structure_id, batch_id) = (structure.as_str(), &record.batch_id);
-            let trace =
-                info_span!(target: "modalwatch::spans", "assess", structure.id = structure_id, batch.id = batch_id);
-            let reason = match place.run(work).instrument(trace).await {
-                Ok(Ok((assessment, points))) => {
-                    let seconds = started.elapsed().as_secs_f64();
-                    metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
-                    report(&structure, &record.batch_id, &assessment, seconds);
-                    if !self.store.insert_assessment(&structure, &record.batch_id, &assessment, points).await? {
-                        // The structure has another version by now: the batch waits for an assessment under that.
-                        self.resume_later(structure);
-                        return Ok(());
-                    }
-                    self.tell_batch(&structure, &record.batch_id, BatchState::Assessed);
-                    self.report_episodes(&structure).await;
-                    // A state declared while this was computed did not find the batch assessed, and so did not send it
-                    // back: it is compared now.
-                    let swapped = self.swapped_since(watched, &baseline);
-                    let same_model = swapped.is_none();
-                    baseline = swapped.unwrap_or(baseline);
-                    undamaged = self.comparable(&structure, &record, &baseline).await?;
-                    if same_model && undamaged.as_ref().map(|state| state.version) == version {
-                        return Ok(());
-                    }
-                    continue;
-                }
-                Ok(Err(error)) => error.to_string(),
-                Err(panicked) => panicked.to_string(),
-            };
-            let id = &record.batch_id;
-            metrics::counter!("modalwatch_assessments_failed_total").increment(1);
-            warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
-            if self.store.mark_failed(&structure, id, watched.simulator.digest(), &reason).await? {
-                self.tell_batch(&structure, id, BatchState::Failed);
-            } else {
-                self.resume_later(structure);
-            }
-            return Ok(());
-        }
-    }
-
-    /// The baseline that took the place of another for the same version of the structure: a batch that was begun with the old
-    /// one would be compared with nothing.
-    fn swapped_since(&self, watched: &Watched, used: &Baseline) -> Option<Arc<Baseline>> {
-        let present = self.structure(watched.simulator.id()).ok()?;
-        let newer = present.baseline.as_ref().ok().filter(|baseline| baseline.digest() != used.digest())?;
-        (present.simulator.digest() == watched.simulator.digest()).then(|| Arc::clone(newer))
-    }
-
-    /// The undamaged state a batch is compared with: the newest, if it was taken with this baseline and without this batch.
-    async fn comparable(
-        &self,
-        structure: &StructureId,
-        record: &BatchRecord,
-        baseline: &Baseline,
-    ) -> Result<Option<UndamagedState>, Error> {
-        let newest = self.store.undamaged(structure).await?;
-        let fits =
-            |u: &store::UndamagedRecord| u.model_digest == *baseline.digest() && !u.batches.contains(&record.batch_id);
-        Ok(newest.filter(fits).map(|u| u.state))
-    }
-
-    fn draws(&self, baseline: &Baseline, record: &BatchRecord) -> Draws {
-        Draws {
-            per_measurement: self.settings.draws_per_measurement,
-            for_population: self.settings.draws_for_population,
-            seed: assessment_seed(&record.content_digest, baseline.digest()),
-        }
-    }
-
     /// Logs alarms that were raised since the last look, each once, and tells of all that changed.
     async fn report_episodes(&self, structure: &StructureId) {
         self.tell_alarms(structure).await;
@@ -674,16 +505,4 @@ impl Monitor {
 fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baseline>, Error> {
     let missing = |reason: &String| Error::NoModel { structure: structure.clone(), reason: reason.clone() };
     watched.baseline.as_ref().map(Arc::clone).map_err(missing)
-}
-
-fn report(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
-    metrics::counter!("modalwatch_assessments_total").increment(1);
-    let exceeding = assessment.quantities.iter().filter(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
-    let exceeding: Vec<&str> = exceeding.map(|q| q.name.as_str()).collect();
-    let duration_ms = seconds * 1e3;
-    let measurements = assessment.measurements_used;
-    info!(
-        structure.id = %structure, batch.id = %batch_id, model.digest = %assessment.model_digest, duration_ms,
-        exceeding = ?exceeding, "Assessed {measurements} measurements of {structure}"
-    );
 }

@@ -1,9 +1,11 @@
 //! The n-th call fails, for all n: whatever breaks on the way of a batch, a retry stores it once and assesses it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::OnceLock;
 
+use super::compute::ComputeSettings;
+use super::events::News;
 use super::{Error, Ingested, Monitor, MonitorSettings};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
@@ -45,6 +47,10 @@ fn batch(number: usize) -> MeasurementBatch {
 }
 
 async fn open(folder: &Path) -> Monitor {
+    open_with(folder, MonitorSettings::default()).await
+}
+
+async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
     let mut opened = Store::open(folder).await;
     for _ in 0..200 {
         // Tasks of the monitor before this one may still hold it.
@@ -55,7 +61,7 @@ async fn open(folder: &Path) -> Monitor {
         opened = Store::open(folder).await;
     }
     let store = opened.expect("the store opens");
-    Monitor::open(store, Library::open(None).unwrap(), MonitorSettings::default()).await.unwrap()
+    Monitor::open(store, Library::open(None).unwrap(), settings).await.unwrap()
 }
 
 /// Ids of all batches, each of which must be assessed and whole.
@@ -179,4 +185,52 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
         tokio::time::sleep(std::time::Duration::from_millis(50)).await;
     }
     panic!("the comparison with the undamaged state is not the current assessment");
+}
+
+/// Batches that are assessed again.
+const REPLAYED: usize = 40;
+
+/// What a replay on so many threads leaves of each batch: all numbers of its assessment and charts, but for ids and the time.
+async fn replayed(threads: usize) -> Vec<String> {
+    let folder = tempfile::tempdir().unwrap();
+    let compute = ComputeSettings { threads, ..ComputeSettings::default() };
+    let monitor = open_with(folder.path(), MonitorSettings { compute, ..MonitorSettings::default() }).await;
+    let mut ids = Vec::new();
+    for number in 0..REPLAYED {
+        ids.push(monitor.ingest(batch(number)).await.unwrap().view.record.batch_id);
+    }
+    let mut news = monitor.events().watch().unwrap();
+    monitor.declare_undamaged(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
+    let mut told = Vec::new();
+    while told.len() < REPLAYED - 5 {
+        if let News::Batch { batch, state, .. } = news.recv().await.unwrap() {
+            assert_eq!(state, BatchState::Assessed);
+            told.push(batch);
+        }
+    }
+    assert_eq!(told, ids[5..], "in the order of arrival");
+    let mut left = Vec::new();
+    let mut times = BTreeSet::new();
+    for id in &ids {
+        let view = monitor.batch(&structure(), id).await.unwrap();
+        let (mut assessment, mut charts) = (view.assessment.unwrap(), view.charts);
+        times.insert(assessment.assessed_at);
+        assessment.assessed_at = Timestamp::from_micros(0).unwrap();
+        for point in &mut charts {
+            point.batch_id.clear();
+        }
+        // The shortest text that gives the same float tells apart what differs in one bit.
+        left.push(format!("{assessment:?} {charts:?}"));
+    }
+    assert!(times.len() > 1);
+    left
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_replay_gives_the_same_bits_in_the_same_order_on_any_number_of_threads() {
+    let one = replayed(1).await;
+    assert!(one[REPLAYED - 1].contains("undamaged_version: Some(1)"), "{}", one[REPLAYED - 1]);
+    for threads in [2, 5] {
+        assert_eq!(replayed(threads).await, one, "{threads} threads");
+    }
 }

@@ -1,5 +1,7 @@
 //! Declaring batches as the undamaged state.
 
+use std::sync::Arc;
+
 use tracing::{info, warn, Instrument as _};
 
 use super::assess::{self, Draws, UndamagedError};
@@ -21,7 +23,7 @@ impl Monitor {
         structure: &StructureId,
         batch_ids: Vec<String>,
         threshold_probability: f64,
-    ) -> Result<UndamagedRecord, Error> {
+    ) -> Result<Arc<UndamagedRecord>, Error> {
         let (monitor, structure) = (self.clone(), structure.clone());
         let place = self.compute.reserve()?;
         let declare = async move { monitor.declare_here(&structure, batch_ids, threshold_probability, place).await };
@@ -49,7 +51,7 @@ impl Monitor {
             warn!(structure.id = %structure, "The undamaged batches of {structure} make no undamaged state with its present baseline: {error}");
         };
         let newest = self.store.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
-        let (mut batches, threshold) = (newest.batches, newest.state.threshold_probability);
+        let (mut batches, threshold) = (newest.batches.clone(), newest.state.threshold_probability);
         loop {
             let place = self.compute.wait().await;
             match self.declare_here(structure, batches.clone(), threshold, place).await {
@@ -72,7 +74,7 @@ impl Monitor {
         batch_ids: Vec<String>,
         threshold_probability: f64,
         place: Place,
-    ) -> Result<UndamagedRecord, Error> {
+    ) -> Result<Arc<UndamagedRecord>, Error> {
         let watched = self.structure(structure)?;
         let baseline = baseline_of(structure, &watched)?;
         let mut records = Vec::new();

@@ -1,12 +1,14 @@
 //! Assessments: written beside each other, one for each pair of trained baseline and undamaged state.
 
 use std::collections::BTreeMap;
+use std::future::Future;
+use std::sync::LazyLock;
 
-use sqlx::FromRow;
+use sqlx::{FromRow, SqliteConnection};
 
 use super::alarm::{chart, NewChartPoint};
-use super::structure::is_present;
-use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
+use super::rows::{insert_statements, parts};
+use super::{bad_row, from_blob, plotted, timestamp, to_blob, Error, Store};
 use crate::assessment::Assessment;
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use crate::quantity::{Digest, StructureId};
@@ -60,6 +62,10 @@ struct QuantityRow {
     group_name: Option<String>,
 }
 
+/// Statements that insert quantities; the first four columns are common to all rows.
+static INSERT_QUANTITIES: LazyLock<Vec<String>> =
+    LazyLock::new(|| insert_statements("quantity_assessment", 29, &[0, 1, 2, 3]));
+
 /// Orders the assessments of a batch; the current one comes first.
 pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
 
@@ -77,92 +83,24 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn insert_assessment(
+    pub fn insert_assessment(
         &self,
         structure: &StructureId,
         batch_id: &str,
         assessment: &Assessment,
         charted: Vec<NewChartPoint>,
-    ) -> Result<bool, Error> {
+    ) -> impl Future<Output = Result<bool, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.write(move |connection| {
             Box::pin(async move {
-                if !is_present(connection, &structure, &a.structure_digest).await? {
+                let Some(place) = place_of(connection, &structure, &id, &a).await? else {
                     return Ok(false);
+                };
+                let assessed_at = timestamp("assessment", place.assessed_at_us)?;
+                if place.taken {
+                    remove(connection, &structure, &id, &a).await?;
                 }
-                let version = a.undamaged_version.unwrap_or(0);
-                let assessed_at_us = place_in_time(connection, &structure, &id, &a, version).await?;
-                let assessed_at = timestamp("assessment", assessed_at_us)?;
-                for table in ["quantity_assessment", "assessment"] {
-                    let delete = format!(
-                        "delete from {table}
-                         where structure_id = ? and batch_id = ? and model_digest = ? and undamaged_version = ?"
-                    );
-                    sqlx::query(sqlx::AssertSqlSafe(delete))
-                        .bind(&structure)
-                        .bind(&id)
-                        .bind(a.model_digest.as_str())
-                        .bind(version)
-                        .execute(&mut *connection)
-                        .await?;
-                }
-                let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
-                sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
-                    .bind(&structure)
-                    .bind(&id)
-                    .bind(a.model_digest.as_str())
-                    .bind(version)
-                    .bind(a.structure_digest.as_str())
-                    .bind(a.seed.cast_signed())
-                    .bind(a.draws_per_measurement as i64)
-                    .bind(a.measurements_used as i64)
-                    .bind(a.measurements_left_out as i64)
-                    .bind(a.measurements_outside as i64)
-                    .bind(to_blob(a.misfit_percent.iter().map(|misfit| misfit.unwrap_or(f64::NAN))))
-                    .bind(assessed_at_us)
-                    .bind(a.effective_sample_size)
-                    .bind(trust)
-                    .execute(&mut *connection)
-                    .await?;
-                for (position, q) in a.quantities.iter().enumerate() {
-                    let damage = q.damage.as_ref();
-                    sqlx::query(
-                        "insert into quantity_assessment
-                         values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?,
-                                 ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                    )
-                    .bind(&structure)
-                    .bind(&id)
-                    .bind(a.model_digest.as_str())
-                    .bind(version)
-                    .bind(&q.name)
-                    .bind(position as i64)
-                    .bind(&q.unit)
-                    .bind(kind_name(q.kind))
-                    .bind(q.mean)
-                    .bind(q.std)
-                    .bind(q.pooled.within)
-                    .bind(q.pooled.between)
-                    .bind(q.edge_mass)
-                    .bind(damage.map(|d| d.threshold))
-                    .bind(damage.map(|d| d.probability_of_damage))
-                    .bind(damage.map(|d| d.exceeds))
-                    .bind(damage.map(|d| d.relative_change))
-                    .bind(q.mean_interval.map(|i| i[0]))
-                    .bind(q.mean_interval.map(|i| i[1]))
-                    .bind(q.std_interval.map(|i| i[0]))
-                    .bind(q.std_interval.map(|i| i[1]))
-                    .bind(q.pooled.mean)
-                    .bind(q.pooled.std)
-                    .bind(damage.and_then(|d| d.probability_interval).map(|i| i[0]))
-                    .bind(damage.and_then(|d| d.probability_interval).map(|i| i[1]))
-                    .bind(damage.map(|d| d.pooled_probability))
-                    .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[0]))
-                    .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[1]))
-                    .bind(&q.group)
-                    .execute(&mut *connection)
-                    .await?;
-                }
+                insert(connection, &structure, &id, &a, place.assessed_at_us).await?;
                 chart(connection, &structure, &id, charted, assessed_at).await?;
                 sqlx::query(
                     "update measurement_batch set state = 'assessed', failure = null
@@ -175,7 +113,6 @@ impl Store {
                 Ok(true)
             })
         })
-        .await
     }
 
     /// The current assessment of a batch: the newest.
@@ -241,29 +178,131 @@ impl Store {
     }
 }
 
-/// The time an assessment is stored under, µs: after all others of its batch, also where the clock was set back since, for the
-/// newest is the current one. An assessment that is stored again keeps its place.
-async fn place_in_time(
-    connection: &mut sqlx::SqliteConnection,
+/// Where an assessment is stored.
+struct Place {
+    /// The time it is stored under, µs: after all others of its batch, also where the clock was set back since, for the newest
+    /// is the current one. An assessment that is stored again keeps its time.
+    assessed_at_us: i64,
+    /// Whether one of the same trained baseline and undamaged state is there.
+    taken: bool,
+}
+
+/// The place of an assessment; `None` when it is of a version of the structure that is not the present one.
+async fn place_of(
+    connection: &mut SqliteConnection,
     structure: &str,
     batch_id: &str,
-    assessment: &Assessment,
-    version: u32,
-) -> Result<i64, Error> {
-    let (same, others): (bool, Option<i64>) = sqlx::query_as(
-        "select coalesce(max(model_digest = ?3 and undamaged_version = ?4 and assessed_at_us = ?5), 0),
+    a: &Assessment,
+) -> Result<Option<Place>, Error> {
+    let given = a.assessed_at.micros();
+    let (present, taken, same, others): (bool, bool, bool, Option<i64>) = sqlx::query_as(
+        "select exists (select 1 from structure where structure_id = ?1 and digest = ?6),
+                coalesce(max(model_digest = ?3 and undamaged_version = ?4), 0),
+                coalesce(max(model_digest = ?3 and undamaged_version = ?4 and assessed_at_us = ?5), 0),
                 max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4))
          from assessment where structure_id = ?1 and batch_id = ?2",
     )
     .bind(structure)
     .bind(batch_id)
-    .bind(assessment.model_digest.as_str())
-    .bind(version)
-    .bind(assessment.assessed_at.micros())
+    .bind(a.model_digest.as_str())
+    .bind(a.undamaged_version.unwrap_or(0))
+    .bind(given)
+    .bind(a.structure_digest.as_str())
     .fetch_one(&mut *connection)
     .await?;
-    let given = assessment.assessed_at.micros();
-    Ok(if same { given } else { others.map_or(given, |latest| given.max(latest + 1)) })
+    let assessed_at_us = if same { given } else { others.map_or(given, |latest| given.max(latest + 1)) };
+    Ok(present.then_some(Place { assessed_at_us, taken }))
+}
+
+/// Removes the assessment that another takes the place of.
+async fn remove(
+    connection: &mut SqliteConnection,
+    structure: &str,
+    batch_id: &str,
+    a: &Assessment,
+) -> Result<(), Error> {
+    for table in ["quantity_assessment", "assessment"] {
+        let delete = format!(
+            "delete from {table}
+             where structure_id = ? and batch_id = ? and model_digest = ? and undamaged_version = ?"
+        );
+        sqlx::query(sqlx::AssertSqlSafe(delete))
+            .bind(structure)
+            .bind(batch_id)
+            .bind(a.model_digest.as_str())
+            .bind(a.undamaged_version.unwrap_or(0))
+            .execute(&mut *connection)
+            .await?;
+    }
+    Ok(())
+}
+
+async fn insert(
+    connection: &mut SqliteConnection,
+    structure: &str,
+    batch_id: &str,
+    a: &Assessment,
+    assessed_at_us: i64,
+) -> Result<(), Error> {
+    let version = a.undamaged_version.unwrap_or(0);
+    let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
+    sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
+        .bind(structure)
+        .bind(batch_id)
+        .bind(a.model_digest.as_str())
+        .bind(version)
+        .bind(a.structure_digest.as_str())
+        .bind(a.seed.cast_signed())
+        .bind(a.draws_per_measurement as i64)
+        .bind(a.measurements_used as i64)
+        .bind(a.measurements_left_out as i64)
+        .bind(a.measurements_outside as i64)
+        .bind(to_blob(a.misfit_percent.iter().map(|misfit| misfit.unwrap_or(f64::NAN))))
+        .bind(assessed_at_us)
+        .bind(a.effective_sample_size)
+        .bind(trust)
+        .bind(plotted::pack(a))
+        .execute(&mut *connection)
+        .await?;
+    for (statement, rows) in parts(a.quantities.len()) {
+        let mut insert = sqlx::query(INSERT_QUANTITIES[statement].as_str())
+            .bind(structure)
+            .bind(batch_id)
+            .bind(a.model_digest.as_str())
+            .bind(version);
+        for position in rows {
+            let q = &a.quantities[position];
+            let damage = q.damage.as_ref();
+            insert = insert
+                .bind(&q.name)
+                .bind(position as i64)
+                .bind(&q.unit)
+                .bind(kind_name(q.kind))
+                .bind(q.mean)
+                .bind(q.std)
+                .bind(q.pooled.within)
+                .bind(q.pooled.between)
+                .bind(q.edge_mass)
+                .bind(damage.map(|d| d.threshold))
+                .bind(damage.map(|d| d.probability_of_damage))
+                .bind(damage.map(|d| d.exceeds))
+                .bind(damage.map(|d| d.relative_change))
+                .bind(q.mean_interval.map(|i| i[0]))
+                .bind(q.mean_interval.map(|i| i[1]))
+                .bind(q.std_interval.map(|i| i[0]))
+                .bind(q.std_interval.map(|i| i[1]))
+                .bind(q.pooled.mean)
+                .bind(q.pooled.std)
+                .bind(damage.and_then(|d| d.probability_interval).map(|i| i[0]))
+                .bind(damage.and_then(|d| d.probability_interval).map(|i| i[1]))
+                .bind(damage.map(|d| d.pooled_probability))
+                .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[0]))
+                .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[1]))
+                .bind(&q.group);
+        }
+        insert.execute(&mut *connection).await?;
+    }
+    Ok(())
 }
 
 fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {

@@ -1,8 +1,12 @@
 //! Batches and their measurements.
 
+use std::future::Future;
+use std::sync::LazyLock;
+
 use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
 
+use super::rows::{insert_statements, parts};
 use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
 use crate::assessment::BatchState;
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
@@ -182,13 +186,13 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn mark_failed(
+    pub fn mark_failed(
         &self,
         structure: &StructureId,
         batch_id: &str,
         version: &Digest,
         reason: &str,
-    ) -> Result<bool, Error> {
+    ) -> impl Future<Output = Result<bool, Error>> + Send + 'static {
         let (structure, id, reason) = (structure.to_string(), batch_id.to_owned(), reason.to_owned());
         let version = version.clone();
         self.write(move |connection| {
@@ -207,7 +211,6 @@ impl Store {
                 Ok(true)
             })
         })
-        .await
     }
 }
 
@@ -241,29 +244,30 @@ async fn find_stored(
             }));
         }
     }
-    for (ordinal, measurement) in batch.measurements.iter().enumerate() {
-        let holder: Option<(String, String)> = sqlx::query_as(
-            "select b.batch_id, b.content_digest from measurement m
-             join measurement_batch b using (structure_id, batch_id)
-             where m.structure_id = ? and m.source = ? and m.measured_at_us = ?",
-        )
-        .bind(structure)
-        .bind(&batch.source)
-        .bind(measurement.measured_at.micros())
-        .fetch_optional(&mut *connection)
-        .await?;
-        if let Some((batch_id, content)) = holder {
-            // Equal digests mean equal measurements: if one of them is in that batch, all are.
-            let measured_at = measurement.measured_at;
-            return Ok(Some(if content == digest.as_str() {
-                InsertBatch::Replayed(batch_id)
-            } else {
-                InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id }
-            }));
+    let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
+    let holder: Option<(i64, String, String)> = sqlx::query_as(
+        "select t.key, b.batch_id, b.content_digest from json_each(?3) t
+         cross join measurement m on m.structure_id = ?1 and m.source = ?2 and m.measured_at_us = t.value
+         join measurement_batch b on b.structure_id = m.structure_id and b.batch_id = m.batch_id
+         order by t.key limit 1",
+    )
+    .bind(structure)
+    .bind(&batch.source)
+    .bind(serde_json::to_string(&times).map_err(|e| bad_row("batch")(&e))?)
+    .fetch_optional(&mut *connection)
+    .await?;
+    // Equal digests mean equal measurements: if one of them is in that batch, all are.
+    Ok(holder.map(|(ordinal, batch_id, content)| {
+        if content == digest.as_str() {
+            return InsertBatch::Replayed(batch_id);
         }
-    }
-    Ok(None)
+        let ordinal = ordinal as usize;
+        InsertBatch::MeasurementConflict { ordinal, measured_at: batch.measurements[ordinal].measured_at, batch_id }
+    }))
 }
+
+/// Statements that insert measurements; structure, batch and source are common to all rows.
+static INSERT_MEASUREMENTS: LazyLock<Vec<String>> = LazyLock::new(|| insert_statements("measurement", 10, &[0, 1, 3]));
 
 async fn insert(
     connection: &mut SqliteConnection,
@@ -290,22 +294,25 @@ async fn insert(
     .execute(&mut *connection)
     .await?;
     let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("measurement")(&e));
-    for (ordinal, m) in batch.measurements.iter().enumerate() {
-        let frequencies = m.frequencies_hz.iter().map(|f| f.map_or(f64::NAN, Hertz::get));
-        let std = m.std_hz.as_ref().map(|stds| to_blob(stds.iter().map(|s| s.unwrap_or(f64::NAN))));
-        sqlx::query("insert into measurement values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
+    for (statement, rows) in parts(batch.measurements.len()) {
+        let mut insert = sqlx::query(INSERT_MEASUREMENTS[statement].as_str())
             .bind(batch.structure.as_str())
             .bind(batch_id)
-            .bind(ordinal as i64)
-            .bind(&batch.source)
-            .bind(m.measured_at.micros())
-            .bind(to_blob(frequencies))
-            .bind(std)
-            .bind(json(serde_json::to_string(&m.covariates))?)
-            .bind(json(serde_json::to_string(&m.settings))?)
-            .bind(m.mode_shapes.as_ref().map(|s| json(serde_json::to_string(s))).transpose()?)
-            .execute(&mut *connection)
-            .await?;
+            .bind(&batch.source);
+        for ordinal in rows {
+            let m = &batch.measurements[ordinal];
+            let frequencies = m.frequencies_hz.iter().map(|f| f.map_or(f64::NAN, Hertz::get));
+            let std = m.std_hz.as_ref().map(|stds| to_blob(stds.iter().map(|s| s.unwrap_or(f64::NAN))));
+            insert = insert
+                .bind(ordinal as i64)
+                .bind(m.measured_at.micros())
+                .bind(to_blob(frequencies))
+                .bind(std)
+                .bind(json(serde_json::to_string(&m.covariates))?)
+                .bind(json(serde_json::to_string(&m.settings))?)
+                .bind(m.mode_shapes.as_ref().map(|s| json(serde_json::to_string(s))).transpose()?);
+        }
+        insert.execute(&mut *connection).await?;
         fault_point!("store::measurement", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     }
     Ok(())

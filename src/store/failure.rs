@@ -1,7 +1,9 @@
 //! Failures of the disk: told apart from bugs, counted, and survived.
 
 use std::sync::atomic::Ordering;
+use std::sync::Arc;
 
+use super::writer::Writer;
 use super::{Error, Store};
 
 impl From<sqlx::Error> for Error {
@@ -14,7 +16,7 @@ impl From<sqlx::Error> for Error {
             Some(8) => Self::BecameReadOnly(error.to_string()),
             Some(5 | 6) => Self::Busy(error.to_string()),
             _ if matches!(error, sqlx::Error::PoolTimedOut) => Self::Busy(error.to_string()),
-            _ => Self::Sqlite(error),
+            _ => Self::Sqlite(Arc::new(error)),
         }
     }
 }
@@ -38,24 +40,39 @@ impl Error {
         }
     }
 
+    /// The same once more, for others who waited for the same transaction.
+    pub(super) fn again(&self) -> Self {
+        match self {
+            Self::DiskFull(reason) => Self::DiskFull(reason.clone()),
+            Self::Disk(reason) => Self::Disk(reason.clone()),
+            Self::BecameReadOnly(reason) => Self::BecameReadOnly(reason.clone()),
+            Self::Busy(reason) => Self::Busy(reason.clone()),
+            Self::Gone(path) => Self::Gone(path.clone()),
+            Self::Sqlite(error) => Self::Sqlite(Arc::clone(error)),
+            other => Self::Sqlite(Arc::new(sqlx::Error::Protocol(other.to_string()))),
+        }
+    }
+
     /// True when the connection that gave this must not be used again.
     pub(super) fn spoils_the_connection(&self) -> bool {
         matches!(self, Self::DiskFull(_) | Self::Disk(_) | Self::BecameReadOnly(_) | Self::Busy(_) | Self::Sqlite(_))
     }
 }
 
-impl Store {
+impl Writer {
     /// Counts a write that the disk refused.
     pub(super) fn count_failure(&self, error: &Error) {
         if let Some(cause) = error.disk_cause() {
             metrics::counter!("modalwatch_write_failures_total", "cause" => cause).increment(1);
-            self.refused_writes.fetch_add(1, Ordering::Relaxed);
+            self.refused.fetch_add(1, Ordering::Relaxed);
         }
     }
+}
 
+impl Store {
     /// How many writes the disk has refused since the store was opened: what was known before of the disk is old when it grows.
     pub fn refused_writes(&self) -> u64 {
-        self.refused_writes.load(Ordering::Relaxed)
+        self.writer.refused.load(Ordering::Relaxed)
     }
 }
 
@@ -75,9 +92,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let settings = StoreSettings { min_free_bytes: 0, ..StoreSettings::default() };
         let store = Store::open_with(folder.path(), &settings).await.unwrap();
-        let pages: (i64,) = sqlx::query_as("pragma page_count").fetch_one(&store.writer).await.unwrap();
+        let pages: (i64,) = sqlx::query_as("pragma page_count").fetch_one(&store.writer.pool).await.unwrap();
         let limit = format!("pragma max_page_count = {}", pages.0 + 2);
-        sqlx::query(sqlx::AssertSqlSafe(limit)).execute(&store.writer).await.unwrap();
+        sqlx::query(sqlx::AssertSqlSafe(limit)).execute(&store.writer.pool).await.unwrap();
         // The limit belongs to a connection: the one that fails is thrown away, so the next has none, as after making room.
         let error = put(&store, "large", 100_000).await.unwrap_err();
         assert_eq!(error.disk_cause(), Some("disk_full"), "{error}");

@@ -1,10 +1,12 @@
 //! The archive: the only room that speaks SQL.
 //!
-//! One SQLite file, one writer connection, WAL, `synchronous = FULL`: what was acknowledged survives a power loss. Every
-//! write is a task of its own in one `BEGIN IMMEDIATE` transaction, so that a caller who goes away never leaves one open.
+//! One SQLite file, one writer connection, WAL, `synchronous = FULL`: what was acknowledged survives a power loss. Writes run
+//! in a task of their own in a `BEGIN IMMEDIATE` transaction, so that a caller who goes away never leaves one open; those that
+//! wait at the same time share one, and its sync of the disk.
 
 mod alarm;
 pub mod archive;
+mod assessed;
 mod assessment;
 mod audit;
 pub mod backup;
@@ -18,8 +20,10 @@ mod jobs;
 mod measurements;
 mod outbox;
 mod overview;
+mod plotted;
 mod quarantine;
 mod retention;
+mod rows;
 mod series;
 mod structure;
 #[cfg(test)]
@@ -27,27 +31,29 @@ mod tests;
 mod token;
 mod undamaged;
 mod webhook;
+mod writer;
 
+use std::collections::BTreeMap;
 use std::fs::{File, TryLockError};
 use std::future::Future;
 use std::io::Read as _;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use sqlx::migrate::{MigrateError, Migrator};
-use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{
     SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous,
 };
-use sqlx::{Connection as _, Sqlite};
-use tokio::sync::Notify;
+use sqlx::Connection as _;
 use tracing::{info_span, Instrument as _};
 
+use crate::quantity::StructureId;
 use crate::volume;
+use writer::{Work, Writer};
 
 pub use alarm::{
     Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, ALARM_KINDS, FIT_SERIES,
@@ -60,7 +66,7 @@ pub use history::{Exceedance, HistoryEntry, HistoryQuery};
 pub use jobs::{JobKind, JobRecord};
 pub use measurements::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
 pub use outbox::{Delivery, DeliveryState, OutboxEvent, Settlement, Turns};
-pub use overview::StructureOverview;
+pub use overview::{LatestAssessment, StructureOverview};
 pub use quarantine::QuarantinedMessage;
 pub use retention::{Deleted, Expired};
 pub use series::{ChartMark, ChartSeries, Extent, QuantityMark, QuantitySeries, SeriesWindow, TrustMark};
@@ -209,7 +215,7 @@ pub enum Error {
     Busy(String),
     /// SQLite failed.
     #[error("database: {0}")]
-    Sqlite(sqlx::Error),
+    Sqlite(Arc<sqlx::Error>),
     /// A task of ours panicked: a bug.
     #[error("a database task panicked")]
     Panicked,
@@ -224,14 +230,12 @@ struct Limits {
 /// The store: a cheap handle.
 #[derive(Clone)]
 pub struct Store {
-    writer: SqlitePool,
+    writer: Arc<Writer>,
     reader: SqlitePool,
     path: Arc<Path>,
     sqlite_version: Arc<str>,
-    /// Told after every write.
-    written: Arc<Notify>,
-    refused_writes: Arc<AtomicU64>,
-    file: Arc<OpenedFile>,
+    /// Newest undamaged states that were read.
+    undamaged: Arc<Mutex<BTreeMap<StructureId, Arc<UndamagedRecord>>>>,
     limits: Arc<Limits>,
     /// Held as long as the store is open: a second instance on the same folder is refused.
     _lock: Arc<File>,
@@ -296,15 +300,13 @@ impl Store {
             min_free_bytes: AtomicU64::new(settings.min_free_bytes),
             max_wal_bytes: AtomicU64::new(settings.max_wal_bytes),
         };
-        let file = Arc::new(OpenedFile::of(path.clone())?);
+        let file = OpenedFile::of(path.clone())?;
         Ok(Self {
-            writer,
+            writer: Arc::new(Writer::new(writer, file)),
             reader,
             path: path.into(),
-            file,
             sqlite_version: sqlite_version.into(),
-            written: Arc::default(),
-            refused_writes: Arc::default(),
+            undamaged: Arc::default(),
             limits: Arc::new(limits),
             _lock: Arc::new(lock),
         })
@@ -370,84 +372,44 @@ impl Store {
 
     /// Whether it was closed: whatever still wants to write can give up.
     pub fn is_closed(&self) -> bool {
-        self.writer.is_closed()
+        self.writer.pool.is_closed()
     }
 
     /// Writes the log back into the database and closes it.
     pub async fn close(&self) {
         self.reader.close().await;
-        let _ = sqlx::query("pragma wal_checkpoint(truncate)").execute(&self.writer).await;
-        self.writer.close().await;
+        let _ = sqlx::query("pragma wal_checkpoint(truncate)").execute(&self.writer.pool).await;
+        self.writer.pool.close().await;
     }
 
-    /// Runs `work` in one immediate transaction of the writer, in a task of its own.
-    ///
-    /// Immediate, because a transaction that begins with a read and then writes is refused at once when another writes,
-    /// whatever the busy timeout. Its own task, because axum drops handlers whose client is gone.
-    async fn write<T, F>(&self, work: F) -> Result<T, Error>
+    /// Runs `work` in an immediate transaction of the writer, in a task of its own; what waits at the same time shares the
+    /// transaction. Works are done in the order of the calls, also where the answer is waited for later.
+    fn write<T, F>(&self, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
     where
         T: Send + 'static,
         F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
     {
-        if let Err(error) = self.refuse_without_room() {
-            self.count_failure(&error);
-            return Err(error);
+        let queued = self.refuse_without_room().map(|()| self.write_without_floor(work));
+        let writer = Arc::clone(&self.writer);
+        async move {
+            match queued {
+                Ok(answer) => answer.await,
+                Err(error) => {
+                    writer.count_failure(&error);
+                    Err(error)
+                }
+            }
         }
-        self.write_without_floor(work).await
     }
 
     /// As [`Self::write`], however little is free: for what makes room.
-    async fn write_without_floor<T, F>(&self, work: F) -> Result<T, Error>
+    fn write_without_floor<T, F>(&self, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
     where
         T: Send + 'static,
         F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
     {
-        let (writer, file) = (self.writer.clone(), Arc::clone(&self.file));
-        let written = Arc::clone(&self.written);
-        let transaction = async move {
-            fault_point!("store::begin", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
-            let mut connection = writer.acquire().await?;
-            let result = in_transaction(&mut connection, work).await;
-            if result.is_ok() {
-                written.notify_one();
-            }
-            if result.as_ref().is_err_and(Error::spoils_the_connection) {
-                // SQLite ends a transaction by itself when the disk fails. sqlx still counts it as open and would refuse the
-                // next one for ever; and a handle that failed once is best not trusted. The pool makes a new one.
-                let _ = connection.detach().close_hard().await;
-            }
-            let result = result?;
-            file.check()?;
-            Ok(result)
-        };
         let trace = info_span!(target: "modalwatch::spans", "store transaction");
-        let result = tokio::spawn(transaction.instrument(trace)).await.map_err(|_| Error::Panicked)?;
-        if let Err(error) = &result {
-            self.count_failure(error);
-        }
-        result
-    }
-}
-
-async fn in_transaction<T, F>(connection: &mut PoolConnection<Sqlite>, work: F) -> Result<T, Error>
-where
-    F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
-{
-    let mut transaction = connection.begin_with("begin immediate").await?;
-    match work(&mut transaction).await {
-        Ok(result) => {
-            fault_point!("store::commit", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
-            transaction.commit().await?;
-            fault_point!("store::committed", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
-            Ok(result)
-        }
-        Err(error) => {
-            // A roll back that fails is the worse news, unless SQLite has rolled back already.
-            match transaction.rollback().await {
-                Err(failed) if !error.spoils_the_connection() => Err(failed.into()),
-                _ => Err(error),
-            }
-        }
+        self.writer.queue(work).instrument(trace)
     }
 }
 
@@ -480,9 +442,6 @@ impl OpenedFile {
 fn device_and_inode(path: &Path) -> std::io::Result<(u64, u64)> {
     std::fs::metadata(path).map(|m| (m.dev(), m.ino()))
 }
-
-/// What runs inside a write transaction.
-type Work<'c, T> = std::pin::Pin<Box<dyn Future<Output = Result<T, Error>> + Send + 'c>>;
 
 /// Makes the folder, takes its lock, and looks at permissions before SQLite does.
 fn prepare_folder(data_dir: &Path, database: &Path) -> Result<File, Error> {
@@ -571,7 +530,7 @@ fn not_a_database(error: sqlx::Error, path: &Path) -> Error {
     match code.as_deref() {
         Some("26") => Error::NotADatabase(path.to_owned()),
         Some("11") => Error::Corrupt { path: path.to_owned(), detail: error.to_string() },
-        _ => Error::Sqlite(error),
+        _ => Error::Sqlite(Arc::new(error)),
     }
 }
 

@@ -161,7 +161,7 @@ fn delivery(row: DeliveryRow) -> Result<Delivery, Error> {
 impl Store {
     /// Done when something was written since the last call; for one listener.
     pub async fn written(&self) {
-        self.written.notified().await;
+        self.writer.written.notified().await;
     }
 
     /// Webhooks with a message that may be sent and is due, that is neither later than `now` nor, after the clock was set

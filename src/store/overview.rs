@@ -1,10 +1,16 @@
 //! All structures at a glance.
 
+use std::collections::BTreeMap;
+
+use serde::de::IgnoredAny;
+use serde::Deserialize;
 use sqlx::FromRow;
 
+use super::assessment::IS_CURRENT;
 use super::{bad_row, timestamp, Error, Store};
 use crate::alarm::machine::State;
 use crate::quantity::{StructureId, Timestamp};
+use crate::trust::Verdict;
 
 /// What is known of a structure at a glance.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,7 +24,7 @@ pub struct StructureOverview {
     /// When its newest batch arrived.
     pub last_received_at: Option<Timestamp>,
     /// The assessed batch that was measured last.
-    pub latest_assessed: Option<String>,
+    pub latest: Option<LatestAssessment>,
     /// Alarms that last.
     pub open_alarms: u64,
     /// Those of them that nobody has seen.
@@ -31,108 +37,253 @@ pub struct StructureOverview {
     pub chart_states: Vec<State>,
 }
 
+/// What the overview shows of the assessed batch that was measured last.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LatestAssessment {
+    /// The batch.
+    pub batch_id: String,
+    /// Whether it can be believed.
+    pub verdict: Verdict,
+    /// Number of findings.
+    pub findings: usize,
+    /// Whether a probability of damage is above that of the undamaged state.
+    pub exceeds: bool,
+    /// The largest probability of damage, and the quantity that has it.
+    pub worst: Option<(f64, String)>,
+}
+
 #[derive(FromRow)]
 struct Row {
     structure_id: String,
     batches: i64,
     last_measured_us: Option<i64>,
     last_received_us: Option<i64>,
-    latest_assessed: Option<String>,
     open_alarms: i64,
     unacknowledged: i64,
     silent: bool,
     undamaged_version: Option<u32>,
 }
 
+#[derive(FromRow)]
+struct LatestRow {
+    structure_id: String,
+    batch_id: String,
+    trust: Option<String>,
+    exceeds: bool,
+    probability_of_damage: Option<f64>,
+    quantity: Option<String>,
+}
+
+/// The part of a stored trust that the overview shows.
+#[derive(Deserialize)]
+struct TrustColumn {
+    verdict: Verdict,
+    findings: Vec<IgnoredAny>,
+}
+
 /// The open alarms of a structure `s`.
 const OPEN: &str =
     "from alarm_episode e where e.structure_id = s.structure_id and ended_at_us is null and withdrawn = 0";
 
+/// The compared quantities of an assessment `a`.
+const COMPARED: &str = "from quantity_assessment q
+     where q.structure_id = a.structure_id and q.batch_id = a.batch_id and q.model_digest = a.model_digest
+       and q.undamaged_version = a.undamaged_version and q.threshold is not null and q.exceeds is not null
+       and q.relative_change is not null and q.probability_of_damage is not null";
+
 impl Store {
-    /// All structures, by id.
+    /// All structures, by id: three statements, however many there are.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn overview(&self) -> Result<Vec<StructureOverview>, Error> {
         let select = format!(
-            "select s.structure_id,
-                    (select count(*) from measurement_batch b where b.structure_id = s.structure_id) as batches,
-                    (select max(measured_to_us) from measurement_batch b where b.structure_id = s.structure_id)
-                        as last_measured_us,
+            "select s.structure_id, coalesce(c.batches, 0) as batches, c.last_measured_us,
                     -- Ids are in the order of arrival.
                     (select received_at_us from measurement_batch b where b.structure_id = s.structure_id
                      order by batch_id desc limit 1) as last_received_us,
-                    (select batch_id from measurement_batch b
-                     where b.structure_id = s.structure_id and state = 'assessed'
-                     order by measured_from_us desc, batch_id desc limit 1) as latest_assessed,
                     (select count(*) {OPEN}) as open_alarms,
                     (select count(*) {OPEN} and acknowledged_at_us is null) as unacknowledged,
                     exists (select 1 {OPEN} and kind = 'silence') as silent,
                     (select max(version) from undamaged_state u where u.structure_id = s.structure_id)
                         as undamaged_version
-             from structure s order by s.structure_id"
+             from structure s left join structure_summary c using (structure_id) order by s.structure_id"
         );
         let rows: Vec<Row> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
-        let mut all = Vec::with_capacity(rows.len());
-        for row in rows {
-            let what = "structure";
-            let chart_states = self.chart_states(&row.structure_id, row.undamaged_version.unwrap_or(0)).await?;
-            all.push(StructureOverview {
+        let mut latest = self.latest_assessments().await?;
+        let mut chart_states = self.chart_states().await?;
+        let what = "structure";
+        let overview = |row: Row| {
+            Ok(StructureOverview {
                 id: StructureId::parse(&row.structure_id).map_err(|e| bad_row(what)(&e))?,
                 batches: row.batches.unsigned_abs(),
                 last_measured_at: row.last_measured_us.map(|at| timestamp(what, at)).transpose()?,
                 last_received_at: row.last_received_us.map(|at| timestamp(what, at)).transpose()?,
-                latest_assessed: row.latest_assessed,
+                latest: latest.remove(&row.structure_id),
                 open_alarms: row.open_alarms.unsigned_abs(),
                 unacknowledged_alarms: row.unacknowledged.unsigned_abs(),
                 silent: row.silent,
                 undamaged_version: row.undamaged_version,
-                chart_states,
-            });
-        }
-        Ok(all)
+                chart_states: chart_states.remove(&row.structure_id).unwrap_or_default(),
+            })
+        };
+        rows.into_iter().map(overview).collect()
     }
 
-    /// The state after the last point of each chart.
-    async fn chart_states(&self, structure: &str, undamaged_version: u32) -> Result<Vec<State>, Error> {
-        let mut states = Vec::new();
-        for (version, series) in self.chart_names(structure, undamaged_version).await? {
-            let (state,): (String,) = sqlx::query_as(
-                "select state from chart_point where structure_id = ? and undamaged_version = ? and series = ?
-                 order by measured_to_us desc, batch_id desc limit 1",
-            )
-            .bind(structure)
-            .bind(version)
-            .bind(series)
-            .fetch_one(&self.reader)
-            .await?;
-            states.push(super::alarm::state_of(&state)?);
+    /// The current assessment of the assessed batch that was measured last, by structure.
+    async fn latest_assessments(&self) -> Result<BTreeMap<String, LatestAssessment>, Error> {
+        let select = format!(
+            "with latest as materialized (
+                 select s.structure_id,
+                        (select batch_id from measurement_batch b
+                         where b.structure_id = s.structure_id and state = 'assessed'
+                         order by measured_from_us desc, batch_id desc limit 1) as batch_id
+                 from structure s)
+             select a.structure_id, a.batch_id, a.trust, exists (select 1 {COMPARED} and q.exceeds = 1) as exceeds,
+                    (select q.probability_of_damage {COMPARED}
+                     order by q.probability_of_damage desc, q.position desc limit 1) as probability_of_damage,
+                    (select q.quantity {COMPARED}
+                     order by q.probability_of_damage desc, q.position desc limit 1) as quantity
+             from latest cross join assessment a using (structure_id, batch_id) where {IS_CURRENT}"
+        );
+        let rows: Vec<LatestRow> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
+        let latest = |row: LatestRow| {
+            let trust = match &row.trust {
+                Some(trust) => serde_json::from_str(trust).map_err(|e| bad_row("assessment")(&e))?,
+                // From before trust was judged.
+                None => TrustColumn { verdict: Verdict::Accepted, findings: Vec::new() },
+            };
+            let latest = LatestAssessment {
+                batch_id: row.batch_id,
+                verdict: trust.verdict,
+                findings: trust.findings.len(),
+                exceeds: row.exceeds,
+                worst: row.probability_of_damage.zip(row.quantity),
+            };
+            Ok((row.structure_id, latest))
+        };
+        rows.into_iter().map(latest).collect()
+    }
+
+    /// The states after the last points of the charts under the newest undamaged state, by structure.
+    async fn chart_states(&self) -> Result<BTreeMap<String, Vec<State>>, Error> {
+        let select = format!(
+            "with recursive whose (structure_id, version) as (
+                 select structure_id, max(version) from undamaged_state group by structure_id
+                 union select structure_id, 0 from structure),
+             {CHARTS}
+             select structure_id,
+                    (select state from chart_point p where p.structure_id = chart.structure_id
+                     and p.undamaged_version = chart.version and p.series = chart.series
+                     order by measured_to_us desc, batch_id desc limit 1)
+             from chart where series is not null"
+        );
+        let rows: Vec<(String, String)> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
+        let mut states: BTreeMap<String, Vec<State>> = BTreeMap::new();
+        for (structure, state) in rows {
+            states.entry(structure).or_default().push(super::alarm::state_of(&state)?);
         }
         Ok(states)
     }
 
     /// The charts of a structure under an undamaged state, with the state they belong to: 0 for the fit.
-    ///
-    /// Name by name, because `select distinct` reads all points.
     pub(super) async fn chart_names(
         &self,
         structure: &str,
         undamaged_version: u32,
     ) -> Result<Vec<(u32, String)>, Error> {
-        Ok(sqlx::query_as(
-            "with recursive chart (version, series) as (
-                 select version, (select min(series) from chart_point
-                                  where structure_id = ?1 and undamaged_version = version)
-                 from (select ?2 as version union select 0)
-                 union all
-                 select version, (select min(series) from chart_point p
-                                  where structure_id = ?1 and undamaged_version = version and p.series > chart.series)
-                 from chart where series is not null)
-             select version, series from chart where series is not null order by version desc, series",
-        )
-        .bind(structure)
-        .bind(undamaged_version)
-        .fetch_all(&self.reader)
-        .await?)
+        let select = format!(
+            "with recursive whose (structure_id, version) as (select ?1, ?2 union select ?1, 0),
+             {CHARTS}
+             select version, series from chart where series is not null order by version desc, series"
+        );
+        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structure)
+            .bind(undamaged_version)
+            .fetch_all(&self.reader)
+            .await?)
+    }
+}
+
+/// The charts of the structures and versions of a table `whose`, name by name, because `select distinct` reads all points.
+const CHARTS: &str = "chart (structure_id, version, series) as (
+         select w.structure_id, w.version, (select min(series) from chart_point p
+             where p.structure_id = w.structure_id and p.undamaged_version = w.version)
+         from whose w
+         union all
+         select structure_id, version, (select min(series) from chart_point p
+             where p.structure_id = chart.structure_id and p.undamaged_version = chart.version
+               and p.series > chart.series)
+         from chart where series is not null)";
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::super::tests::{assessment, at, batch, bridge, open};
+    use super::super::Store;
+
+    /// What the summaries say, and what a recount says.
+    async fn both(store: &Store) -> [Vec<(String, i64, Option<i64>)>; 2] {
+        let kept = "select structure_id, batches, last_measured_us from structure_summary
+                    where batches > 0 or last_measured_us is not null";
+        let counted = "select structure_id, count(*), max(measured_to_us) from measurement_batch group by structure_id";
+        let ask = async |select: &'static str| sqlx::query_as(select).fetch_all(&store.reader).await.unwrap();
+        [ask(kept).await, ask(counted).await]
+    }
+
+    /// Batches come in any order, some of them twice, and the old ones go.
+    async fn check(steps: Vec<(i64, bool)>) {
+        let (store, _folder) = open().await;
+        for (number, (start, expire)) in steps.into_iter().enumerate() {
+            let id = format!("b{number:03}");
+            // Half of them are there already: another source makes them new.
+            let source = if start % 2 == 0 { "s".to_owned() } else { format!("s{number}") };
+            let _ = store.insert_batch(&batch(&source, start, None), &id, at(0)).await.unwrap();
+            let _ = store.insert_assessment(&bridge(), &id, &assessment("m", None, at(1)), Vec::new()).await;
+            if expire {
+                store.delete_expired(at(start), 3).await.unwrap();
+            }
+            let [kept, counted] = both(&store).await;
+            assert_eq!(kept, counted);
+        }
+        store.delete_expired(at(1_000_000), 1_000).await.unwrap();
+        let [kept, counted] = both(&store).await;
+        assert!(kept.is_empty() && counted.is_empty(), "{kept:?} {counted:?}");
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 8, ..ProptestConfig::default() })]
+
+        #[test]
+        fn summaries_are_the_recount(steps in prop::collection::vec((0_i64..60, prop::bool::weighted(0.2)), 1..40)) {
+            tokio::runtime::Runtime::new().unwrap().block_on(check(steps));
+        }
+    }
+
+    #[tokio::test]
+    async fn the_latest_of_the_overview_is_the_current_assessment_of_the_batch_measured_last() {
+        let (store, _folder) = open().await;
+        for (number, start) in [3, 9, 5].into_iter().enumerate() {
+            let id = format!("b{number}");
+            store.insert_batch(&batch(&id, start, None), &id, at(0)).await.unwrap();
+        }
+        let overview = async || store.overview().await.unwrap().remove(0);
+        assert_eq!(overview().await.latest, None);
+        let mut other = assessment("later", Some(1), at(3));
+        other.quantities[1].damage.as_mut().unwrap().probability_of_damage = 0.7;
+        for (id, given) in
+            [("b0", assessment("m", Some(1), at(1))), ("b1", assessment("m", None, at(2))), ("b1", other)]
+        {
+            store.insert_assessment(&bridge(), id, &given, Vec::new()).await.unwrap();
+            let found = overview().await.latest.unwrap();
+            let expected = store.assessment(&bridge(), &found.batch_id).await.unwrap().unwrap();
+            let damages = || expected.quantities.iter().filter_map(|q| Some((q.damage.as_ref()?, q.name.clone())));
+            assert_eq!(found.batch_id, id);
+            assert_eq!((found.verdict, found.findings), (expected.trust.verdict, expected.trust.findings.len()));
+            assert_eq!(found.exceeds, damages().any(|(damage, _)| damage.exceeds));
+            let worst = damages().map(|(damage, name)| (damage.probability_of_damage, name));
+            assert_eq!(found.worst, worst.max_by(|a, b| a.0.total_cmp(&b.0)));
+        }
     }
 }

@@ -3,13 +3,12 @@
 //! A window is a set of batches: those that begin in it. Assessments are the current ones, as in the history, of batches that
 //! are assessed and do not wait for another assessment.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use futures_util::TryStreamExt as _;
 use serde::Deserialize;
 use sqlx::Row as _;
 
-use super::assessment::{kind_of, IS_CURRENT};
 use super::{bad_row, timestamp, Error, Store};
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
@@ -47,7 +46,7 @@ impl Extent {
         self.measurements.div_ceil(MOST_MEASUREMENTS).max(1)
     }
 
-    fn span(&self) -> (i64, i64) {
+    pub(super) fn span(&self) -> (i64, i64) {
         self.measured.map_or((0, 0), |(from, to)| (from.micros(), to.micros()))
     }
 }
@@ -109,19 +108,6 @@ pub struct TrustMark {
     pub verdict: Verdict,
     /// What was found, each code once.
     pub findings: Vec<Code>,
-}
-
-/// The part of a stored trust that a series shows.
-#[derive(Deserialize)]
-struct TrustColumn {
-    verdict: Verdict,
-    p_value: Option<f64>,
-    findings: Vec<FindingColumn>,
-}
-
-#[derive(Deserialize)]
-struct FindingColumn {
-    code: Code,
 }
 
 impl Store {
@@ -197,110 +183,6 @@ impl Store {
         Ok(reducer.finish())
     }
 
-    /// Monitored quantities of assessed batches, in the order of their position.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn quantity_series(
-        &self,
-        structure: &StructureId,
-        window: SeriesWindow,
-        extent: &Extent,
-    ) -> Result<Vec<QuantitySeries>, Error> {
-        let (from, to) = bounds(window);
-        // In this order: whether an assessment is the current one is asked once, not for each of its quantities.
-        let select = format!(
-            "select q.quantity, b.measured_to_us, q.mean, q.probability_of_damage, b.batch_id, q.mean_low, q.mean_high,
-                    q.probability_low, q.probability_high
-             from measurement_batch b
-             cross join assessment a using (structure_id, batch_id)
-             cross join quantity_assessment q using (structure_id, batch_id, model_digest, undamaged_version)
-             where b.structure_id = ? and b.measured_from_us >= ? and b.measured_from_us < ? and b.state = 'assessed'
-               and {IS_CURRENT}"
-        );
-        let mut rows =
-            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
-        let mut found: HashMap<String, Reducer<QuantityMark>> = HashMap::new();
-        while let Some(row) = rows.try_next().await? {
-            let name: &str = row.try_get_unchecked(0)?;
-            if !found.contains_key(name) {
-                found.insert(name.to_owned(), Reducer::new(extent.span(), window.points, 2));
-            }
-            let number = |column: usize| row.try_get_unchecked::<Option<f64>, _>(column);
-            let values = [row.try_get_unchecked(2)?, number(3)?.unwrap_or(f64::NAN)];
-            let mark = || {
-                Ok(QuantityMark {
-                    batch: row.try_get_unchecked(4)?,
-                    mean_interval: [number(5)?, number(6)?],
-                    probability_interval: [number(7)?, number(8)?],
-                })
-            };
-            let reducer = found.get_mut(name).expect("it was put there if it was not");
-            reducer.try_push(row.try_get_unchecked(1)?, &values, mark).map_err(Error::Sqlite)?;
-        }
-        drop(rows);
-        let mut all = Vec::with_capacity(found.len());
-        for (name, reducer) in found {
-            let batches = reducer.finish();
-            let Some(first) = batches.rows.first() else { continue };
-            let (position, unit, kind): (i64, String, String) = sqlx::query_as(
-                "select position, unit, kind from quantity_assessment
-                 where structure_id = ? and batch_id = ? and quantity = ? limit 1",
-            )
-            .bind(structure.as_str())
-            .bind(&first.tag.batch)
-            .bind(&name)
-            .fetch_one(&self.reader)
-            .await?;
-            all.push((position, QuantitySeries { name, unit, kind: kind_of(&kind)?, batches }));
-        }
-        all.sort_by(|(a, first), (b, second)| (a, &first.name).cmp(&(b, &second.name)));
-        Ok(all.into_iter().map(|(_, series)| series).collect())
-    }
-
-    /// How far the assessed batches can be believed; rejected ones and the most findings of a time are kept.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn trust_series(
-        &self,
-        structure: &StructureId,
-        window: SeriesWindow,
-        extent: &Extent,
-    ) -> Result<Reduced<TrustMark>, Error> {
-        let (from, to) = bounds(window);
-        let select = format!(
-            "select b.measured_to_us, a.trust, b.batch_id
-             from measurement_batch b join assessment a using (structure_id, batch_id)
-             where b.structure_id = ? and b.measured_from_us >= ? and b.measured_from_us < ? and b.state = 'assessed'
-               and {IS_CURRENT}"
-        );
-        let mut rows =
-            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
-        let mut reducer = Reducer::new(extent.span(), window.points, 3);
-        while let Some(row) = rows.try_next().await? {
-            let column: Option<&str> = row.try_get_unchecked(1)?;
-            let trust = match column {
-                Some(text) => serde_json::from_str(text).map_err(|e| bad_row("assessment")(&e))?,
-                // From before trust was judged.
-                None => TrustColumn { verdict: Verdict::Accepted, p_value: None, findings: Vec::new() },
-            };
-            let rejected = if trust.verdict == Verdict::Rejected { 1.0 } else { 0.0 };
-            let values = [trust.p_value.unwrap_or(f64::NAN), rejected, trust.findings.len() as f64];
-            let mark = || {
-                let mut findings: Vec<Code> = Vec::new();
-                for finding in &trust.findings {
-                    if !findings.contains(&finding.code) {
-                        findings.push(finding.code);
-                    }
-                }
-                Ok(TrustMark { batch: row.try_get_unchecked(2)?, verdict: trust.verdict, findings })
-            };
-            reducer.try_push(row.try_get_unchecked(0)?, &values, mark).map_err(Error::Sqlite)?;
-        }
-        Ok(reducer.finish())
-    }
-
     /// The charts under the newest undamaged state: points of batches that end in the window.
     ///
     /// # Errors
@@ -342,7 +224,7 @@ impl Store {
                         state: row.try_get_unchecked(7)?,
                     })
                 };
-                reducer.try_push(row.try_get_unchecked(0)?, &values, mark).map_err(Error::Sqlite)?;
+                reducer.try_push(row.try_get_unchecked(0)?, &values, mark).map_err(|e: sqlx::Error| Error::from(e))?;
             }
             drop(rows);
             all.push(ChartSeries { chart, points: reducer.finish() });
@@ -372,6 +254,6 @@ impl Covariate<'_> {
     }
 }
 
-fn bounds(window: SeriesWindow) -> (i64, i64) {
+pub(super) fn bounds(window: SeriesWindow) -> (i64, i64) {
     (window.from.map_or(i64::MIN, Timestamp::micros), window.to.map_or(i64::MAX, Timestamp::micros))
 }

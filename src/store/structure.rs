@@ -146,10 +146,8 @@ impl Store {
     /// [`Error::Sqlite`].
     pub async fn structures(&self) -> Result<Vec<StructureSummary>, Error> {
         let rows: Vec<(String, String, i64, i64, Option<i64>)> = sqlx::query_as(
-            "select s.structure_id, s.digest, s.created_at_us,
-                    (select count(*) from measurement_batch b where b.structure_id = s.structure_id),
-                    (select max(measured_to_us) from measurement_batch b where b.structure_id = s.structure_id)
-             from structure s order by s.structure_id",
+            "select s.structure_id, s.digest, s.created_at_us, coalesce(c.batches, 0), c.last_measured_us
+             from structure s left join structure_summary c using (structure_id) order by s.structure_id",
         )
         .fetch_all(&self.reader)
         .await?;

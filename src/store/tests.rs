@@ -14,15 +14,15 @@ use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 use crate::trust::Trust;
 
-fn bridge() -> StructureId {
+pub(super) fn bridge() -> StructureId {
     StructureId::parse("bridge").unwrap()
 }
 
-fn at(seconds: i64) -> Timestamp {
+pub(super) fn at(seconds: i64) -> Timestamp {
     Timestamp::from_micros(1_700_000_000_000_000 + seconds * 1_000_000).unwrap()
 }
 
-fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementBatch {
+pub(super) fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementBatch {
     let measurement = |i: i64| ModalMeasurement {
         measured_at: at(start + i),
         frequencies_hz: vec![None, Some(Hertz::new(1.5).unwrap())],
@@ -42,7 +42,7 @@ fn batch(source: &str, start: i64, key: Option<&str>) -> MeasurementBatch {
     }
 }
 
-fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestamp) -> Assessment {
+pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestamp) -> Assessment {
     let damage = Damage {
         threshold: 3.5,
         probability_of_damage: 0.4,
@@ -93,7 +93,7 @@ fn undamaged() -> UndamagedState {
     }
 }
 
-async fn open() -> (Store, tempfile::TempDir) {
+pub(super) async fn open() -> (Store, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(folder.path()).await.unwrap();
     let put = store.put_structure(&bridge(), "{}", &Digest::of(&[b"v1"]), at(0)).await.unwrap();

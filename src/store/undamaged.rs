@@ -1,5 +1,8 @@
 //! Undamaged states: versions that never change.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use sqlx::FromRow;
 
 use super::assessment::CURRENT_FIRST;
@@ -117,11 +120,30 @@ impl Store {
         .await
     }
 
-    /// The newest undamaged state of a structure.
+    /// The newest undamaged state of a structure. Read once: a version never changes.
     ///
     /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn undamaged(&self, structure: &StructureId) -> Result<Option<UndamagedRecord>, Error> {
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn undamaged(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+        let (newest,): (Option<u32>,) =
+            sqlx::query_as("select max(version) from undamaged_state where structure_id = ?")
+                .bind(structure.as_str())
+                .fetch_one(&self.reader)
+                .await?;
+        let Some(newest) = newest else { return Ok(None) };
+        let known = |all: &BTreeMap<StructureId, Arc<UndamagedRecord>>| {
+            all.get(structure).filter(|record| record.state.version == newest).map(Arc::clone)
+        };
+        if let Some(record) = known(&self.undamaged.lock().expect("no holder of this lock panics")) {
+            return Ok(Some(record));
+        }
+        let Some(record) = self.read_undamaged(structure).await?.map(Arc::new) else { return Ok(None) };
+        let mut all = self.undamaged.lock().expect("no holder of this lock panics");
+        all.insert(structure.clone(), Arc::clone(&record));
+        Ok(Some(record))
+    }
+
+    async fn read_undamaged(&self, structure: &StructureId) -> Result<Option<UndamagedRecord>, Error> {
         let row: Option<(u32, String, i64, f64, i64, String, String)> = sqlx::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts
              from undamaged_state where structure_id = ? order by version desc limit 1",

@@ -181,7 +181,7 @@ async fn a_new_undamaged_state_sends_back_only_what_was_never_compared() {
     assert_eq!(store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".into()], at(9)).await.unwrap(), 2);
     assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b0"], "b0 was never compared; b2 was");
     let newest = store.undamaged(&bridge()).await.unwrap().unwrap();
-    assert_eq!((newest.state.version, newest.batches), (2, vec!["b1".to_owned()]));
+    assert_eq!((newest.state.version, newest.batches.as_slice()), (2, &["b1".to_owned()][..]));
     let unknown = store.insert_undamaged(&bridge(), &undamaged(), &model, &["nothing".into()], at(9)).await;
     assert!(unknown.unwrap_err().to_string().contains("no batch nothing"));
     assert_eq!(store.undamaged(&bridge()).await.unwrap().unwrap().state.version, 2);

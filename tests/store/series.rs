@@ -54,7 +54,7 @@ async fn fill(folder: &tempfile::TempDir) {
         "insert into measurement select 'bridge', name, 0, 'logger', at, iif(i = ?5, ?2, iif(i % 10 = 3, ?3, ?1)), null,
              printf('{\"temperature_c\":%.2f,\"wind_m_per_s\":3.5,\"operator\":\"A\"}', 10 + i % 7), '{}' from n",
         "insert into assessment select 'bridge', name, ?4, 1, 'v1', 1, 10, 1, 0, 0, x'', at, 40.0,
-             iif(i = ?6, ?8, ?7) from n",
+             iif(i = ?6, ?8, ?7), null from n",
         "insert into quantity_assessment
          select 'bridge', name, ?4, 1, k.value, k.key, 'N/m', 'parameter', 4.0 + iif(i = ?5, 1.5, i % 13 * 0.01), 0.1, 0.01,
                 0.01, 0.0, 3.5, iif(i = ?6, null, 0.01 * (i % 5)), 0, 0.0, 3.9, 4.1, 0.1, 0.2, 4.0, 0.1,
@@ -112,8 +112,8 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     assert_eq!(measured.rows[behind - 1].time_us, time_of(AFTER_THE_GAP - 1));
 
     let started = Instant::now();
-    let quantities = store.quantity_series(&bridge(), ALL, &extent).await.unwrap();
-    println!("4 quantities of {MANY} batches: {:?}", started.elapsed());
+    let (quantities, trust) = store.assessed_series(&bridge(), ALL, &extent).await.unwrap();
+    println!("4 quantities and trust of {MANY} batches: {:?}", started.elapsed());
     assert_eq!(quantities.iter().map(|q| q.name.as_str()).collect::<Vec<_>>(), ["k1", "k2", "k3", "k4"]);
     for quantity in &quantities {
         assert_eq!((quantity.unit.as_str(), quantity.kind), ("N/m", QuantityKind::Parameter));
@@ -136,9 +136,6 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
         assert_eq!(alarming, ["b077777"], "{}", chart.chart);
     }
 
-    let started = Instant::now();
-    let trust = store.trust_series(&bridge(), ALL, &extent).await.unwrap();
-    println!("trust of {MANY} batches: {:?}", started.elapsed());
     let rejected: Vec<_> = trust.rows.iter().filter(|row| row.tag.verdict == Verdict::Rejected).collect();
     assert_eq!(rejected.len(), 1);
     assert_eq!(
@@ -149,7 +146,8 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let started = Instant::now();
     let overview = store.overview().await.unwrap();
     println!("overview of a structure with {MANY} batches: {:?}", started.elapsed());
-    assert_eq!((overview[0].batches, overview[0].latest_assessed.as_deref()), (MANY as u64, Some("b099999")));
+    let latest = overview[0].latest.as_ref().unwrap();
+    assert_eq!((overview[0].batches, latest.batch_id.as_str()), (MANY as u64, "b099999"));
     assert_eq!(overview[0].last_measured_at.unwrap().micros(), time_of(MANY - 1));
     assert_eq!(overview[0].chart_states.len(), 5);
 
@@ -167,7 +165,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let started = Instant::now();
     let extent = store.extent(&bridge(), window).await.unwrap();
     let measured = store.frequency_series(&bridge(), window, &extent, 5, &covariates).await.unwrap();
-    let quantities = store.quantity_series(&bridge(), window, &extent).await.unwrap();
+    let (quantities, _) = store.assessed_series(&bridge(), window, &extent).await.unwrap();
     println!("a window of ten batches: {:?}", started.elapsed());
     assert_eq!((extent.batches, measured.rows.len(), quantities[0].batches.rows.len()), (10, 10, 10));
     assert!(!measured.reduced && !quantities[0].batches.reduced);
@@ -188,14 +186,48 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
     store.mark_failed(&bridge(), "b2", &version, "it failed under the new model").await.unwrap();
     let extent = store.extent(&bridge(), ALL).await.unwrap();
     assert_eq!((extent.batches, extent.measurements), (3, 6));
-    let quantities = store.quantity_series(&bridge(), ALL, &extent).await.unwrap();
+    let (quantities, trust) = store.assessed_series(&bridge(), ALL, &extent).await.unwrap();
     assert_eq!(quantities.len(), 2);
     for quantity in quantities {
         let [row] = &quantity.batches.rows[..] else { panic!("one batch: {quantity:?}") };
         assert_eq!((row.tag.batch.as_str(), row.values[0]), ("b1", 3.6));
         assert!(row.values[1].is_nan(), "compared with nothing under the new model: {row:?}");
     }
-    let trust = store.trust_series(&bridge(), ALL, &extent).await.unwrap();
     assert_eq!(trust.rows.len(), 1);
     assert_eq!(trust.rows[0].tag.findings, [Code::Outlier]);
+}
+
+#[tokio::test]
+async fn the_column_for_plots_says_what_the_rows_say() {
+    let (store, folder) = open().await;
+    for i in 0..60 {
+        let id = format!("b{i:02}");
+        store.insert_batch(&batch(&id, 1_000 * i, 2), &id, at(0)).await.unwrap();
+        let mut given = assessment(["m1", "m2"][i as usize % 2], (i % 3 > 0).then_some(1), at(i));
+        if i % 7 == 0 {
+            given.trust.verdict = Verdict::Rejected;
+            given.trust.p_value = None;
+        }
+        for (position, quantity) in given.quantities.iter_mut().enumerate() {
+            quantity.mean += 0.01 * (i * (1 + position as i64)) as f64;
+            if i % 5 == 0 {
+                quantity.mean_interval = None;
+            }
+        }
+        if i % 2 == 1 {
+            // Another baseline has other quantities, in another order.
+            given.quantities.reverse();
+            given.quantities[0].name = "k9".to_owned();
+        }
+        store.insert_assessment(&bridge(), &id, &given, Vec::new()).await.unwrap();
+    }
+    // Longer than the points of the plot, so that the reduction takes part.
+    let window = SeriesWindow { points: 20, ..ALL };
+    let extent = store.extent(&bridge(), window).await.unwrap();
+    let by_column = store.assessed_series(&bridge(), window, &extent).await.unwrap();
+    assert!(by_column.1.reduced && by_column.0.iter().any(|quantity| quantity.batches.reduced));
+    sqlx::query("update assessment set plotted = null").execute(&mut connection(&folder).await).await.unwrap();
+    let by_rows = store.assessed_series(&bridge(), window, &extent).await.unwrap();
+    // NaN is not equal to itself: the texts are compared.
+    assert_eq!(format!("{by_column:?}"), format!("{by_rows:?}"));
 }

@@ -1,0 +1,262 @@
+//! Series of what was found: monitored quantities, and how far the batches can be believed.
+
+use std::collections::{BTreeMap, HashMap};
+
+use futures_util::TryStreamExt as _;
+use serde::Deserialize;
+use sqlx::sqlite::SqliteRow;
+use sqlx::Row as _;
+
+use super::assessment::{kind_of, IS_CURRENT};
+use super::plotted::Plotted;
+use super::series::{bounds, Extent, QuantityMark, QuantitySeries, SeriesWindow, TrustMark};
+use super::{bad_row, Error, Store};
+use crate::damage::QuantityKind;
+use crate::quantity::StructureId;
+use crate::reduction::{Reduced, Reducer, Row};
+use crate::trust::{Code, Verdict};
+
+/// The part of a stored trust that a series shows.
+#[derive(Deserialize)]
+struct TrustColumn {
+    verdict: Verdict,
+    p_value: Option<f64>,
+    findings: Vec<FindingColumn>,
+}
+
+#[derive(Deserialize)]
+struct FindingColumn {
+    code: Code,
+}
+
+impl TrustColumn {
+    fn of(text: Option<&str>) -> Result<Self, Error> {
+        match text {
+            Some(text) => serde_json::from_str(text).map_err(|e| bad_row("assessment")(&e)),
+            // From before trust was judged.
+            None => Ok(Self { verdict: Verdict::Accepted, p_value: None, findings: Vec::new() }),
+        }
+    }
+}
+
+/// A quantity whose series is read.
+struct Track {
+    name: String,
+    unit: String,
+    kind: QuantityKind,
+    position: i64,
+    batches: Reducer<QuantityMark>,
+}
+
+/// Series on their way.
+struct Tracks {
+    extent: Extent,
+    points: usize,
+    quantities: Vec<Track>,
+    /// Place of a quantity by its name.
+    places: HashMap<String, usize>,
+    /// Batches by their p-value, whether they are rejected, and the number of their findings.
+    trust: Reducer<String>,
+}
+
+impl Tracks {
+    fn new(extent: Extent, points: usize) -> Self {
+        let trust = Reducer::new(extent.span(), points, 3);
+        Self { extent, points, quantities: Vec::new(), places: HashMap::new(), trust }
+    }
+
+    /// Place of a quantity, which is new where the name is.
+    fn place(&mut self, (name, unit, kind, position): (String, String, QuantityKind, i64)) -> usize {
+        if let Some(place) = self.places.get(&name) {
+            return *place;
+        }
+        let place = self.quantities.len();
+        self.places.insert(name.clone(), place);
+        let batches = Reducer::new(self.extent.span(), self.points, 2);
+        self.quantities.push(Track { name, unit, kind, position, batches });
+        place
+    }
+}
+
+impl Store {
+    /// Monitored quantities of the assessed batches of a window, in the order of their position; and how far those batches can be
+    /// believed: rejected ones and the most findings of a time are kept.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn assessed_series(
+        &self,
+        structure: &StructureId,
+        window: SeriesWindow,
+        extent: &Extent,
+    ) -> Result<(Vec<QuantitySeries>, Reduced<TrustMark>), Error> {
+        let mut tracks = Tracks::new(*extent, window.points);
+        self.read_plotted(structure, window, &mut tracks).await?;
+        self.read_unplotted(structure, window, &mut tracks).await?;
+        let trust = self.with_findings(structure, tracks.trust.finish()).await?;
+        let mut quantities = tracks.quantities;
+        quantities.sort_by(|a, b| (a.position, &a.name).cmp(&(b.position, &b.name)));
+        let series =
+            |Track { name, unit, kind, batches, .. }| QuantitySeries { name, unit, kind, batches: batches.finish() };
+        Ok((quantities.into_iter().map(series).collect(), trust))
+    }
+
+    /// Reads assessments with the column for plots.
+    async fn read_plotted(
+        &self,
+        structure: &StructureId,
+        window: SeriesWindow,
+        tracks: &mut Tracks,
+    ) -> Result<(), Error> {
+        let (from, to) = bounds(window);
+        let select = format!(
+            "select b.measured_to_us, b.batch_id, a.model_digest, a.undamaged_version, a.plotted
+             from measurement_batch b cross join assessment a using (structure_id, batch_id)
+             where b.structure_id = ? and b.measured_from_us >= ? and b.measured_from_us < ? and b.state = 'assessed'
+               and a.plotted is not null and {IS_CURRENT}"
+        );
+        let mut rows =
+            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
+        // The quantities of an assessment are those of its baseline.
+        let mut known: HashMap<String, Vec<usize>> = HashMap::new();
+        while let Some(row) = rows.try_next().await? {
+            let (time, batch): (i64, &str) = (row.try_get_unchecked(0)?, row.try_get_unchecked(1)?);
+            let model: &str = row.try_get_unchecked(2)?;
+            if !known.contains_key(model) {
+                let quantities = self.quantities_of(structure, batch, model, row.try_get_unchecked(3)?).await?;
+                let places = quantities.into_iter().map(|quantity| tracks.place(quantity)).collect();
+                known.insert(model.to_owned(), places);
+            }
+            let places = &known[model];
+            let plotted = Plotted::read(row.try_get_unchecked(4)?, places.len())?;
+            tracks.trust.push(time, &plotted.trust(), || batch.to_owned());
+            for (position, place) in places.iter().enumerate() {
+                let quantity = plotted.quantity(position);
+                let mark = || QuantityMark {
+                    batch: batch.to_owned(),
+                    mean_interval: quantity.mean_interval,
+                    probability_interval: quantity.probability_interval,
+                };
+                let values = [quantity.mean, quantity.probability];
+                tracks.quantities[*place].batches.push(time, &values, mark);
+            }
+        }
+        Ok(())
+    }
+
+    /// The quantities of an assessment by their position: name, unit, kind, position.
+    async fn quantities_of(
+        &self,
+        structure: &StructureId,
+        batch: &str,
+        model: &str,
+        undamaged_version: u32,
+    ) -> Result<Vec<(String, String, QuantityKind, i64)>, Error> {
+        let rows: Vec<(String, String, String, i64)> = sqlx::query_as(
+            "select quantity, unit, kind, position from quantity_assessment
+             where structure_id = ? and batch_id = ? and model_digest = ? and undamaged_version = ? order by position",
+        )
+        .bind(structure.as_str())
+        .bind(batch)
+        .bind(model)
+        .bind(undamaged_version)
+        .fetch_all(&self.reader)
+        .await?;
+        rows.into_iter().map(|(name, unit, kind, position)| Ok((name, unit, kind_of(&kind)?, position))).collect()
+    }
+
+    /// Reads assessments from before there was a column for plots: row by row.
+    async fn read_unplotted(
+        &self,
+        structure: &StructureId,
+        window: SeriesWindow,
+        tracks: &mut Tracks,
+    ) -> Result<(), Error> {
+        let (from, to) = bounds(window);
+        let of_window = format!(
+            "where b.structure_id = ? and b.measured_from_us >= ? and b.measured_from_us < ? and b.state = 'assessed'
+               and a.plotted is null and {IS_CURRENT}"
+        );
+        let select = format!(
+            "select b.measured_to_us, b.batch_id, a.trust
+             from measurement_batch b cross join assessment a using (structure_id, batch_id) {of_window}"
+        );
+        let mut rows =
+            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
+        while let Some(row) = rows.try_next().await? {
+            let trust = TrustColumn::of(row.try_get_unchecked(2)?)?;
+            let rejected = if trust.verdict == Verdict::Rejected { 1.0 } else { 0.0 };
+            let values = [trust.p_value.unwrap_or(f64::NAN), rejected, trust.findings.len() as f64];
+            let batch = || row.try_get_unchecked(1);
+            tracks.trust.try_push(row.try_get_unchecked(0)?, &values, batch).map_err(sqlx_error)?;
+        }
+        drop(rows);
+        // In this order: whether an assessment is the current one is asked once, not for each of its quantities.
+        let select = format!(
+            "select q.quantity, b.measured_to_us, q.mean, q.probability_of_damage, b.batch_id, q.mean_low, q.mean_high,
+                    q.probability_low, q.probability_high, q.unit, q.kind, q.position
+             from measurement_batch b
+             cross join assessment a using (structure_id, batch_id)
+             cross join quantity_assessment q using (structure_id, batch_id, model_digest, undamaged_version)
+             {of_window}"
+        );
+        let mut rows =
+            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
+        while let Some(row) = rows.try_next().await? {
+            let name: &str = row.try_get_unchecked(0)?;
+            let place = match tracks.places.get(name) {
+                Some(place) => *place,
+                None => tracks.place(named(&row)?),
+            };
+            let number = |column: usize| row.try_get_unchecked::<Option<f64>, _>(column);
+            let values = [row.try_get_unchecked(2)?, number(3)?.unwrap_or(f64::NAN)];
+            let mark = || {
+                Ok(QuantityMark {
+                    batch: row.try_get_unchecked(4)?,
+                    mean_interval: [number(5)?, number(6)?],
+                    probability_interval: [number(7)?, number(8)?],
+                })
+            };
+            let batches = &mut tracks.quantities[place].batches;
+            batches.try_push(row.try_get_unchecked(1)?, &values, mark).map_err(sqlx_error)?;
+        }
+        Ok(())
+    }
+
+    /// Looks up what was found in the batches that are kept.
+    async fn with_findings(&self, structure: &StructureId, kept: Reduced<String>) -> Result<Reduced<TrustMark>, Error> {
+        let batches: Vec<&String> = kept.rows.iter().map(|row| &row.tag).collect();
+        let batches = serde_json::to_string(&batches).map_err(|e| bad_row("batch")(&e))?;
+        let select = format!(
+            "select a.batch_id, a.trust from assessment a
+             where a.structure_id = ? and a.batch_id in (select value from json_each(?)) and {IS_CURRENT}"
+        );
+        let found: Vec<(String, Option<String>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(batches)
+            .fetch_all(&self.reader)
+            .await?;
+        let found: BTreeMap<String, Option<String>> = found.into_iter().collect();
+        let row = |Row { time_us, values, tag: batch }| {
+            let trust = TrustColumn::of(found.get(&batch).and_then(Option::as_deref))?;
+            let mut findings: Vec<Code> = Vec::new();
+            for finding in trust.findings {
+                if !findings.contains(&finding.code) {
+                    findings.push(finding.code);
+                }
+            }
+            Ok(Row { time_us, values, tag: TrustMark { batch, verdict: trust.verdict, findings } })
+        };
+        let rows = kept.rows.into_iter().map(row).collect::<Result<_, Error>>()?;
+        Ok(Reduced { rows, gaps: kept.gaps, reduced: kept.reduced })
+    }
+}
+
+fn named(row: &SqliteRow) -> Result<(String, String, QuantityKind, i64), Error> {
+    let kind = kind_of(row.try_get_unchecked(10)?)?;
+    Ok((row.try_get_unchecked(0)?, row.try_get_unchecked(9)?, kind, row.try_get_unchecked(11)?))
+}
+
+fn sqlx_error(error: sqlx::Error) -> Error {
+    error.into()
+}

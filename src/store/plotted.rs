@@ -1,0 +1,68 @@
+//! What a plot over time needs of an assessment, in one column: a window of a hundred thousand batches is drawn without a look at
+//! the rows of their quantities.
+
+use crate::assessment::Assessment;
+use crate::trust::Verdict;
+
+use super::{bad_row, to_blob, Error};
+
+/// Values of the trust, which come first: p-value, 1 for rejected, number of findings.
+const OF_TRUST: usize = 3;
+/// Values of a quantity: mean, the ends of its interval, probability of damage, the ends of its interval.
+const OF_A_QUANTITY: usize = 6;
+
+/// The column of an assessment; NaN stands for a value that is not there.
+pub(super) fn pack(a: &Assessment) -> Vec<u8> {
+    let rejected = if a.trust.verdict == Verdict::Rejected { 1.0 } else { 0.0 };
+    let trust = [a.trust.p_value.unwrap_or(f64::NAN), rejected, a.trust.findings.len() as f64];
+    let ends = |interval: Option<[f64; 2]>| interval.unwrap_or([f64::NAN; 2]);
+    let quantities = a.quantities.iter().flat_map(|q| {
+        let [mean_low, mean_high] = ends(q.mean_interval);
+        let probability = q.damage.as_ref().map_or(f64::NAN, |d| d.probability_of_damage);
+        let [low, high] = ends(q.damage.as_ref().and_then(|d| d.probability_interval));
+        [q.mean, mean_low, mean_high, probability, low, high]
+    });
+    to_blob(trust.into_iter().chain(quantities))
+}
+
+/// The column, read where it lies.
+pub(super) struct Plotted<'a> {
+    values: &'a [[u8; 8]],
+}
+
+/// A quantity of the column.
+pub(super) struct PlottedQuantity {
+    pub(super) mean: f64,
+    pub(super) mean_interval: [Option<f64>; 2],
+    pub(super) probability: f64,
+    pub(super) probability_interval: [Option<f64>; 2],
+}
+
+impl<'a> Plotted<'a> {
+    /// The column of an assessment with so many quantities.
+    pub(super) fn read(blob: &'a [u8], quantities: usize) -> Result<Self, Error> {
+        let (values, rest) = blob.as_chunks::<8>();
+        if rest.is_empty() && values.len() == OF_TRUST + OF_A_QUANTITY * quantities {
+            Ok(Self { values })
+        } else {
+            Err(bad_row("assessment")(&format!("{} bytes to plot for {quantities} quantities", blob.len())))
+        }
+    }
+
+    /// P-value, 1 for rejected, number of findings.
+    pub(super) fn trust(&self) -> [f64; OF_TRUST] {
+        std::array::from_fn(|i| f64::from_le_bytes(self.values[i]))
+    }
+
+    /// A quantity by its position.
+    pub(super) fn quantity(&self, position: usize) -> PlottedQuantity {
+        let value = |i: usize| f64::from_le_bytes(self.values[OF_TRUST + OF_A_QUANTITY * position + i]);
+        let end = |i: usize| Some(value(i)).filter(|v| !v.is_nan());
+        PlottedQuantity {
+            mean: value(0),
+            mean_interval: [end(1), end(2)],
+            probability: value(3),
+            probability_interval: [end(4), end(5)],
+        }
+    }
+}
