@@ -1,68 +1,172 @@
-//! Latency of a POST of 50 measurements on loopback, and the memory of the service. `cargo bench --bench service`
+//! The service over loopback, each batch on disk before its 201. `cargo bench --bench service`
 //!
-//! Open loop: post number i starts at i/rate, whether or not the one before was answered, so a slow answer does not hide
-//! the ones behind it. Arguments after `--`: rate per second and seconds, 20 and 30 without them.
+//! - `latency`: posts of 50 measurements, assessed, open loop: post number i starts at i/rate, whether or not the one before was
+//!   answered, so a slow answer does not hide the ones behind it.
+//! - `sustained`: posts of 20 measurements, assessed, as many as the service takes from 32 clients.
+//! - `storing`: the same without an assessment, beside bare SQLite commits of the same rows on the same disk.
+//!
+//! Arguments after `--`: which of these (all without), and `rate=50 seconds=30`. `MODALWATCH_BENCH_PROGRAM` is another build of
+//! the program to measure instead.
 
 use std::io::{BufRead as _, BufReader};
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use modalwatch::baseline::library::find_structure;
+use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::population::Population;
 use modalwatch::stats;
+use modalwatch::store::Store;
 use serde_json::{json, Value};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
+use sqlx::Connection as _;
 
-const MEASUREMENTS: usize = 50;
+/// Measurements of a post whose latency is measured, and of one of many.
+const LARGE: usize = 50;
+const SMALL: usize = 20;
+
+/// Clients that post as fast as they are answered.
+const CLIENTS: usize = 32;
+
+/// Populations that are drawn; further batches repeat them at other times.
+const DRAWN: usize = 200;
+
+/// 2026-01-01T00:00:00Z, µs.
+const EPOCH_MICROS: i64 = 1_767_225_600_000_000;
+
+/// A structure with a trained baseline, and the same under another id, which has none.
+const ASSESSED: &str = "three-dof";
+const STORED: &str = "plain";
 
 fn main() {
-    let numbers: Vec<u32> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
-    let (rate, seconds) = (numbers.first().copied().unwrap_or(20), numbers.get(1).copied().unwrap_or(30));
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut service = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
-        .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
-        .arg(folder.path())
-        .env("MODALWATCH__LOG__LEVEL", "warn")
-        .stdout(Stdio::piped())
-        .spawn()
-        .expect("the service starts");
-    let mut line = String::new();
-    BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
-    let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
-    let bodies: Vec<Value> = (0..rate * seconds).map(body).collect();
-
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let number = |name: &str, default: u32| {
+        let given = arguments.iter().find_map(|a| a.strip_prefix(name)?.strip_prefix('=')?.parse().ok());
+        given.unwrap_or(default)
+    };
+    let named: Vec<&String> = arguments.iter().filter(|a| !a.contains('=')).collect();
+    let wanted = |part: &str| named.is_empty() || named.iter().any(|name| *name == part);
+    let (rate, seconds) = (number("rate", 50), number("seconds", 30));
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
-    let mut latencies_ms = runtime.block_on(post_all(&url, bodies, rate));
-    let status = std::fs::read_to_string(format!("/proc/{}/status", service.id())).unwrap_or_default();
-    let peak = status.lines().find(|l| l.starts_with("VmHWM")).unwrap_or("VmHWM: unknown").to_owned();
-    service.kill().expect("it runs");
-    service.wait().expect("it was started here");
-
-    latencies_ms.sort_by(f64::total_cmp);
-    let quantile = |level| stats::quantile(&latencies_ms, level);
-    println!(
-        "POST of {MEASUREMENTS} measurements, {rate}/s for {seconds} s, each assessed and on disk before its 201:"
-    );
-    println!("  p50 {:.1} ms, p99 {:.1} ms, largest {:.1} ms", quantile(0.5), quantile(0.99), quantile(1.0));
-    println!(
-        "  peak resident memory of the service: {}",
-        peak.split_whitespace().skip(1).collect::<Vec<_>>().join(" ")
-    );
+    if wanted("latency") {
+        runtime.block_on(latency(rate, seconds));
+    }
+    if wanted("sustained") {
+        runtime.block_on(sustained(seconds));
+    }
+    if wanted("storing") {
+        runtime.block_on(storing(seconds));
+    }
 }
 
-async fn post_all(url: &str, bodies: Vec<Value>, rate: u32) -> Vec<f64> {
-    let client = reqwest::Client::new();
-    let path = format!("{url}/v1/structures/three-dof/batches");
-    let first = client.post(&path).json(&bodies[0]).send().await.expect("the service answers");
-    let batch: Value = first.json().await.expect("it answers JSON");
-    let baseline = json!({ "batches": [batch["batch"]] });
-    let answer = client.post(format!("{url}/v1/structures/three-dof/baseline")).json(&baseline).send().await;
-    assert!(answer.expect("the service answers").status().is_success());
+/// The program on a folder of its own.
+struct Service {
+    process: Child,
+    url: String,
+    client: reqwest::Client,
+    folder: tempfile::TempDir,
+}
+
+impl Service {
+    fn start() -> Self {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let program = std::env::var("MODALWATCH_BENCH_PROGRAM");
+        let mut process = Command::new(program.as_deref().unwrap_or(env!("CARGO_BIN_EXE_modalwatch")))
+            .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
+            .arg(folder.path())
+            .env("MODALWATCH__LOG__LEVEL", "warn")
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("the service starts");
+        let mut line = String::new();
+        BufReader::new(process.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
+        let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
+        Self { process, url, client: reqwest::Client::new(), folder }
+    }
+
+    async fn post(&self, path: &str, body: Vec<u8>) -> Value {
+        let request = self.client.post(format!("{}{path}", self.url)).header("content-type", "application/json");
+        let response = request.body(body).send().await.expect("the service answers");
+        assert_eq!(response.status(), 201);
+        response.json().await.expect("the answer is whole")
+    }
+
+    /// Declares a first batch as the undamaged state.
+    async fn declare_undamaged(&self) {
+        let batch = self.post(&batches(ASSESSED), body("undamaged", 0, LARGE)).await;
+        let declared = json!({ "batches": [batch["batch"]] }).to_string().into_bytes();
+        self.post(&format!("/v1/structures/{ASSESSED}/baseline"), declared).await;
+    }
+
+    /// Posts until the time is over; what each took, ms.
+    async fn load(&self, structure: &str, seconds: u32) -> (Vec<f64>, f64) {
+        let next = Arc::new(AtomicUsize::new(0));
+        let started = Instant::now();
+        let end = started + Duration::from_secs(u64::from(seconds));
+        let clients: Vec<_> = (0..CLIENTS)
+            .map(|_| {
+                let (next, client, url) = (Arc::clone(&next), self.client.clone(), self.url.clone());
+                let path = format!("{url}{}", batches(structure));
+                tokio::spawn(async move {
+                    let mut latencies_ms = Vec::new();
+                    while Instant::now() < end {
+                        let body = body("logger", next.fetch_add(1, Ordering::Relaxed), SMALL);
+                        let posted = Instant::now();
+                        let request = client.post(&path).header("content-type", "application/json").body(body);
+                        let response = request.send().await.expect("the service answers");
+                        assert_eq!(response.status(), 201);
+                        response.bytes().await.expect("the answer is whole");
+                        latencies_ms.push(posted.elapsed().as_secs_f64() * 1e3);
+                    }
+                    latencies_ms
+                })
+            })
+            .collect();
+        let mut all = Vec::new();
+        for client in clients {
+            all.extend(client.await.expect("no client panics"));
+        }
+        let per_second = all.len() as f64 / started.elapsed().as_secs_f64();
+        (all, per_second)
+    }
+
+    /// Peak resident memory, as the system writes it.
+    fn peak(&self) -> String {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id())).unwrap_or_default();
+        let line = status.lines().find(|l| l.starts_with("VmHWM")).unwrap_or("VmHWM: unknown").to_owned();
+        line.split_whitespace().skip(1).collect::<Vec<_>>().join(" ")
+    }
+
+    /// Seconds of processor time so far, of all threads.
+    fn processor_s(&self) -> f64 {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.process.id())).unwrap_or_default();
+        let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+        // Hundredths of a second, in user and system mode.
+        [11, 12].iter().filter_map(|i| fields.get(*i)?.parse::<f64>().ok()).sum::<f64>() / 100.0
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+async fn latency(rate: u32, seconds: u32) {
+    let service = Service::start();
+    service.declare_undamaged().await;
+    let bodies: Vec<Vec<u8>> = (0..rate * seconds).map(|i| body("logger", i as usize, LARGE)).collect();
+    let path = format!("{}{}", service.url, batches(ASSESSED));
     let started = Instant::now();
     let mut posts = Vec::new();
-    for (i, body) in bodies.into_iter().skip(1).enumerate() {
+    for (i, body) in bodies.into_iter().enumerate() {
         let due = started + Duration::from_secs(1) * u32::try_from(i).expect("few posts") / rate;
         tokio::time::sleep_until(due.into()).await;
-        let post = client.post(&path).json(&body).send();
+        let post = service.client.post(&path).header("content-type", "application/json").body(body).send();
         posts.push(tokio::spawn(async move {
             let response = post.await.expect("the service answers");
             assert_eq!(response.status(), 201);
@@ -70,23 +174,124 @@ async fn post_all(url: &str, bodies: Vec<Value>, rate: u32) -> Vec<f64> {
             due.elapsed().as_secs_f64() * 1e3
         }));
     }
-    let mut latencies = Vec::new();
+    let mut latencies_ms = Vec::new();
     for post in posts {
-        latencies.push(post.await.expect("no post panics"));
+        latencies_ms.push(post.await.expect("no post panics"));
     }
-    latencies
+    println!("latency: POST of {LARGE} measurements, assessed, {rate}/s open loop for {seconds} s");
+    println!("  {}", quantiles(latencies_ms));
+    println!("  {:.1} ms of processor time a batch", 1e3 * service.processor_s() / f64::from(rate * seconds));
+    println!("  peak resident memory of the service: {}", service.peak());
 }
 
-fn body(index: u32) -> Value {
-    let simulator = find_structure("three-dof").expect("it is shipped");
-    let moments = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)].map(|(n, m, s)| (n.to_owned(), m, s));
-    let population = Population::new(simulator.space(), &moments).expect("all parameters are named");
-    let drawn = population.draw(&simulator, MEASUREMENTS, 1.0, u64::from(index)).expect("the population is physical");
-    let row = |(i, row): (usize, nalgebra::MatrixView1xX<'_, f64, nalgebra::U1, nalgebra::Dyn>)| {
-        let second = index as usize * MEASUREMENTS + i;
-        let (day, rest) = (second / 86_400, second % 86_400);
-        let at = format!("2026-01-{:02}T{:02}:{:02}:{:02}Z", 1 + day, rest / 3600, rest / 60 % 60, rest % 60);
-        json!({ "measured_at": at, "frequencies_hz": row.iter().collect::<Vec<_>>() })
+async fn sustained(seconds: u32) {
+    let service = Service::start();
+    service.declare_undamaged().await;
+    let before = service.processor_s();
+    let (latencies_ms, per_second) = service.load(ASSESSED, seconds).await;
+    let each_ms = 1e3 * (service.processor_s() - before) / latencies_ms.len() as f64;
+    println!("sustained: POST of {SMALL} measurements, assessed, {CLIENTS} clients for {seconds} s");
+    println!("  {per_second:.0} batches/s; {}", quantiles(latencies_ms));
+    println!("  {each_ms:.1} ms of processor time a batch; peak resident memory: {}", service.peak());
+}
+
+async fn storing(seconds: u32) {
+    let service = Service::start();
+    let definition = find_structure(ASSESSED).expect("it is shipped").definition().canonical_json();
+    let definition = definition.replace("\"three-dof\"", "\"plain\"");
+    let put = service.client.put(format!("{}/v1/structures/{STORED}", service.url));
+    let put = put.header("content-type", "application/json").body(definition).send().await.expect("an answer");
+    assert!(put.status().is_success());
+    // Before and after, since the disk is not ours alone.
+    let bare_before = bare_commits(service.folder.path(), seconds.div_ceil(2)).await;
+    let before = service.processor_s();
+    let (latencies_ms, per_second) = service.load(STORED, seconds).await;
+    let each_ms = 1e3 * (service.processor_s() - before) / latencies_ms.len() as f64;
+    let bare_after = bare_commits(service.folder.path(), seconds.div_ceil(2)).await;
+    let bare = f64::midpoint(bare_before, bare_after);
+    println!("storing: POST of {SMALL} measurements, not assessed, {CLIENTS} clients for {seconds} s");
+    println!("  {per_second:.0} batches/s; {}; {each_ms:.2} ms of processor time a batch", quantiles(latencies_ms));
+    println!("  bare SQLite: {bare_before:.0} and {bare_after:.0} commits/s of the same rows");
+    println!("  ratio {:.2} (bare to service)", bare / per_second);
+}
+
+/// Commits a second of the rows of a batch, one transaction each, on the disk of a folder: the same tables, WAL, synced in full,
+/// one statement a table, no service.
+async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
+    let folder = tempfile::tempdir_in(beside).expect("a temporary folder");
+    // The tables are those of a store.
+    Store::open(folder.path()).await.expect("a store").close().await;
+    let options = SqliteConnectOptions::new()
+        .filename(folder.path().join("modalwatch.sqlite"))
+        .foreign_keys(true)
+        .synchronous(SqliteSynchronous::Full);
+    let mut connection = SqliteConnection::connect_with(&options).await.expect("a connection");
+    let plain = "insert into structure values ('plain', '{}', 'digest', 0, 0)";
+    sqlx::query(plain).execute(&mut connection).await.expect("a structure");
+    let rows: Vec<String> =
+        (0..SMALL).map(|i| format!("('plain', ?1, {i}, 'logger', ?2 + {i}, ?3, null, '{{}}', '{{}}')")).collect();
+    let measurements = format!("insert into measurement values {}", rows.join(", "));
+    let frequencies = [0.5_f64, 0.9, 1.2].map(f64::to_le_bytes).concat();
+    let (started, mut commits) = (Instant::now(), 0_u32);
+    while started.elapsed() < Duration::from_secs(u64::from(seconds)) {
+        let (id, at) = (format!("01890000-0000-7000-8000-{commits:012}"), i64::from(commits) * 1_000_000);
+        let mut transaction = connection.begin_with("begin immediate").await.expect("a transaction");
+        sqlx::query(
+            "insert into measurement_batch values ('plain', ?1, 'logger', null, ?2, ?3, ?3, ?3, 20, 'received', null)",
+        )
+        .bind(&id)
+        .bind("d".repeat(64))
+        .bind(at)
+        .execute(&mut *transaction)
+        .await
+        .expect("a batch");
+        sqlx::query(sqlx::AssertSqlSafe(measurements.clone()))
+            .bind(&id)
+            .bind(at)
+            .bind(&frequencies)
+            .execute(&mut *transaction)
+            .await
+            .expect("its measurements");
+        transaction.commit().await.expect("a commit");
+        commits += 1;
+    }
+    let per_second = f64::from(commits) / started.elapsed().as_secs_f64();
+    connection.close().await.expect("it closes");
+    per_second
+}
+
+fn quantiles(mut latencies_ms: Vec<f64>) -> String {
+    latencies_ms.sort_by(f64::total_cmp);
+    let [p50, p99, most] = [0.5, 0.99, 1.0].map(|level| stats::quantile(&latencies_ms, level));
+    format!("p50 {p50:.1} ms, p99 {p99:.1} ms, largest {most:.1} ms")
+}
+
+fn batches(structure: &str) -> String {
+    format!("/v1/structures/{structure}/batches")
+}
+
+/// Body number `index` of a source, a second between measurements.
+fn body(source: &str, index: usize, measurements: usize) -> Vec<u8> {
+    let rows = &drawn()[index % DRAWN];
+    let row = |(i, row): (usize, &Vec<f64>)| {
+        let micros = EPOCH_MICROS + 1_000_000 * (index * measurements + i) as i64;
+        json!({ "measured_at": Timestamp::from_micros(micros).expect("a time"), "frequencies_hz": row })
     };
-    json!({ "measurements": drawn.frequencies_hz.row_iter().enumerate().map(row).collect::<Vec<_>>() })
+    let rows: Vec<Value> = rows.iter().take(measurements).enumerate().map(row).collect();
+    json!({ "source": source, "measurements": rows }).to_string().into_bytes()
+}
+
+/// Measurements of the structure of the paper, undamaged: one population drawn again and again.
+fn drawn() -> &'static Vec<Vec<Vec<f64>>> {
+    static DRAWN_ROWS: std::sync::OnceLock<Vec<Vec<Vec<f64>>>> = std::sync::OnceLock::new();
+    DRAWN_ROWS.get_or_init(|| {
+        let simulator = find_structure(ASSESSED).expect("it is shipped");
+        let moments = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)].map(|(n, m, s)| (n.to_owned(), m, s));
+        let population = Population::new(simulator.space(), &moments).expect("all parameters are named");
+        let one = |seed: usize| {
+            let drawn = population.draw(&simulator, LARGE, 1.0, seed as u64).expect("the population is physical");
+            drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect()
+        };
+        (0..DRAWN).map(one).collect()
+    })
 }

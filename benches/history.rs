@@ -1,0 +1,301 @@
+//! Questions to a database of a million batches, and history assessed again. `cargo bench --bench history`
+//!
+//! - `queries`: pages of history, the overview of a thousand structures, a plot of a hundred thousand batches; over loopback, by
+//!   the program itself, on a database of `MODALWATCH_BENCH_BATCHES` batches (1 000 000), which is made first and removed
+//!   afterwards. Half of them are of one structure.
+//! - `replay`: stored batches assessed again after a new undamaged state, on one thread and on all.
+//!
+//! Arguments after `--`: which of these (both without).
+
+use std::io::{BufRead as _, BufReader};
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use modalwatch::assessment::BatchState;
+use modalwatch::baseline::library::{find_structure, Library};
+use modalwatch::measurement::{at_intervals, MeasurementBatch};
+use modalwatch::monitor::compute::ComputeSettings;
+use modalwatch::monitor::{Monitor, MonitorSettings};
+use modalwatch::quantity::{Digest, StructureId, Timestamp};
+use modalwatch::simulator::population::Population;
+use modalwatch::stats;
+use modalwatch::store::{HistoryQuery, Store, DATABASE_FILE};
+use rand::Rng as _;
+use serde_json::json;
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
+use sqlx::{AssertSqlSafe, Connection as _};
+
+/// Structures beside the large one; they share the other half of the batches.
+const STRUCTURES: usize = 999;
+/// Measurements of a generated batch.
+const MEASUREMENTS: usize = 5;
+/// Batches that are inserted by one statement a table.
+const AT_A_TIME: usize = 2_000;
+/// Pages that are asked for.
+const PAGES: usize = 500;
+/// Times that the overview is asked for.
+const OVERVIEWS: usize = 50;
+/// Batches of the plot.
+const PLOTTED: i64 = 100_000;
+/// Microseconds between batches of a structure: ten minutes.
+const BETWEEN_US: i64 = 600_000_000;
+/// 2020-01-01T00:00:00Z, µs.
+const EPOCH_US: i64 = 1_577_836_800_000_000;
+
+/// Batches that are replayed, and measurements of each.
+const REPLAYED: usize = 600;
+const OF_A_REPLAYED: usize = 20;
+
+fn main() {
+    let named: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let wanted = |part: &str| named.is_empty() || named.iter().any(|name| name == part);
+    let batches = std::env::var("MODALWATCH_BENCH_BATCHES").map_or(1_000_000, |text| text.parse().expect("a number"));
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    if wanted("queries") {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let large = runtime.block_on(generate(folder.path(), batches));
+        runtime.block_on(queries(folder.path(), large));
+    }
+    if wanted("replay") {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let one = runtime.block_on(replay(1));
+        let all = runtime.block_on(replay(cores));
+        println!("replay: {REPLAYED} batches of {OF_A_REPLAYED} measurements assessed again");
+        println!("  1 thread {one:.0} batches/s, {cores} threads {all:.0} batches/s: {:.2} times", all / one);
+    }
+}
+
+fn id_of(structure: usize) -> String {
+    if structure == 0 {
+        "large".to_owned()
+    } else {
+        format!("s{structure:04}")
+    }
+}
+
+/// A database of `batches` batches, as the service would have written them over years; the number of those of the large
+/// structure.
+async fn generate(folder: &Path, batches: usize) -> usize {
+    let started = Instant::now();
+    let store = Store::open(folder).await.expect("a store");
+    let definition = find_structure("three-dof").expect("it is shipped").definition().canonical_json();
+    for structure in 0..=STRUCTURES {
+        let id = id_of(structure);
+        let json = definition.replace("\"three-dof\"", &format!("\"{id}\""));
+        let digest = Digest::of_file(json.as_bytes());
+        let id = StructureId::parse(&id).expect("an id");
+        store.put_structure(&id, &json, &digest, Timestamp::now()).await.expect("a structure");
+    }
+    store.close().await;
+    drop(store);
+    let options = SqliteConnectOptions::new()
+        .filename(folder.join(DATABASE_FILE))
+        .journal_mode(SqliteJournalMode::Off)
+        .synchronous(SqliteSynchronous::Off)
+        .pragma("cache_size", "-400000");
+    let mut connection = SqliteConnection::connect_with(&options).await.expect("a connection");
+    let (mut written, mut large) = (0, 0);
+    let mut of_structure = vec![0_i64; STRUCTURES + 1];
+    let mut frequencies = vec![];
+    for wave in 0..32 {
+        let wave = 1.0 + 0.01 * f64::from(wave).sin();
+        frequencies.push([0.495 * wave, 0.925 * wave, 1.243 * wave].to_vec());
+    }
+    while written < batches {
+        let count = AT_A_TIME.min(batches - written);
+        // Every second one is of the large structure: time goes on in all of them together.
+        let of = |i: usize| if i.is_multiple_of(2) { 0 } else { 1 + (i / 2) % STRUCTURES };
+        let rows: Vec<_> = (written..written + count)
+            .map(|i| {
+                let structure = of(i);
+                let number = of_structure[structure];
+                of_structure[structure] += 1;
+                large += usize::from(structure == 0);
+                generated(structure, number, i, &frequencies[i % frequencies.len()])
+            })
+            .collect();
+        insert(&mut connection, &serde_json::to_string(&rows).expect("plain data")).await;
+        written += count;
+    }
+    connection.close().await.expect("it closes");
+    let bytes = std::fs::metadata(folder.join(DATABASE_FILE)).expect("a file").len();
+    println!(
+        "database: {batches} batches of {MEASUREMENTS} measurements, {} structures, {large} batches of one of them",
+        STRUCTURES + 1
+    );
+    println!("  {:.2} GB, made in {:.0} s", bytes as f64 / 1e9, started.elapsed().as_secs_f64());
+    large
+}
+
+/// What the statements of [`insert`] need of a batch.
+fn generated(structure: usize, number: i64, index: usize, frequencies: &[f64]) -> serde_json::Value {
+    let start = Timestamp::from_micros(EPOCH_US + BETWEEN_US * number).expect("a time");
+    let id = StructureId::parse(&id_of(structure)).expect("an id");
+    let rows = vec![frequencies.to_vec(); MEASUREMENTS];
+    let measurements = at_intervals(&rows, start, 10, None).expect("measurements");
+    let batch = MeasurementBatch { structure: id, source: "logger".to_owned(), idempotency_key: None, measurements };
+    let hex = |values: &[f64]| {
+        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        data_encoding::HEXLOWER.encode(&bytes)
+    };
+    let wave = (index as f64 * 0.37).sin();
+    // The column that the store packs for plots: trust, then each quantity as the statement of `insert` gives it.
+    let mut plotted = vec![0.25, 0.0, 1.0];
+    for mean in [4.0, 5.0, 6.0] {
+        let mean = mean + 0.1 * wave;
+        plotted.extend([mean, mean - 0.1, mean + 0.1, 0.02 + 0.01 * wave, 0.01, 0.05]);
+    }
+    json!([
+        batch.structure.to_string(),
+        format!("01890000-0000-7000-8000-{index:012}"),
+        start.micros(),
+        batch.content_digest().to_string(),
+        hex(frequencies),
+        wave,
+        hex(&plotted)
+    ])
+}
+
+/// Inserts generated batches with their measurements, assessments and chart points.
+async fn insert(connection: &mut SqliteConnection, rows: &str) {
+    let trust = r#"{"verdict":"accepted","p_value":0.25,"distance":1.1,"degrees_of_freedom":12,"findings":[
+        {"code":"outlier","effect":"note","message":"one of them, far from the others","measurements":[2]}]}"#;
+    let given = "with r as (select value ->> 0 as s, value ->> 1 as id, value ->> 2 as at, value ->> 3 as digest,
+                                value ->> 4 as hex, value ->> 5 as wave, value ->> 6 as plotted from json_each(?1))";
+    let steps: Vec<String> = (0..MEASUREMENTS).map(|i| format!("({i})")).collect();
+    let last = 10_000_000 * (MEASUREMENTS - 1);
+    let digest = "m".repeat(64);
+    let statements = [
+        format!(
+            "insert into measurement_batch select s, id, 'logger', null, digest, at + 60000000, at, at + {last},
+             {MEASUREMENTS}, 'assessed', null from r"
+        ),
+        format!(
+            "insert into measurement select s, id, k.column1, 'logger', at + k.column1 * 10000000, unhex(hex), null,
+             '{{}}', '{{}}' from r, (values {}) k",
+            steps.join(", ")
+        ),
+        format!(
+            "insert into assessment select s, id, '{digest}', 0, '{digest}', 1, 10, {MEASUREMENTS}, 0, 0, unhex(hex),
+             at + 60000000, 40.0, '{trust}', unhex(plotted) from r"
+        ),
+        format!(
+            "insert into quantity_assessment select s, id, '{digest}', 0, k.column1, k.column2, 'N/m', 'parameter',
+                 k.column3 + 0.1 * wave, 0.1, 0.01, 0.01, 0.0, 3.5, 0.02 + 0.01 * wave, 0, 0.01 * wave,
+                 k.column3 - 0.1 + 0.1 * wave, k.column3 + 0.1 + 0.1 * wave, 0.1, 0.2, k.column3, 0.1, 0.01, 0.05, 0.02,
+                 -0.1, 0.1, null
+             from r, (values ('k1', 0, 4.0), ('k2', 1, 5.0), ('k3', 2, 6.0)) k"
+        ),
+        format!(
+            "insert into chart_point select s, 0, k.column1, at + {last}, id, wave, 3.0, 1.0, 0.3, 0, 0.2 * wave, 0,
+             'normal' from r, (values ('k1'), ('k2'), ('k3'), ('simulation:fit')) k"
+        ),
+    ];
+    let mut transaction = connection.begin().await.expect("a transaction");
+    for statement in statements {
+        let (table, select) = statement.split_once(" select ").expect("one of the above");
+        sqlx::query(AssertSqlSafe(format!("{table} {given} select {select}")))
+            .bind(rows)
+            .execute(&mut *transaction)
+            .await
+            .expect("rows");
+    }
+    transaction.commit().await.expect("a commit");
+}
+
+/// Asks the program itself.
+async fn queries(folder: &Path, large: usize) {
+    let started = Instant::now();
+    let program = std::env::var("MODALWATCH_BENCH_PROGRAM");
+    let mut service = Command::new(program.as_deref().unwrap_or(env!("CARGO_BIN_EXE_modalwatch")))
+        .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
+        .arg(folder)
+        .env("MODALWATCH__LOG__LEVEL", "error")
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("the service starts");
+    let mut line = String::new();
+    BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
+    let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
+    println!("  the service is there after {:.0} s, its check of the file included", started.elapsed().as_secs_f64());
+    let client = reqwest::Client::new();
+    let get = async |path: &str| {
+        let started = Instant::now();
+        let response = client.get(format!("{url}{path}")).send().await.expect("the service answers");
+        assert_eq!(response.status(), 200, "{path}");
+        let bytes = response.bytes().await.expect("the answer is whole");
+        (started.elapsed().as_secs_f64() * 1e3, bytes.len())
+    };
+    let mut stream = stats::stream(20_260_301, "pages that somebody looks at");
+    let mut pages = Vec::new();
+    for page in 0..PAGES {
+        let (structure, length) =
+            if page.is_multiple_of(2) { (0, large) } else { (stream.random_range(1..=STRUCTURES), large / STRUCTURES) };
+        let number = stream.random_range(0..length.max(1)) as i64;
+        // The cursor of the page before.
+        let cursor = format!("{}~01890000-0000-7000-8000-000000000000", EPOCH_US + BETWEEN_US * number);
+        pages.push(get(&format!("/v1/structures/{}/history?cursor={cursor}", id_of(structure))).await.0);
+    }
+    println!("history page of 100 batches, {PAGES} at random places: {}", quantiles(pages));
+    let mut overviews = Vec::new();
+    for _ in 0..OVERVIEWS {
+        overviews.push(get("/v1/overview").await.0);
+    }
+    println!("overview of {} structures, {OVERVIEWS} times: {}", STRUCTURES + 2, quantiles(overviews));
+    let to = Timestamp::from_micros(EPOCH_US + BETWEEN_US * PLOTTED.min(large as i64)).expect("a time");
+    let mut plots = Vec::new();
+    for _ in 0..5 {
+        plots.push(get(&format!("/v1/structures/large/series?to={to}")).await.0);
+    }
+    println!("series of {} batches, 5 times: {}", PLOTTED.min(large as i64), quantiles(plots));
+    service.kill().expect("it runs");
+    service.wait().expect("it was started here");
+}
+
+fn quantiles(mut latencies_ms: Vec<f64>) -> String {
+    latencies_ms.sort_by(f64::total_cmp);
+    let [p50, p99, most] = [0.5, 0.99, 1.0].map(|level| stats::quantile(&latencies_ms, level));
+    format!("p50 {p50:.1} ms, p99 {p99:.1} ms, largest {most:.1} ms")
+}
+
+/// Batches a second that are assessed again, with so many threads.
+async fn replay(threads: usize) -> f64 {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let store = Store::open(folder.path()).await.expect("a store");
+    let compute = ComputeSettings { threads, ..ComputeSettings::default() };
+    let settings = MonitorSettings { compute, ..MonitorSettings::default() };
+    let monitor = Monitor::open(store, Library::open(None).expect("shipped"), settings).await.expect("a monitor");
+    let structure = StructureId::parse("three-dof").expect("an id");
+    let simulator = find_structure("three-dof").expect("it is shipped");
+    let moments = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)].map(|(n, m, s)| (n.to_owned(), m, s));
+    let population = Population::new(simulator.space(), &moments).expect("all parameters are named");
+    let mut first = None;
+    for number in 0..REPLAYED {
+        let drawn = population.draw(&simulator, OF_A_REPLAYED, 1.0, number as u64).expect("a physical population");
+        let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
+        let start = Timestamp::from_micros(EPOCH_US + BETWEEN_US * number as i64).expect("a time");
+        let measurements = at_intervals(&rows, start, 1, None).expect("measurements");
+        let (structure, source) = (structure.clone(), "logger".to_owned());
+        let batch = MeasurementBatch { structure, source, idempotency_key: None, measurements };
+        let taken = monitor.ingest(batch).await.expect("it is taken");
+        first.get_or_insert(taken.view.record.batch_id);
+    }
+    let started = Instant::now();
+    // All others go back to be compared with it.
+    monitor.declare_undamaged(&structure, first.into_iter().collect(), 0.05).await.expect("an undamaged state");
+    let waiting = async || !monitor.store().pending(&structure, 1).await.expect("an answer").is_empty();
+    while waiting().await {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let seconds = started.elapsed().as_secs_f64();
+    let query = HistoryQuery { limit: REPLAYED, ..HistoryQuery::default() };
+    let history = monitor.store().history(&structure, &query).await.expect("a history");
+    let compared = |entry: &modalwatch::store::HistoryEntry| {
+        entry.assessment.as_ref().is_some_and(|assessment| assessment.undamaged_version == Some(1))
+    };
+    assert!(history.iter().all(|entry| entry.state == BatchState::Assessed), "some batches failed");
+    assert_eq!(history.iter().filter(|entry| compared(entry)).count(), REPLAYED - 1);
+    monitor.store().close().await;
+    (REPLAYED - 1) as f64 / seconds
+}
