@@ -253,16 +253,19 @@ async fn check(service: &Service, document: &Value, template: &str, path: &str) 
     let content_type = answer.headers()["content-type"].to_str().unwrap().to_owned();
     let schema = response_schema(document, template, "get", status, &content_type);
     let text = answer.text().await.unwrap();
-    let value = if content_type.contains("json") && !content_type.contains("ndjson") {
-        serde_json::from_str(&text).unwrap()
-    } else {
-        json!(text)
-    };
     let validator = validator(document, &schema);
-    let errors: Vec<String> =
-        validator.iter_errors(&value).map(|e| format!("{} at {}", e, e.instance_path())).collect();
-    assert!(errors.is_empty(), "GET {path}: {errors:?}\n{value:#}");
-    (status, value)
+    // Of lines of JSON the schema is that of a line.
+    let values: Vec<Value> = match content_type.as_str() {
+        lines if lines.contains("ndjson") => text.lines().map(|line| serde_json::from_str(line).unwrap()).collect(),
+        one if one.contains("json") => vec![serde_json::from_str(&text).unwrap()],
+        _ => vec![json!(text)],
+    };
+    for value in &values {
+        let errors: Vec<String> =
+            validator.iter_errors(value).map(|e| format!("{} at {}", e, e.instance_path())).collect();
+        assert!(errors.is_empty(), "GET {path}: {errors:?}\n{value:#}");
+    }
+    (status, values.into_iter().next().unwrap_or_default())
 }
 
 #[tokio::test]
