@@ -70,7 +70,7 @@ struct Span {
 }
 
 fn spans(export: &[u8]) -> Vec<Span> {
-    let hex = |bytes: Vec<&[u8]>| bytes.concat().iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+    let hex = |bytes: Vec<&[u8]>| data_encoding::HEXLOWER.encode(&bytes.concat());
     let of_resources = all(export, 1).into_iter().flat_map(|resource| all(resource, 2));
     let found = of_resources.flat_map(|scope| all(scope, 2)).map(|span| Span {
         trace: hex(all(span, 1)),
