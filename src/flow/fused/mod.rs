@@ -86,7 +86,7 @@ impl Fused {
         let architecture = flow.architecture();
         let dimensions = architecture.parameters;
         let first = dimensions / 2;
-        let context = Context::new(&layout, architecture, flow.context.width() - architecture.context_features);
+        let context = Context::new(&layout, architecture, flow.context.shortcut_width());
         let clamp = architecture.clamp_tenths as f32 / 10.0;
         let unit = |(index, order): (usize, &Vec<u32>)| {
             let net =
