@@ -35,7 +35,9 @@ trap finish EXIT
 "$program" token file "$folder/admin-token" > /dev/null 2>&1
 TOKEN=$(cat "$folder/admin-token")
 export TOKEN
-MODALWATCH_ADMIN_TOKEN_FILE=$folder/admin-token MODALWATCH__LOG__LEVEL=warn "$program" serve --listen 127.0.0.1:0 --data-dir "$folder/data" \
+# More wrong tokens than a service takes from one address in a minute are tried on purpose.
+MODALWATCH_ADMIN_TOKEN_FILE=$folder/admin-token MODALWATCH__HTTP__RATE_LIMIT__FAILED_AUTHENTICATIONS_PER_MIN=0 \
+    MODALWATCH__LOG__LEVEL=warn "$program" serve --listen 127.0.0.1:0 --data-dir "$folder/data" \
     > "$folder/address" 2> "$folder/service.log" &
 service=$!
 url=

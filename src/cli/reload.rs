@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use tokio::signal::unix::{signal, SignalKind};
+use tokio::signal::unix::{signal, Signal, SignalKind};
 use tracing::{error, info, warn};
 
 use crate::config::{Config, Flags};
@@ -24,12 +24,16 @@ pub struct Reloading {
 }
 
 impl Reloading {
-    /// Follows SIGHUP for as long as the process runs.
+    /// Catches SIGHUP from now on, which would else end the process.
     ///
     /// # Errors
     /// When the process may not handle signals.
-    pub fn follow(self, monitor: Monitor, started_with: Config) -> std::io::Result<()> {
-        let mut hangups = signal(SignalKind::hangup())?;
+    pub fn hangups() -> std::io::Result<Signal> {
+        signal(SignalKind::hangup())
+    }
+
+    /// Follows `hangups` for as long as the process runs.
+    pub fn follow(self, mut hangups: Signal, monitor: Monitor, started_with: Config) {
         let mut in_force = started_with;
         tokio::spawn(async move {
             while hangups.recv().await.is_some() {
@@ -41,7 +45,6 @@ impl Reloading {
                 }
             }
         });
-        Ok(())
     }
 
     /// Takes over what can be changed; the configuration in force afterwards.

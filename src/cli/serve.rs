@@ -100,8 +100,10 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
 /// # Errors
 /// Whatever keeps the service from starting.
 pub async fn serve(config: Config, reloading: Reloading) -> anyhow::Result<()> {
+    // Before anything is said to listen: whoever reads that may send it at once.
+    let hangups = Reloading::hangups()?;
     let running = start(config.clone(), stop_signal()?).await?;
-    reloading.follow(running.monitor.clone(), config)?;
+    reloading.follow(hangups, running.monitor.clone(), config);
     supervisor::ready(running.monitor);
     println!("modalwatch listens on http://{}", running.address);
     running.task.await.context("the service ended by a panic")

@@ -8,6 +8,8 @@ use crate::access::{Need, Scope};
 const OPEN: [&str; 6] = ["/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs"];
 /// Folders of files that need no token.
 const OPEN_FOLDERS: [&str; 2] = ["/assets/", "/docs/"];
+/// Methods that change something.
+const CHANGES: [Method; 4] = [Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
 /// Routes that take batches.
 const INGEST: [&str; 1] = ["/v1/structures/{id}/batches"];
 /// Below `/v1`: what shows or changes the service itself, and needs admin even to read.
@@ -47,7 +49,9 @@ pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
     let mut segments = pattern.trim_start_matches('/').split('/');
     let (version, collection, id) = (segments.next(), segments.next(), segments.next());
     let in_service = version == Some("v1") && collection.is_some_and(|c| SERVICE.contains(&c));
-    let need = if reads && open {
+    let changes = CHANGES.contains(method);
+    // A method that such a route does not take, TRACE say, is told so (405) rather than asked for a token.
+    let need = if open && !changes {
         Need::Nothing
     } else if reads && !in_service && (version == Some("v1") || pattern == "/metrics") {
         Need::Scope(Scope::Read)
@@ -67,8 +71,7 @@ pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
 
 /// Whether a request of this class belongs into the audit.
 pub fn is_change(method: &Method, class: Class) -> bool {
-    let changes = [Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
-    class.need == Need::Scope(Scope::Admin) && changes.contains(method)
+    class.need == Need::Scope(Scope::Admin) && CHANGES.contains(method)
 }
 
 #[cfg(test)]
