@@ -201,7 +201,9 @@ impl Fused {
         let context_gradient = &mut lane.context_gradient[..self.context.width() * count];
         context_gradient.fill(0.0);
         // ∂loss/∂z = z/M.
-        state.iter_mut().for_each(|z| *z *= share);
+        for z in state.iter_mut() {
+            *z *= share;
+        }
         let mut traces = lane.traces.iter().rev();
         for unit in self.units.iter().rev() {
             for net in unit.nets.iter().rev() {
@@ -218,7 +220,7 @@ impl Fused {
     }
 
     fn lane(&self) -> Lane {
-        let nets = self.units.iter().flat_map(|unit| &unit.nets);
+        let nets: Vec<&Net> = self.units.iter().flat_map(|unit| &unit.nets).collect();
         Lane {
             gradient: vec![0.0; self.weights.len()],
             loss: 0.0,
@@ -226,8 +228,8 @@ impl Fused {
             context_gradient: vec![0.0; self.context.width() * TILE],
             state: vec![0.0; self.dimensions * TILE],
             context_trace: self.context.trace(TILE),
-            traces: nets.clone().map(|net| net.trace(TILE)).collect(),
-            scratch: Net::scratch(nets, TILE),
+            traces: nets.iter().map(|net| net.trace(TILE)).collect(),
+            scratch: Net::scratch(&nets, TILE),
         }
     }
 }

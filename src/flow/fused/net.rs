@@ -71,8 +71,8 @@ impl Net {
     }
 
     /// Scratch that also a net of the other sizes can use.
-    pub(super) fn scratch<'a>(nets: impl Iterator<Item = &'a Net> + Clone, tile: usize) -> Scratch {
-        let largest = |size: fn(&Net) -> usize| vec![0.0; tile * nets.clone().map(size).max().unwrap_or(0)];
+    pub(super) fn scratch(nets: &[&Net], tile: usize) -> Scratch {
+        let largest = |size: fn(&Net) -> usize| vec![0.0; tile * nets.iter().map(|net| size(net)).max().unwrap_or(0)];
         Scratch {
             output: largest(|net| net.output.outputs),
             hidden: largest(|net| net.hidden.outputs),

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 /// Weights that are updated by one task.
-const AT_A_TIME: usize = 16_384;
+const AT_A_TIME: usize = 4_096;
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPSILON: f32 = 1e-8;
