@@ -29,7 +29,6 @@ type Piece = Box<dyn for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, ()> + 
 
 /// A piece of work that waits for its turn.
 struct Waiting {
-    number: u64,
     piece: Piece,
     caller: Caller,
 }
@@ -45,9 +44,9 @@ struct Done {
 
 #[derive(Default)]
 struct Queue {
-    /// Number of the next piece of work.
-    next: u64,
     waiting: VecDeque<Waiting>,
+    /// Whether a task works the queue off: one for all, since one for each would queue for the connection itself.
+    worked_off: bool,
 }
 
 /// The one connection that writes, and what waits for it.
@@ -84,16 +83,16 @@ impl Writer {
             })
         });
         let (caller, answer) = oneshot::channel();
-        let number = {
+        let idle = {
             let mut queue = self.lock();
-            queue.next += 1;
-            let number = queue.next;
-            queue.waiting.push_back(Waiting { number, piece, caller });
-            number
+            queue.waiting.push_back(Waiting { piece, caller });
+            !std::mem::replace(&mut queue.worked_off, true)
         };
-        let writer = Arc::clone(self);
-        // A task of its own, because axum drops handlers whose client is gone.
-        tokio::spawn(async move { writer.take_turn(number).await });
+        if idle {
+            let writer = Arc::clone(self);
+            // A task of its own, because axum drops handlers whose client is gone.
+            tokio::spawn(async move { writer.work_off().await });
+        }
         let writer = Arc::clone(self);
         async move {
             let result = match answer.await {
@@ -112,27 +111,29 @@ impl Writer {
         self.queue.lock().expect("no holder of this lock panics")
     }
 
-    /// Waits for the connection and does all that waits by then; nothing if an earlier turn has done it.
-    async fn take_turn(&self, number: u64) {
-        let connection = match self.pool.acquire().await {
-            Ok(connection) => connection,
-            Err(error) => {
+    /// Does all that waits, and what comes meanwhile, until nothing waits any more.
+    async fn work_off(&self) {
+        loop {
+            let connection = self.pool.acquire().await.map_err(Error::from);
+            // Now, not before: what came while the connection was waited for goes into the same transaction.
+            let together: Vec<Waiting> = {
                 let mut queue = self.lock();
-                if let Some(place) = queue.waiting.iter().position(|waiting| waiting.number == number) {
-                    if let Some(mine) = queue.waiting.remove(place) {
-                        answer(mine.caller, Err(error.into()));
+                if queue.waiting.is_empty() {
+                    queue.worked_off = false;
+                    return;
+                }
+                let count = queue.waiting.len().min(MOST_TOGETHER);
+                queue.waiting.drain(..count).collect()
+            };
+            match connection {
+                // A panic drops the callers, who take it for one; those behind them still have their turn.
+                Ok(connection) => drop(AssertUnwindSafe(self.write(connection, together)).catch_unwind().await),
+                Err(error) => {
+                    for waiting in together {
+                        answer(waiting.caller, Err(error.again()));
                     }
                 }
-                return;
             }
-        };
-        let together: Vec<Waiting> = {
-            let mut queue = self.lock();
-            let count = queue.waiting.len().min(MOST_TOGETHER);
-            queue.waiting.drain(..count).collect()
-        };
-        if !together.is_empty() {
-            self.write(connection, together).await;
         }
     }
 
