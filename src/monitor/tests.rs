@@ -96,14 +96,20 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
     for point in ["store::begin", "store::measurement", "store::commit", "store::committed", "store::read"] {
         // Once as an error, once as a panic, and as an error that stays until somebody mends it.
         for (action, stays) in [("1*return", false), ("1*panic", false), ("return", true)] {
-            for call in 0.. {
+            let (mut call, mut elsewhere) = (0, 0);
+            loop {
                 faults.set(point, &format!("{call}*off->{action}"));
                 let outcome = monitor.ingest(batch(number)).await;
                 let Err(error) = outcome else {
-                    // No call was left to fail.
-                    assert!(call >= 2, "{point} is called {call} times only");
                     faults.clear(point);
                     number += 1;
+                    if call < 2 {
+                        // What goes on with batches two seconds after an earlier fault has met this one.
+                        elsewhere += 1;
+                        assert!(elsewhere < 10, "{point} is called {call} times only");
+                        continue;
+                    }
+                    // No call was left to fail.
                     break;
                 };
                 assert!(matches!(error, Error::Store(_) | Error::Panicked), "{point} {action}: {error}");
@@ -115,6 +121,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
                 assert_eq!(taken.view.record.state, BatchState::Assessed, "{point} {action}, call {call}");
                 assert!(monitor.ingest(batch(number)).await.unwrap().replayed);
                 (number, failures) = (number + 1, failures + 1);
+                call += 1;
                 assert!(call < 50, "{point} never runs out");
             }
         }
