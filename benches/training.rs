@@ -1,5 +1,4 @@
-//! Speed of the flow against the arithmetic limit of the machine and against PyTorch, and accuracy against training time, in
-//! one run. `cargo bench --bench training`
+//! Speed of the flow against the arithmetic limit of the machine and against PyTorch, in one run. `cargo bench --bench training`
 //!
 //! PyTorch is timed by `benches/peers/flow.py` where the Python named by `MODALWATCH_PYTHON` (`python3` without it) has it.
 
@@ -10,17 +9,11 @@ use std::time::Instant;
 use candle_core::{DType, Device, Tensor};
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, Par};
-use modalwatch::baseline::library::Library;
-use modalwatch::baseline::observation::{Observation, DEFAULT_NOISE_RANGE};
-use modalwatch::baseline::train::train;
-use modalwatch::baseline::Baseline;
 use modalwatch::flow::fused::Fused;
 use modalwatch::flow::train::{train_by_candle, Pairs, TrainSettings};
 use modalwatch::flow::weights::untrained_flow;
 use modalwatch::flow::{Architecture, FlowSettings};
-use modalwatch::quantity::StructureId;
 use modalwatch::stats;
-use nalgebra::DMatrix;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
@@ -30,17 +23,12 @@ const STEPS: usize = 50;
 const READINGS: usize = 21;
 /// Measurements and draws of each in the bulk.
 const BULK: [usize; 2] = [50, 1_000];
-/// Repetitions of fifty structures that the hyperparameters are estimated from.
-const REPETITIONS: u64 = 30;
-const STRUCTURES: usize = 50;
-const DRAWS: usize = 10;
 
 fn main() {
     // As the program does at its start: candle on one thread, see `main.rs`.
     let _ = rayon::ThreadPoolBuilder::new().build_global();
     std::env::set_var("RAYON_NUM_THREADS", "1");
     speed();
-    accuracy();
 }
 
 /// Runs `work` on a pool of so many threads.
@@ -165,76 +153,4 @@ fn peer(threads: usize) -> Option<BTreeMap<String, f64>> {
     let found: BTreeMap<String, f64> =
         pairs.filter_map(|(name, value)| Some((name.to_owned(), value.parse().ok()?))).collect();
     (!found.is_empty()).then_some(found)
-}
-
-/// Case 1 of the paper: time of the whole training, its record included, and what it reaches.
-fn accuracy() {
-    let library = Library::open(None).expect("no folder is read");
-    let id = StructureId::parse("three-dof").expect("it is an id");
-    let shipped = library.get(&id).and_then(|entry| entry.baseline.clone()).expect("it is shipped");
-    println!("case 1, 10,000 samples: training with its record, held out, gross outliers, hyperparameters");
-    for (threads, epochs) in [(1, 100), (2, 200)] {
-        let settings = TrainSettings { epochs, ..TrainSettings::default() };
-        let start = Instant::now();
-        let trained = on(threads, || {
-            train(shipped.simulator(), 10_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {})
-        });
-        let took = start.elapsed().as_secs_f64();
-        let trained = trained.expect("it trains").baseline;
-        let held_out = &trained.manifest().validation;
-        let (outliers, draws) = gross_outliers(&trained);
-        println!(
-            "  {threads} thread(s), {epochs} epochs: {took:.1} s; {:.2} ± {:.2} nats; {outliers} of {draws} draws further than \
-             0.1 N/m from the truth; errors of mean and std {:.3} times those of the exact posterior",
-            held_out.negative_log_likelihood,
-            held_out.negative_log_likelihood_error,
-            hyperparameter_error_ratio(&trained)
-        );
-    }
-}
-
-fn observations(set: &modalwatch::simulator::TrainingSet) -> Vec<Observation> {
-    let row =
-        |index: usize| Observation::complete(&set.frequencies_hz.row(index).iter().copied().collect::<Vec<f64>>());
-    (0..set.frequencies_hz.nrows()).map(row).collect()
-}
-
-/// Single draws of noise-free measurements that lie further than 0.1 N/m from the truth in any parameter.
-fn gross_outliers(baseline: &Baseline) -> (usize, usize) {
-    let set = baseline.simulator().training_set(20_000, 99).expect("the prior holds no mechanism");
-    let samples = baseline.infer(&observations(&set), 1, 99).expect("all draws are finite, or this says which is not");
-    let far = |row: usize| {
-        (0..set.theta.ncols()).any(|column| (samples.column(column)[row] - set.theta[(row, column)]).abs() > 0.1)
-    };
-    ((0..set.theta.nrows()).filter(|row| far(*row)).count(), set.theta.nrows())
-}
-
-/// Root mean square error of the means and standard deviations of populations, over that of the true stiffnesses of the same
-/// structures: what the exact posterior of noise-free measurements gives.
-fn hyperparameter_error_ratio(baseline: &Baseline) -> f64 {
-    let [mut own, mut exact] = [0.0; 2];
-    for repetition in 0..REPETITIONS {
-        let mut stream = stats::stream(repetition, "population");
-        let space = baseline.space();
-        let (middle, spread): (Vec<f64>, Vec<f64>) =
-            space.iter().map(|p| (0.5 * (p.lower + p.upper), 0.08 * (p.upper - p.lower))).unzip();
-        let draw = |_: usize, column: usize| middle[column] + spread[column] * stream.sample::<f64, _>(StandardNormal);
-        let theta = DMatrix::from_fn(STRUCTURES, middle.len(), draw);
-        let frequencies = |row: nalgebra::RowDVector<f64>| {
-            baseline.simulator().frequencies_hz(row.as_slice()).expect("inside the prior")
-        };
-        let rows: Vec<Observation> =
-            theta.row_iter().map(|row| Observation::complete(&frequencies(row.into_owned()))).collect();
-        let samples = baseline.infer(&rows, DRAWS, repetition).expect("it infers");
-        for column in 0..middle.len() {
-            let width = space.iter().nth(column).map_or(1.0, |p| p.upper - p.lower);
-            let error = |values: &[f64]| {
-                let std = stats::sample_std(values).expect("fifty values");
-                ((stats::mean(values) - middle[column]) / width).powi(2) + ((std - spread[column]) / width).powi(2)
-            };
-            own += error(&samples.column(column));
-            exact += error(theta.column(column).as_slice());
-        }
-    }
-    (own / exact).sqrt()
 }
