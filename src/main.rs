@@ -2,9 +2,13 @@
 
 use std::process::ExitCode;
 
+// The C library's allocator keeps the memory of large bodies for the thread that read them, and ever more of it.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() -> ExitCode {
-    // candle splits even tiny products over its own thread pool, which costs more than it gains at our sizes (a training
-    // step takes 5.6 ms on one thread). It reads this variable at its first product; our own pool is made before.
+    // candle splits even tiny products over its own thread pool, which costs more than it gains at our sizes. It reads this
+    // variable at its first product; our own pool is made before.
     let _ = rayon::ThreadPoolBuilder::new().build_global();
     if std::env::var_os("RAYON_NUM_THREADS").is_none() {
         std::env::set_var("RAYON_NUM_THREADS", "1");

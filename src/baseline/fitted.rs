@@ -1,7 +1,7 @@
 //! Draws and densities of a flow that starts at the best fit, and what it is trained on; see [`super::start`].
 
 use candle_core::{DType, Device, Tensor};
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DMatrixView};
 use rayon::prelude::*;
 
 use super::observation::Observation;
@@ -9,6 +9,7 @@ use super::resample::Proposals;
 use super::start::{features, locate_all, Located};
 use super::{Baseline, InferenceError};
 use crate::flow::train::Pairs;
+use crate::parameter::Parameter;
 use crate::simulator::{Simulator, TrainingSet};
 use crate::stats;
 
@@ -99,13 +100,8 @@ impl Baseline {
         for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
             let located = self.locate(part)?;
             let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
-            let mut x = Vec::with_capacity(part.len() * each * d);
-            for (row, fit) in located.iter().enumerate() {
-                let first = (chunk * AT_A_TIME + row) * each;
-                let unit = DMatrix::from_fn(d, each, |k, draw| prior[k].to_unit(theta[(first + draw, k)]));
-                x.extend_from_slice(fit.to_flow(&unit).as_slice());
-            }
-            let x = Tensor::from_vec(x, (part.len() * each, d), &Device::Cpu)?.to_dtype(self.flow.dtype())?;
+            let x = to_flow(&located, prior, &theta.rows(chunk * AT_A_TIME * each, part.len() * each))?;
+            let x = x.to_dtype(self.flow.dtype())?;
             let shape = (part.len(), each, features(d));
             let repeated = context.unsqueeze(1)?.expand(shape)?.reshape((part.len() * each, features(d)))?;
             let log_q = self.flow.log_prob(&x, &repeated)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
@@ -125,19 +121,13 @@ pub(super) fn fitted_pairs(
     observations: &[Observation],
 ) -> Result<Pairs, InferenceError> {
     let prior = simulator.space().as_slice();
-    let d = prior.len();
-    let (mut x, mut y) = (Vec::with_capacity(set.theta.len()), Vec::new());
+    let (mut x, mut y) = (Vec::new(), Vec::new());
     for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
         let located = locate_all(simulator, part).map_err(|e| InferenceError::Simulation(e.to_string()))?;
-        for (row, fit) in located.iter().enumerate() {
-            let row = chunk * AT_A_TIME + row;
-            let unit = DMatrix::from_fn(d, 1, |k, _| prior[k].to_unit(set.theta[(row, k)]));
-            x.extend(fit.to_flow(&unit).iter().map(|x| *x as f32));
-        }
-        y.push(condition(&located, d)?.to_dtype(DType::F32)?);
+        x.push(to_flow(&located, prior, &set.theta.rows(chunk * AT_A_TIME, part.len()))?.to_dtype(DType::F32)?);
+        y.push(condition(&located, prior.len())?.to_dtype(DType::F32)?);
     }
-    let x = Tensor::from_vec(x, (observations.len(), d), &Device::Cpu)?;
-    Ok(Pairs { x, y: Tensor::cat(&y, 0)? })
+    Ok(Pairs { x: Tensor::cat(&x, 0)?, y: Tensor::cat(&y, 0)? })
 }
 
 /// Largest |u − u'| after x → z → x', u the position in the prior box.
@@ -153,18 +143,31 @@ pub(super) fn inverse_error_from_fit(
     let located = baseline.locate(observations)?;
     let context = condition(&located, prior.len())?.to_dtype(DType::F32)?;
     let unit = |row: usize| DMatrix::from_fn(prior.len(), 1, |k, _| prior[k].to_unit(theta[(row, k)]));
-    let x: Vec<f32> = located
-        .iter()
-        .enumerate()
-        .flat_map(|(row, fit)| fit.to_flow(&unit(row)).iter().map(|x| *x as f32).collect::<Vec<_>>())
-        .collect();
-    let x = Tensor::from_vec(x, (located.len(), prior.len()), &Device::Cpu)?;
+    let x = to_flow(&located, prior, &theta.as_view())?.to_dtype(DType::F32)?;
     let (z, _) = baseline.flow.forward(&x, &context)?;
     let back = baseline.flow.inverse(&z, &context)?.0.to_dtype(DType::F64)?.to_vec2::<f64>()?;
     let error = |(row, (x, fit)): (usize, (Vec<f64>, &Located))| {
         (fit.from_flow(&DMatrix::from_column_slice(x.len(), 1, &x)) - unit(row)).amax()
     };
     Ok(back.into_iter().zip(&located).enumerate().map(error).fold(0.0, f64::max))
+}
+
+/// Rows of `theta`, the same number for each fit and in their order, as the flow has them, `[rows, d]`, f64.
+///
+/// # Errors
+/// A candle error, which would be a bug.
+fn to_flow(
+    located: &[Located],
+    prior: &[Parameter],
+    theta: &DMatrixView<'_, f64>,
+) -> Result<Tensor, candle_core::Error> {
+    let (d, each) = (prior.len(), theta.nrows() / located.len().max(1));
+    let mut x = Vec::with_capacity(theta.len());
+    for (row, fit) in located.iter().enumerate() {
+        let unit = DMatrix::from_fn(d, each, |k, draw| prior[k].to_unit(theta[(row * each + draw, k)]));
+        x.extend_from_slice(fit.to_flow(&unit).as_slice());
+    }
+    Tensor::from_vec(x, (theta.nrows(), d), &Device::Cpu)
 }
 
 /// What the flow is told of each fit, `[n, features]`, f64.

@@ -158,7 +158,7 @@ pub fn train(
         let observations = observed(&training, "observations");
         let pairs = fitted_pairs(simulator, &training, &observations)?;
         let validation = fitted_pairs(simulator, &validation, &of_validation)?;
-        let epoch = |_| Ok(Pairs { x: pairs.x.clone(), y: pairs.y.clone() });
+        let epoch = |_| Ok(pairs.clone());
         crate::flow::train::train(&flow, &weights, samples, epoch, &validation, settings, on_epoch)?
     } else {
         let x = to_real_line(&training.theta, &space)?.to_dtype(DType::F32)?;

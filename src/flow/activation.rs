@@ -73,23 +73,33 @@ fn contiguous<'a, T>(values: &'a [T], layout: &Layout) -> Result<&'a [T]> {
 
 fn silu_f32(x: &[f32]) -> Vec<f32> {
     let mut result = x.to_vec();
-    pulp::Arch::new().dispatch(|| {
-        for x in &mut result {
-            *x *= sigmoid(*x);
-        }
-    });
+    silu_of(&mut result);
     result
 }
 
 fn silu_gradient_f32(x: &[f32], g: &[f32]) -> Vec<f32> {
-    let mut result = vec![0.0; x.len()];
-    pulp::Arch::new().dispatch(|| {
-        for ((y, x), g) in result.iter_mut().zip(x).zip(g) {
-            let sigmoid = sigmoid(*x);
-            *y = g * sigmoid * (1.0 + x * (1.0 - sigmoid));
-        }
-    });
+    let mut result = g.to_vec();
+    times_slope(&mut result, x);
     result
+}
+
+/// x ← silu(x).
+#[pulp::with_simd(silu_of = pulp::Arch::new())]
+#[inline(always)]
+fn silu_of_simd<S: pulp::Simd>(_: S, values: &mut [f32]) {
+    for x in values {
+        *x *= sigmoid(*x);
+    }
+}
+
+/// g ← g·silu′(x).
+#[pulp::with_simd(times_slope = pulp::Arch::new())]
+#[inline(always)]
+fn times_slope_simd<S: pulp::Simd>(_: S, gradient: &mut [f32], x: &[f32]) {
+    for (g, x) in gradient.iter_mut().zip(x) {
+        let sigmoid = sigmoid(*x);
+        *g *= sigmoid * (1.0 + x * (1.0 - sigmoid));
+    }
 }
 
 #[cfg(test)]

@@ -1,12 +1,15 @@
 //! What fused training and sampling are made of: products of a layer with a tile, and loops over its elements.
 //!
+//! The body of a loop is compiled once for each width of vectors (`pulp::with_simd`), and what the processor has is chosen at
+//! its call; a closure would not do, since what is not inlined is compiled for the least of them.
+//!
 //! A tile is a slice of single-precision numbers, column by column; a column is one row of the batch, or one draw. Weights
 //! lie row by row, as in candle's tensors and in the weight files.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
 
-use crate::stats::exp_f32;
+use crate::stats::{exp_f32, reciprocal_f32};
 
 /// W and b of a dense layer where they lie.
 #[derive(Clone, Copy)]
@@ -75,69 +78,91 @@ fn accumulation(add: bool) -> Accum {
 }
 
 /// v ← silu(v + b), column by column.
-pub(super) fn add_bias_and_silu(values: &mut [f32], bias: &[f32]) {
-    pulp::Arch::new().dispatch(|| {
-        for column in values.chunks_exact_mut(bias.len()) {
-            for (value, bias) in column.iter_mut().zip(bias) {
-                let x = *value + bias;
-                *value = x * sigmoid(x);
-            }
+#[pulp::with_simd(add_bias_and_silu = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn add_bias_and_silu_simd<S: pulp::Simd>(_: S, values: &mut [f32], bias: &[f32]) {
+    for column in values.chunks_exact_mut(bias.len()) {
+        for (value, bias) in column.iter_mut().zip(bias) {
+            let x = *value + bias;
+            *value = x * sigmoid(x);
         }
-    });
+    }
 }
 
 /// As [`add_bias_and_silu`], with the derivative silu′(v + b) into `slopes`.
-pub(super) fn add_bias_and_silu_with_slopes(values: &mut [f32], bias: &[f32], slopes: &mut [f32]) {
-    pulp::Arch::new().dispatch(|| {
-        let width = bias.len();
-        for (column, slopes) in values.chunks_exact_mut(width).zip(slopes.chunks_exact_mut(width)) {
-            for ((value, slope), bias) in column.iter_mut().zip(slopes).zip(bias) {
-                let x = *value + bias;
-                let sigmoid = sigmoid(x);
-                *value = x * sigmoid;
-                *slope = sigmoid * (1.0 + x * (1.0 - sigmoid));
-            }
+#[pulp::with_simd(add_bias_and_silu_with_slopes = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn add_bias_and_silu_with_slopes_simd<S: pulp::Simd>(
+    _: S,
+    values: &mut [f32],
+    bias: &[f32],
+    slopes: &mut [f32],
+) {
+    let width = bias.len();
+    for (column, slopes) in values.chunks_exact_mut(width).zip(slopes.chunks_exact_mut(width)) {
+        for ((value, slope), bias) in column.iter_mut().zip(slopes).zip(bias) {
+            let x = *value + bias;
+            let sigmoid = sigmoid(x);
+            *value = x * sigmoid;
+            *slope = sigmoid * (1.0 + x * (1.0 - sigmoid));
         }
-    });
+    }
 }
 
 /// d ← d ⊙ slope; the sum of the columns is added to the gradient of the bias.
-pub(super) fn through_slopes(gradient: &mut [f32], slopes: &[f32], bias_gradient: &mut [f32]) {
-    pulp::Arch::new().dispatch(|| {
-        let width = bias_gradient.len();
-        for (column, slopes) in gradient.chunks_exact_mut(width).zip(slopes.chunks_exact(width)) {
-            for ((value, slope), sum) in column.iter_mut().zip(slopes).zip(bias_gradient.iter_mut()) {
-                *value *= slope;
-                *sum += *value;
-            }
+#[pulp::with_simd(through_slopes = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn through_slopes_simd<S: pulp::Simd>(
+    _: S,
+    gradient: &mut [f32],
+    slopes: &[f32],
+    bias_gradient: &mut [f32],
+) {
+    let width = bias_gradient.len();
+    for (column, slopes) in gradient.chunks_exact_mut(width).zip(slopes.chunks_exact(width)) {
+        for ((value, slope), sum) in column.iter_mut().zip(slopes).zip(bias_gradient.iter_mut()) {
+            *value *= slope;
+            *sum += *value;
         }
-    });
+    }
 }
 
 /// Adds the sum of the columns of `gradient` to that of the bias.
 pub(super) fn add_bias_gradient(gradient: &[f32], bias_gradient: &mut [f32]) {
     for column in gradient.chunks_exact(bias_gradient.len()) {
-        for (sum, value) in bias_gradient.iter_mut().zip(column) {
-            *sum += value;
-        }
+        add(bias_gradient, column);
+    }
+}
+
+/// a ← a + b.
+#[inline]
+pub(super) fn add(a: &mut [f32], b: &[f32]) {
+    a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+}
+
+/// s ← α·tanh(s/α), and exp(`sign`·s) into `factors`.
+#[pulp::with_simd(bounded_scales = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn bounded_scales_simd<S: pulp::Simd>(_: S, scales: &mut [f32], factors: &mut [f32], clamp: f32, sign: f32) {
+    for (scale, factor) in scales.iter_mut().zip(factors) {
+        *scale = clamp * tanh(*scale / clamp);
+        *factor = exp_f32(sign * *scale);
     }
 }
 
 /// 1 / (1 + exp(−x)).
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
 pub(super) fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exp_f32(-x))
+    reciprocal_f32(1.0 + exp_f32(-x))
 }
 
 /// tanh x = (1 − e^(−2|x|)) / (1 + e^(−2|x|)) with the sign of x; the odd series below 0.1, where the difference loses digits.
 #[inline(always)]
-#[expect(clippy::inline_always, reason = "inside a dispatched loop, where a call would end vectorisation")]
-pub(super) fn tanh(x: f32) -> f32 {
+fn tanh(x: f32) -> f32 {
     let square = x * x;
     let series = x * (1.0 - square * (1.0 / 3.0 - square * (2.0 / 15.0 - square * (17.0 / 315.0))));
     let decay = exp_f32(-2.0 * x.abs());
-    let quotient = ((1.0 - decay) / (1.0 + decay)).copysign(x);
+    let quotient = ((1.0 - decay) * reciprocal_f32(1.0 + decay)).copysign(x);
     if square < 0.01 {
         series
     } else {

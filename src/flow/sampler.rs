@@ -11,9 +11,8 @@ use rayon::prelude::*;
 
 use super::coupling::Subnet;
 use super::dense::Dense;
-use super::kernel::{add_bias_and_silu, tanh, Layer};
+use super::kernel::{add_bias_and_silu, bounded_scales, Layer};
 use super::Flow;
-use crate::stats::exp_f32;
 
 /// Draws that pass the flow together: with width 64, the buffers of a tile fill half of a core's first-level cache.
 const TILE: usize = 64;
@@ -49,6 +48,8 @@ struct Buffers {
     input: Vec<f32>,
     hidden: Vec<f32>,
     output: Vec<f32>,
+    scales: Vec<f32>,
+    factors: Vec<f32>,
 }
 
 impl Sampler {
@@ -115,6 +116,8 @@ impl Sampler {
             input: buffer(width),
             hidden: buffer(width),
             output: buffer(2 * self.dimensions),
+            scales: buffer(self.dimensions),
+            factors: buffer(self.dimensions),
         }
     }
 }
@@ -167,12 +170,20 @@ impl Net {
         add_bias_and_silu(second, hidden.bias);
         let scale_and_shift = &mut buffers.output[..2 * active * count];
         output.product(second, scale_and_shift, false);
+        let scales = &mut buffers.scales[..active * count];
+        for (own, scales) in scale_and_shift.chunks_exact(2 * active).zip(scales.chunks_exact_mut(active)) {
+            for ((scale, own), bias) in scales.iter_mut().zip(own).zip(output.bias) {
+                *scale = own + bias;
+            }
+        }
+        let factors = &mut buffers.factors[..active * count];
+        bounded_scales(scales, factors, self.clamp, -1.0);
         let columns = scale_and_shift.chunks_exact(2 * active).zip(state.chunks_exact_mut(dimensions));
-        for ((own, state), log_det) in columns.zip(log_det) {
+        let scales = scales.chunks_exact(active).zip(factors.chunks_exact(active));
+        for (((own, state), (scales, factors)), log_det) in columns.zip(scales).zip(log_det) {
             for (row, value) in state[self.active.clone()].iter_mut().enumerate() {
-                let scale = self.clamp * tanh((own[row] + output.bias[row]) / self.clamp);
-                *value = (*value - own[active + row] - output.bias[active + row]) * exp_f32(-scale);
-                *log_det += scale;
+                *value = (*value - own[active + row] - output.bias[active + row]) * factors[row];
+                *log_det += scales[row];
             }
         }
     }

@@ -118,22 +118,6 @@ pub fn train(
     }
 }
 
-/// As [`train`], by candle's own gradients whatever the precision: the reference that the fused way is measured against.
-///
-/// # Errors
-/// As [`train`].
-pub fn train_by_candle(
-    flow: &Flow,
-    weights: &Weights,
-    rows: usize,
-    training: impl FnMut(usize) -> Result<Pairs, candle_core::Error>,
-    validation: &Pairs,
-    settings: &TrainSettings,
-    on_epoch: impl FnMut(EpochReport),
-) -> Result<TrainOutcome, Error> {
-    run(ByCandle::new(flow, weights)?, rows, training, validation, settings, on_epoch)
-}
-
 /// A way to lower the loss.
 trait Descent {
     /// Pairs as this way reads them.
@@ -276,8 +260,11 @@ impl Descent for ByCandle<'_> {
     }
 }
 
-/// Mean of ½|z|² − log|det ∂z/∂x| over the rows.
-fn mean_loss(flow: &Flow, x: &Tensor, y: &Tensor) -> Result<Tensor, candle_core::Error> {
+/// Mean of ½|z|² − log|det ∂z/∂x| over the rows, nats, with candle's gradient: the reference of [`super::fused`].
+///
+/// # Errors
+/// A candle error when shapes do not fit.
+pub fn mean_loss(flow: &Flow, x: &Tensor, y: &Tensor) -> Result<Tensor, candle_core::Error> {
     let (z, log_det) = flow.forward(x, &flow.summarise(y)?)?;
     ((z.sqr()?.sum(D::Minus1)? * 0.5)? - log_det)?.mean(0)
 }

@@ -8,7 +8,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::Row as _;
 
 use super::assessment::{kind_of, IS_CURRENT};
-use super::plotted::Plotted;
+use super::plotted::{trust_values, Plotted};
 use super::series::{bounds, Extent, QuantityMark, QuantitySeries, SeriesWindow, TrustMark};
 use super::{bad_row, Error, Store};
 use crate::damage::QuantityKind;
@@ -185,8 +185,7 @@ impl Store {
             sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
         while let Some(row) = rows.try_next().await? {
             let trust = TrustColumn::of(row.try_get_unchecked(2)?)?;
-            let rejected = if trust.verdict == Verdict::Rejected { 1.0 } else { 0.0 };
-            let values = [trust.p_value.unwrap_or(f64::NAN), rejected, trust.findings.len() as f64];
+            let values = trust_values(trust.p_value, trust.verdict, trust.findings.len());
             let batch = || row.try_get_unchecked(1);
             tracks.trust.try_push(row.try_get_unchecked(0)?, &values, batch).map_err(sqlx_error)?;
         }

@@ -11,10 +11,15 @@ const OF_TRUST: usize = 3;
 /// Values of a quantity: mean, the ends of its interval, probability of damage, the ends of its interval.
 const OF_A_QUANTITY: usize = 6;
 
+/// P-value, 1 for rejected, number of findings; NaN stands for a p-value that is not there.
+pub(super) fn trust_values(p_value: Option<f64>, verdict: Verdict, findings: usize) -> [f64; OF_TRUST] {
+    let rejected = if verdict == Verdict::Rejected { 1.0 } else { 0.0 };
+    [p_value.unwrap_or(f64::NAN), rejected, findings as f64]
+}
+
 /// The column of an assessment; NaN stands for a value that is not there.
 pub(super) fn pack(a: &Assessment) -> Vec<u8> {
-    let rejected = if a.trust.verdict == Verdict::Rejected { 1.0 } else { 0.0 };
-    let trust = [a.trust.p_value.unwrap_or(f64::NAN), rejected, a.trust.findings.len() as f64];
+    let trust = trust_values(a.trust.p_value, a.trust.verdict, a.trust.findings.len());
     let ends = |interval: Option<[f64; 2]>| interval.unwrap_or([f64::NAN; 2]);
     let quantities = a.quantities.iter().flat_map(|q| {
         let [mean_low, mean_high] = ends(q.mean_interval);
@@ -49,7 +54,7 @@ impl<'a> Plotted<'a> {
         }
     }
 
-    /// P-value, 1 for rejected, number of findings.
+    /// As [`trust_values`].
     pub(super) fn trust(&self) -> [f64; OF_TRUST] {
         std::array::from_fn(|i| f64::from_le_bytes(self.values[i]))
     }

@@ -1,9 +1,8 @@
 //! The context network on a tile, there and back.
 
 use super::layout::{Layout, Place};
-use super::net::add;
 use crate::flow::context::KERNEL;
-use crate::flow::kernel::{add_bias_and_silu_with_slopes, add_weight_gradient, through_slopes};
+use crate::flow::kernel::{add, add_bias_and_silu_with_slopes, add_weight_gradient, through_slopes};
 use crate::flow::Architecture;
 
 /// The context network: two convolutions and a dense layer, beside the shortcut; or the shortcut alone.

@@ -157,7 +157,9 @@ impl Fused {
         let count = lanes(chosen.len());
         own[..count].par_iter_mut().enumerate().for_each(|(index, lane)| {
             lane.loss = 0.0;
-            lane.gradient.fill(0.0);
+            if back {
+                lane.gradient.fill(0.0);
+            }
             for tile in tiles.iter().skip(index).step_by(count) {
                 self.tile(rows, tile, back.then_some(share), lane);
             }

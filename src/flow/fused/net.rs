@@ -4,9 +4,8 @@ use std::ops::Range;
 
 use super::layout::{Layout, Place};
 use crate::flow::kernel::{
-    add_bias_and_silu_with_slopes, add_bias_gradient, add_weight_gradient, tanh, through_slopes,
+    add, add_bias_and_silu_with_slopes, add_bias_gradient, add_weight_gradient, bounded_scales, through_slopes,
 };
-use crate::stats::exp_f32;
 
 /// A subnet and what it does to the state: the rows `active` are scaled and shifted by functions of the rows `passive` and
 /// of the context.
@@ -32,12 +31,12 @@ pub(super) struct Trace {
     first_slopes: Vec<f32>,
     second: Vec<f32>,
     second_slopes: Vec<f32>,
-    /// s̃ over t, then s over t.
+    /// s̃ over t, less their biases.
     output: Vec<f32>,
-    /// The active rows before, exp(s), and ds/ds̃.
+    /// The active rows before, s, and exp(s).
     before: Vec<f32>,
     scales: Vec<f32>,
-    clamp_slopes: Vec<f32>,
+    factors: Vec<f32>,
 }
 
 /// Gradients on their way through a net, for one tile; shared by all nets.
@@ -66,7 +65,7 @@ impl Net {
             output: buffer(2 * active),
             before: buffer(active),
             scales: buffer(active),
-            clamp_slopes: buffer(active),
+            factors: buffer(active),
         }
     }
 
@@ -110,27 +109,24 @@ impl Net {
         let scale_and_shift = &mut trace.output[..2 * active * count];
         output.product(second, scale_and_shift, false);
 
-        let (before, scales) = (&mut trace.before[..active * count], &mut trace.scales[..active * count]);
-        let clamp_slopes = &mut trace.clamp_slopes[..active * count];
-        let mut log_det = 0.0;
-        for (column, own) in scale_and_shift.chunks_exact_mut(2 * active).enumerate() {
-            let state = &mut state[column * dimensions..][self.active.clone()];
-            let at = column * active..(column + 1) * active;
-            let (before, scales) = (&mut before[at.clone()], &mut scales[at.clone()]);
-            let slopes = &mut clamp_slopes[at];
-            let mut sum = 0.0;
-            for row in 0..active {
-                let bounded = tanh((own[row] + output.bias[row]) / self.clamp);
-                let scale = self.clamp * bounded;
-                before[row] = state[row];
-                scales[row] = exp_f32(scale);
-                slopes[row] = 1.0 - bounded * bounded;
-                state[row] = state[row] * scales[row] + own[active + row] + output.bias[active + row];
-                sum += scale;
+        let scales = &mut trace.scales[..active * count];
+        for (own, scales) in scale_and_shift.chunks_exact(2 * active).zip(scales.chunks_exact_mut(active)) {
+            for ((scale, own), bias) in scales.iter_mut().zip(own).zip(output.bias) {
+                *scale = own + bias;
             }
-            log_det += f64::from(sum);
         }
-        log_det
+        let factors = &mut trace.factors[..active * count];
+        bounded_scales(scales, factors, self.clamp, 1.0);
+        let columns = scale_and_shift.chunks_exact(2 * active).zip(state.chunks_exact_mut(dimensions));
+        let kept = trace.before.chunks_exact_mut(active).zip(factors.chunks_exact(active));
+        for ((own, state), (before, factors)) in columns.zip(kept) {
+            let state = &mut state[self.active.clone()];
+            before.copy_from_slice(state);
+            for (row, value) in state.iter_mut().enumerate() {
+                *value = *value * factors[row] + own[active + row] + output.bias[active + row];
+            }
+        }
+        scales.iter().map(|scale| f64::from(*scale)).sum()
     }
 
     /// The gradient of the loss by the state after this net becomes that by the state before; the gradient by the context is
@@ -157,9 +153,10 @@ impl Net {
             let state = &mut state_gradient[column * dimensions..][self.active.clone()];
             for row in 0..active {
                 let at = column * active + row;
-                let scaled = state[row] * trace.scales[at];
+                let scaled = state[row] * trace.factors[at];
+                let bounded = trace.scales[at] / self.clamp;
                 own[active + row] = state[row];
-                own[row] = (scaled * trace.before[at] - share) * trace.clamp_slopes[at];
+                own[row] = (scaled * trace.before[at] - share) * (1.0 - bounded * bounded);
                 state[row] = scaled;
             }
         }
@@ -183,9 +180,4 @@ impl Net {
             add(context, &own[passive..]);
         }
     }
-}
-
-/// a ← a + b.
-pub(super) fn add(a: &mut [f32], b: &[f32]) {
-    a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
 }

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::flow::kernel::add;
+
 /// Weights that are updated by one task.
 const AT_A_TIME: usize = 4_096;
 const BETA_1: f32 = 0.9;
@@ -35,16 +37,29 @@ impl AdamW {
             let place = chunk * AT_A_TIME..chunk * AT_A_TIME + weights.len();
             let mut sum = [0.0; AT_A_TIME];
             let sum = &mut sum[..weights.len()];
-            pulp::Arch::new().dispatch(|| {
-                for gradient in gradients {
-                    sum.iter_mut().zip(&gradient[place.clone()]).for_each(|(sum, own)| *sum += own);
-                }
-                for (((weight, gradient), first), second) in weights.iter_mut().zip(&*sum).zip(first).zip(second) {
-                    *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
-                    *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
-                    *weight -= of_first * *first / ((*second * of_second).sqrt() + EPSILON);
-                }
-            });
+            for gradient in gradients {
+                add(sum, &gradient[place.clone()]);
+            }
+            update(weights, sum, first, second, of_first, of_second);
         });
+    }
+}
+
+/// w, m and v of the next step; `of_first` is η/(1 − β₁ᵗ), `of_second` 1/(1 − β₂ᵗ).
+#[pulp::with_simd(update = pulp::Arch::new())]
+#[inline(always)]
+fn update_simd<S: pulp::Simd>(
+    _: S,
+    weights: &mut [f32],
+    gradient: &[f32],
+    first: &mut [f32],
+    second: &mut [f32],
+    of_first: f32,
+    of_second: f32,
+) {
+    for (((weight, gradient), first), second) in weights.iter_mut().zip(gradient).zip(first).zip(second) {
+        *first = BETA_1 * *first + (1.0 - BETA_1) * gradient;
+        *second = BETA_2 * *second + (1.0 - BETA_2) * gradient * gradient;
+        *weight -= of_first * *first / ((*second * of_second).sqrt() + EPSILON);
     }
 }

@@ -1,10 +1,11 @@
 //! The fused way against candle's, in double precision.
 
-use candle_core::{DType, Device, Tensor, D};
+use candle_core::{DType, Device, Tensor};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 use super::*;
+use crate::flow::train::mean_loss;
 use crate::flow::weights::untrained_flow;
 use crate::flow::FlowSettings;
 use crate::stats;
@@ -61,8 +62,7 @@ fn loss_and_gradient_are_those_of_candle() {
         let loss = fused.pass(&data, &chosen, true);
 
         let flow = &case.double.0;
-        let (z, log_det) = flow.forward(&double.x, &flow.summarise(&double.y).unwrap()).unwrap();
-        let expected = ((z.sqr().unwrap().sum(D::Minus1).unwrap() * 0.5).unwrap() - log_det).unwrap().mean(0).unwrap();
+        let expected = mean_loss(flow, &double.x, &double.y).unwrap();
         let gradients = expected.backward().unwrap();
         let expected: f64 = expected.to_scalar().unwrap();
         assert!(
@@ -98,8 +98,7 @@ fn the_optimiser_takes_the_steps_of_candles() {
     let flow = &case.double.0;
     for step in 0..20 {
         let found = fused.step(&data, &chosen, 1e-3);
-        let (z, log_det) = flow.forward(&double.x, &flow.summarise(&double.y).unwrap()).unwrap();
-        let loss = ((z.sqr().unwrap().sum(D::Minus1).unwrap() * 0.5).unwrap() - log_det).unwrap().mean(0).unwrap();
+        let loss = mean_loss(flow, &double.x, &double.y).unwrap();
         reference.backward_step(&loss).unwrap();
         let expected: f64 = loss.to_scalar().unwrap();
         // A step is η·g/|g| at first: a gradient that is nearly zero may go either way, which the loss hardly sees.

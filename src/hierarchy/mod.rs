@@ -10,11 +10,14 @@
 //! The pool of all samples counts the noise twice, once in where each posterior sits and once in its width; here it
 //! counts not at all. Source: Hogg, Myers & Bovy (2010).
 
+mod kernel;
+
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::{ChiSquared, Gamma, StandardNormal};
 use rayon::prelude::*;
 
+use self::kernel::{exponentials, moments, weigh, Weighed};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, Stream};
@@ -25,10 +28,10 @@ pub const INTERVAL: f64 = 0.90;
 /// Draws of (μ, σ) that are kept.
 pub const DRAWS: usize = 400;
 
-/// Sweeps of the sampler for each draw that is kept, and before the first: neighbours are correlated, the more so the
-/// more noise hides of the spread.
-const THINNING: usize = 2;
+/// Sweeps of the sampler before the first draw that is kept, and for each that is kept where noise hides much of the spread:
+/// there neighbours are correlated.
 const BURN_IN: usize = 40;
+const THINNING_OF_NOISY: usize = 2;
 
 /// Share of the spread between measurements that the posterior of one must have for the noise to matter.
 const NOISY: f64 = 0.3;
@@ -171,12 +174,13 @@ pub fn populations(
     let mut state = point.clone();
     let (mut means, mut stds) =
         (vec![Vec::with_capacity(DRAWS); dimension], vec![Vec::with_capacity(DRAWS); dimension]);
-    for sweep in 0..BURN_IN + DRAWS * THINNING {
+    let thinning = if problem.noisy { THINNING_OF_NOISY } else { 1 };
+    for sweep in 0..BURN_IN + DRAWS * thinning {
         problem.sweep(&mut state, &mut stream);
-        if problem.noisy && sweep % 2 == 0 {
+        if problem.noisy && sweep.is_multiple_of(2) {
             problem.collapsed(&mut state, &mut stream);
         }
-        if sweep >= BURN_IN && (sweep - BURN_IN).is_multiple_of(THINNING) {
+        if sweep >= BURN_IN && (sweep - BURN_IN).is_multiple_of(thinning) {
             for column in 0..dimension {
                 means[column].push(to_units(column, state.mean[column]));
                 stds[column].push(state.std[column] * width(column));
@@ -317,11 +321,14 @@ struct State {
     std: Vec<f64>,
 }
 
-/// Samples in the unit box, `[column][measurement·draws + draw]`.
+/// Samples in the unit box.
 struct Problem {
-    columns: Vec<Vec<f64>>,
-    /// Logarithms of the weights that the samples have by themselves.
-    offsets: Vec<f64>,
+    /// Mean of the samples of each measurement, `[measurement·parameters + parameter]`.
+    centres: Vec<f64>,
+    /// What each sample lies off that, `[parameter][measurement·draws + draw]`.
+    deviations: Vec<Vec<f32>>,
+    /// Logarithms of the weights that the samples have by themselves, the greatest of each measurement 0.
+    offsets: Vec<f32>,
     measurements: usize,
     draws: usize,
     /// Least σ of each column that the samples can resolve.
@@ -347,65 +354,66 @@ impl Problem {
             (column.chunks(draws).map(variance).sum::<f64>() / samples.measurements() as f64).sqrt()
         };
         let within: Vec<f64> = columns.iter().map(within).collect();
-        let spread = |column: &Vec<f64>| stats::sample_std(&column.chunks(draws).map(stats::mean).collect::<Vec<_>>());
-        let hides = |(column, within): (&Vec<f64>, &f64)| spread(column).is_none_or(|spread| *within > NOISY * spread);
-        let noisy = columns.iter().zip(&within).any(hides);
+        let means = |column: &Vec<f64>| -> Vec<f64> { column.chunks(draws).map(stats::mean).collect() };
+        let means: Vec<Vec<f64>> = columns.iter().map(means).collect();
+        let hides =
+            |(means, within): (&Vec<f64>, &f64)| stats::sample_std(means).is_none_or(|spread| *within > NOISY * spread);
+        let noisy = means.iter().zip(&within).any(hides);
         // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
         let floor = within.iter().map(|within| (0.25 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
-        let offsets = log_weights.map_or_else(|| vec![0.0; samples.theta().nrows()], <[f64]>::to_vec);
-        Self { columns, offsets, measurements: samples.measurements(), draws, floor, within, noisy }
+        let off_centre = |(column, means): (&Vec<f64>, &Vec<f64>)| {
+            let of_one = column.chunks(draws).zip(means);
+            of_one.flat_map(|(chunk, centre)| chunk.iter().map(move |x| (x - centre) as f32)).collect()
+        };
+        let deviations = columns.iter().zip(&means).map(off_centre).collect();
+        let relative = |weights: &[f64]| {
+            let largest = weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            weights.iter().map(|w| (w - largest) as f32).collect::<Vec<f32>>()
+        };
+        let offsets = log_weights
+            .map_or_else(|| vec![0.0; samples.theta().nrows()], |w| w.chunks(draws).flat_map(relative).collect());
+        let measurements = samples.measurements();
+        let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
+        Self { centres, deviations, offsets, measurements, draws, floor, within, noisy }
     }
 
-    /// Normalised weights of the samples of one measurement under a population.
-    fn weights(&self, measurement: usize, state: &State, weights: &mut [f64]) {
-        weights.copy_from_slice(&self.offsets[measurement * self.draws..(measurement + 1) * self.draws]);
-        for (k, column) in self.columns.iter().enumerate() {
-            let (mean, precision) = (state.mean[k], 0.5 / state.std[k].powi(2));
-            let samples = &column[measurement * self.draws..(measurement + 1) * self.draws];
-            pulp::Arch::new().dispatch(|| {
-                for (weight, x) in weights.iter_mut().zip(samples) {
-                    *weight -= precision * (x - mean) * (x - mean);
-                }
-            });
-        }
-        let largest = weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        pulp::Arch::new().dispatch(|| {
-            for weight in weights.iter_mut() {
-                *weight = f64::from(stats::exp_f32((*weight - largest) as f32));
-            }
-        });
-        let sum: f64 = weights.iter().sum();
-        for weight in weights.iter_mut() {
-            *weight /= sum;
-        }
+    fn centres(&self, measurement: usize) -> &[f64] {
+        let d = self.deviations.len();
+        &self.centres[measurement * d..(measurement + 1) * d]
+    }
+
+    /// Weights of the samples of one measurement under a population.
+    fn weights(&self, measurement: usize, state: &State, weights: &mut [f32]) -> Weighed {
+        let rows = measurement * self.draws..(measurement + 1) * self.draws;
+        weights.copy_from_slice(&self.offsets[rows.clone()]);
+        weigh(weights, &self.deviations, rows, self.centres(measurement), &state.mean, &state.std)
     }
 
     fn maximise(&self) -> State {
-        let n = self.measurements as f64;
-        let start = |(column, floor): (&Vec<f64>, &f64)| {
-            let means: Vec<f64> = column.chunks(self.draws).map(stats::mean).collect();
+        let (n, d) = (self.measurements as f64, self.deviations.len());
+        let start = |k: usize| {
+            let means: Vec<f64> = self.centres.iter().skip(k).step_by(d).copied().collect();
             let std = stats::sample_std(&means).unwrap_or(WIDEST);
-            (stats::mean(&means), std.clamp(*floor, WIDEST))
+            (stats::mean(&means), std.clamp(self.floor[k], WIDEST))
         };
-        let (mean, std) = self.columns.iter().zip(&self.floor).map(start).unzip();
+        let (mean, std) = (0..d).map(start).unzip();
         let mut state = State { mean, std };
         let mut weights = vec![0.0; self.draws];
         for _ in 0..EM_ITERATIONS {
-            let mut sums = vec![(0.0, 0.0, 0.0); self.columns.len()];
+            let mut sums = vec![(0.0, 0.0, 0.0); d];
             for measurement in 0..self.measurements {
-                self.weights(measurement, &state, &mut weights);
-                for (k, column) in self.columns.iter().enumerate() {
-                    let samples = &column[measurement * self.draws..(measurement + 1) * self.draws];
-                    let (mut first, mut second) = (0.0, 0.0);
-                    for (weight, x) in weights.iter().zip(samples) {
-                        // About the last mean: differences of large squares would lose a small spread.
-                        let deviation = x - state.mean[k];
-                        first += weight * deviation;
-                        second += weight * deviation * deviation;
-                    }
-                    sums[k].0 += first;
-                    sums[k].1 += second;
-                    sums[k].2 += (second - first * first).max(0.0);
+                let sum = self.weights(measurement, &state, &mut weights).sum;
+                let rows = measurement * self.draws..(measurement + 1) * self.draws;
+                for ((deviations, centre), (k, sums)) in
+                    self.deviations.iter().zip(self.centres(measurement)).zip(sums.iter_mut().enumerate())
+                {
+                    let (first, second) = moments(&weights, &deviations[rows.clone()]);
+                    let (first, second) = (first / sum, second / sum);
+                    // About the last mean: differences of large squares would lose a small spread.
+                    let off = centre - state.mean[k];
+                    sums.0 += off + first;
+                    sums.1 += second + 2.0 * off * first + off * off;
+                    sums.2 += (second - first * first).max(0.0);
                 }
             }
             let mut moved = 0.0_f64;
@@ -429,51 +437,35 @@ impl Problem {
     fn effective_sample_size(&self, state: &State) -> f64 {
         let mut weights = vec![0.0; self.draws];
         let mut one = |measurement: usize| {
-            self.weights(measurement, state, &mut weights);
-            1.0 / weights.iter().map(|w| w * w).sum::<f64>()
+            let sum = self.weights(measurement, state, &mut weights).sum;
+            sum * sum / weights.iter().map(|w| f64::from(w * w)).sum::<f64>()
         };
         (0..self.measurements).map(&mut one).sum::<f64>() / self.measurements as f64
     }
 
-    /// ln L(μ, σ) up to a constant, from the exponents of all samples.
-    fn log_likelihood(&self, exponents: &[f64], state: &State) -> f64 {
-        let one = |exponents: &[f64]| {
-            let largest = exponents.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            let mut sum = 0.0_f32;
-            pulp::Arch::new().dispatch(|| {
-                // Sixteen partial sums: one after the other, additions would wait for each other.
-                let mut partial = [0.0_f32; 16];
-                let (blocks, rest) = exponents.as_chunks::<16>();
-                for block in blocks {
-                    for (partial, exponent) in partial.iter_mut().zip(block) {
-                        *partial += stats::exp_f32((exponent - largest) as f32);
-                    }
-                }
-                sum = partial.iter().sum::<f32>()
-                    + rest.iter().map(|e| stats::exp_f32((e - largest) as f32)).sum::<f32>();
-            });
-            largest + f64::from(sum).ln()
-        };
-        let likelihood: f64 = exponents.chunks(self.draws).map(one).sum();
-        likelihood - self.measurements as f64 * state.std.iter().map(|std| std.ln()).sum::<f64>()
-    }
-
-    /// Adds `sign` times the exponent of one parameter.
-    fn add_exponent(&self, exponents: &mut [f64], k: usize, state: &State, sign: f64) {
-        let (mean, precision) = (state.mean[k], sign * 0.5 / state.std[k].powi(2));
-        pulp::Arch::new().dispatch(|| {
-            for (exponent, x) in exponents.iter_mut().zip(&self.columns[k]) {
-                *exponent -= precision * (x - mean) * (x - mean);
+    /// ln L(μ, σ) up to a constant.
+    fn log_likelihood(&self, state: &State) -> f64 {
+        let mut weights = vec![0.0; self.draws];
+        // One logarithm for many measurements: the product of their sums, each from 1 to the number of draws.
+        let (mut likelihood, mut product) = (0.0, 1.0_f64);
+        for measurement in 0..self.measurements {
+            let weighed = self.weights(measurement, state, &mut weights);
+            let population = self.centres(measurement).iter().zip(&state.mean).zip(&state.std);
+            let of_centre: f64 = population.map(|((c, mean), std)| ((c - mean) / std).powi(2)).sum();
+            likelihood += f64::from(weighed.largest) - 0.5 * of_centre;
+            product *= weighed.sum;
+            if product > 1e200 {
+                likelihood += product.ln();
+                product = 1.0;
             }
-        });
+        }
+        likelihood + product.ln() - self.measurements as f64 * state.std.iter().map(|std| std.ln()).sum::<f64>()
     }
 
     /// One Metropolis step for each parameter on the likelihood with all samples in it.
     fn collapsed(&self, state: &mut State, stream: &mut Stream) {
-        let mut exponents = self.offsets.clone();
-        (0..self.columns.len()).for_each(|k| self.add_exponent(&mut exponents, k, state, 1.0));
-        let mut current = self.log_likelihood(&exponents, state);
-        for k in 0..self.columns.len() {
+        let mut current = self.log_likelihood(state);
+        for k in 0..self.deviations.len() {
             // Steps of several sizes: how wide the likelihood is depends on how much the noise hides.
             let size = [0.3, 1.0, 2.0][stream.random_range(0..3)];
             let spread = ((state.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
@@ -486,10 +478,7 @@ impl Problem {
             if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
                 continue;
             }
-            let mut proposed = exponents.clone();
-            self.add_exponent(&mut proposed, k, state, -1.0);
-            self.add_exponent(&mut proposed, k, &next, 1.0);
-            let likelihood = self.log_likelihood(&proposed, &next);
+            let likelihood = self.log_likelihood(&next);
             // The step is symmetric in ln σ but its size depends on σ, and σ is uniform a priori.
             let back = size * (1.0 + self.within[k] / next.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
             let moved = (next.std[k] / state.std[k]).ln();
@@ -500,7 +489,6 @@ impl Problem {
                 (spread / next_spread).ln() + 0.5 * shifted * shifted * (spread.powi(-2) - next_spread.powi(-2));
             if threshold.ln() < likelihood - current + moved + sizes + shifts {
                 *state = next;
-                exponents = proposed;
                 current = likelihood;
             }
         }
@@ -512,16 +500,15 @@ impl Problem {
         let mut weights = vec![0.0; self.draws];
         let mut chosen = Vec::with_capacity(self.measurements);
         for measurement in 0..self.measurements {
-            self.weights(measurement, state, &mut weights);
-            let mut left: f64 = stream.random();
-            let position = weights.iter().position(|w| {
-                left -= w;
-                left < 0.0
-            });
-            chosen.push(measurement * self.draws + position.unwrap_or(self.draws - 1));
+            let share = stream.random();
+            chosen.push(self.weights(measurement, state, &mut weights).choose(&weights, share));
         }
-        for (k, column) in self.columns.iter().enumerate() {
-            let values: Vec<f64> = chosen.iter().map(|&row| column[row]).collect();
+        let d = self.deviations.len();
+        for (k, deviations) in self.deviations.iter().enumerate() {
+            let value = |(measurement, place): (usize, &usize)| {
+                self.centres[measurement * d + k] + f64::from(deviations[measurement * self.draws + place])
+            };
+            let values: Vec<f64> = chosen.iter().enumerate().map(value).collect();
             let centre = stats::mean(&values);
             let squares: f64 = values.iter().map(|x| (x - centre).powi(2)).sum();
             state.std[k] = draw_std(squares, n, self.floor[k], stream);
@@ -561,13 +548,7 @@ fn draw_std(squares: f64, n: f64, floor: f64, stream: &mut Stream) -> f64 {
         *density = (2.0 - n) * (low + (i as f64 + 0.5) * step) - 0.5 * squares * precision;
         precision *= ratio;
     }
-    let largest = densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mut sum = 0.0;
-    for density in &mut densities {
-        *density = f64::from(stats::exp_f32((*density - largest) as f32));
-        sum += *density;
-    }
-    let mut left = stream.random::<f64>() * sum;
+    let mut left = exponentials(&mut densities) * stream.random::<f64>();
     let cell = densities.iter().position(|density| {
         left -= density;
         left < 0.0
