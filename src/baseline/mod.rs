@@ -189,19 +189,8 @@ impl Baseline {
                 found,
             });
         }
-        let (d, m) = (simulator.space().len(), simulator.modes());
-        let shapes = [
-            ("architecture.parameters", manifest.architecture.parameters, d),
-            ("architecture.modes", manifest.architecture.modes, m),
-            ("architecture.channels", manifest.architecture.channels, manifest.conditions.channels()),
-            ("architecture.permutations", manifest.architecture.permutations.len(), manifest.architecture.units),
-            ("conditions.training_box", manifest.conditions.training_box.len(), d),
-            ("whitening.mean", manifest.whitening.mean.len(), m),
-            ("whitening.factor", manifest.whitening.factor.len(), m),
-            ("self_test.frequencies_hz", manifest.self_test.frequencies_hz.len(), m),
-            ("architecture.fixed_context", manifest.architecture.fixed_context, manifest.conditions.fixed_context(d)),
-        ];
-        if let Some(&(what, found, expected)) = shapes.iter().find(|(_, found, expected)| found != expected) {
+        let lengths = lengths(&manifest, simulator);
+        if let Some((what, found, expected)) = lengths.into_iter().find(|(_, found, expected)| found != expected) {
             return Err(LoadError::Shape { what, found, expected });
         }
         let flow = checkpoint::from_bytes(weights, &manifest.architecture, DType::F32)?;
@@ -338,18 +327,18 @@ impl Baseline {
         for round in 1..=ROUNDS {
             let pending: Vec<u32> =
                 (0..observations.len() as u32).filter(|&row| filled[row as usize] < draws).collect();
-            if pending.is_empty() {
-                break;
-            }
+            // Few are missing after the first round: twice as many as the row that lacks most, or all where most fall outside.
+            let Some(missing) = pending.iter().map(|&row| draws - filled[row as usize]).max() else { break };
+            let count = draws.min(2 * missing);
             let (mut real, mut log_q) = (Vec::new(), Vec::new());
-            for part in pending.chunks((ROWS_AT_A_TIME / draws).max(1)) {
+            for part in pending.chunks((ROWS_AT_A_TIME / count).max(1)) {
                 let rows = Tensor::from_slice(part, part.len(), &Device::Cpu)?;
-                let (x, own) = self.flow.sample(&context.index_select(&rows, 0)?, draws, &mut stream)?;
+                let (x, own) = self.flow.sample(&context.index_select(&rows, 0)?, count, &mut stream)?;
                 real.extend(x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?);
                 log_q.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
             }
             for (place, values) in real.chunks_exact(d).enumerate() {
-                let row = pending[place / draws] as usize;
+                let row = pending[place / count] as usize;
                 if filled[row] == draws {
                     continue;
                 }
@@ -583,6 +572,31 @@ impl Baseline {
             Err(LoadError::SelfTest { difference })
         }
     }
+}
+
+/// What has a length in a manifest: its name, how long it is, and how long it must be for this structure.
+fn lengths(manifest: &Manifest, simulator: &Simulator) -> Vec<(&'static str, usize, usize)> {
+    let (d, m) = (simulator.space().len(), simulator.modes());
+    let Manifest { architecture, conditions, whitening, self_test, calibration, .. } = manifest;
+    let mut all = vec![
+        ("architecture.parameters", architecture.parameters, d),
+        ("architecture.modes", architecture.modes, m),
+        ("architecture.channels", architecture.channels, conditions.channels()),
+        ("architecture.permutations", architecture.permutations.len(), architecture.units),
+        ("architecture.fixed_context", architecture.fixed_context, conditions.fixed_context(d)),
+        ("conditions.training_box", conditions.training_box.len(), d),
+        ("whitening.mean", whitening.mean.len(), m),
+        ("whitening.factor", whitening.factor.len(), m),
+        ("self_test.frequencies_hz", self_test.frequencies_hz.len(), m),
+    ];
+    all.extend(whitening.factor.iter().map(|row| ("a row of whitening.factor", row.len(), m)));
+    if !self_test.shapes.is_empty() {
+        all.push(("self_test.shapes", self_test.shapes.len(), m));
+        let points = simulator.shape_points();
+        all.extend(self_test.shapes.iter().map(|shape| ("a shape of self_test.shapes", shape.len(), points)));
+    }
+    all.extend(calibration.cells.iter().map(|cell| ("parameters of calibration.cells", cell.parameters.len(), d)));
+    all
 }
 
 /// Seed of the draws for a batch: the same data and baseline always give the same draws.

@@ -201,6 +201,23 @@ fn a_damaged_foreign_or_outdated_baseline_is_refused_with_the_reason() {
         refuse(&changed("\"parameters\": 3", "\"parameters\": 4"), &weights, &simulator),
         LoadError::Shape { .. }
     ));
+    // A list that lacks its last number, in each that an inference or an assessment goes through.
+    let whole: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
+    for list in [
+        "/architecture/permutations",
+        "/conditions/training_box",
+        "/whitening/mean",
+        "/whitening/factor",
+        "/whitening/factor/2",
+        "/self_test/frequencies_hz",
+        "/self_test/expected/0",
+        "/calibration/cells/0/parameters",
+    ] {
+        let mut short = whole.clone();
+        short.pointer_mut(list).unwrap_or_else(|| panic!("{list}")).as_array_mut().unwrap().pop().unwrap();
+        let error = refuse(&serde_json::to_vec(&short).unwrap(), &weights, &simulator);
+        assert!(matches!(error, LoadError::Shape { .. }), "{list}: {error}");
+    }
     // Draws of noise-free data hardly depend on the latent seed, so the expected value itself is moved.
     let mut value: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
     let expected = &mut value["self_test"]["expected"][0][0];
