@@ -9,7 +9,7 @@ use std::ops::Range;
 use crate::stats::exp_f32;
 
 /// Numbers of the widest vector.
-pub(super) const LANES: usize = 16;
+const LANES: usize = 16;
 
 /// Weights of the samples of a measurement under a normal population, the greatest 1.
 pub(super) struct Weighed {
