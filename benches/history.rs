@@ -173,7 +173,7 @@ async fn insert(connection: &mut SqliteConnection, rows: &str) {
         ),
         format!(
             "insert into measurement select s, id, k.column1, 'logger', at + k.column1 * 10000000, unhex(hex), null,
-             '{{}}', '{{}}' from r, (values {}) k",
+             '{{}}', '{{}}', null from r, (values {}) k",
             steps.join(", ")
         ),
         format!(

@@ -233,7 +233,7 @@ async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
     let plain = "insert into structure values ('plain', '{}', 'digest', 0, 0)";
     sqlx::query(plain).execute(&mut connection).await.expect("a structure");
     let rows: Vec<String> =
-        (0..SMALL).map(|i| format!("('plain', ?1, {i}, 'logger', ?2 + {i}, ?3, null, '{{}}', '{{}}')")).collect();
+        (0..SMALL).map(|i| format!("('plain', ?1, {i}, 'logger', ?2 + {i}, ?3, null, '{{}}', '{{}}', null)")).collect();
     let measurements = format!("insert into measurement values {}", rows.join(", "));
     let frequencies = [0.5_f64, 0.9, 1.2].map(f64::to_le_bytes).concat();
     let (started, mut commits) = (Instant::now(), 0_u32);
