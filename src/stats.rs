@@ -102,12 +102,13 @@ pub fn quantile(values: &[f64], level: f64) -> f64 {
     if values.is_empty() {
         return f64::NAN;
     }
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let position = level.clamp(0.0, 1.0) * (sorted.len() - 1) as f64;
-    let below = position.floor() as usize;
-    let above = (below + 1).min(sorted.len() - 1);
-    sorted[below] + (position - below as f64) * (sorted[above] - sorted[below])
+    let mut values = values.to_vec();
+    let position = level.clamp(0.0, 1.0) * (values.len() - 1) as f64;
+    let place = position.floor() as usize;
+    let (_, below, rest) = values.select_nth_unstable_by(place, f64::total_cmp);
+    let below = *below;
+    let above = rest.iter().copied().min_by(f64::total_cmp).unwrap_or(below);
+    below + (position - place as f64) * (above - below)
 }
 
 /// Cumulative distribution of the standard normal, Φ(z).

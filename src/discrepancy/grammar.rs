@@ -251,6 +251,11 @@ impl Candidate {
         }
     }
 
+    /// What it depends on: covariate and category.
+    pub fn input(&self) -> (Option<&str>, Option<&str>) {
+        (self.covariate.as_deref(), self.level.as_deref())
+    }
+
     /// Laws by which it can be written.
     pub fn laws(&self, data: &Data) -> Vec<LawKind> {
         let Some(name) = &self.covariate else { return vec![LawKind::Constant] };

@@ -182,18 +182,20 @@ pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share
     let mut targets: Vec<Target> = fit.effects.iter().map(|e| e.target.clone()).collect();
     targets.retain(|t| t.sizes() == 1);
     let directions = study.directions(rows, fit, &targets)?;
-    let along: Vec<_> =
-        (0..targets.len()).map(|column| whitened.sums(|place| directions[place].column(column).into_owned())).collect();
+    let sums = |column: usize| whitened.sums(|place, mode| directions[place][(mode, column)]);
+    let along: Vec<_> = (0..targets.len()).map(sums).collect();
+    let of_modes = whitened.mode_sums(modes);
     let functions = functions(study.data, rows);
     let looks = (functions.len() * (1 + targets.len())) as f64;
     let mut best: Option<(Remainder, f64)> = None;
     for (function, covariates, values) in functions {
         let range = stats::quantile(&values, 0.95) - stats::quantile(&values, 0.05);
-        let free = whitened.free_score(&values, modes);
+        let values = DVector::from_vec(values);
+        let free = whitened.free_score(&of_modes, &values);
         let mut tests: Vec<(f64, usize, Vec<f64>)> =
             vec![(free.nats, free.numbers, free.psi.iter().map(|s| 100.0 * s * range).collect())];
         for (column, sums) in along.iter().enumerate() {
-            let score = whitened.score(sums, std::slice::from_ref(&values));
+            let score = whitened.score(sums, &[&values]);
             let mean =
                 |mode: usize| directions.iter().map(|d| d[(mode, column)]).sum::<f64>() / directions.len() as f64;
             let sizes = (0..modes).map(|mode| 100.0 * score.psi[0] * range * mean(mode)).collect();

@@ -586,7 +586,12 @@ fn extreme(simulator: &Simulator, data: &Data, fit: &Fit, modes: usize) -> Optio
     }
     let inputs: Vec<_> =
         fit.effects.iter().zip(&fit.psi).map(|(e, psi)| data.inputs(&e.law, e.lag().map(|l| psi[l]))).collect();
-    let size = |e: usize, row: usize| fit.effects[e].sizes(inputs[e][row], &fit.psi[e]).0;
+    let size = |e: usize, row: usize| {
+        let (effect, psi) = (&fit.effects[e], &fit.psi[e]);
+        let mut sizes = vec![0.0; effect.target.sizes()];
+        effect.sizes(inputs[e][row], psi, &mut sizes, &mut vec![0.0; psi.len()]);
+        sizes
+    };
     let row = (0..data.rows()).max_by(|a, b| {
         let abs = |row: usize| size(last, row).first().copied().unwrap_or(0.0).abs();
         abs(*a).total_cmp(&abs(*b))

@@ -24,6 +24,11 @@ const TAILS: [f64; 7] = [3.0, 4.0, 6.0, 10.0, 20.0, 50.0, f64::INFINITY];
 /// Steps of a fit at most.
 const MOST_STEPS: usize = 40;
 
+/// Rows from which a fit begins at that of a part of them, some [`FEW_ROWS`]: it takes many steps there, which are cheap, and
+/// few with all.
+const MANY_ROWS: usize = 1_200;
+const FEW_ROWS: usize = 400;
+
 /// A fit ends when a step promises less than this, nats.
 const ENOUGH_NATS: f64 = 5e-3;
 
@@ -83,16 +88,23 @@ impl Effect {
         (self.law.kind == LawKind::Lagged).then(|| self.numbers.len() - 1)
     }
 
-    /// Sizes at one input and, row by row of the sizes, their derivatives by the numbers.
-    pub fn sizes(&self, input: Input, psi: &[f64]) -> (Vec<f64>, Vec<Vec<f64>>) {
+    /// The sizes at one input (`sizes`), and by each number the slope of the one that it moves (`slopes`), see [`Self::moved`].
+    pub fn sizes(&self, input: Input, psi: &[f64], sizes: &mut [f64], slopes: &mut [f64]) {
         match self.target {
-            Target::ModeOrder(_) => (Vec::new(), Vec::new()),
-            Target::Oscillator(_) => (psi.to_vec(), vec![vec![1.0, 0.0], vec![0.0, 1.0]]),
-            _ => {
-                let mut slopes = vec![0.0; psi.len()];
-                let size = self.law.size(input, psi, &mut slopes);
-                (vec![size], vec![slopes])
+            Target::ModeOrder(_) => {}
+            Target::Oscillator(_) => {
+                sizes.copy_from_slice(psi);
+                slopes.fill(1.0);
             }
+            _ => sizes[0] = self.law.size(input, psi, slopes),
+        }
+    }
+
+    /// Which of the sizes a number moves.
+    fn moved(&self, number: usize) -> usize {
+        match self.target {
+            Target::Oscillator(_) => number,
+            _ => 0,
         }
     }
 }
@@ -151,6 +163,8 @@ pub struct Study<'a> {
     /// The measurements.
     pub data: &'a Data,
     free: Vec<usize>,
+    /// Of each row, the modes present and the sum of the logarithms of their stated noise.
+    present: Vec<(Vec<usize>, f64)>,
 }
 
 /// Everything at one point: value, gradient and information in prior units.
@@ -169,7 +183,13 @@ impl<'a> Study<'a> {
     pub fn new(simulator: &'a Simulator, data: &'a Data) -> Self {
         let set = |k: &usize| data.settings.iter().all(|row| row[*k].is_some());
         let free = (0..simulator.space().len()).filter(|k| !set(k)).collect();
-        Self { simulator, data, free }
+        let present = |(y, noise): (&Vec<f64>, &Vec<f64>)| {
+            let present: Vec<usize> = (0..y.len()).filter(|mode| y[*mode].is_finite()).collect();
+            let log_noise = present.iter().map(|mode| noise[*mode].ln()).sum();
+            (present, log_noise)
+        };
+        let present = data.log_frequencies.iter().zip(&data.noise).map(present).collect();
+        Self { simulator, data, free, present }
     }
 
     /// Parameters that are not set in every row.
@@ -182,25 +202,8 @@ impl<'a> Study<'a> {
     /// # Errors
     /// `None` when the structure has no frequencies at the start.
     pub fn fit(&self, rows: &[usize], effects: &[Effect], start: Option<&Start<'_>>) -> Option<Fit> {
-        let problem = Problem { study: self, rows, effects };
-        let mut eta = problem.origin();
-        let mut tails = TAILS[2];
-        if let Some(start) = start {
-            problem.set_out(&mut eta, start);
-            tails = start.fit.tails;
-        }
-        let mut here = problem.point(&eta, tails);
-        if let (None, Some(start)) = (&here, start) {
-            // A first guess that leaves no stiffness somewhere is taken nearer to nothing.
-            for share in [0.5, 0.2, 0.05, 0.0] {
-                let shrunk = problem.towards_prior(&eta, start, share);
-                here = problem.point(&shrunk, tails);
-                if here.is_some() {
-                    break;
-                }
-            }
-        }
-        let mut here = here?;
+        let problem = Problem::new(self, rows, effects);
+        let (mut here, mut tails) = problem.first_point(start)?;
         for _ in 0..MOST_STEPS {
             // What stands at a bound and wants beyond it stays there, and out of the step of the others.
             let (mut information, mut gradient) = (here.information.clone(), here.gradient.clone());
@@ -242,21 +245,20 @@ impl<'a> Study<'a> {
 
     /// Each row of `rows` under a fit.
     pub fn view(&self, rows: &[usize], fit: &Fit) -> Option<Vec<RowView>> {
-        let problem = Problem { study: self, rows, effects: &fit.effects };
-        let (sizes, _) = problem.all_sizes(&fit.psi);
-        let responses = problem.responses(&fit.mean, &sizes, &[])?;
-        Some(rows.iter().enumerate().map(|(place, row)| self.row_view(*row, fit, &responses, place)).collect())
+        let problem = Problem::new(self, rows, &fit.effects);
+        let responses = problem.responses(&fit.mean, &problem.sizes(&fit.psi).values, &[])?;
+        let density = Density::new(fit.tails, responses.modes());
+        let view = |(place, row): (usize, &usize)| self.row_view(*row, fit, &density, &responses, place);
+        Some(rows.iter().enumerate().map(view).collect())
     }
 
     /// Slopes of ln f by the sizes of `targets` beside the effects of a fit, at sizes 0, `[m, sizes]` for each row of `rows`.
     pub fn directions(&self, rows: &[usize], fit: &Fit, targets: &[Target]) -> Option<Vec<DMatrix<f64>>> {
-        let problem = Problem { study: self, rows, effects: &fit.effects };
-        let (mut sizes, _) = problem.all_sizes(&fit.psi);
+        let problem = Problem::new(self, rows, &fit.effects);
         let further: usize = targets.iter().map(Target::sizes).sum();
-        let first = sizes.first().map_or(0, Vec::len);
-        for sizes in &mut sizes {
-            sizes.extend(std::iter::repeat_n(0.0, further));
-        }
+        let sizes = problem.sizes(&fit.psi).values;
+        let first = sizes.nrows();
+        let sizes = sizes.resize_vertically(first + further, 0.0);
         let responses = problem.responses(&fit.mean, &sizes, targets)?;
         let slopes = |place: usize| {
             DMatrix::from_fn(responses.modes(), further, |mode, column| responses.by_size(place, mode)[first + column])
@@ -266,9 +268,9 @@ impl<'a> Study<'a> {
 
     /// Slopes of M by the free means and all ψ, `[m, ·]` for each row, in their own units.
     pub fn nuisance(&self, rows: &[usize], fit: &Fit) -> Option<Vec<DMatrix<f64>>> {
-        let problem = Problem { study: self, rows, effects: &fit.effects };
-        let (sizes, slopes) = problem.all_sizes(&fit.psi);
-        let responses = problem.responses(&fit.mean, &sizes, &[])?;
+        let problem = Problem::new(self, rows, &fit.effects);
+        let sizes = problem.sizes(&fit.psi);
+        let responses = problem.responses(&fit.mean, &sizes.values, &[])?;
         let free = self.free.len();
         let columns = free + fit.psi.iter().map(Vec::len).sum::<usize>();
         let by = |(place, row): (usize, &usize)| {
@@ -279,10 +281,9 @@ impl<'a> Study<'a> {
                         by[(mode, column)] = responses.by_parameter(place, mode)[*k];
                     }
                 }
-                for (by_size, slopes) in responses.by_size(place, mode).iter().zip(&slopes[place]) {
-                    for (number, slope) in slopes {
-                        by[(mode, free + number)] += by_size * slope;
-                    }
+                let by_size = responses.by_size(place, mode);
+                for (number, (moved, slope)) in sizes.moved.iter().zip(sizes.slopes.column(place).iter()).enumerate() {
+                    by[(mode, free + number)] = by_size[*moved] * slope;
                 }
             }
             by
@@ -308,13 +309,9 @@ impl<'a> Study<'a> {
         self.free.iter().map(mean).chain(numbers).collect()
     }
 
-    fn theta(&self, row: usize, mean: &[f64]) -> Vec<f64> {
-        mean.iter().enumerate().map(|(k, mean)| self.data.settings[row][k].unwrap_or(*mean)).collect()
-    }
-
-    fn row_view(&self, row: usize, fit: &Fit, responses: &Responses, place: usize) -> RowView {
+    fn row_view(&self, row: usize, fit: &Fit, density: &Density, responses: &Responses, place: usize) -> RowView {
         let y = &self.data.log_frequencies[row];
-        let present: Vec<usize> = (0..y.len()).filter(|mode| y[*mode].is_finite()).collect();
+        let present = self.present[row].0.clone();
         let d = fit.mean.len();
         let spread = |k: usize| if self.data.settings[row][k].is_some() { 0.0 } else { fit.spread[k] };
         let residual = DVector::from_iterator(
@@ -338,7 +335,7 @@ impl<'a> Study<'a> {
         let deviation = (0..d).map(|k| spread(k).powi(2) * by_parameter.column(k).dot(&solved)).collect();
         RowView {
             row,
-            log_density: log_density(distance, present.len(), half_log_det, fit.tails),
+            log_density: density.log(distance, present.len(), half_log_det),
             weight: weight(distance, present.len(), fit.tails),
             present,
             residual,
@@ -362,15 +359,29 @@ struct Problem<'a> {
     study: &'a Study<'a>,
     rows: &'a [usize],
     effects: &'a [Effect],
+    /// Inputs of each effect at each row; of those with a lag, which moves with ψ, none.
+    inputs: Vec<Vec<Input>>,
 }
 
-/// Inputs of each effect at each row, and where a lag was tried.
-type Inputs = Vec<Vec<Input>>;
+/// Sizes of all effects at each row.
+struct Sizes {
+    /// `[sizes, rows]`
+    values: DMatrix<f64>,
+    /// By each number of ψ, the slope of the size that it moves, `[ψ, rows]`.
+    slopes: DMatrix<f64>,
+    /// Which size that is.
+    moved: Vec<usize>,
+}
 
-/// Slopes of one size: (column of ψ over all effects, value).
-type Slopes = Vec<Vec<(usize, f64)>>;
+impl<'a> Problem<'a> {
+    fn new(study: &'a Study<'a>, rows: &'a [usize], effects: &'a [Effect]) -> Self {
+        let inputs = |effect: &Effect| match effect.lag() {
+            Some(_) => Vec::new(),
+            None => inputs(study.data, rows, effect, None),
+        };
+        Self { study, rows, effects, inputs: effects.iter().map(inputs).collect() }
+    }
 
-impl Problem<'_> {
     fn modes(&self) -> usize {
         self.study.simulator.modes()
     }
@@ -417,6 +428,29 @@ impl Problem<'_> {
             column += effect.numbers.len();
         }
         self.bound(eta);
+    }
+
+    /// Where a fit begins, and its tails: at the fit of a part of the rows where they are many, else at `start`.
+    fn first_point(&self, start: Option<&Start<'_>>) -> Option<(Point, f64)> {
+        if self.rows.len() >= MANY_ROWS {
+            let part: Vec<usize> = self.rows.iter().step_by(self.rows.len() / FEW_ROWS).copied().collect();
+            if let Some(fit) = self.study.fit(&part, self.effects, start) {
+                let psi = fit.psi.iter().cloned().map(Some).collect();
+                let mut eta = self.origin();
+                self.set_out(&mut eta, &Start { fit: &fit, psi });
+                if let Some(point) = self.point(&eta, fit.tails) {
+                    return Some((point, fit.tails));
+                }
+            }
+        }
+        let mut eta = self.origin();
+        let Some(start) = start else { return Some((self.point(&eta, TAILS[2])?, TAILS[2])) };
+        self.set_out(&mut eta, start);
+        let tails = start.fit.tails;
+        // A first guess that leaves no stiffness somewhere is taken nearer to nothing.
+        let shares = [1.0, 0.5, 0.2, 0.05, 0.0].into_iter();
+        let point = { shares }.find_map(|share| self.point(&self.towards_prior(&eta, start, share), tails));
+        Some((point?, tails))
     }
 
     /// The same with the numbers of the last effect, where it is a new one, moved towards the middle of their prior.
@@ -482,43 +516,36 @@ impl Problem<'_> {
         (mean, spread, noise, psi)
     }
 
-    fn inputs(&self, psi: &[Vec<f64>]) -> Inputs {
-        let of = |(effect, psi): (&Effect, &Vec<f64>)| {
-            let all = self.study.data.inputs(&effect.law, effect.lag().map(|lag| psi[lag]));
-            self.rows.iter().map(|row| all[*row]).collect()
-        };
-        self.effects.iter().zip(psi).map(of).collect()
-    }
-
-    /// All sizes of each row, and of each its slopes.
-    fn all_sizes(&self, psi: &[Vec<f64>]) -> (Vec<Vec<f64>>, Vec<Slopes>) {
-        let inputs = self.inputs(psi);
-        (0..self.rows.len()).map(|place| self.sizes(&inputs, place, psi)).unzip()
-    }
-
-    /// All sizes of one row, and of each its slopes.
-    fn sizes(&self, inputs: &Inputs, place: usize, psi: &[Vec<f64>]) -> (Vec<f64>, Slopes) {
-        let (mut sizes, mut slopes) = (Vec::new(), Vec::new());
-        let mut column = 0;
-        for ((effect, inputs), psi) in self.effects.iter().zip(inputs).zip(psi) {
-            let (mut own, mut by) = effect.sizes(inputs[place], psi);
-            if !self.study.is_set(self.rows[place], &effect.target) {
-                own.fill(0.0);
-                for slopes in &mut by {
-                    slopes.fill(0.0);
+    fn sizes(&self, psi: &[Vec<f64>]) -> Sizes {
+        let count = self.effects.iter().map(|effect| effect.target.sizes()).sum();
+        let mut values = DMatrix::zeros(count, self.rows.len());
+        let mut slopes = DMatrix::zeros(psi.iter().map(Vec::len).sum(), self.rows.len());
+        let mut moved = Vec::with_capacity(slopes.nrows());
+        let mut first = 0;
+        for ((effect, inputs_without_lag), psi) in self.effects.iter().zip(&self.inputs).zip(psi) {
+            let lagged = effect.lag().map(|lag| inputs(self.study.data, self.rows, effect, Some(psi[lag])));
+            let inputs = lagged.as_ref().unwrap_or(inputs_without_lag);
+            let own = first..first + effect.target.sizes();
+            let numbers = moved.len()..moved.len() + psi.len();
+            moved.extend((0..psi.len()).map(|place| first + effect.moved(place)));
+            for (place, (row, input)) in self.rows.iter().zip(inputs).enumerate() {
+                if self.study.is_set(*row, &effect.target) {
+                    let (mut values, mut slopes) = (values.column_mut(place), slopes.column_mut(place));
+                    let values = &mut values.as_mut_slice()[own.clone()];
+                    effect.sizes(*input, psi, values, &mut slopes.as_mut_slice()[numbers.clone()]);
                 }
             }
-            sizes.extend(own);
-            slopes.extend(by.into_iter().map(|by| by.into_iter().enumerate().map(|(i, s)| (column + i, s)).collect()));
-            column += psi.len();
+            first = own.end;
         }
-        (sizes, slopes)
+        Sizes { values, slopes, moved }
     }
 
-    /// Responses of all rows under the effects and `further` targets.
-    fn responses(&self, mean: &[f64], sizes: &[Vec<f64>], further: &[Target]) -> Option<Responses> {
+    /// Responses of all rows under the effects and `further` targets; `sizes`: `[sizes, rows]`.
+    fn responses(&self, mean: &[f64], sizes: &DMatrix<f64>, further: &[Target]) -> Option<Responses> {
         let targets: Vec<Target> = self.effects.iter().map(|e| &e.target).chain(further).cloned().collect();
-        let theta: Vec<Vec<f64>> = self.rows.iter().map(|row| self.study.theta(*row, mean)).collect();
+        let settings = &self.study.data.settings;
+        let set = |k: usize, place: usize| settings[self.rows[place]][k].unwrap_or(mean[k]);
+        let theta = DMatrix::from_fn(mean.len(), self.rows.len(), set);
         Responses::new(self.study.simulator, &targets, &theta, sizes)
     }
 
@@ -529,61 +556,39 @@ impl Problem<'_> {
         let free = &self.study.free;
         let (means, variances) = (self.means(), free.len() + self.modes());
         let unknowns = means + variances;
-        let (sizes, slopes) = self.all_sizes(&psi);
-        let responses = self.responses(&mean, &sizes, &[])?;
+        let sizes = self.sizes(&psi);
+        let responses = self.responses(&mean, &sizes.values, &[])?;
         let scales: Vec<f64> =
             free.iter().map(|k| self.scale(*k).1).chain(self.numbers().map(|n| n.prior_std)).collect();
 
-        let mut log_likelihood = 0.0;
         let mut gradient = DVector::zeros(unknowns);
         let mut information = DMatrix::<f64>::zeros(unknowns, unknowns);
         let mut distances = Vec::with_capacity(self.rows.len());
-        // Columns of one row: residual, slopes of the mean, square root of V; whitened in place.
-        let width = 1 + means + variances;
-        let mut work: Vec<f64> = Vec::new();
-        let mut factor: Vec<f64> = Vec::new();
-        let mut products = vec![0.0; variances * variances];
+        let log_factors: Vec<f64> = noise.iter().map(|factor| factor.ln()).collect();
+        let mut of_row = RowSums::new(means, free.len(), self.modes());
         for (place, &row) in self.rows.iter().enumerate() {
-            let y = &data.log_frequencies[row];
-            let present: Vec<usize> = (0..y.len()).filter(|mode| y[*mode].is_finite()).collect();
-            let p = present.len();
-            work.clear();
-            work.resize(p * width, 0.0);
+            let (present, log_noise) = &self.study.present[row];
             for (i, &mode) in present.iter().enumerate() {
-                let line = &mut work[i * width..(i + 1) * width];
-                line[0] = y[mode] - responses.log_frequency(place, mode);
+                let inverse = 1.0 / (noise[mode] * data.noise[row][mode]);
+                of_row.residual[i] = inverse * (data.log_frequencies[row][mode] - responses.log_frequency(place, mode));
                 let by_parameter = responses.by_parameter(place, mode);
                 for (column, k) in free.iter().enumerate() {
-                    if data.settings[row][*k].is_none() {
-                        let by = by_parameter[*k];
-                        line[1 + column] = by * scales[column];
-                        line[1 + means + column] = by * spread[*k];
-                    }
+                    let slope = if data.settings[row][*k].is_none() { inverse * by_parameter[*k] } else { 0.0 };
+                    of_row.slopes[i * means + column] = slope * scales[column];
+                    of_row.spreads[i * free.len() + column] = slope * spread[*k];
                 }
-                for (by_size, slopes) in responses.by_size(place, mode).iter().zip(&slopes[place]) {
-                    for (number, slope) in slopes {
-                        let column = free.len() + number;
-                        line[1 + column] += by_size * slope * scales[column];
-                    }
+                let by_size = responses.by_size(place, mode);
+                for (number, (moved, slope)) in sizes.moved.iter().zip(sizes.slopes.column(place).iter()).enumerate() {
+                    let column = free.len() + number;
+                    of_row.slopes[i * means + column] = inverse * by_size[*moved] * slope * scales[column];
                 }
-                line[1 + means + free.len() + mode] = noise[mode] * data.noise[row][mode];
             }
-            let root = 1 + means;
-            let half_log_det = whiten(&mut work, &mut factor, p, width, root);
-            let distance: f64 = (0..p).map(|i| work[i * width].powi(2)).sum();
-            let weight = weight(distance, p, tails);
-            let (flat, deep) = if tails.is_finite() {
-                let total = tails + p as f64;
-                (total / (total + 2.0), 2.0 / (total + 2.0))
-            } else {
-                (1.0, 0.0)
-            };
-            log_likelihood += log_density(distance, p, half_log_det, tails);
-            distances.push((distance, p, half_log_det));
-            let row = WhiteRow { values: &work, width, means, variances, weight, flat, deep };
-            row.add_means(&mut gradient, &mut information);
-            row.add_variances(&mut products, &mut gradient, &mut information);
+            let (distance, log_stretch) = of_row.solve(present.len());
+            let log_noise = log_noise + present.iter().map(|mode| log_factors[*mode]).sum::<f64>();
+            distances.push((distance, present.len(), log_noise + log_stretch));
+            of_row.add(present, distance, tails, &mut gradient, &mut information);
         }
+        let log_likelihood = Density::new(tails, self.modes()).total(&distances);
         // From derivatives by ln σ and ln s to prior units.
         for u in 0..variances {
             let unit = if u < free.len() { SPREAD_LN_STD } else { NOISE_LN_STD };
@@ -646,94 +651,186 @@ impl Fit {
     }
 }
 
-/// One whitened row: by lines of the modes present, residual, slopes of the mean, square root of V.
-struct WhiteRow<'a> {
-    values: &'a [f64],
-    width: usize,
+/// Inputs of an effect at `rows`.
+fn inputs(data: &Data, rows: &[usize], effect: &Effect, lag_days: Option<f64>) -> Vec<Input> {
+    let all = data.inputs(&effect.law, lag_days);
+    rows.iter().map(|row| all[*row]).collect()
+}
+
+/// One row over its noise, and what it adds to gradient and information.
+///
+/// With everything over the noise of its mode, V = 1 + U Uᵀ: U the slopes by the parameters times their spreads, few columns.
+///
+/// ```text
+///  C = 1 + UᵀU = L Lᵀ,   S = L⁻ᵀ,   T = U S:      V⁻¹ = 1 − T Tᵀ,   |V| = |L|²
+///  q = Tᵀe,   z = V⁻¹e = e − T q,   UᵀV⁻¹e = S q,   UᵀV⁻¹ = S Tᵀ,   UᵀV⁻¹U = 1 − S Sᵀ
+/// ```
+struct RowSums {
     means: usize,
-    variances: usize,
-    /// Of the residual, in the gradient.
-    weight: f64,
-    /// Of the information: (ν + p)/(ν + p + 2) and 2/(ν + p + 2), 1 and 0 for a normal distribution.
-    flat: f64,
-    deep: f64,
+    free: usize,
+    /// e, `[p]`.
+    residual: Vec<f64>,
+    /// Slopes of the mean, `[p][means]`.
+    slopes: Vec<f64>,
+    /// U, `[p][free]`.
+    spreads: Vec<f64>,
+    /// L, then S transposed, `[free][free]`, lower triangles.
+    factor: Vec<f64>,
+    inverse: Vec<f64>,
+    /// T, `[p][free]`.
+    absorbed: Vec<f64>,
+    /// q, `[free]`.
+    along: Vec<f64>,
+    /// z, `[p]`.
+    solved: Vec<f64>,
+    /// Tᵀ of the slopes, `[free][means]`.
+    slopes_absorbed: Vec<f64>,
+    /// GᵀV⁻¹e and GᵀV⁻¹G, G the columns of the square root (U, 1): by parameters, then by modes.
+    score: Vec<f64>,
+    products: Vec<f64>,
 }
 
-impl WhiteRow<'_> {
-    /// Adds w Dᵀ V⁻¹ e and Dᵀ V⁻¹ D.
-    fn add_means(&self, gradient: &mut DVector<f64>, information: &mut DMatrix<f64>) {
-        for line in self.values.chunks_exact(self.width) {
-            for a in 0..self.means {
-                let slope = line[1 + a];
-                if slope != 0.0 {
-                    gradient[a] += self.weight * slope * line[0];
-                    for b in 0..=a {
-                        information[(a, b)] += self.flat * slope * line[1 + b];
-                    }
-                }
-            }
+impl RowSums {
+    /// For rows of at most `modes` modes.
+    fn new(means: usize, free: usize, modes: usize) -> Self {
+        let (of_free, of_modes) = (vec![0.0; free * free], vec![0.0; modes * free]);
+        let variances = free + modes;
+        Self {
+            means,
+            free,
+            residual: vec![0.0; modes],
+            slopes: vec![0.0; modes * means],
+            spreads: of_modes.clone(),
+            factor: of_free.clone(),
+            inverse: of_free,
+            absorbed: of_modes,
+            along: vec![0.0; free],
+            solved: vec![0.0; modes],
+            slopes_absorbed: vec![0.0; free * means],
+            score: vec![0.0; variances],
+            products: vec![0.0; variances * variances],
         }
     }
 
-    /// Adds the score and information of the logarithms of the columns of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G,
-    /// w h_u² − B_uu and 2 B_uv², less what the tails take.
-    fn add_variances(&self, products: &mut [f64], gradient: &mut DVector<f64>, information: &mut DMatrix<f64>) {
-        let (root, count) = (1 + self.means, self.variances);
-        products.fill(0.0);
-        for u in 0..count {
-            let mut along = 0.0;
-            for line in self.values.chunks_exact(self.width) {
-                let slope = line[root + u];
-                if slope != 0.0 {
-                    along += slope * line[0];
-                    for v in 0..=u {
-                        products[u * count + v] += slope * line[root + v];
-                    }
+    /// Factors V and solves for the residual of `p` modes: eᵀV⁻¹e and ½ ln|V|.
+    fn solve(&mut self, p: usize) -> (f64, f64) {
+        let f = self.free;
+        let mut volume = 1.0;
+        for a in 0..f {
+            for b in 0..=a {
+                let mut sum = f64::from(u8::from(a == b));
+                sum += self.spreads[..p * f].chunks_exact(f).map(|u| u[a] * u[b]).sum::<f64>();
+                for c in 0..b {
+                    sum -= self.factor[a * f + c] * self.factor[b * f + c];
+                }
+                self.factor[a * f + b] = if a == b { sum.sqrt() } else { sum / self.factor[b * f + b] };
+            }
+            volume *= self.factor[a * f + a];
+        }
+        for column in 0..f {
+            for a in column..f {
+                let mut sum = f64::from(u8::from(a == column));
+                for c in column..a {
+                    sum -= self.factor[a * f + c] * self.inverse[c * f + column];
+                }
+                self.inverse[a * f + column] = sum / self.factor[a * f + a];
+            }
+        }
+        self.along.fill(0.0);
+        for i in 0..p {
+            for a in 0..f {
+                let sum: f64 = (0..=a).map(|b| self.spreads[i * f + b] * self.inverse[a * f + b]).sum();
+                self.absorbed[i * f + a] = sum;
+                self.along[a] += sum * self.residual[i];
+            }
+        }
+        let mut distance = 0.0;
+        for i in 0..p {
+            let taken: f64 = self.absorbed[i * f..(i + 1) * f].iter().zip(&self.along).map(|(t, q)| t * q).sum();
+            self.solved[i] = self.residual[i] - taken;
+            distance += self.residual[i] * self.solved[i];
+        }
+        (distance.max(0.0), volume.ln())
+    }
+
+    /// Adds w Dᵀ V⁻¹ e and Dᵀ V⁻¹ D, D the slopes of the mean; and the score and information of the logarithms of the columns
+    /// of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G, w h_u² − B_uu and 2 B_uv², less what the tails take.
+    fn add(
+        &mut self,
+        present: &[usize],
+        distance: f64,
+        tails: f64,
+        gradient: &mut DVector<f64>,
+        information: &mut DMatrix<f64>,
+    ) {
+        let (p, f, means) = (present.len(), self.free, self.means);
+        let weight = weight(distance, p, tails);
+        // (ν + p)/(ν + p + 2) and 2/(ν + p + 2); 1 and 0 for a normal distribution.
+        let (flat, deep) = if tails.is_finite() {
+            let total = tails + p as f64;
+            (total / (total + 2.0), 2.0 / (total + 2.0))
+        } else {
+            (1.0, 0.0)
+        };
+        self.slopes_absorbed.fill(0.0);
+        for i in 0..p {
+            let line = &self.slopes[i * means..(i + 1) * means];
+            for (absorbed, own) in
+                self.absorbed[i * f..(i + 1) * f].iter().zip(self.slopes_absorbed.chunks_exact_mut(means.max(1)))
+            {
+                for (sum, slope) in own.iter_mut().zip(line) {
+                    *sum += absorbed * slope;
                 }
             }
-            gradient[self.means + u] += self.weight * along * along - products[u * count + u];
+            for (a, slope) in line.iter().enumerate() {
+                gradient[a] += weight * slope * self.solved[i];
+                let flat_slope = flat * slope;
+                for (sum, other) in information.column_mut(a).as_mut_slice()[..means].iter_mut().zip(line) {
+                    *sum += flat_slope * other;
+                }
+            }
         }
+        for line in self.slopes_absorbed.chunks_exact(means.max(1)) {
+            for (a, slope) in line.iter().enumerate() {
+                let flat_slope = flat * slope;
+                for (sum, other) in information.column_mut(a).as_mut_slice()[..means].iter_mut().zip(line) {
+                    *sum -= flat_slope * other;
+                }
+            }
+        }
+
+        let count = f + p;
+        for a in 0..f {
+            self.score[a] = (a..f).map(|c| self.inverse[c * f + a] * self.along[c]).sum();
+            for b in 0..=a {
+                let sum: f64 = (a..f).map(|c| self.inverse[c * f + a] * self.inverse[c * f + b]).sum();
+                self.products[a * count + b] = f64::from(u8::from(a == b)) - sum;
+            }
+        }
+        for i in 0..p {
+            self.score[f + i] = self.solved[i];
+            let own = &self.absorbed[i * f..(i + 1) * f];
+            let line = &mut self.products[(f + i) * count..(f + i + 1) * count];
+            for (a, product) in line[..f].iter_mut().enumerate() {
+                *product = (a..f).map(|c| self.inverse[c * f + a] * own[c]).sum();
+            }
+            for (j, product) in line[f..=f + i].iter_mut().enumerate() {
+                let sum: f64 = own.iter().zip(&self.absorbed[j * f..(j + 1) * f]).map(|(a, b)| a * b).sum();
+                *product = f64::from(u8::from(i == j)) - sum;
+            }
+        }
+        let place = |u: usize| means + if u < f { u } else { f + present[u - f] };
         for u in 0..count {
+            let own = self.products[u * count + u];
+            gradient[place(u)] += weight * self.score[u] * self.score[u] - own;
+            // Modes ascend: what stands below the diagonal here stands below it there.
+            let (flat, deep) = (2.0 * flat, deep * own);
             for v in 0..=u {
-                let shared = products[u * count + v];
-                let own = products[u * count + u] * products[v * count + v];
-                information[(self.means + u, self.means + v)] += self.flat * 2.0 * shared * shared - self.deep * own;
+                let shared = self.products[u * count + v];
+                information[(place(u), place(v))] += flat * shared * shared - deep * self.products[v * count + v];
             }
         }
     }
-}
-
-/// Factors V = G Gᵀ = L Lᵀ, G the columns of `work` from `root` on, and multiplies every column by L⁻¹; ½ ln|V|.
-fn whiten(work: &mut [f64], factor: &mut Vec<f64>, p: usize, width: usize, root: usize) -> f64 {
-    factor.clear();
-    factor.resize(p * p, 0.0);
-    let mut half_log_det = 0.0;
-    for i in 0..p {
-        for j in 0..=i {
-            let (a, b) = (&work[i * width + root..(i + 1) * width], &work[j * width + root..(j + 1) * width]);
-            let mut sum: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum();
-            for k in 0..j {
-                sum -= factor[i * p + k] * factor[j * p + k];
-            }
-            factor[i * p + j] = if i == j { sum.max(1e-300).sqrt() } else { sum / factor[j * p + j] };
-        }
-        half_log_det += factor[i * p + i].ln();
-    }
-    for i in 0..p {
-        let (done, rest) = work.split_at_mut(i * width);
-        let line = &mut rest[..width];
-        for j in 0..i {
-            let l = factor[i * p + j];
-            for (value, earlier) in line.iter_mut().zip(&done[j * width..(j + 1) * width]) {
-                *value -= l * earlier;
-            }
-        }
-        let inverse = 1.0 / factor[i * p + i];
-        for value in line.iter_mut() {
-            *value *= inverse;
-        }
-    }
-    half_log_det
 }
 
 /// Share of a normal row's weight that a row at `distance` has.
@@ -745,22 +842,141 @@ fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
     }
 }
 
-/// Logarithm of the density of a multivariate t, or normal, distribution.
-fn log_density(distance: f64, modes: usize, half_log_det: f64, tails: f64) -> f64 {
-    let m = modes as f64;
-    if tails.is_finite() {
-        ln_gamma(0.5 * (tails + m))
-            - ln_gamma(0.5 * tails)
-            - 0.5 * m * (tails * std::f64::consts::PI).ln()
-            - half_log_det
-            - 0.5 * (tails + m) * (distance / tails).ln_1p()
-    } else {
-        -0.5 * distance - half_log_det - 0.5 * m * std::f64::consts::TAU.ln()
+/// The density of a multivariate t, or normal, distribution.
+struct Density {
+    tails: f64,
+    /// Logarithm of what depends on the number of modes alone, `[modes + 1]`.
+    constants: Vec<f64>,
+}
+
+impl Density {
+    /// Of at most `most` modes.
+    fn new(tails: f64, most: usize) -> Self {
+        let constant = |modes: usize| {
+            let m = modes as f64;
+            if tails.is_finite() {
+                ln_gamma(0.5 * (tails + m)) - ln_gamma(0.5 * tails) - 0.5 * m * (tails * std::f64::consts::PI).ln()
+            } else {
+                -0.5 * m * std::f64::consts::TAU.ln()
+            }
+        };
+        Self { tails, constants: (0..=most).map(constant).collect() }
+    }
+
+    fn log(&self, distance: f64, modes: usize, half_log_det: f64) -> f64 {
+        let of_distance = if self.tails.is_finite() {
+            0.5 * (self.tails + modes as f64) * (distance / self.tails).ln_1p()
+        } else {
+            0.5 * distance
+        };
+        self.constants[modes] - half_log_det - of_distance
+    }
+
+    /// Sum over rows: Mahalanobis distance, number of modes, ½ ln|V| of each.
+    fn total(&self, rows: &[(f64, usize, f64)]) -> f64 {
+        // One logarithm for many rows: the product of what stands in it, for each number of modes.
+        let mut products = vec![1.0; self.constants.len()];
+        let mut sum = 0.0;
+        for (distance, modes, half_log_det) in rows {
+            sum += self.constants[*modes] - half_log_det;
+            if self.tails.is_finite() {
+                let product = &mut products[*modes];
+                *product *= 1.0 + distance / self.tails;
+                if *product > 1e150 {
+                    sum -= 0.5 * (self.tails + *modes as f64) * product.ln();
+                    *product = 1.0;
+                }
+            } else {
+                sum -= 0.5 * distance;
+            }
+        }
+        let left = |(modes, product): (usize, &f64)| 0.5 * (self.tails + modes as f64) * product.ln();
+        if self.tails.is_finite() {
+            sum -= products.iter().enumerate().map(left).sum::<f64>();
+        }
+        sum
     }
 }
 
 /// The tails that make the rows most probable; distances are those of the present scale.
 fn best_tails(distances: &[(f64, usize, f64)]) -> f64 {
-    let total = |tails: f64| distances.iter().map(|(q, m, half)| log_density(*q, *m, *half, tails)).sum::<f64>();
+    let most = distances.iter().map(|(_, modes, _)| *modes).max().unwrap_or(0);
+    let total = |tails: f64| Density::new(tails, most).total(distances);
     TAILS.into_iter().map(|t| (total(t), t)).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(f64::INFINITY, |best| best.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng as _;
+
+    use super::*;
+    use crate::stats;
+
+    /// A row's distance, ½ ln|V|, score and information against dense matrices.
+    #[test]
+    fn a_row_is_that_of_dense_matrices() {
+        for (p, f, means, tails) in [(4, 2, 3, 5.0), (3, 3, 5, f64::INFINITY), (2, 4, 4, 3.0), (3, 0, 2, 10.0)] {
+            let mut stream = stats::stream(p as u64, "a row");
+            let mut random =
+                |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| stream.random_range(-1.0..1.0));
+            let (e, d, u) = (random(p, 1), random(p, means), random(p, f));
+            // Of six modes these are present.
+            let present: Vec<usize> = (0..p).map(|i| i + usize::from(i > 0)).collect();
+            let mut row = RowSums::new(means, f, 6);
+            row.residual[..p].copy_from_slice(e.as_slice());
+            row.slopes[..p * means].copy_from_slice(d.transpose().as_slice());
+            row.spreads[..p * f].copy_from_slice(u.transpose().as_slice());
+            let (distance, log_stretch) = row.solve(p);
+            let unknowns = means + f + 6;
+            let (mut gradient, mut information) = (DVector::zeros(unknowns), DMatrix::zeros(unknowns, unknowns));
+            row.add(&present, distance, tails, &mut gradient, &mut information);
+
+            let v = DMatrix::identity(p, p) + &u * u.transpose();
+            let inverse = v.clone().try_inverse().unwrap();
+            assert!((distance - (e.transpose() * &inverse * &e)[(0, 0)]).abs() < 1e-12);
+            assert!((log_stretch - 0.5 * v.determinant().ln()).abs() < 1e-12);
+            let weight = weight(distance, p, tails);
+            let (flat, deep) = if tails.is_finite() {
+                let total = tails + p as f64;
+                (total / (total + 2.0), 2.0 / (total + 2.0))
+            } else {
+                (1.0, 0.0)
+            };
+            let of_means = d.transpose() * &inverse * &e * weight;
+            let between = d.transpose() * &inverse * &d * flat;
+            let g = DMatrix::from_fn(p, f + p, |i, k| if k < f { u[(i, k)] } else { f64::from(u8::from(i == k - f)) });
+            let (h, b) = (g.transpose() * &inverse * &e, g.transpose() * &inverse * &g);
+            let mut expected = DVector::zeros(unknowns);
+            let mut expected_information = DMatrix::zeros(unknowns, unknowns);
+            let place = |k: usize| means + if k < f { k } else { f + present[k - f] };
+            for k in 0..means {
+                expected[k] = of_means[(k, 0)];
+                for l in 0..means {
+                    expected_information[(k, l)] = between[(k, l)];
+                }
+            }
+            for k in 0..f + p {
+                expected[place(k)] = weight * h[(k, 0)] * h[(k, 0)] - b[(k, k)];
+                for l in 0..=k {
+                    let shared = b[(k, l)];
+                    expected_information[(place(k), place(l))] =
+                        flat * 2.0 * shared * shared - deep * b[(k, k)] * b[(l, l)];
+                }
+            }
+            assert!((gradient - expected).amax() < 1e-12, "{p} modes, {f} parameters");
+            assert!((information - expected_information).amax() < 1e-12, "{p} modes, {f} parameters");
+        }
+    }
+
+    #[test]
+    fn densities_of_rows_add_up() {
+        let mut stream = stats::stream(1, "densities");
+        let mut row = |_| (50.0 * stream.random::<f64>(), stream.random_range(1..5), stream.random::<f64>());
+        let rows: Vec<(f64, usize, f64)> = (0..500).map(&mut row).collect();
+        for tails in TAILS {
+            let density = Density::new(tails, 4);
+            let each: f64 = rows.iter().map(|(q, m, half)| density.log(*q, *m, *half)).sum();
+            assert!((density.total(&rows) - each).abs() < 1e-9 * each.abs(), "{tails}");
+        }
+    }
 }

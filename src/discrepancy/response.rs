@@ -7,6 +7,8 @@
 
 use std::collections::HashMap;
 
+use nalgebra::DMatrix;
+
 use crate::physics::effect::Target;
 use crate::simulator::Simulator;
 
@@ -14,7 +16,10 @@ use crate::simulator::Simulator;
 const FEW: usize = 12;
 
 /// Ranges, as a share of what they act on, up to which so many nodes do; beyond the last, the last number.
-const NODES: [(f64, usize); 3] = [(0.02, 5), (0.2, 7), (f64::INFINITY, 10)];
+const NODES: [(f64, usize); 3] = [(0.02, 5), (0.2, 7), (f64::INFINITY, MOST_NODES)];
+
+/// The most of them.
+const MOST_NODES: usize = 10;
 
 /// Most numbers to interpolate over.
 const MOST_DIMENSIONS: usize = 3;
@@ -51,46 +56,55 @@ impl Responses {
         self.modes
     }
 
-    /// The responses at each row of parameters and sizes; `None` where the structure has no frequencies.
-    pub fn new(simulator: &Simulator, targets: &[Target], theta: &[Vec<f64>], sizes: &[Vec<f64>]) -> Option<Self> {
+    /// The responses at each row of parameters (`[d, rows]`) and sizes (`[sizes, rows]`); `None` where the structure has no
+    /// frequencies.
+    pub fn new(simulator: &Simulator, targets: &[Target], theta: &DMatrix<f64>, sizes: &DMatrix<f64>) -> Option<Self> {
         let after = Afterwards::new(simulator, targets);
         if after.steps.is_empty() {
             return Self::structural(simulator, targets, theta, sizes);
         }
         let left: Vec<Target> = after.structural.iter().map(|(target, _)| targets[*target].clone()).collect();
-        let pick = |row: &Vec<f64>| -> Vec<f64> {
-            let own = |(target, first): &(usize, usize)| row[*first..first + targets[*target].sizes()].to_vec();
-            after.structural.iter().flat_map(own).collect()
-        };
-        let inner = Self::structural(simulator, &left, theta, &sizes.iter().map(pick).collect::<Vec<_>>())?;
+        let own = |(target, first): &(usize, usize)| *first..first + targets[*target].sizes();
+        let picked: Vec<usize> = after.structural.iter().flat_map(own).collect();
+        let inner = Self::structural(simulator, &left, theta, &sizes.select_rows(&picked))?;
         after.apply(&inner, targets, sizes)
     }
 
-    fn structural(simulator: &Simulator, targets: &[Target], theta: &[Vec<f64>], sizes: &[Vec<f64>]) -> Option<Self> {
+    fn structural(
+        simulator: &Simulator,
+        targets: &[Target],
+        theta: &DMatrix<f64>,
+        sizes: &DMatrix<f64>,
+    ) -> Option<Self> {
         let (modes, parameters) = (simulator.modes(), simulator.space().len());
-        let count = sizes.first().map_or(0, Vec::len);
+        let (count, rows) = sizes.shape();
         let width = 1 + parameters + count;
-        let mut found = Self { modes, parameters, width, values: Vec::new(), places: Vec::with_capacity(theta.len()) };
+        let mut found = Self { modes, parameters, width, values: Vec::new(), places: Vec::with_capacity(rows) };
         let at = |row: usize, dimension: usize| {
             if dimension < parameters {
-                theta[row][dimension]
+                theta[(dimension, row)]
             } else {
-                sizes[row][dimension - parameters]
+                sizes[(dimension - parameters, row)]
             }
         };
         let mut smooth: Vec<Dimension> = Vec::new();
         for index in 0..parameters + count {
-            let values = (0..theta.len()).map(|row| at(row, index));
+            let values = (0..rows).map(|row| at(row, index));
             if let Some(dimension) = Dimension::new(index, values, parameters, targets) {
                 smooth.push(dimension);
             }
         }
         let corners: usize = smooth.iter().map(|d| d.nodes.len()).product();
-        let interpolated = !smooth.is_empty() && smooth.len() <= MOST_DIMENSIONS && 2 * corners < theta.len();
-        let mut known: HashMap<Vec<u64>, usize> = HashMap::new();
-        let mut weights: Vec<f64> = Vec::new();
-        for row in 0..theta.len() {
-            let mut point: Vec<f64> = theta[row].iter().chain(&sizes[row]).copied().collect();
+        let interpolated = !smooth.is_empty() && smooth.len() <= MOST_DIMENSIONS && 2 * corners < rows;
+        let mut known = Known::default();
+        let exact: Vec<usize> = (0..parameters + count).filter(|i| smooth.iter().all(|d| d.index != *i)).collect();
+        // Rows that agree in all that is not interpolated over share their corners.
+        let mut shared: HashMap<Vec<u64>, Vec<usize>> = HashMap::new();
+        let (mut weights, mut further, mut key): (Vec<f64>, Vec<f64>, Vec<u64>) = Default::default();
+        let mut point = Vec::with_capacity(parameters + count);
+        for row in 0..rows {
+            point.clear();
+            point.extend(theta.column(row).iter().chain(sizes.column(row).iter()));
             if !interpolated {
                 let place = found.solved(simulator, targets, &mut known, &point)?;
                 found.places.push(place);
@@ -100,22 +114,28 @@ impl Responses {
             weights.clear();
             weights.push(1.0);
             for dimension in &smooth {
-                let along = dimension.weights(point[dimension.index]);
-                weights = weights.iter().flat_map(|w| along.iter().map(move |a| w * a)).collect();
+                further.clear();
+                dimension.weights(point[dimension.index], &weights, &mut further);
+                std::mem::swap(&mut weights, &mut further);
             }
-            let mut sources = Vec::with_capacity(corners);
-            for corner in 0..corners {
-                let mut rest = corner;
-                for dimension in smooth.iter().rev() {
-                    point[dimension.index] = dimension.nodes[rest % dimension.nodes.len()];
-                    rest /= dimension.nodes.len();
+            key.clear();
+            key.extend(exact.iter().map(|i| point[*i].to_bits()));
+            if !shared.contains_key(key.as_slice()) {
+                let mut sources = Vec::with_capacity(corners);
+                for corner in 0..corners {
+                    let mut rest = corner;
+                    for dimension in smooth.iter().rev() {
+                        point[dimension.index] = dimension.nodes[rest % dimension.nodes.len()];
+                        rest /= dimension.nodes.len();
+                    }
+                    sources.push(found.solved(simulator, targets, &mut known, &point)?);
                 }
-                sources.push(found.solved(simulator, targets, &mut known, &point)?);
+                shared.insert(key.clone(), sources);
             }
             let first = found.values.len();
             found.values.resize(first + modes * width, 0.0);
             let (before, own) = found.values.split_at_mut(first);
-            for (weight, source) in weights.iter().zip(&sources) {
+            for (weight, source) in weights.iter().zip(&shared[key.as_slice()]) {
                 for (value, node) in own.iter_mut().zip(&before[*source..*source + modes * width]) {
                     *value += weight * node;
                 }
@@ -126,15 +146,10 @@ impl Responses {
     }
 
     /// Place of the response at a point, solved if it is new.
-    fn solved(
-        &mut self,
-        simulator: &Simulator,
-        targets: &[Target],
-        known: &mut HashMap<Vec<u64>, usize>,
-        point: &[f64],
-    ) -> Option<usize> {
-        let key: Vec<u64> = point.iter().map(|v| v.to_bits()).collect();
-        if let Some(place) = known.get(&key) {
+    fn solved(&mut self, simulator: &Simulator, targets: &[Target], known: &mut Known, point: &[f64]) -> Option<usize> {
+        known.key.clear();
+        known.key.extend(point.iter().map(|v| v.to_bits()));
+        if let Some(place) = known.places.get(known.key.as_slice()) {
             return Some(*place);
         }
         let (theta, sizes) = point.split_at(self.parameters);
@@ -148,9 +163,18 @@ impl Responses {
             self.values.extend((0..self.parameters).map(|k| response.by_parameter[(mode, k)] / f));
             self.values.extend((0..sizes.len()).map(|s| response.by_size[(mode, s)] / f));
         }
-        known.insert(key, place);
+        known.places.insert(known.key.clone(), place);
         Some(place)
     }
+}
+
+/// Points that were solved.
+#[derive(Default)]
+struct Known {
+    /// Place of the response by the bits of the point.
+    places: HashMap<Vec<u64>, usize>,
+    /// The bits of the point that is looked up.
+    key: Vec<u64>,
 }
 
 /// Targets that act on frequencies which are known already.
@@ -187,11 +211,12 @@ impl Afterwards {
     ///  f' = f·Π s + Σ o;   s = 1 + g, √(1 + g) for all springs, 1/√(1 + g) for all masses
     ///  ∂ln f'/∂· = (f·Π s/f') ∂ln f/∂·,   ∂ln f'/∂g = (f·Π s/f') ∂ln s/∂g,   ∂ln f'/∂o = 1/f'
     /// ```
-    fn apply(&self, inner: &Responses, targets: &[Target], sizes: &[Vec<f64>]) -> Option<Responses> {
+    fn apply(&self, inner: &Responses, targets: &[Target], sizes: &DMatrix<f64>) -> Option<Responses> {
         let (modes, parameters) = (inner.modes, inner.parameters);
-        let width = 1 + parameters + sizes.first().map_or(0, Vec::len);
-        let mut values = vec![0.0; sizes.len() * modes * width];
-        for (row, sizes) in sizes.iter().enumerate() {
+        let (count, rows) = sizes.shape();
+        let width = 1 + parameters + count;
+        let mut values = vec![0.0; rows * modes * width];
+        for (row, sizes) in sizes.column_iter().enumerate() {
             for mode in 0..modes {
                 let line = &mut values[(row * modes + mode) * width..(row * modes + mode + 1) * width];
                 let mut scaled_hz = inner.log_frequency(row, mode).exp();
@@ -241,7 +266,7 @@ impl Afterwards {
                 }
             }
         }
-        let places = (0..sizes.len()).map(|row| row * modes * width).collect();
+        let places = (0..rows).map(|row| row * modes * width).collect();
         Some(Responses { modes, parameters, width, values, places })
     }
 }
@@ -282,7 +307,7 @@ impl Dimension {
             } else {
                 scale(index - parameters, targets)
             };
-        let count = NODES.iter().find(|(limit, _)| range <= *limit).map_or(10, |n| n.1);
+        let count = NODES.iter().find(|(limit, _)| range <= *limit).map_or(MOST_NODES, |n| n.1);
         // Chebyshev nodes of the first kind, whose barycentric weights are known.
         let angle = |i: usize| std::f64::consts::PI * (2 * i + 1) as f64 / (2 * count) as f64;
         let nodes = (0..count).map(|i| f64::midpoint(low, high) - 0.5 * (high - low) * angle(i).cos()).collect();
@@ -291,23 +316,25 @@ impl Dimension {
         Some(Self { index, nodes, barycentric })
     }
 
-    /// Weight of each node at a value.
-    fn weights(&self, value: f64) -> Vec<f64> {
-        let mut weights = Vec::with_capacity(self.nodes.len());
-        let mut sum = 0.0;
-        for (place, (node, own)) in self.nodes.iter().zip(&self.barycentric).enumerate() {
-            let distance = value - node;
-            if distance == 0.0 {
-                return (0..self.nodes.len()).map(|i| f64::from(u8::from(i == place))).collect();
-            }
-            let weight = own / distance;
-            sum += weight;
-            weights.push(weight);
+    /// Appends each of `before` times the weight of each node at a value.
+    fn weights(&self, value: f64, before: &[f64], products: &mut Vec<f64>) {
+        let mut own = [0.0; MOST_NODES];
+        let own = &mut own[..self.nodes.len()];
+        for (weight, (node, barycentric)) in own.iter_mut().zip(self.nodes.iter().zip(&self.barycentric)) {
+            *weight = barycentric / (value - node);
         }
-        for weight in &mut weights {
-            *weight /= sum;
+        // At a node it has all weight.
+        if let Some(at) = own.iter().position(|weight| weight.is_infinite()) {
+            own.fill(0.0);
+            own[at] = 1.0;
         }
-        weights
+        let scale = own.iter().sum::<f64>().recip();
+        for weight in own.iter_mut() {
+            *weight *= scale;
+        }
+        for earlier in before {
+            products.extend(own.iter().map(|weight| earlier * weight));
+        }
     }
 }
 
@@ -353,10 +380,11 @@ mod tests {
                 vec![0.15 * a, 0.1 * b, 0.004 * c]
             };
             let rows: Vec<Vec<f64>> = (0..400).map(row).collect();
-            let theta = vec![vec![4.0, 5.0, 6.0]; 400];
-            let many = Responses::new(&simulator, &targets, &theta, &rows).unwrap();
+            let theta = DMatrix::from_fn(3, rows.len(), |k, _| 4.0 + k as f64);
+            let sizes = DMatrix::from_fn(3, rows.len(), |k, row| rows[row][k]);
+            let many = Responses::new(&simulator, &targets, &theta, &sizes).unwrap();
             for (place, sizes) in rows.iter().enumerate().step_by(7) {
-                let one = simulator.respond(&theta[place], 3, &targets, sizes).unwrap();
+                let one = simulator.respond(&[4.0, 5.0, 6.0], 3, &targets, sizes).unwrap();
                 for (mode, f) in one.frequencies_hz.iter().enumerate() {
                     // Noise is 1e-4 at the least: an error of 1e-6 says nothing about it.
                     assert!((many.log_frequency(place, mode) - f.ln()).abs() < 1e-6, "{targets:?}");

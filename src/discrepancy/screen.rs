@@ -7,7 +7,8 @@
 //!  S = ⟨D, e⟩,   I = ⟨D, D⟩ − ⟨D, N⟩⟨N, N⟩⁻¹⟨N, D⟩,    promised gain = ½ Sᵀ I⁻¹ S  nats,    first guess ψ = I⁻¹ S
 //! ```
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Dyn};
+use rayon::prelude::*;
 
 use super::data::{Data, Values};
 use super::grammar::Candidate;
@@ -52,11 +53,22 @@ pub struct Whitened {
     factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
 }
 
-/// Sums of one direction per row: ⟨T, e⟩, ⟨T, T⟩, ⟨T, N⟩.
+/// Products of one direction T, row by row: TᵀV⁻¹e, TᵀV⁻¹T, TᵀV⁻¹N.
 pub struct Sums {
-    along: Vec<f64>,
-    square: Vec<f64>,
-    nuisance: Vec<DVector<f64>>,
+    along: DVector<f64>,
+    square: DVector<f64>,
+    /// `[rows, columns of N]`
+    nuisance: DMatrix<f64>,
+}
+
+/// The same of the direction of each mode by itself.
+pub struct ModeSums {
+    /// `[rows, modes]`
+    along: DMatrix<f64>,
+    /// `[rows, modes·modes]`
+    square: DMatrix<f64>,
+    /// `[rows, columns of N·modes]`
+    nuisance: DMatrix<f64>,
 }
 
 /// A score test.
@@ -104,71 +116,84 @@ impl Whitened {
         Some(Self { residual, nuisance, inverse, factors })
     }
 
-    /// Sums of a direction given row by row, over all modes.
-    pub fn sums(&self, direction: impl Fn(usize) -> DVector<f64>) -> Sums {
-        let mut sums = Sums { along: Vec::new(), square: Vec::new(), nuisance: Vec::new() };
+    /// Products of a direction given row by row: `direction(place, mode)`.
+    pub fn sums(&self, direction: impl Fn(usize, usize) -> f64) -> Sums {
+        let rows = self.factors.len();
+        let mut sums = Sums {
+            along: DVector::zeros(rows),
+            square: DVector::zeros(rows),
+            nuisance: DMatrix::zeros(rows, self.inverse.nrows()),
+        };
+        let mut white = Vec::new();
         for (place, (inverse, present, root)) in self.factors.iter().enumerate() {
-            let all = direction(place);
-            let white = inverse * DVector::from_iterator(present.len(), present.iter().map(|m| all[*m])) * *root;
-            sums.along.push(white.dot(&self.residual[place]));
-            sums.square.push(white.norm_squared());
-            sums.nuisance.push(self.nuisance[place].tr_mul(&white));
+            white.clear();
+            white.resize(present.len(), 0.0);
+            for (column, mode) in inverse.column_iter().zip(present) {
+                let value = direction(place, *mode) * root;
+                for (white, factor) in white.iter_mut().zip(column.iter()) {
+                    *white += factor * value;
+                }
+            }
+            let along = |other: &[f64]| white.iter().zip(other).map(|(a, b)| a * b).sum::<f64>();
+            sums.along[place] = along(self.residual[place].as_slice());
+            sums.square[place] = along(&white);
+            for (column, nuisance) in self.nuisance[place].column_iter().enumerate() {
+                sums.nuisance[(place, column)] = along(nuisance.as_slice());
+            }
         }
         sums
     }
 
     /// The score of numbers that act through one direction, with basis values `[q][n]`.
-    pub fn score(&self, sums: &Sums, basis: &[Vec<f64>]) -> Score {
+    pub fn score(&self, sums: &Sums, basis: &[&DVector<f64>]) -> Score {
         let q = basis.len();
         let mut score = DVector::zeros(q);
         let mut information = DMatrix::zeros(q, q);
         let mut cross = DMatrix::zeros(q, self.inverse.nrows());
-        for (place, along) in sums.along.iter().enumerate() {
-            for a in 0..q {
-                let value = basis[a][place];
-                if value == 0.0 {
-                    continue;
-                }
-                score[a] += value * along;
-                for b in 0..=a {
-                    information[(a, b)] += value * basis[b][place] * sums.square[place];
-                }
-                for (column, n) in sums.nuisance[place].iter().enumerate() {
-                    cross[(a, column)] += value * n;
-                }
-            }
-        }
         for a in 0..q {
-            for b in a + 1..q {
-                information[(a, b)] = information[(b, a)];
+            score[a] = basis[a].dot(&sums.along);
+            cross.row_mut(a).tr_copy_from(&sums.nuisance.tr_mul(basis[a]));
+            let weighed = basis[a].component_mul(&sums.square);
+            for b in 0..=a {
+                information[(a, b)] = basis[b].dot(&weighed);
+                information[(b, a)] = information[(a, b)];
             }
         }
         self.solve(&score, &information, &cross)
     }
 
-    /// The score of an arbitrary response of each mode to one function of the row, `[n]`.
-    pub fn free_score(&self, function: &[f64], modes: usize) -> Score {
-        let columns = self.inverse.nrows();
-        let (mut score, mut information, mut cross) =
-            (DVector::zeros(modes), DMatrix::zeros(modes, modes), DMatrix::zeros(modes, columns));
+    /// Products of the directions of the modes themselves.
+    pub fn mode_sums(&self, modes: usize) -> ModeSums {
+        let (rows, columns) = (self.factors.len(), self.inverse.nrows());
+        let mut sums = ModeSums {
+            along: DMatrix::zeros(rows, modes),
+            square: DMatrix::zeros(rows, modes * modes),
+            nuisance: DMatrix::zeros(rows, modes * columns),
+        };
         for (place, (inverse, present, root)) in self.factors.iter().enumerate() {
-            let value = function[place] * root;
-            if value == 0.0 {
-                continue;
-            }
-            let along = inverse.tr_mul(&self.residual[place]) * value;
-            let square = inverse.tr_mul(inverse) * (value * value);
-            let with = inverse.tr_mul(&self.nuisance[place]) * value;
+            let along = inverse.tr_mul(&self.residual[place]) * *root;
+            let square = inverse.tr_mul(inverse) * (root * root);
+            let with = inverse.tr_mul(&self.nuisance[place]) * *root;
             for (i, a) in present.iter().enumerate() {
-                score[*a] += along[i];
+                sums.along[(place, *a)] = along[i];
                 for (j, b) in present.iter().enumerate() {
-                    information[(*a, *b)] += square[(i, j)];
+                    sums.square[(place, b * modes + a)] = square[(i, j)];
                 }
                 for column in 0..columns {
-                    cross[(*a, column)] += with[(i, column)];
+                    sums.nuisance[(place, column * modes + a)] = with[(i, column)];
                 }
             }
         }
+        sums
+    }
+
+    /// The score of an arbitrary response of each mode to one function of the row, `[n]`.
+    pub fn free_score(&self, sums: &ModeSums, function: &DVector<f64>) -> Score {
+        let modes = sums.along.ncols();
+        let score = sums.along.tr_mul(function);
+        let information = sums.square.tr_mul(&function.component_mul(function)).reshape_generic(Dyn(modes), Dyn(modes));
+        let columns = self.inverse.nrows();
+        let cross = sums.nuisance.tr_mul(function).reshape_generic(Dyn(modes), Dyn(columns));
         self.solve(&score, &information, &cross)
     }
 
@@ -212,46 +237,84 @@ pub fn promises(
     }
     let owned: Vec<Target> = targets.iter().map(|t| (*t).clone()).collect();
     let directions = study.directions(rows, fit, &owned)?;
-    let mut found = Vec::new();
-    for (column, target) in targets.iter().enumerate() {
-        let sums = whitened.sums(|place| {
+    // The same for every target.
+    let mut inputs: Vec<(Option<&str>, Option<&str>)> = Vec::new();
+    for candidate in candidates {
+        let input = candidate.input();
+        if !inputs.contains(&input) {
+            inputs.push(input);
+        }
+    }
+    let bases_of = |input: &(Option<&str>, Option<&str>)| {
+        let candidate = candidates.iter().find(|c| c.input() == *input).expect("inputs are those of candidates");
+        bases(candidate, study.data, rows)
+    };
+    let bases: Vec<Vec<Basis>> = inputs.par_iter().map(bases_of).collect();
+    let ones = DVector::from_element(rows.len(), 1.0);
+    let of_target = |(column, target): (usize, &&Target)| {
+        let sums = whitened.sums(|place, mode| {
             let set = f64::from(u8::from(study.is_set(rows[place], target)));
-            directions[place].column(column) * set
+            directions[place][(mode, column)] * set
         });
-        let ones = vec![vec![1.0; rows.len()]];
-        let told = whitened.score(&sums, &ones).numbers == 1;
+        let told = whitened.score(&sums, &[&ones]).numbers == 1;
+        let mut found = Vec::new();
         for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.target == **target) {
             let mut best: Vec<Promise> = Vec::new();
-            for (law, basis, further, step_days) in bases(candidate, study.data, rows) {
+            let input = candidate.input();
+            let place = inputs.iter().position(|i| *i == input).expect("all inputs are there");
+            for Basis { law, values, further, step_days } in &bases[place] {
                 let levelled = told && law.has_level();
-                let basis: Vec<Vec<f64>> = if levelled { [ones.clone(), basis].concat() } else { basis };
+                let level = levelled.then_some(&ones);
+                let basis: Vec<&DVector<f64>> = level.into_iter().chain(values).collect();
                 let score = whitened.score(&sums, &basis);
                 // Everything that the law can do must be more than what is fitted already.
                 if score.numbers == 0 || (score.numbers == 1 && levelled) {
                     continue;
                 }
-                let psi = score.psi.iter().copied().chain(further).collect();
-                let (nats, numbers) = (score.nats, score.numbers);
-                let promise = Promise { candidate: index, law, with_level: levelled, nats, numbers, psi, step_days };
-                match best.iter_mut().find(|p| p.law == law) {
-                    Some(known) if known.nats >= nats => {}
+                let psi = score.psi.iter().chain(further).copied().collect();
+                let promise = Promise {
+                    candidate: index,
+                    law: *law,
+                    with_level: levelled,
+                    nats: score.nats,
+                    numbers: score.numbers,
+                    psi,
+                    step_days: *step_days,
+                };
+                match best.iter_mut().find(|p| p.law == *law) {
+                    Some(known) if known.nats >= promise.nats => {}
                     Some(known) => *known = promise,
                     None => best.push(promise),
                 }
             }
             found.extend(best);
         }
-    }
-    Some(found)
+        found
+    };
+    let found: Vec<Vec<Promise>> = targets.par_iter().enumerate().map(of_target).collect();
+    Some(found.into_iter().flatten().collect())
 }
 
-/// Ways in which a law can act at small sizes: the law, basis values `[q][n]`, numbers beyond the linear ones, and the time
-/// of a step.
-type Basis = (LawKind, Vec<Vec<f64>>, Vec<f64>, f64);
+/// A way in which a law can act at small sizes.
+struct Basis {
+    law: LawKind,
+    /// Values at each row, `[q][n]`.
+    values: Vec<DVector<f64>>,
+    /// Numbers of the law beyond the linear ones.
+    further: Vec<f64>,
+    /// Time of a step, days.
+    step_days: f64,
+}
+
+impl Basis {
+    fn new(law: LawKind, values: Vec<Vec<f64>>, further: Vec<f64>) -> Self {
+        Self { law, values: values.into_iter().map(DVector::from_vec).collect(), further, step_days: 0.0 }
+    }
+}
 
 fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
     let Some(column) = candidate.covariate.as_deref().and_then(|name| data.column(name)) else {
-        return vec![(LawKind::Constant, vec![vec![1.0; rows.len()]], Vec::new(), 0.0)];
+        return vec![Basis::new(LawKind::Constant, vec![vec![1.0; rows.len()]], Vec::new())];
     };
     let values = match &column.values {
         Values::Categories(..) => {
@@ -261,7 +324,7 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
                 let is = |row: &usize| f64::from(u8::from(indices[*row].is_some_and(|i| names[i] == *level)));
                 rows.iter().map(is).collect::<Vec<f64>>()
             };
-            return vec![(LawKind::Category, effect_levels.iter().map(of).collect(), Vec::new(), 0.0)];
+            return vec![Basis::new(LawKind::Category, effect_levels.iter().map(of).collect(), Vec::new())];
         }
         Values::Numbers(values) => values,
     };
@@ -273,27 +336,28 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
     let mut all = Vec::new();
     for law in candidate.laws(data) {
         match law {
-            LawKind::Linear => all.push((law, vec![at(&|c| c - mean)], Vec::new(), 0.0)),
+            LawKind::Linear => all.push(Basis::new(law, vec![at(&|c| c - mean)], Vec::new())),
             LawKind::Quadratic => {
-                all.push((law, vec![at(&|c| c - mean), at(&|c| (c - mean).powi(2))], Vec::new(), 0.0));
+                all.push(Basis::new(law, vec![at(&|c| c - mean), at(&|c| (c - mean).powi(2))], Vec::new()));
             }
             LawKind::Bilinear => {
                 for level in [0.1, 0.2, 0.35, 0.5, 0.7] {
                     let knee = stats::quantile(&numbers, level);
                     let basis = vec![at(&|c| (c - knee).min(0.0)), at(&|c| (c - knee).max(0.0))];
-                    all.push((law, basis, vec![knee], 0.0));
+                    all.push(Basis::new(law, basis, vec![knee]));
                 }
             }
             LawKind::Exponential => {
                 for rate in [-1.0 / std, -0.4 / std, 0.4 / std, 1.0 / std] {
                     let basis = vec![at(&|c| (rate * (c - mean)).exp_m1() / rate)];
-                    all.push((law, basis, vec![rate], 0.0));
+                    all.push(Basis::new(law, basis, vec![rate]));
                 }
             }
             LawKind::Step => {
                 for share in 1..20 {
                     let days = stats::quantile(&numbers, f64::from(share) / 20.0);
-                    all.push((law, vec![at(&|c| f64::from(u8::from(c >= days)))], Vec::new(), days));
+                    let after = at(&|c| f64::from(u8::from(c >= days)));
+                    all.push(Basis { step_days: days, ..Basis::new(law, vec![after], Vec::new()) });
                 }
             }
             LawKind::Lagged => {
@@ -302,7 +366,7 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
                     let lag = span / divisor;
                     let followed = lagged(&data.times_days, values, lag);
                     let basis = vec![rows.iter().map(|row| followed[*row].0 - mean).collect()];
-                    all.push((law, basis, vec![lag], 0.0));
+                    all.push(Basis::new(law, basis, vec![lag]));
                 }
             }
             LawKind::Constant | LawKind::Category => {}

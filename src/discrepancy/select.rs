@@ -1,5 +1,6 @@
 //! Naming causes: forward selection by evidence, what else could be it, and a check on blocks left out.
 
+use nalgebra::DVector;
 use rayon::prelude::*;
 
 use super::grammar::Candidate;
@@ -199,7 +200,8 @@ fn rank(
     };
     let mut tried: Vec<(usize, LawKind, Fit, f64)> = chosen.par_iter().filter_map(fitted).collect();
     // Any constant effect promises at most what each mode's own constant does.
-    let constant = whitened.free_score(&vec![1.0; rows.len()], study.simulator.modes());
+    let ones = DVector::from_element(rows.len(), 1.0);
+    let constant = whitened.free_score(&whitened.mode_sums(study.simulator.modes()), &ones);
     if constant.nats > CONSTANT_NATS {
         tried.extend(unscreened(study, rows, fit, candidates));
     }
