@@ -56,6 +56,24 @@ impl PosteriorSamples {
         Self::new(DMatrix::from_fn(rows, self.theta.ncols(), |row, column| self.theta[(source(row), column)]), draws)
     }
 
+    /// These samples of each measurement, then those of `further`.
+    ///
+    /// # Panics
+    /// When those are of other measurements or parameters: a bug.
+    #[must_use]
+    pub fn joined(&self, further: &Self) -> Self {
+        assert!(self.measurements() == further.measurements(), "samples of the same measurements");
+        let draws = self.draws + further.draws;
+        let value = |row: usize, column: usize| {
+            let (measurement, draw) = (row / draws, row % draws);
+            match draw.checked_sub(self.draws) {
+                None => self.theta[(measurement * self.draws + draw, column)],
+                Some(draw) => further.theta[(measurement * further.draws + draw, column)],
+            }
+        };
+        Self::new(DMatrix::from_fn(self.measurements() * draws, self.theta.ncols(), value), draws)
+    }
+
     /// Posterior mean of each measurement, `[n, d]`.
     pub fn means(&self) -> DMatrix<f64> {
         DMatrix::from_fn(self.measurements(), self.theta.ncols(), |measurement, parameter| {
@@ -70,5 +88,23 @@ impl PosteriorSamples {
             self.theta.column(index).iter().filter(at_edge).count() as f64 / self.theta.nrows() as f64
         };
         space.iter().enumerate().map(share).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joined_samples_stay_with_their_measurement() {
+        // Measurement · 10 + draw; the further ones begin at draw 2.
+        let of = |first: usize, draws: usize| {
+            let value = |row: usize, _| (row / draws * 10 + first + row % draws) as f64;
+            PosteriorSamples::new(DMatrix::from_fn(3 * draws, 1, value), draws)
+        };
+        let joined = of(0, 2).joined(&of(2, 3));
+        assert_eq!((joined.measurements(), joined.draws()), (3, 5));
+        assert_eq!(joined.column(0), of(0, 5).column(0));
+        assert_eq!(joined.first(2).column(0), of(0, 2).column(0));
     }
 }

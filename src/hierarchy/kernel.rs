@@ -1,131 +1,138 @@
-//! Loops over the samples of a measurement, compiled once for each width of vectors (`pulp::with_simd`).
+//! Loops over the samples of sixteen measurements at a time, one in each lane, compiled once for each width of vectors
+//! (`pulp::with_simd`).
 //!
-//! Single precision, about the centre of the measurement's own samples: what is lost is lost of differences between samples of
-//! one posterior, however far away the population lies. Sums and maxima run in lanes, since one after the other each addition
-//! would wait for the one before; sample s is in lane s mod [`LANES`] on every processor, so that the bits are the same.
+//! Single precision, about the centre of each measurement's own samples: what is lost is lost of differences between samples of
+//! one posterior, however far away the population lies. Nothing is summed over lanes, so that the bits are the same on every
+//! processor.
 
 use std::ops::Range;
 
 use crate::stats::exp_f32;
 
-/// Numbers of the widest vector.
-const LANES: usize = 16;
+/// Measurements side by side: the numbers of the widest vector.
+pub(super) const LANES: usize = 16;
 
-/// Weights of the samples of a measurement under a normal population, the greatest 1.
+/// A number of each of the measurements side by side; on a line of the cache, which half of all loads would straddle else.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C, align(64))]
+pub(super) struct Lanes(pub [f32; LANES]);
+
+impl Lanes {
+    pub const ZERO: Self = Self([0.0; LANES]);
+}
+
+/// Weights of the samples of some measurements under a normal population, the greatest of each 1.
+#[derive(Clone, Copy)]
 pub(super) struct Weighed {
     /// Logarithm of what the weights were divided by.
-    pub largest: f32,
-    /// Sum of all weights.
-    pub sum: f64,
-    /// Sum of the weights of each lane.
-    of_lanes: [f32; LANES],
+    pub largest: Lanes,
+    /// Sum of the weights.
+    pub sum: Lanes,
 }
 
-impl Weighed {
-    /// A sample by its weight; `share`, from 0 to below 1, is how much of all weight comes before it, lane after lane.
-    pub fn choose(&self, weights: &[f32], share: f64) -> usize {
-        // Counting what ends before the target leaves the processor nothing to guess.
-        let target = (share * self.sum) as f32;
-        let (mut lane, mut before, mut passed) = (0, 0.0, 0.0);
-        for sum in &self.of_lanes[..LANES.min(weights.len()) - 1] {
-            passed += sum;
-            let ends_before = passed <= target;
-            lane += usize::from(ends_before);
-            before = if ends_before { passed } else { before };
-        }
-        let (mut place, mut passed) = (lane, before);
-        for next in (lane + LANES..weights.len()).step_by(LANES) {
-            passed += weights[next - LANES];
-            place += if passed <= target { LANES } else { 0 };
-        }
-        place
-    }
-}
-
-/// Lane by lane, then halves onto halves: the same order for every width of vectors.
-#[inline(always)]
-fn folded(mut lanes: [f32; LANES], combine: impl Fn(f32, f32) -> f32) -> f32 {
-    let mut half = LANES / 2;
-    while half > 0 {
-        for lane in 0..half {
-            lanes[lane] = combine(lanes[lane], lanes[lane + half]);
-        }
-        half /= 2;
-    }
-    lanes[0]
-}
-
-/// w_s of the samples `rows`, those of a measurement, from the logarithms of what they weigh without the population (`weights`).
+/// w_s from the logarithms of what the samples weigh without the population (`weights`, one entry a sample).
 ///
 /// ```text
-///  ln w_s = offset_s − Σ_k ½((x_sk − μ_k)/σ_k)² + ½((c_k − μ_k)/σ_k)²
+///  ln w_s = offset_s + Σ_k x_sk (x_sk square_k + linear_k)
 /// ```
 ///
-/// `deviations`: x − c of each parameter; `centres`: c of each; `mean`, `std`: μ and σ of each.
+/// `deviations`: x of each parameter; `squares`: −1/2σ² of each; `linears`: (μ − c)/σ² of each, c the centre.
 #[pulp::with_simd(weigh = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn weigh_simd<S: pulp::Simd>(
-    _: S,
-    weights: &mut [f32],
-    deviations: &[Vec<f32>],
-    rows: Range<usize>,
-    centres: &[f64],
-    mean: &[f64],
-    std: &[f64],
+    simd: S,
+    weights: &mut [Lanes],
+    deviations: &[&[Lanes]],
+    squares: &[f32],
+    linears: &[Lanes],
 ) -> Weighed {
-    for (((deviations, centre), mean), std) in deviations.iter().zip(centres).zip(mean).zip(std) {
-        let precision = 1.0 / (std * std);
-        let (square, linear) = ((-0.5 * precision) as f32, ((mean - centre) * precision) as f32);
-        for (weight, x) in weights.iter_mut().zip(&deviations[rows.clone()]) {
-            *weight = x.mul_add(x.mul_add(square, linear), *weight);
+    let (mut largest, mut sum) = (Lanes::ZERO, Lanes::ZERO);
+    // Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
+    for first in (0..LANES).step_by(S::F32_LANES) {
+        let part = first..first + S::F32_LANES;
+        for ((deviations, square), linear) in deviations.iter().zip(squares).zip(linears) {
+            let (square, linear) = (simd.splat_f32s(*square), S::as_simd_f32s(&linear.0[part.clone()]).0[0]);
+            for (weights, x) in weights.iter_mut().zip(*deviations) {
+                let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
+                let x = S::as_simd_f32s(&x.0[part.clone()]).0[0];
+                *weight = simd.mul_add_f32s(x, simd.mul_add_f32s(x, square, linear), *weight);
+            }
+        }
+        let most = in_fours(simd, weights, &part, f32::NEG_INFINITY, |a, b| simd.max_f32s(a, b));
+        for weights in weights.iter_mut() {
+            let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
+            *weight = simd.sub_f32s(*weight, most);
+        }
+        S::as_mut_simd_f32s(&mut largest.0[part]).0[0] = most;
+    }
+    for weights in weights.iter_mut() {
+        for weight in &mut weights.0 {
+            *weight = exp_f32(*weight);
         }
     }
-    let larger = |a: f32, b: f32| if b > a { b } else { a };
-    let mut lanes = [f32::NEG_INFINITY; LANES];
-    let (blocks, rest) = weights.as_chunks::<LANES>();
-    for block in blocks {
-        for (lane, weight) in lanes.iter_mut().zip(block) {
-            *lane = larger(*lane, *weight);
-        }
+    for first in (0..LANES).step_by(S::F32_LANES) {
+        let part = first..first + S::F32_LANES;
+        let all = in_fours(simd, weights, &part, 0.0, |a, b| simd.add_f32s(a, b));
+        S::as_mut_simd_f32s(&mut sum.0[part]).0[0] = all;
     }
-    for (lane, weight) in lanes.iter_mut().zip(rest) {
-        *lane = larger(*lane, *weight);
-    }
-    let largest = folded(lanes, larger);
-    let mut of_lanes = [0.0; LANES];
-    let (blocks, rest) = weights.as_chunks_mut::<LANES>();
-    for block in blocks {
-        for (weight, sum) in block.iter_mut().zip(&mut of_lanes) {
-            *weight = exp_f32(*weight - largest);
-            *sum += *weight;
-        }
-    }
-    for (weight, sum) in rest.iter_mut().zip(&mut of_lanes) {
-        *weight = exp_f32(*weight - largest);
-        *sum += *weight;
-    }
-    Weighed { largest, sum: f64::from(folded(of_lanes, |a, b| a + b)), of_lanes }
+    Weighed { largest, sum }
 }
 
-/// Σ w x and Σ w x²
-#[pulp::with_simd(moments = pulp::Arch::new())]
+/// The lanes `part` of all entries combined, in four rows that do not wait for each other.
 #[inline(always)]
-pub(super) fn moments_simd<S: pulp::Simd>(_: S, weights: &[f32], x: &[f32]) -> (f64, f64) {
-    let (mut first, mut second) = ([0.0_f32; LANES], [0.0_f32; LANES]);
-    let ((weights, more_weights), (x, more)) = (weights.as_chunks::<LANES>(), x.as_chunks::<LANES>());
-    for (weights, x) in weights.iter().zip(x) {
-        for lane in 0..LANES {
-            let weighed = weights[lane] * x[lane];
-            first[lane] += weighed;
-            second[lane] += weighed * x[lane];
+fn in_fours<S: pulp::Simd>(
+    simd: S,
+    all: &[Lanes],
+    part: &Range<usize>,
+    neutral: f32,
+    combine: impl Fn(S::f32s, S::f32s) -> S::f32s,
+) -> S::f32s {
+    let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
+    let mut rows = [simd.splat_f32s(neutral); 4];
+    let (fours, rest) = all.as_chunks::<4>();
+    for four in fours {
+        for (row, lanes) in rows.iter_mut().zip(four) {
+            *row = combine(*row, of(lanes));
         }
     }
-    for (lane, (weight, x)) in more_weights.iter().zip(more).enumerate() {
-        first[lane] += weight * x;
-        second[lane] += weight * x * x;
+    for lanes in rest {
+        rows[0] = combine(rows[0], of(lanes));
     }
-    let sum = |lanes| f64::from(folded(lanes, |a, b| a + b));
-    (sum(first), sum(second))
+    combine(combine(rows[0], rows[1]), combine(rows[2], rows[3]))
+}
+
+/// A sample of each measurement by its weight; `shares`, from 0 to below 1, is how much of all weight comes before it.
+#[pulp::with_simd(choose = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn choose_simd<S: pulp::Simd>(_: S, weights: &[Lanes], sum: &Lanes, shares: &Lanes) -> [u32; LANES] {
+    let mut targets = [0.0_f32; LANES];
+    for ((target, sum), share) in targets.iter_mut().zip(&sum.0).zip(&shares.0) {
+        *target = sum * share;
+    }
+    // Counting what ends before the target leaves the processor nothing to guess.
+    let (mut passed, mut places) = ([0.0_f32; LANES], [0_u32; LANES]);
+    for weights in &weights[..weights.len().saturating_sub(1)] {
+        for (((weight, passed), place), target) in weights.0.iter().zip(&mut passed).zip(&mut places).zip(&targets) {
+            *passed += weight;
+            *place += u32::from(*passed <= *target);
+        }
+    }
+    places
+}
+
+/// Σ w x and Σ w x² of each measurement.
+#[pulp::with_simd(moments = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn moments_simd<S: pulp::Simd>(_: S, weights: &[Lanes], x: &[Lanes]) -> (Lanes, Lanes) {
+    let (mut first, mut second) = (Lanes::ZERO, Lanes::ZERO);
+    for (weights, x) in weights.iter().zip(x) {
+        for (((weight, x), first), second) in weights.0.iter().zip(&x.0).zip(&mut first.0).zip(&mut second.0) {
+            let weighed = weight * x;
+            *first += weighed;
+            *second = weighed.mul_add(*x, *second);
+        }
+    }
+    (first, second)
 }
 
 /// w ← exp(w − max w); returns their sum.
@@ -144,41 +151,50 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lanes_and_what_is_left_over_count_alike() {
-        for count in [1, 15, 16, 17, 64, 100] {
-            let x: Vec<f64> = (0..count).map(|i| (f64::from(i) * 0.7).sin()).collect();
-            let offsets: Vec<f64> = (0..count).map(|i| (f64::from(i) * 1.3).cos()).collect();
-            // The population lies twenty of its own standard deviations away from the centre.
-            let (mean, std) = (8.0, 0.4_f64);
-            let exponent = |place: usize| offsets[place] - 0.5 * ((x[place] - mean) / std).powi(2);
-            let exponents: Vec<f64> = (0..x.len()).map(exponent).collect();
-            let largest = exponents.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            let expected: Vec<f64> = exponents.iter().map(|e| (e - largest).exp()).collect();
-
-            let deviations: Vec<f32> = x.iter().map(|x| *x as f32).collect();
-            let mut weights: Vec<f32> = offsets.iter().map(|o| *o as f32).collect();
-            let columns = std::slice::from_ref(&deviations);
-            let found = weigh(&mut weights, columns, 0..x.len(), &[0.0], &[mean], &[std]);
-            // Exponents of some fifty in single precision: 50 · 6e-8 · some operations.
-            for (found, expected) in weights.iter().zip(&expected) {
-                assert!((f64::from(*found) - expected).abs() < 3e-5, "{count}: {found}, expected {expected}");
-            }
-            let sum: f64 = expected.iter().sum();
-            assert!((found.sum / sum - 1.0).abs() < 3e-5, "{count}");
-            let log_sum = f64::from(found.largest) - 0.5 * (mean / std).powi(2) + found.sum.ln();
-            assert!((log_sum - largest - sum.ln()).abs() < 1e-4, "{count}");
-            let direct =
-                expected.iter().zip(&x).fold((0.0, 0.0), |(first, second), (w, x)| (first + w * x, second + w * x * x));
+    fn every_lane_is_a_measurement_of_its_own() {
+        for count in [1_usize, 15, 64, 100] {
+            // The population lies up to twenty of its own standard deviations away from the centre, another way in each lane.
+            let std = 0.4_f64;
+            let off = |lane: usize| 8.0 * (lane as f64 * 0.9).cos();
+            let x = |sample: usize, lane: usize| (sample as f64 * 0.7 + lane as f64).sin();
+            let offset = |sample: usize, lane: usize| (sample as f64 * 1.3 - lane as f64).cos();
+            let lanes = |f: &dyn Fn(usize) -> f64| -> Lanes { Lanes(std::array::from_fn(|lane| f(lane) as f32)) };
+            let deviations: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| x(s, lane))).collect();
+            let mut weights: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| offset(s, lane))).collect();
+            let square = (-0.5 / (std * std)) as f32;
+            let linear = lanes(&|lane| off(lane) / (std * std));
+            let found = weigh(&mut weights, &[&deviations], &[square], &[linear]);
             let moments = moments(&weights, &deviations);
-            assert!((moments.0 - direct.0).abs() + (moments.1 - direct.1).abs() < 1e-4 * sum, "{count}: {moments:?}");
-
-            // Through all shares each sample comes as often as it weighs.
-            let shares = 200_000;
-            let mut counts = vec![0.0; x.len()];
-            (0..shares).for_each(|i| counts[found.choose(&weights, (f64::from(i) + 0.5) / f64::from(shares))] += 1.0);
-            for (count, weight) in counts.iter().zip(&weights) {
-                let expected = f64::from(*weight) / found.sum * f64::from(shares);
-                assert!((count - expected).abs() < 2.0, "{count}, expected {expected}");
+            let shares = 20_000_u32;
+            let mut counts = vec![0.0; count * LANES];
+            for i in 0..shares {
+                let share = ((f64::from(i) + 0.5) / f64::from(shares)) as f32;
+                for (lane, place) in choose(&weights, &found.sum, &Lanes([share; LANES])).iter().enumerate() {
+                    counts[*place as usize * LANES + lane] += 1.0;
+                }
+            }
+            for lane in 0..LANES {
+                let exponent = |s: usize| offset(s, lane) - 0.5 * ((x(s, lane) - off(lane)) / std).powi(2);
+                let largest = (0..count).map(exponent).fold(f64::NEG_INFINITY, f64::max);
+                let expected: Vec<f64> = (0..count).map(|s| (exponent(s) - largest).exp()).collect();
+                // Exponents of some two hundred in single precision: 200 · 6e-8 · some operations.
+                for (sample, expected) in expected.iter().enumerate() {
+                    let found = f64::from(weights[sample].0[lane]);
+                    assert!((found - expected).abs() < 1e-4, "{count}: {found}, expected {expected}");
+                }
+                let sum: f64 = expected.iter().sum();
+                assert!((f64::from(found.sum.0[lane]) / sum - 1.0).abs() < 1e-4, "{count}");
+                let log_sum = f64::from(found.largest.0[lane]) - 0.5 * (off(lane) / std).powi(2) + sum.ln();
+                assert!((log_sum - largest - sum.ln()).abs() < 2e-4, "{count}");
+                let direct = |power: i32| -> f64 { (0..count).map(|s| expected[s] * x(s, lane).powi(power)).sum() };
+                assert!((f64::from(moments.0 .0[lane]) - direct(1)).abs() < 1e-4 * sum, "{count}");
+                assert!((f64::from(moments.1 .0[lane]) - direct(2)).abs() < 1e-4 * sum, "{count}");
+                // Through all shares each sample comes as often as it weighs.
+                for sample in 0..count {
+                    let expected =
+                        f64::from(weights[sample].0[lane]) / f64::from(found.sum.0[lane]) * f64::from(shares);
+                    assert!((counts[sample * LANES + lane] - expected).abs() < 3.0, "{count}: {expected}");
+                }
             }
         }
     }

@@ -14,10 +14,10 @@ mod kernel;
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
-use rand_distr::{ChiSquared, Gamma, StandardNormal};
+use rand_distr::{Gamma, StandardNormal};
 use rayon::prelude::*;
 
-use self::kernel::{exponentials, moments, weigh, Weighed};
+use self::kernel::{choose, exponentials, moments, weigh, Lanes, Weighed, LANES};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, Stream};
@@ -27,6 +27,9 @@ pub const INTERVAL: f64 = 0.90;
 
 /// Draws of (μ, σ) that are kept.
 pub const DRAWS: usize = 400;
+
+/// Markov chains that they come from, side by side.
+const CHAINS: usize = 2;
 
 /// Sweeps of the sampler before the first draw that is kept, and for each that is kept where noise hides much of the spread:
 /// there neighbours are correlated.
@@ -156,7 +159,6 @@ pub fn populations(
     seed: u64,
 ) -> Populations {
     let problem = Problem::new(samples, log_weights, space);
-    let mut stream = stats::stream(seed, "population draws");
     let dimension = space.len();
     let to_units = |column: usize, u: f64| space.as_slice()[column].from_unit(u);
     let width = |column: usize| space.as_slice()[column].upper - space.as_slice()[column].lower;
@@ -171,20 +173,16 @@ pub fn populations(
     }
     let point = problem.maximise();
     let effective_sample_size = problem.effective_sample_size(&point);
-    let mut state = point.clone();
+    let chains: Vec<Vec<State>> = (0..CHAINS)
+        .into_par_iter()
+        .map(|chain| problem.chain(&point, DRAWS / CHAINS, stats::stream(seed, &format!("population draws {chain}"))))
+        .collect();
     let (mut means, mut stds) =
         (vec![Vec::with_capacity(DRAWS); dimension], vec![Vec::with_capacity(DRAWS); dimension]);
-    let thinning = if problem.noisy { THINNING_OF_NOISY } else { 1 };
-    for sweep in 0..BURN_IN + DRAWS * thinning {
-        problem.sweep(&mut state, &mut stream);
-        if problem.noisy && sweep.is_multiple_of(2) {
-            problem.collapsed(&mut state, &mut stream);
-        }
-        if sweep >= BURN_IN && (sweep - BURN_IN).is_multiple_of(thinning) {
-            for column in 0..dimension {
-                means[column].push(to_units(column, state.mean[column]));
-                stds[column].push(state.std[column] * width(column));
-            }
+    for state in chains.iter().flatten() {
+        for column in 0..dimension {
+            means[column].push(to_units(column, state.mean[column]));
+            stds[column].push(state.std[column] * width(column));
         }
     }
     // Of few measurements the most probable σ can lie below all that is probable: the median then stands for it.
@@ -244,15 +242,21 @@ pub fn estimate(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: 
     Populations { parameters: space.iter().enumerate().map(one).collect(), effective_sample_size }
 }
 
+/// Widths of the normal distributions that proposals come from, and the turn of eight proposals among them.
+const WIDTHS: [f64; 3] = [1.0, 1.6, 3.0];
+const TURNS: [usize; 8] = [0, 1, 0, 1, 0, 1, 0, 2];
+
 /// Samples near where posterior and population meet, for batches whose noise hides the spread: few samples of the posterior
 /// itself fall there. Returns them with the logarithm of their density in the unit box.
 ///
 /// ```text
-///  r_j = t₅(x; c_j, 1.5 C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
+///  r_j = Σ_w share_w N(x; c_j, w² C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
 /// ```
 ///
 /// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them, its spread at least
-/// half that of one posterior.
+/// half that of one posterior. The points are of a scrambled Sobol' sequence, each measurement's its own, and take the widths
+/// in turn: they stand for an integral as well as several times as many random ones (Owen & Zhou 2000, Safe and effective
+/// importance sampling).
 pub fn proposals(
     samples: &PosteriorSamples,
     found: &Populations,
@@ -260,8 +264,6 @@ pub fn proposals(
     draws: usize,
     seed: u64,
 ) -> (PosteriorSamples, Vec<f64>) {
-    const DEGREES: f64 = 5.0;
-    const STRETCH: f64 = 1.5;
     let (d, parameters) = (space.len(), space.as_slice());
     let width = |k: usize| parameters[k].upper - parameters[k].lower;
     let within = Problem::new(samples, None, space).within;
@@ -275,10 +277,15 @@ pub fn proposals(
             0.0
         }
     });
-    let chi_squared = ChiSquared::new(DEGREES).expect("the degrees of freedom are positive");
     let mut stream = stats::stream(seed, "population proposals");
     let mut theta = DMatrix::zeros(samples.measurements() * draws, d);
     let mut log_density = Vec::with_capacity(theta.nrows());
+    let turn = |draw: usize| TURNS[draw % TURNS.len()];
+    // How many have each width, over its volume.
+    let volumes: [f64; WIDTHS.len()] = std::array::from_fn(|own| {
+        let count = (0..draws).filter(|draw| turn(*draw) == own).count();
+        count as f64 / draws as f64 / WIDTHS[own].powi(d as i32)
+    });
     for measurement in 0..samples.measurements() {
         let rows = measurement * samples.draws()..(measurement + 1) * samples.draws();
         let unit = |row: usize, k: usize| parameters[k].to_unit(samples.theta()[(row, k)]);
@@ -291,21 +298,29 @@ pub fn proposals(
         }
         let own = covariance.cholesky().map_or_else(|| DMatrix::identity(d, d) * 12.0, |c| c.inverse());
         let together = (&own + &precision).cholesky().expect("a sum of positive definite matrices is one");
-        let (centre, covariance) =
-            (together.solve(&(&own * &centre + &precision * &mean)), together.inverse() * STRETCH);
-        let factor = covariance.cholesky().expect("the inverse of a positive definite matrix is one");
-        let log_volume: f64 = factor.l_dirty().diagonal().iter().map(|x| x.ln()).sum();
+        let (centre, covariance) = (together.solve(&(&own * &centre + &precision * &mean)), together.inverse());
+        let factor = covariance.cholesky().expect("the inverse of a positive definite matrix is one").unpack();
+        let log_volume: f64 = factor.diagonal().iter().map(|x| x.ln()).sum();
+        let scrambling: u32 = stream.random();
         for draw in 0..draws {
-            let normal = DVector::from_fn(d, |_, _| stream.sample::<f64, _>(StandardNormal));
-            let stretched = normal / (stream.sample(chi_squared) / DEGREES).sqrt();
-            let point = &centre + factor.l() * &stretched;
+            // In the middle of its cell of 2⁻²⁴: no level is 0 or 1.
+            let level =
+                |k: usize| f64::from(sobol_burley::sample(draw as u32, k as u32, scrambling)) + 0.5_f64.powi(25);
+            let width = WIDTHS[turn(draw)];
+            let stretched = DVector::from_fn(d, |k, _| width * stats::normal_quantile(level(k)));
+            let point = &centre + &factor * &stretched;
             let inside = point.iter().all(|u| (0.0..=1.0).contains(u));
             for k in 0..d {
                 theta[(measurement * draws + draw, k)] = parameters[k].from_unit(point[k].clamp(0.0, 1.0));
             }
-            let log_t = -0.5 * (DEGREES + d as f64) * (1.0 + stretched.norm_squared() / DEGREES).ln() - log_volume;
+            let squared = stretched.norm_squared();
+            let density: f64 = WIDTHS
+                .iter()
+                .zip(volumes)
+                .map(|(width, volume)| volume * (-0.5 * squared / (width * width)).exp())
+                .sum();
             // Beyond the prior nothing is possible.
-            log_density.push(if inside { log_t } else { IMPOSSIBLE });
+            log_density.push(if inside { density.ln() - log_volume } else { IMPOSSIBLE });
         }
     }
     (PosteriorSamples::new(theta, draws), log_density)
@@ -321,14 +336,15 @@ struct State {
     std: Vec<f64>,
 }
 
-/// Samples in the unit box.
+/// Samples in the unit box, those of sixteen measurements side by side (a block); what is left over of the last block is 0.
 struct Problem {
     /// Mean of the samples of each measurement, `[measurement·parameters + parameter]`.
     centres: Vec<f64>,
-    /// What each sample lies off that, `[parameter][measurement·draws + draw]`.
-    deviations: Vec<Vec<f32>>,
-    /// Logarithms of the weights that the samples have by themselves, the greatest of each measurement 0.
-    offsets: Vec<f32>,
+    /// What each sample lies off that, `[parameter][block·draws + draw]`.
+    deviations: Vec<Vec<Lanes>>,
+    /// Logarithms of the weights that the samples have by themselves, the greatest of each measurement 0,
+    /// `[block·draws + draw]`.
+    offsets: Vec<Lanes>,
     measurements: usize,
     draws: usize,
     /// Least σ of each column that the samples can resolve.
@@ -339,9 +355,17 @@ struct Problem {
     noisy: bool,
 }
 
+/// Weights of the samples of a block, and room for what they are made of.
+struct Weights {
+    /// `[draws]`
+    values: Vec<Lanes>,
+    squares: Vec<f32>,
+    linears: Vec<Lanes>,
+}
+
 impl Problem {
     fn new(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Self {
-        let draws = samples.draws();
+        let (draws, measurements) = (samples.draws(), samples.measurements());
         let unit = |(column, p): (usize, &crate::parameter::Parameter)| -> Vec<f64> {
             samples.theta().column(column).iter().map(|x| p.to_unit(*x)).collect()
         };
@@ -351,7 +375,7 @@ impl Problem {
                 let centre = stats::mean(chunk);
                 chunk.iter().map(|x| (x - centre).powi(2)).sum::<f64>() / chunk.len() as f64
             };
-            (column.chunks(draws).map(variance).sum::<f64>() / samples.measurements() as f64).sqrt()
+            (column.chunks(draws).map(variance).sum::<f64>() / measurements as f64).sqrt()
         };
         let within: Vec<f64> = columns.iter().map(within).collect();
         let means = |column: &Vec<f64>| -> Vec<f64> { column.chunks(draws).map(stats::mean).collect() };
@@ -361,18 +385,26 @@ impl Problem {
         let noisy = means.iter().zip(&within).any(hides);
         // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
         let floor = within.iter().map(|within| (0.25 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
+        let side_by_side = |value: &dyn Fn(usize, usize) -> f64| {
+            let mut all = vec![Lanes::ZERO; measurements.div_ceil(LANES) * draws];
+            for measurement in 0..measurements {
+                for draw in 0..draws {
+                    let place = measurement / LANES * draws + draw;
+                    all[place].0[measurement % LANES] = value(measurement, draw) as f32;
+                }
+            }
+            all
+        };
         let off_centre = |(column, means): (&Vec<f64>, &Vec<f64>)| {
-            let of_one = column.chunks(draws).zip(means);
-            of_one.flat_map(|(chunk, centre)| chunk.iter().map(move |x| (x - centre) as f32)).collect()
+            side_by_side(&|measurement, draw| column[measurement * draws + draw] - means[measurement])
         };
         let deviations = columns.iter().zip(&means).map(off_centre).collect();
         let relative = |weights: &[f64]| {
-            let largest = weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            weights.iter().map(|w| (w - largest) as f32).collect::<Vec<f32>>()
+            let largest: Vec<f64> =
+                weights.chunks(draws).map(|own| own.iter().copied().fold(f64::NEG_INFINITY, f64::max)).collect();
+            side_by_side(&|measurement, draw| weights[measurement * draws + draw] - largest[measurement])
         };
-        let offsets = log_weights
-            .map_or_else(|| vec![0.0; samples.theta().nrows()], |w| w.chunks(draws).flat_map(relative).collect());
-        let measurements = samples.measurements();
+        let offsets = log_weights.map_or_else(|| side_by_side(&|_, _| 0.0), relative);
         let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
         Self { centres, deviations, offsets, measurements, draws, floor, within, noisy }
     }
@@ -382,11 +414,42 @@ impl Problem {
         &self.centres[measurement * d..(measurement + 1) * d]
     }
 
-    /// Weights of the samples of one measurement under a population.
-    fn weights(&self, measurement: usize, state: &State, weights: &mut [f32]) -> Weighed {
-        let rows = measurement * self.draws..(measurement + 1) * self.draws;
-        weights.copy_from_slice(&self.offsets[rows.clone()]);
-        weigh(weights, &self.deviations, rows, self.centres(measurement), &state.mean, &state.std)
+    /// First measurement of each block, and how many there are in it.
+    fn blocks(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        (0..self.measurements).step_by(LANES).map(|first| (first, LANES.min(self.measurements - first)))
+    }
+
+    fn room(&self) -> Weights {
+        let d = self.deviations.len();
+        Weights { values: vec![Lanes::ZERO; self.draws], squares: vec![0.0; d], linears: vec![Lanes::ZERO; d] }
+    }
+
+    /// Places of the samples of the block that begins with measurement `first`.
+    fn places(&self, first: usize) -> std::ops::Range<usize> {
+        let block = first / LANES;
+        block * self.draws..(block + 1) * self.draws
+    }
+
+    /// Weights of the samples of a block under a population.
+    ///
+    /// ```text
+    ///  ln w_s = offset_s − Σ_k ½((x_sk − μ_k)/σ_k)² + ½((c_k − μ_k)/σ_k)²
+    /// ```
+    fn weigh(&self, (first, count): (usize, usize), state: &State, weights: &mut Weights) -> Weighed {
+        let d = self.deviations.len();
+        for k in 0..d {
+            let precision = 1.0 / (state.std[k] * state.std[k]);
+            weights.squares[k] = (-0.5 * precision) as f32;
+            for lane in 0..count {
+                let off = state.mean[k] - self.centres[(first + lane) * d + k];
+                weights.linears[k].0[lane] = (off * precision) as f32;
+            }
+            weights.linears[k].0[count..].fill(0.0);
+        }
+        let places = self.places(first);
+        weights.values.copy_from_slice(&self.offsets[places.clone()]);
+        let deviations: Vec<&[Lanes]> = self.deviations.iter().map(|all| &all[places.clone()]).collect();
+        weigh(&mut weights.values, &deviations, &weights.squares, &weights.linears)
     }
 
     fn maximise(&self) -> State {
@@ -398,22 +461,23 @@ impl Problem {
         };
         let (mean, std) = (0..d).map(start).unzip();
         let mut state = State { mean, std };
-        let mut weights = vec![0.0; self.draws];
+        let mut weights = self.room();
         for _ in 0..EM_ITERATIONS {
             let mut sums = vec![(0.0, 0.0, 0.0); d];
-            for measurement in 0..self.measurements {
-                let sum = self.weights(measurement, &state, &mut weights).sum;
-                let rows = measurement * self.draws..(measurement + 1) * self.draws;
-                for ((deviations, centre), (k, sums)) in
-                    self.deviations.iter().zip(self.centres(measurement)).zip(sums.iter_mut().enumerate())
-                {
-                    let (first, second) = moments(&weights, &deviations[rows.clone()]);
-                    let (first, second) = (first / sum, second / sum);
-                    // About the last mean: differences of large squares would lose a small spread.
-                    let off = centre - state.mean[k];
-                    sums.0 += off + first;
-                    sums.1 += second + 2.0 * off * first + off * off;
-                    sums.2 += (second - first * first).max(0.0);
+            for block in self.blocks() {
+                let weighed = self.weigh(block, &state, &mut weights);
+                let (from, count) = block;
+                for ((k, deviations), sums) in self.deviations.iter().enumerate().zip(&mut sums) {
+                    let (first, second) = moments(&weights.values, &deviations[self.places(from)]);
+                    for lane in 0..count {
+                        let sum = f64::from(weighed.sum.0[lane]);
+                        let (first, second) = (f64::from(first.0[lane]) / sum, f64::from(second.0[lane]) / sum);
+                        // About the last mean: differences of large squares would lose a small spread.
+                        let off = self.centres[(from + lane) * d + k] - state.mean[k];
+                        sums.0 += off + first;
+                        sums.1 += second + 2.0 * off * first + off * off;
+                        sums.2 += (second - first * first).max(0.0);
+                    }
                 }
             }
             let mut moved = 0.0_f64;
@@ -435,36 +499,57 @@ impl Problem {
     }
 
     fn effective_sample_size(&self, state: &State) -> f64 {
-        let mut weights = vec![0.0; self.draws];
-        let mut one = |measurement: usize| {
-            let sum = self.weights(measurement, state, &mut weights).sum;
-            sum * sum / weights.iter().map(|w| f64::from(w * w)).sum::<f64>()
-        };
-        (0..self.measurements).map(&mut one).sum::<f64>() / self.measurements as f64
+        let (mut weights, mut all) = (self.room(), 0.0);
+        for block in self.blocks() {
+            let weighed = self.weigh(block, state, &mut weights);
+            for lane in 0..block.1 {
+                let squares: f64 = weights.values.iter().map(|w| f64::from(w.0[lane] * w.0[lane])).sum();
+                all += f64::from(weighed.sum.0[lane]).powi(2) / squares;
+            }
+        }
+        all / self.measurements as f64
     }
 
     /// ln L(μ, σ) up to a constant.
-    fn log_likelihood(&self, state: &State) -> f64 {
-        let mut weights = vec![0.0; self.draws];
+    fn log_likelihood(&self, state: &State, weights: &mut Weights) -> f64 {
         // One logarithm for many measurements: the product of their sums, each from 1 to the number of draws.
         let (mut likelihood, mut product) = (0.0, 1.0_f64);
-        for measurement in 0..self.measurements {
-            let weighed = self.weights(measurement, state, &mut weights);
-            let population = self.centres(measurement).iter().zip(&state.mean).zip(&state.std);
-            let of_centre: f64 = population.map(|((c, mean), std)| ((c - mean) / std).powi(2)).sum();
-            likelihood += f64::from(weighed.largest) - 0.5 * of_centre;
-            product *= weighed.sum;
-            if product > 1e200 {
-                likelihood += product.ln();
-                product = 1.0;
+        for block in self.blocks() {
+            let weighed = self.weigh(block, state, weights);
+            for lane in 0..block.1 {
+                let population = self.centres(block.0 + lane).iter().zip(&state.mean).zip(&state.std);
+                let of_centre: f64 = population.map(|((c, mean), std)| ((c - mean) / std).powi(2)).sum();
+                likelihood += f64::from(weighed.largest.0[lane]) - 0.5 * of_centre;
+                product *= f64::from(weighed.sum.0[lane]);
+                if product > 1e200 {
+                    likelihood += product.ln();
+                    product = 1.0;
+                }
             }
         }
         likelihood + product.ln() - self.measurements as f64 * state.std.iter().map(|std| std.ln()).sum::<f64>()
     }
 
+    /// `draws` states of a Markov chain that begins at `point`.
+    fn chain(&self, point: &State, draws: usize, mut stream: Stream) -> Vec<State> {
+        let (mut state, mut weights) = (point.clone(), self.room());
+        let mut kept = Vec::with_capacity(draws);
+        let thinning = if self.noisy { THINNING_OF_NOISY } else { 1 };
+        for sweep in 0..BURN_IN + draws * thinning {
+            self.sweep(&mut state, &mut weights, &mut stream);
+            if self.noisy && sweep.is_multiple_of(2) {
+                self.collapsed(&mut state, &mut weights, &mut stream);
+            }
+            if sweep >= BURN_IN && (sweep - BURN_IN).is_multiple_of(thinning) {
+                kept.push(state.clone());
+            }
+        }
+        kept
+    }
+
     /// One Metropolis step for each parameter on the likelihood with all samples in it.
-    fn collapsed(&self, state: &mut State, stream: &mut Stream) {
-        let mut current = self.log_likelihood(state);
+    fn collapsed(&self, state: &mut State, weights: &mut Weights, stream: &mut Stream) {
+        let mut current = self.log_likelihood(state, weights);
         for k in 0..self.deviations.len() {
             // Steps of several sizes: how wide the likelihood is depends on how much the noise hides.
             let size = [0.3, 1.0, 2.0][stream.random_range(0..3)];
@@ -478,7 +563,7 @@ impl Problem {
             if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
                 continue;
             }
-            let likelihood = self.log_likelihood(&next);
+            let likelihood = self.log_likelihood(&next, weights);
             // The step is symmetric in ln σ but its size depends on σ, and σ is uniform a priori.
             let back = size * (1.0 + self.within[k] / next.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
             let moved = (next.std[k] / state.std[k]).ln();
@@ -495,18 +580,21 @@ impl Problem {
     }
 
     /// One sweep of the Gibbs sampler.
-    fn sweep(&self, state: &mut State, stream: &mut Stream) {
+    fn sweep(&self, state: &mut State, weights: &mut Weights, stream: &mut Stream) {
         let n = self.measurements as f64;
-        let mut weights = vec![0.0; self.draws];
         let mut chosen = Vec::with_capacity(self.measurements);
-        for measurement in 0..self.measurements {
-            let share = stream.random();
-            chosen.push(self.weights(measurement, state, &mut weights).choose(&weights, share));
+        for block in self.blocks() {
+            let weighed = self.weigh(block, state, weights);
+            let mut shares = Lanes::ZERO;
+            shares.0[..block.1].fill_with(|| stream.random());
+            let places = choose(&weights.values, &weighed.sum, &shares);
+            chosen.extend_from_slice(&places[..block.1]);
         }
         let d = self.deviations.len();
         for (k, deviations) in self.deviations.iter().enumerate() {
-            let value = |(measurement, place): (usize, &usize)| {
-                self.centres[measurement * d + k] + f64::from(deviations[measurement * self.draws + place])
+            let value = |(measurement, draw): (usize, &u32)| {
+                let place = measurement / LANES * self.draws + *draw as usize;
+                self.centres[measurement * d + k] + f64::from(deviations[place].0[measurement % LANES])
             };
             let values: Vec<f64> = chosen.iter().enumerate().map(value).collect();
             let centre = stats::mean(&values);

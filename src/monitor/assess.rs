@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use rand::RngCore as _;
+
 use crate::assessment::Assessment;
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
@@ -14,13 +16,17 @@ use crate::quantity::{Hertz, Timestamp};
 use crate::stats;
 use crate::trust::{cause, fit, quality, standing_findings, Code, Effect, Finding, Trust};
 
-/// Effective samples for each measurement below which the hyperparameters are estimated again from samples that lie nearer: the
-/// logarithm of a mean of few weights is too low, and the more so the narrower the population, so that few samples make σ too
-/// large.
-const FEW_EFFECTIVE: f64 = 36.0;
+/// Samples of each measurement near where its posterior meets the population, which the population is estimated from: the
+/// logarithm of a mean of few weights is too low, and the more so the narrower the population, so that samples that lie far from
+/// it make σ too large.
+const NEAR_DRAWS: usize = 64;
 
-/// Samples of each measurement drawn then, near where its posterior meets the population.
-const NEAR_DRAWS: usize = 128;
+/// Share of the posterior samples for the population that tells where that is.
+const FIRST_SHARE: usize = 4;
+
+/// The posterior samples themselves are taken where their effective share is so many times that of the nearer ones: those come
+/// from normal distributions, and a posterior may be far from one.
+const POSTERIOR_BETTER: f64 = 2.0;
 
 /// Effective samples for each measurement below which the reader is warned.
 const TOO_FEW_EFFECTIVE: f64 = 3.0;
@@ -105,8 +111,11 @@ pub fn draw(
     if observations.is_empty() {
         return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
     }
-    let per_measurement = draws.for_population.max(draws.per_measurement);
-    let posterior = baseline.infer(&observations, per_measurement, draws.seed)?;
+    let all = draws.for_population.max(draws.per_measurement);
+    // A single measurement and a population of each parameter by itself take all as they are.
+    let staged = observations.len() > 1 && !baseline.starts_at_fit();
+    let first = if staged { draws.per_measurement.max(draws.for_population / FIRST_SHARE) } else { all };
+    let posterior = baseline.infer(&observations, first, draws.seed)?;
     let starts = rows(&posterior.means());
     let fit = fit::fit(baseline.simulator(), &observations, &starts)?;
     findings.extend(fit.findings(baseline.simulator(), &indices));
@@ -133,9 +142,9 @@ pub fn draw(
     let posterior = if fit.outside.is_empty() && fit.gross.is_empty() {
         posterior
     } else {
-        baseline.infer(&asked, per_measurement, draws.seed)?
+        baseline.infer(&asked, first, draws.seed)?
     };
-    let population = population_behind(baseline, &posterior, &asked, draws.seed)?;
+    let (posterior, population) = population_behind(baseline, posterior, &asked, all, draws.seed)?;
     if population.effective_sample_size < TOO_FEW_EFFECTIVE && posterior.measurements() > 1 {
         let message = format!(
             "only {:.1} effective samples a measurement stand behind the hyperparameters: the noise drowns the spread; \
@@ -153,32 +162,45 @@ pub fn draw(
     Ok(BatchSamples { posterior, populations: population, asked, observations: used, fit, findings, left_out })
 }
 
-/// The population behind posterior samples, drawn again where the noise hides it.
+/// The population behind posterior samples: from samples nearer to it, weighed by their posterior density, or from `draws` of
+/// each posterior where those serve better, which are returned then.
 fn population_behind(
     baseline: &Baseline,
-    posterior: &PosteriorSamples,
+    posterior: PosteriorSamples,
     observations: &[Observation],
+    draws: usize,
     seed: u64,
-) -> Result<Populations, InferenceError> {
+) -> Result<(PosteriorSamples, Populations), InferenceError> {
     let space = baseline.space();
     if posterior.measurements() < 2 {
-        let mut one = populations(posterior, None, space, seed);
+        let mut one = populations(&posterior, None, space, seed);
         for (column, estimate) in one.parameters.iter_mut().enumerate() {
             conform(baseline, column, &observations[0], &mut estimate.mean_draws);
         }
-        return Ok(one);
+        return Ok((posterior, one));
     }
     if baseline.starts_at_fit() {
-        return Ok(populations_of_each(posterior, space, seed));
+        let populations = populations_of_each(&posterior, space, seed);
+        return Ok((posterior, populations));
     }
-    let found = estimate(posterior, None, space);
-    if found.effective_sample_size >= FEW_EFFECTIVE {
-        return Ok(populations(posterior, None, space, seed));
-    }
-    let (samples, log_density) = proposals(posterior, &found, space, NEAR_DRAWS, seed);
+    let found = estimate(&posterior, None, space);
+    let (samples, log_density) = proposals(&posterior, &found, space, NEAR_DRAWS, seed);
     let log_posterior = baseline.log_posterior_of_draws(samples.theta(), observations)?;
     let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
-    Ok(populations(&samples, Some(&log_weights), space, seed))
+    let near = populations(&samples, Some(&log_weights), space, seed);
+    let share = found.effective_sample_size / posterior.draws() as f64;
+    if share <= POSTERIOR_BETTER * near.effective_sample_size / NEAR_DRAWS as f64 {
+        return Ok((posterior, near));
+    }
+    let missing = draws.saturating_sub(posterior.draws());
+    let posterior = if missing > 0 {
+        let further = stats::stream(seed, "further draws").next_u64();
+        posterior.joined(&baseline.infer(observations, missing, further)?)
+    } else {
+        posterior
+    };
+    let populations = populations(&posterior, None, space, seed);
+    Ok((posterior, populations))
 }
 
 /// Stretches the draws of one measurement about their median by the factor that gave 90 % intervals their coverage in the
@@ -244,8 +266,7 @@ pub fn undamaged_state(
         let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
         return Err(too_few.into());
     };
-    let samples =
-        joined(baseline, parts, draws.seed).map_err(|e| UndamagedError::Assess { batch: 0, source: e.into() })?;
+    let samples = joined(baseline, parts, *draws).map_err(|e| UndamagedError::Assess { batch: 0, source: e.into() })?;
     let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
     let mut state = UndamagedState::from_samples(&quantities, &sizes, threshold_probability)?;
     state.conditions = conditions(batches.iter().flat_map(|(measurements, _)| *measurements));
@@ -253,17 +274,20 @@ pub fn undamaged_state(
 }
 
 /// Several batches as one, with the population behind all of them; at least one.
-fn joined(baseline: &Baseline, parts: Vec<BatchSamples>, seed: u64) -> Result<BatchSamples, InferenceError> {
-    let draws = parts.first().map_or(1, |part| part.posterior.draws());
-    let all: Vec<_> = parts.iter().flat_map(|part| part.posterior.theta().row_iter()).collect();
-    let posterior = PosteriorSamples::new(nalgebra::DMatrix::from_rows(&all), draws);
+fn joined(baseline: &Baseline, parts: Vec<BatchSamples>, draws: Draws) -> Result<BatchSamples, InferenceError> {
+    // Of some batches more samples were drawn than of others.
+    let least = parts.iter().map(|part| part.posterior.draws()).min().unwrap_or(1);
+    let cut: Vec<PosteriorSamples> = parts.iter().map(|part| part.posterior.first(least)).collect();
+    let all: Vec<_> = cut.iter().flat_map(|part| part.theta().row_iter()).collect();
+    let posterior = PosteriorSamples::new(nalgebra::DMatrix::from_rows(&all), least);
     let mut parts = parts.into_iter();
     let mut first = parts.next().expect("the caller has batches");
     for part in parts {
         first.observations.extend(part.observations);
         first.asked.extend(part.asked);
     }
-    let populations = population_behind(baseline, &posterior, &first.asked, seed)?;
+    let wanted = draws.for_population.max(draws.per_measurement);
+    let (posterior, populations) = population_behind(baseline, posterior, &first.asked, wanted, draws.seed)?;
     Ok(BatchSamples { posterior, populations, ..first })
 }
 

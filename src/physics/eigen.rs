@@ -2,7 +2,7 @@
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par, Side};
-use nalgebra::{DMatrix, SymmetricEigen};
+use nalgebra::{DMatrix, Matrix2, Matrix3, Matrix4, Matrix5, Matrix6, SymmetricEigen};
 
 /// Degrees of freedom from which faer is faster; `cargo bench --bench size -- --eigen` measures both.
 const MANY: usize = 32;
@@ -14,7 +14,20 @@ pub fn eigenvalues(symmetric: &DMatrix<f64>) -> Vec<f64> {
         let found = view(symmetric).self_adjoint_eigenvalues(Side::Lower);
         return found.unwrap_or_else(|_| vec![f64::NAN; n]);
     }
-    let mut values: Vec<f64> = symmetric.symmetric_eigenvalues().iter().copied().collect();
+    // Matrices of a known size need no memory from the allocator, and their loops are unrolled.
+    macro_rules! of_size {
+        ($matrix:ty) => {
+            <$matrix>::from_column_slice(symmetric.as_slice()).symmetric_eigenvalues().as_slice().to_vec()
+        };
+    }
+    let mut values: Vec<f64> = match n {
+        2 => of_size!(Matrix2<f64>),
+        3 => of_size!(Matrix3<f64>),
+        4 => of_size!(Matrix4<f64>),
+        5 => of_size!(Matrix5<f64>),
+        6 => of_size!(Matrix6<f64>),
+        _ => symmetric.symmetric_eigenvalues().as_slice().to_vec(),
+    };
     // nalgebra gives them unsorted.
     values.sort_by(f64::total_cmp);
     values
