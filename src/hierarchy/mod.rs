@@ -31,10 +31,8 @@ pub const DRAWS: usize = 400;
 /// Markov chains that they come from, side by side.
 const CHAINS: usize = 2;
 
-/// Sweeps of the sampler before the first draw that is kept, and for each that is kept where noise hides much of the spread:
-/// there neighbours are correlated.
+/// Sweeps of each before the first draw that is kept. All after them are: intervals of every eighth cover no better.
 const BURN_IN: usize = 40;
-const THINNING_OF_NOISY: usize = 2;
 
 /// Share of the spread between measurements that the posterior of one must have for the noise to matter.
 const NOISY: f64 = 0.3;
@@ -277,53 +275,52 @@ pub fn proposals(
             0.0
         }
     });
-    let mut stream = stats::stream(seed, "population proposals");
-    let mut theta = DMatrix::zeros(samples.measurements() * draws, d);
-    let mut log_density = Vec::with_capacity(theta.nrows());
     let turn = |draw: usize| TURNS[draw % TURNS.len()];
     // How many have each width, over its volume.
     let volumes: [f64; WIDTHS.len()] = std::array::from_fn(|own| {
         let count = (0..draws).filter(|draw| turn(*draw) == own).count();
         count as f64 / draws as f64 / WIDTHS[own].powi(d as i32)
     });
-    for measurement in 0..samples.measurements() {
+    let of_one = |(measurement, scrambling): (usize, u32)| {
         let rows = measurement * samples.draws()..(measurement + 1) * samples.draws();
         let unit = |row: usize, k: usize| parameters[k].to_unit(samples.theta()[(row, k)]);
         let count = samples.draws() as f64;
         let centre = DVector::from_fn(d, |k, _| rows.clone().map(|row| unit(row, k)).sum::<f64>() / count);
-        let mut covariance = DMatrix::identity(d, d) * 1e-12;
-        for row in rows {
-            let deviation = DVector::from_fn(d, |k, _| unit(row, k)) - &centre;
-            covariance += &deviation * deviation.transpose() / count;
-        }
+        let deviations = DMatrix::from_fn(d, samples.draws(), |k, draw| unit(rows.start + draw, k) - centre[k]);
+        let covariance = DMatrix::identity(d, d) * 1e-12 + &deviations * deviations.transpose() / count;
         let own = covariance.cholesky().map_or_else(|| DMatrix::identity(d, d) * 12.0, |c| c.inverse());
         let together = (&own + &precision).cholesky().expect("a sum of positive definite matrices is one");
         let (centre, covariance) = (together.solve(&(&own * &centre + &precision * &mean)), together.inverse());
         let factor = covariance.cholesky().expect("the inverse of a positive definite matrix is one").unpack();
         let log_volume: f64 = factor.diagonal().iter().map(|x| x.ln()).sum();
-        let scrambling: u32 = stream.random();
+        let (mut points, mut log_density) = (Vec::with_capacity(draws * d), Vec::with_capacity(draws));
+        let mut stretched = vec![0.0; d];
         for draw in 0..draws {
             // In the middle of its cell of 2⁻²⁴: no level is 0 or 1.
             let level =
                 |k: usize| f64::from(sobol_burley::sample(draw as u32, k as u32, scrambling)) + 0.5_f64.powi(25);
-            let width = WIDTHS[turn(draw)];
-            let stretched = DVector::from_fn(d, |k, _| width * stats::normal_quantile(level(k)));
-            let point = &centre + &factor * &stretched;
-            let inside = point.iter().all(|u| (0.0..=1.0).contains(u));
-            for k in 0..d {
-                theta[(measurement * draws + draw, k)] = parameters[k].from_unit(point[k].clamp(0.0, 1.0));
+            for (k, stretched) in stretched.iter_mut().enumerate() {
+                *stretched = WIDTHS[turn(draw)] * stats::normal_quantile(level(k));
             }
-            let squared = stretched.norm_squared();
-            let density: f64 = WIDTHS
-                .iter()
-                .zip(volumes)
-                .map(|(width, volume)| volume * (-0.5 * squared / (width * width)).exp())
-                .sum();
+            let mut inside = true;
+            for k in 0..d {
+                let position = centre[k] + (0..=k).map(|l| factor[(k, l)] * stretched[l]).sum::<f64>();
+                inside &= (0.0..=1.0).contains(&position);
+                points.push(parameters[k].from_unit(position.clamp(0.0, 1.0)));
+            }
+            let squared: f64 = stretched.iter().map(|z| z * z).sum();
+            let density = |(width, volume): (&f64, f64)| volume * (-0.5 * squared / (width * width)).exp();
+            let density: f64 = WIDTHS.iter().zip(volumes).map(density).sum();
             // Beyond the prior nothing is possible.
             log_density.push(if inside { density.ln() - log_volume } else { IMPOSSIBLE });
         }
-    }
-    (PosteriorSamples::new(theta, draws), log_density)
+        (points, log_density)
+    };
+    let mut stream = stats::stream(seed, "population proposals");
+    let scramblings: Vec<u32> = (0..samples.measurements()).map(|_| stream.random()).collect();
+    let (points, log_density): (Vec<_>, Vec<_>) = scramblings.into_par_iter().enumerate().map(of_one).unzip();
+    let theta = DMatrix::from_row_iterator(samples.measurements() * draws, d, points.into_iter().flatten());
+    (PosteriorSamples::new(theta, draws), log_density.concat())
 }
 
 /// Logarithm of a density of a sample that counts for nothing.
@@ -534,13 +531,12 @@ impl Problem {
     fn chain(&self, point: &State, draws: usize, mut stream: Stream) -> Vec<State> {
         let (mut state, mut weights) = (point.clone(), self.room());
         let mut kept = Vec::with_capacity(draws);
-        let thinning = if self.noisy { THINNING_OF_NOISY } else { 1 };
-        for sweep in 0..BURN_IN + draws * thinning {
+        for sweep in 0..BURN_IN + draws {
             self.sweep(&mut state, &mut weights, &mut stream);
             if self.noisy && sweep.is_multiple_of(2) {
                 self.collapsed(&mut state, &mut weights, &mut stream);
             }
-            if sweep >= BURN_IN && (sweep - BURN_IN).is_multiple_of(thinning) {
+            if sweep >= BURN_IN {
                 kept.push(state.clone());
             }
         }

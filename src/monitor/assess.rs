@@ -21,8 +21,15 @@ use crate::trust::{cause, fit, quality, standing_findings, Code, Effect, Finding
 /// it make σ too large.
 const NEAR_DRAWS: usize = 64;
 
-/// Share of the posterior samples for the population that tells where that is.
+/// The same where noise hides the population: few of them count there.
+const NEAR_DRAWS_HIDDEN: usize = 128;
+
+/// Share of the posterior samples for the population that tells where that is, unless noise hides it.
 const FIRST_SHARE: usize = 4;
+
+/// Noise hides it below this effective share of the posterior samples: there the moments of few samples of each measurement
+/// are not good enough, and σ comes out too large.
+const HIDDEN: f64 = 0.56;
 
 /// The posterior samples themselves are taken where their effective share is so many times that of the nearer ones: those come
 /// from normal distributions, and a posterior may be far from one.
@@ -183,22 +190,30 @@ fn population_behind(
         let populations = populations_of_each(&posterior, space, seed);
         return Ok((posterior, populations));
     }
-    let found = estimate(&posterior, None, space);
-    let (samples, log_density) = proposals(&posterior, &found, space, NEAR_DRAWS, seed);
+    let complete = |posterior: PosteriorSamples| match draws.saturating_sub(posterior.draws()) {
+        0 => Ok(posterior),
+        missing => {
+            let further = stats::stream(seed, "further draws").next_u64();
+            baseline.infer(observations, missing, further).map(|samples| posterior.joined(&samples))
+        }
+    };
+    let share = |populations: &Populations, draws: usize| populations.effective_sample_size / draws as f64;
+    let mut found = estimate(&posterior, None, space);
+    let mut posterior = posterior;
+    let mut near_draws = NEAR_DRAWS;
+    if share(&found, posterior.draws()) < HIDDEN {
+        posterior = complete(posterior)?;
+        found = estimate(&posterior, None, space);
+        near_draws = NEAR_DRAWS_HIDDEN;
+    }
+    let (samples, log_density) = proposals(&posterior, &found, space, near_draws, seed);
     let log_posterior = baseline.log_posterior_of_draws(samples.theta(), observations)?;
     let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
     let near = populations(&samples, Some(&log_weights), space, seed);
-    let share = found.effective_sample_size / posterior.draws() as f64;
-    if share <= POSTERIOR_BETTER * near.effective_sample_size / NEAR_DRAWS as f64 {
+    if share(&found, posterior.draws()) <= POSTERIOR_BETTER * share(&near, near_draws) {
         return Ok((posterior, near));
     }
-    let missing = draws.saturating_sub(posterior.draws());
-    let posterior = if missing > 0 {
-        let further = stats::stream(seed, "further draws").next_u64();
-        posterior.joined(&baseline.infer(observations, missing, further)?)
-    } else {
-        posterior
-    };
+    let posterior = complete(posterior)?;
     let populations = populations(&posterior, None, space, seed);
     Ok((posterior, populations))
 }

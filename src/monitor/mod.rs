@@ -404,30 +404,34 @@ impl Monitor {
     async fn ingest_here(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {
         let structure = batch.structure.clone();
         let watched = self.structure(&structure)?;
-        let id = uuid::Uuid::now_v7().to_string();
-        let (id, replayed) = match self.store.insert_batch(&batch, &id, Timestamp::now()).await? {
+        let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
+        let (record, replayed) = match self.store.insert_batch(&batch, &batch_id, received_at).await? {
             InsertBatch::Inserted => {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
-                (id, false)
+                // What was stored, without reading all of it back.
+                let (content_digest, state) = (batch.content_digest(), BatchState::Received);
+                (BatchRecord { batch_id, batch, content_digest, received_at, state, failure: None }, false)
             }
-            InsertBatch::Replayed(id) => (id, true),
+            InsertBatch::Replayed(id) => (self.stored(&structure, &id).await?, true),
             InsertBatch::KeyConflict { batch_id } => return Err(Error::KeyConflict { batch: batch_id }),
             InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
                 return Err(Error::MeasurementConflict { ordinal, measured_at, batch: batch_id });
             }
         };
-        let record = self.stored(&structure, &id).await?;
-        if record.state == BatchState::Received && watched.baseline.is_ok() {
-            if let Err(failure) = self.assess_stored(watched, record, place).await {
-                // The batch is stored, and whoever sent it may not send it again.
-                self.resume_until_done(structure);
-                return Err(failure);
+        if record.state != BatchState::Received || watched.baseline.is_err() {
+            if !replayed {
+                self.tell_batch(&structure, &record.batch_id, record.state);
             }
-        } else if !replayed {
-            self.tell_batch(&structure, &id, record.state);
+            return Ok(Ingested { view: self.view(record).await?, replayed });
         }
-        Ok(Ingested { view: self.batch(&structure, &id).await?, replayed })
+        if let Err(failure) = self.assess_stored(watched, record.clone(), place).await {
+            // The batch is stored, and whoever sent it may not send it again.
+            self.resume_until_done(structure);
+            return Err(failure);
+        }
+        let (state, failure) = self.store.state_of_batch(&structure, &record.batch_id).await?;
+        Ok(Ingested { view: self.view(BatchRecord { state, failure, ..record }).await?, replayed })
     }
 
     /// One batch with its current assessment.
@@ -435,8 +439,13 @@ impl Monitor {
     /// # Errors
     /// [`Error::UnknownBatch`], [`Error::UnknownStructure`].
     pub async fn batch(&self, structure: &StructureId, batch_id: &str) -> Result<BatchView, Error> {
+        self.view(self.stored(structure, batch_id).await?).await
+    }
+
+    /// A batch with what was made of it.
+    async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
+        let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
         let watched = self.structure(structure)?;
-        let record = self.stored(structure, batch_id).await?;
         let assessment = self.store.assessment(structure, batch_id).await?;
         let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
         let next_step = match (&assessment, &watched.baseline) {

@@ -178,6 +178,8 @@ pub(super) async fn chart(
             .bind(structure)
             .fetch_one(&mut *connection)
             .await?;
+    // All points of a batch are of the same time.
+    let mut maintained = None;
     // A state declared while this was computed has ended the charts of the one before.
     for new in points.into_iter().filter(|new| [0, newest].contains(&new.undamaged_version)) {
         let stored: Option<(f64, f64, Option<f64>, bool)> = sqlx::query_as(
@@ -195,7 +197,15 @@ pub(super) async fn chart(
         // A maintenance window declared later leaves what was charted as it is.
         let held = match stored {
             Some((.., held)) => held,
-            None => new.point.held || in_maintenance(connection, structure, new.measured).await?,
+            None if new.point.held => true,
+            None => match maintained {
+                Some((measured, maintained)) if measured == new.measured => maintained,
+                _ => {
+                    let found = in_maintenance(connection, structure, new.measured).await?;
+                    maintained = Some((new.measured, found));
+                    found
+                }
+            },
         };
         if stored == Some((new.point.shift, new.point.limit, ewma_limit, held)) {
             continue;

@@ -144,6 +144,24 @@ impl Store {
         }))
     }
 
+    /// How far a stored batch has come, and why its assessment failed.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], also for an unknown batch; [`Error::Row`].
+    pub async fn state_of_batch(
+        &self,
+        structure: &StructureId,
+        batch_id: &str,
+    ) -> Result<(BatchState, Option<String>), Error> {
+        let (state, failure): (String, Option<String>) =
+            sqlx::query_as("select state, failure from measurement_batch where structure_id = ? and batch_id = ?")
+                .bind(structure.as_str())
+                .bind(batch_id)
+                .fetch_one(&self.reader)
+                .await?;
+        Ok((batch_state(&state)?, failure))
+    }
+
     /// Frequencies of the last measurement of a source before a time.
     ///
     /// # Errors
