@@ -754,7 +754,8 @@ impl RowSums {
     }
 
     /// Adds w Dᵀ V⁻¹ e and Dᵀ V⁻¹ D, D the slopes of the mean; and the score and information of the logarithms of the columns
-    /// of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G, w h_u² − B_uu and 2 B_uv², less what the tails take.
+    /// of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G, w h_u² − B_uu and 2 B_uv², less what the tails take. Of the information, the
+    /// lower triangle.
     fn add(
         &mut self,
         present: &[usize],
@@ -785,7 +786,7 @@ impl RowSums {
             for (a, slope) in line.iter().enumerate() {
                 gradient[a] += weight * slope * self.solved[i];
                 let flat_slope = flat * slope;
-                for (sum, other) in information.column_mut(a).as_mut_slice()[..means].iter_mut().zip(line) {
+                for (sum, other) in information.column_mut(a).as_mut_slice()[a..means].iter_mut().zip(&line[a..]) {
                     *sum += flat_slope * other;
                 }
             }
@@ -793,7 +794,7 @@ impl RowSums {
         for line in self.slopes_absorbed.chunks_exact(means.max(1)) {
             for (a, slope) in line.iter().enumerate() {
                 let flat_slope = flat * slope;
-                for (sum, other) in information.column_mut(a).as_mut_slice()[..means].iter_mut().zip(line) {
+                for (sum, other) in information.column_mut(a).as_mut_slice()[a..means].iter_mut().zip(&line[a..]) {
                     *sum -= flat_slope * other;
                 }
             }
@@ -951,7 +952,7 @@ mod tests {
             let place = |k: usize| means + if k < f { k } else { f + present[k - f] };
             for k in 0..means {
                 expected[k] = of_means[(k, 0)];
-                for l in 0..means {
+                for l in 0..=k {
                     expected_information[(k, l)] = between[(k, l)];
                 }
             }

@@ -153,6 +153,7 @@ impl Store {
         structure: &StructureId,
         batch_id: &str,
     ) -> Result<(BatchState, Option<String>), Error> {
+        fault_point!("store::read", |_| Err(bad_row("batch")(&"a fault")));
         let (state, failure): (String, Option<String>) =
             sqlx::query_as("select state, failure from measurement_batch where structure_id = ? and batch_id = ?")
                 .bind(structure.as_str())
