@@ -3,6 +3,7 @@
 //! ```text
 //! cargo bench --bench size -- [--frames] [--threads N] [--out FOLDER] [PARAMETERS…]
 //! cargo bench --bench size -- --eigen     both eigen solvers at several sizes
+//! cargo bench --bench size -- --fits [PARAMETERS…]    how far the truth lies from the fits, without a training
 //! ```
 //!
 //! Each size is trained in a process of its own, whose peak memory is read at its end. Prints a line for each and writes
@@ -22,7 +23,7 @@ use modalwatch::flow::FlowSettings;
 use modalwatch::physics::eigen::eigen;
 use modalwatch::plot::{Line, Plot};
 use modalwatch::simulator::definition::StructureDefinition;
-use modalwatch::simulator::Simulator;
+use modalwatch::simulator::{Simulator, TrainingSet};
 use modalwatch::stats;
 use nalgebra::DMatrix;
 use rand::Rng as _;
@@ -33,6 +34,8 @@ const SIZES: [usize; 4] = [10, 30, 100, 300];
 /// Measurements that accuracy is measured on, and posterior draws for each.
 const MEASUREMENTS: usize = 200;
 const DRAWS: usize = 100;
+/// Measurements whose fits are looked at.
+const FITS: usize = 40;
 /// Columns of masses of a frame.
 const BAYS: usize = 5;
 
@@ -80,6 +83,9 @@ fn main() {
     if sizes.is_empty() {
         sizes = SIZES.to_vec();
     }
+    if arguments.iter().any(|a| a == "--fits") {
+        return sizes.into_iter().for_each(|size| look_at_fits(size, frames));
+    }
     std::fs::create_dir_all(&out).expect("a folder for the figures");
     let mut all: Vec<Figures> = Vec::new();
     println!("  d modes points samples | fit ms  train s  MiB  infer ms | NLL  cover (least-greatest)  R2 optimum fit-alone | groups");
@@ -104,6 +110,30 @@ fn main() {
         std::fs::write(out.join("size.svg"), growth(&all)).expect("a plot");
     }
     eprintln!("{} and size.json", out.join("size.svg").display());
+}
+
+/// Squared distance of the truth from the fit, in variances of the normal distribution at the fit, mean over the parameters and
+/// over its independent directions: 1 where it is the posterior. Quantiles over measurements.
+fn look_at_fits(parameters: usize, frames: bool) {
+    let text = if frames { frame(parameters) } else { chain(parameters) };
+    let simulator = Simulator::new(StructureDefinition::parse_toml(&text).expect("a structure")).expect("a structure");
+    let (set, observations) = held_out(&simulator, FITS);
+    let fits = locate_all(&simulator, &observations).expect("fits");
+    let space = simulator.space().as_slice();
+    let (mut of_parameters, mut of_directions) = (Vec::new(), Vec::new());
+    for (row, fit) in fits.iter().enumerate() {
+        let unit = DMatrix::from_fn(parameters, 1, |k, _| space[k].to_unit(set.theta[(row, k)]));
+        let off = (unit.column(0) - &fit.unit).component_div(&fit.std);
+        of_parameters.push(off.norm_squared() / parameters as f64);
+        of_directions.push(fit.to_flow(&unit).norm_squared() / parameters as f64);
+    }
+    let spread =
+        |values: &[f64]| [0.0, 0.5, 1.0].map(|level| format!("{:.2}", stats::quantile(values, level))).join(" ");
+    println!(
+        "{parameters} parameters, {FITS} measurements, least, median, greatest: parameters {}, directions {}",
+        spread(&of_parameters),
+        spread(&of_directions)
+    );
 }
 
 /// All eigenvalues and eigenvectors of a chain's matrix: nalgebra beside what the program takes.
@@ -166,15 +196,7 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
     let training_s = started.elapsed().as_secs_f64();
     let peak_mib = peak_memory_mib();
 
-    let set = simulator.training_set(MEASUREMENTS, 99).expect("a set");
-    let mut stream = stats::stream(99, "observations");
-    let observe = |row: usize| -> Observation {
-        let exact: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
-        let mut one = measure(&simulator, &exact, &[], &vec![Some(1.0); exact.len()], &mut stream);
-        measure_shapes(&simulator, &mut one, &set.shapes[row], &vec![false; exact.len()], &mut stream);
-        one
-    };
-    let observations: Vec<Observation> = (0..MEASUREMENTS).map(observe).collect();
+    let (set, observations) = held_out(&simulator, MEASUREMENTS);
     let started = Instant::now();
     let fits = locate_all(&simulator, &observations).expect("fits");
     let fit_ms = 1e3 * started.elapsed().as_secs_f64() / MEASUREMENTS as f64;
@@ -221,6 +243,20 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
         groups: manifest.identifiability.groups.len(),
         calibration_failures: manifest.calibration.failures.len(),
     }
+}
+
+/// Measurements that were not trained on, at the structure's own noise, and what they were made of.
+fn held_out(simulator: &Simulator, count: usize) -> (TrainingSet, Vec<Observation>) {
+    let set = simulator.training_set(count, 99).expect("a set");
+    let mut stream = stats::stream(99, "observations");
+    let observe = |row: usize| -> Observation {
+        let exact: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
+        let mut one = measure(simulator, &exact, &[], &vec![Some(1.0); exact.len()], &mut stream);
+        measure_shapes(simulator, &mut one, &set.shapes[row], &vec![false; exact.len()], &mut stream);
+        one
+    };
+    let observations = (0..count).map(observe).collect();
+    (set, observations)
 }
 
 /// Most memory this process has held, MiB; 0 where the system does not tell.
