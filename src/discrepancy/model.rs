@@ -88,7 +88,7 @@ impl Effect {
         (self.law.kind == LawKind::Lagged).then(|| self.numbers.len() - 1)
     }
 
-    /// The sizes at one input (`sizes`), and by each number the slope of the one that it moves (`slopes`), see [`Self::moved`].
+    /// The sizes at one input (`sizes`), and by each number the slope of the one that it moves (`slopes`).
     pub fn sizes(&self, input: Input, psi: &[f64], sizes: &mut [f64], slopes: &mut [f64]) {
         match self.target {
             Target::ModeOrder(_) => {}

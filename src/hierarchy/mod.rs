@@ -240,7 +240,8 @@ pub fn estimate(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: 
     Populations { parameters: space.iter().enumerate().map(one).collect(), effective_sample_size }
 }
 
-/// Widths of the normal distributions that proposals come from, and the turn of eight proposals among them.
+/// Widths of the normal distributions that proposals come from, and the turns that eight proposals take among them: wide ones reach
+/// what a posterior has beyond its moments.
 const WIDTHS: [f64; 3] = [1.0, 1.6, 3.0];
 const TURNS: [usize; 8] = [0, 1, 0, 1, 0, 1, 0, 2];
 

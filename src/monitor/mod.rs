@@ -52,7 +52,8 @@ pub use watched::Watched;
 pub struct MonitorSettings {
     /// Posterior samples drawn for each measurement (paper §5.2: 10).
     pub draws_per_measurement: usize,
-    /// Posterior samples drawn for each measurement to find the population behind a batch.
+    /// Posterior samples drawn for each measurement to find the population behind a batch: a quarter of them at first, all where
+    /// noise hides it or samples near it serve no better.
     pub draws_for_population: usize,
     /// Most measurements of one batch.
     pub max_measurements: usize,
