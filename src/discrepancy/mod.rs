@@ -1,6 +1,6 @@
 //! What the simulation gets wrong: show it, name the cause, measure what naming it gains.
 //!
-//! [`data`] holds the rows, [`grammar`] what could be wrong, [`model`] the likelihood, [`screen`] quick tests of every
+//! [`data`] holds the rows, [`grammar`] what could be wrong, [`model`] the likelihood, `row` that of one row, [`screen`] quick tests of every
 //! candidate, [`mod@select`] the choice among them, [`misfit`] what is odd before and after, [`gain`] what the extension is
 //! worth on rows that nothing has seen, [`describe`] the words, [`report`] the page, [`extend`] the structure with the causes.
 
@@ -13,6 +13,7 @@ pub mod misfit;
 pub mod model;
 pub mod report;
 pub mod response;
+mod row;
 pub mod screen;
 pub mod select;
 

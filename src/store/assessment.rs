@@ -120,6 +120,7 @@ impl Store {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn assessment(&self, structure: &StructureId, batch_id: &str) -> Result<Option<Assessment>, Error> {
+        fault_point!("store::read", |_| Err(bad_row("assessment")(&"a fault")));
         let mut found = self.current_assessments(structure, &[batch_id.to_owned()], None).await?;
         Ok(found.remove(batch_id))
     }

@@ -1,0 +1,336 @@
+//! The density of one row, and what it adds to the gradient and information of a fit.
+
+use nalgebra::{DMatrix, DVector};
+use statrs::function::gamma::ln_gamma;
+
+/// Weights of tails that a fit chooses from.
+const TAILS: [f64; 7] = [3.0, 4.0, 6.0, 10.0, 20.0, 50.0, f64::INFINITY];
+
+/// The one that a fit begins with.
+pub(super) const FIRST_TAILS: f64 = TAILS[2];
+
+/// One row over its noise, and what it adds to gradient and information.
+///
+/// With everything over the noise of its mode, V = 1 + U Uᵀ: U the slopes by the parameters times their spreads, few columns.
+///
+/// ```text
+///  C = 1 + UᵀU = L Lᵀ,   S = L⁻ᵀ,   T = U S:      V⁻¹ = 1 − T Tᵀ,   |V| = |L|²
+///  q = Tᵀe,   z = V⁻¹e = e − T q,   UᵀV⁻¹e = S q,   UᵀV⁻¹ = S Tᵀ,   UᵀV⁻¹U = 1 − S Sᵀ
+/// ```
+pub(super) struct RowSums {
+    means: usize,
+    free: usize,
+    /// e, `[p]`.
+    pub(super) residual: Vec<f64>,
+    /// Slopes of the mean, `[p][means]`.
+    pub(super) slopes: Vec<f64>,
+    /// U, `[p][free]`.
+    pub(super) spreads: Vec<f64>,
+    /// L, `[free][free]`, its lower triangle.
+    factor: Vec<f64>,
+    /// L⁻¹, S transposed, the same.
+    inverse: Vec<f64>,
+    /// T, `[p][free]`.
+    absorbed: Vec<f64>,
+    /// q, `[free]`.
+    along: Vec<f64>,
+    /// z, `[p]`.
+    solved: Vec<f64>,
+    /// Tᵀ of the slopes, `[free][means]`.
+    slopes_absorbed: Vec<f64>,
+    /// GᵀV⁻¹e and GᵀV⁻¹G, G the columns of the square root (U, 1): by parameters, then by modes.
+    score: Vec<f64>,
+    products: Vec<f64>,
+}
+
+impl RowSums {
+    /// For rows of at most `modes` modes.
+    pub(super) fn new(means: usize, free: usize, modes: usize) -> Self {
+        let (of_free, of_modes) = (vec![0.0; free * free], vec![0.0; modes * free]);
+        let variances = free + modes;
+        Self {
+            means,
+            free,
+            residual: vec![0.0; modes],
+            slopes: vec![0.0; modes * means],
+            spreads: of_modes.clone(),
+            factor: of_free.clone(),
+            inverse: of_free,
+            absorbed: of_modes,
+            along: vec![0.0; free],
+            solved: vec![0.0; modes],
+            slopes_absorbed: vec![0.0; free * means],
+            score: vec![0.0; variances],
+            products: vec![0.0; variances * variances],
+        }
+    }
+
+    /// Factors V and solves for the residual of `p` modes: eᵀV⁻¹e and ½ ln|V|.
+    pub(super) fn solve(&mut self, p: usize) -> (f64, f64) {
+        let f = self.free;
+        let mut volume = 1.0;
+        for a in 0..f {
+            for b in 0..=a {
+                let mut sum = f64::from(u8::from(a == b));
+                sum += self.spreads[..p * f].chunks_exact(f).map(|u| u[a] * u[b]).sum::<f64>();
+                for c in 0..b {
+                    sum -= self.factor[a * f + c] * self.factor[b * f + c];
+                }
+                self.factor[a * f + b] = if a == b { sum.sqrt() } else { sum / self.factor[b * f + b] };
+            }
+            volume *= self.factor[a * f + a];
+        }
+        for column in 0..f {
+            for a in column..f {
+                let mut sum = f64::from(u8::from(a == column));
+                for c in column..a {
+                    sum -= self.factor[a * f + c] * self.inverse[c * f + column];
+                }
+                self.inverse[a * f + column] = sum / self.factor[a * f + a];
+            }
+        }
+        self.along.fill(0.0);
+        for i in 0..p {
+            for a in 0..f {
+                let sum: f64 = (0..=a).map(|b| self.spreads[i * f + b] * self.inverse[a * f + b]).sum();
+                self.absorbed[i * f + a] = sum;
+                self.along[a] += sum * self.residual[i];
+            }
+        }
+        let mut distance = 0.0;
+        for i in 0..p {
+            let taken: f64 = self.absorbed[i * f..(i + 1) * f].iter().zip(&self.along).map(|(t, q)| t * q).sum();
+            self.solved[i] = self.residual[i] - taken;
+            distance += self.residual[i] * self.solved[i];
+        }
+        (distance.max(0.0), volume.ln())
+    }
+
+    /// Adds w Dᵀ V⁻¹ e and Dᵀ V⁻¹ D, D the slopes of the mean; and the score and information of the logarithms of the columns
+    /// of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G, w h_u² − B_uu and 2 B_uv², less what the tails take. Of the information, the
+    /// lower triangle.
+    pub(super) fn add(
+        &mut self,
+        present: &[usize],
+        distance: f64,
+        tails: f64,
+        gradient: &mut DVector<f64>,
+        information: &mut DMatrix<f64>,
+    ) {
+        let (p, f, means) = (present.len(), self.free, self.means);
+        let weight = weight(distance, p, tails);
+        let (flat, deep) = information_shares(p, tails);
+        self.slopes_absorbed.fill(0.0);
+        for i in 0..p {
+            let line = &self.slopes[i * means..(i + 1) * means];
+            for (absorbed, own) in
+                self.absorbed[i * f..(i + 1) * f].iter().zip(self.slopes_absorbed.chunks_exact_mut(means.max(1)))
+            {
+                for (sum, slope) in own.iter_mut().zip(line) {
+                    *sum += absorbed * slope;
+                }
+            }
+            for (a, slope) in line.iter().enumerate() {
+                gradient[a] += weight * slope * self.solved[i];
+                let flat_slope = flat * slope;
+                for (sum, other) in information.column_mut(a).as_mut_slice()[a..means].iter_mut().zip(&line[a..]) {
+                    *sum += flat_slope * other;
+                }
+            }
+        }
+        for line in self.slopes_absorbed.chunks_exact(means.max(1)) {
+            for (a, slope) in line.iter().enumerate() {
+                let flat_slope = flat * slope;
+                for (sum, other) in information.column_mut(a).as_mut_slice()[a..means].iter_mut().zip(&line[a..]) {
+                    *sum -= flat_slope * other;
+                }
+            }
+        }
+
+        let count = f + p;
+        for a in 0..f {
+            self.score[a] = (a..f).map(|c| self.inverse[c * f + a] * self.along[c]).sum();
+            for b in 0..=a {
+                let sum: f64 = (a..f).map(|c| self.inverse[c * f + a] * self.inverse[c * f + b]).sum();
+                self.products[a * count + b] = f64::from(u8::from(a == b)) - sum;
+            }
+        }
+        for i in 0..p {
+            self.score[f + i] = self.solved[i];
+            let own = &self.absorbed[i * f..(i + 1) * f];
+            let line = &mut self.products[(f + i) * count..(f + i + 1) * count];
+            for (a, product) in line[..f].iter_mut().enumerate() {
+                *product = (a..f).map(|c| self.inverse[c * f + a] * own[c]).sum();
+            }
+            for (j, product) in line[f..=f + i].iter_mut().enumerate() {
+                let sum: f64 = own.iter().zip(&self.absorbed[j * f..(j + 1) * f]).map(|(a, b)| a * b).sum();
+                *product = f64::from(u8::from(i == j)) - sum;
+            }
+        }
+        let place = |u: usize| means + if u < f { u } else { f + present[u - f] };
+        for u in 0..count {
+            let own = self.products[u * count + u];
+            gradient[place(u)] += weight * self.score[u] * self.score[u] - own;
+            // Modes ascend: what stands below the diagonal here stands below it there.
+            let (flat, deep) = (2.0 * flat, deep * own);
+            for v in 0..=u {
+                let shared = self.products[u * count + v];
+                information[(place(u), place(v))] += flat * shared * shared - deep * self.products[v * count + v];
+            }
+        }
+    }
+}
+
+/// Share of a normal row's weight that a row at `distance` has.
+pub(super) fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
+    if tails.is_finite() {
+        (tails + modes as f64) / (tails + distance)
+    } else {
+        1.0
+    }
+}
+
+/// (ν + p)/(ν + p + 2) and 2/(ν + p + 2), what the tails leave of a normal row's information and what they take; 1 and 0 for a
+/// normal distribution.
+fn information_shares(modes: usize, tails: f64) -> (f64, f64) {
+    if tails.is_finite() {
+        let total = tails + modes as f64;
+        (total / (total + 2.0), 2.0 / (total + 2.0))
+    } else {
+        (1.0, 0.0)
+    }
+}
+
+/// The density of a multivariate t, or normal, distribution.
+pub(super) struct Density {
+    tails: f64,
+    /// Logarithm of what depends on the number of modes alone, `[modes + 1]`.
+    constants: Vec<f64>,
+}
+
+impl Density {
+    /// Of at most `most` modes.
+    pub(super) fn new(tails: f64, most: usize) -> Self {
+        let constant = |modes: usize| {
+            let m = modes as f64;
+            if tails.is_finite() {
+                ln_gamma(0.5 * (tails + m)) - ln_gamma(0.5 * tails) - 0.5 * m * (tails * std::f64::consts::PI).ln()
+            } else {
+                -0.5 * m * std::f64::consts::TAU.ln()
+            }
+        };
+        Self { tails, constants: (0..=most).map(constant).collect() }
+    }
+
+    pub(super) fn log(&self, distance: f64, modes: usize, half_log_det: f64) -> f64 {
+        let of_distance = if self.tails.is_finite() {
+            0.5 * (self.tails + modes as f64) * (distance / self.tails).ln_1p()
+        } else {
+            0.5 * distance
+        };
+        self.constants[modes] - half_log_det - of_distance
+    }
+
+    /// Sum over rows: Mahalanobis distance, number of modes, ½ ln|V| of each.
+    pub(super) fn total(&self, rows: &[(f64, usize, f64)]) -> f64 {
+        // One logarithm for many rows: the product of what stands in it, for each number of modes.
+        let mut products = vec![1.0; self.constants.len()];
+        let mut sum = 0.0;
+        for (distance, modes, half_log_det) in rows {
+            sum += self.constants[*modes] - half_log_det;
+            if self.tails.is_finite() {
+                let product = &mut products[*modes];
+                *product *= 1.0 + distance / self.tails;
+                if *product > 1e150 {
+                    sum -= 0.5 * (self.tails + *modes as f64) * product.ln();
+                    *product = 1.0;
+                }
+            } else {
+                sum -= 0.5 * distance;
+            }
+        }
+        let left = |(modes, product): (usize, &f64)| 0.5 * (self.tails + modes as f64) * product.ln();
+        if self.tails.is_finite() {
+            sum -= products.iter().enumerate().map(left).sum::<f64>();
+        }
+        sum
+    }
+}
+
+/// The tails that make the rows most probable; distances are those of the present scale.
+pub(super) fn best_tails(distances: &[(f64, usize, f64)]) -> f64 {
+    let most = distances.iter().map(|(_, modes, _)| *modes).max().unwrap_or(0);
+    let total = |tails: f64| Density::new(tails, most).total(distances);
+    TAILS.into_iter().map(|t| (total(t), t)).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(f64::INFINITY, |best| best.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng as _;
+
+    use super::*;
+    use crate::stats;
+
+    /// A row's distance, ½ ln|V|, score and information against dense matrices.
+    #[test]
+    fn a_row_is_that_of_dense_matrices() {
+        for (p, f, means, tails) in [(4, 2, 3, 5.0), (3, 3, 5, f64::INFINITY), (2, 4, 4, 3.0), (3, 0, 2, 10.0)] {
+            let mut stream = stats::stream(p as u64, "a row");
+            let mut random =
+                |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| stream.random_range(-1.0..1.0));
+            let (e, d, u) = (random(p, 1), random(p, means), random(p, f));
+            // Of six modes these are present.
+            let present: Vec<usize> = (0..p).map(|i| i + usize::from(i > 0)).collect();
+            let mut row = RowSums::new(means, f, 6);
+            row.residual[..p].copy_from_slice(e.as_slice());
+            row.slopes[..p * means].copy_from_slice(d.transpose().as_slice());
+            row.spreads[..p * f].copy_from_slice(u.transpose().as_slice());
+            let (distance, log_stretch) = row.solve(p);
+            let unknowns = means + f + 6;
+            let (mut gradient, mut information) = (DVector::zeros(unknowns), DMatrix::zeros(unknowns, unknowns));
+            row.add(&present, distance, tails, &mut gradient, &mut information);
+
+            let v = DMatrix::identity(p, p) + &u * u.transpose();
+            let inverse = v.clone().try_inverse().unwrap();
+            assert!((distance - (e.transpose() * &inverse * &e)[(0, 0)]).abs() < 1e-12);
+            assert!((log_stretch - 0.5 * v.determinant().ln()).abs() < 1e-12);
+            let weight = weight(distance, p, tails);
+            let (flat, deep) = information_shares(p, tails);
+            let of_means = d.transpose() * &inverse * &e * weight;
+            let between = d.transpose() * &inverse * &d * flat;
+            let g = DMatrix::from_fn(p, f + p, |i, k| if k < f { u[(i, k)] } else { f64::from(u8::from(i == k - f)) });
+            let (h, b) = (g.transpose() * &inverse * &e, g.transpose() * &inverse * &g);
+            let mut expected = DVector::zeros(unknowns);
+            let mut expected_information = DMatrix::zeros(unknowns, unknowns);
+            let place = |k: usize| means + if k < f { k } else { f + present[k - f] };
+            for k in 0..means {
+                expected[k] = of_means[(k, 0)];
+                for l in 0..=k {
+                    expected_information[(k, l)] = between[(k, l)];
+                }
+            }
+            for k in 0..f + p {
+                expected[place(k)] = weight * h[(k, 0)] * h[(k, 0)] - b[(k, k)];
+                for l in 0..=k {
+                    let shared = b[(k, l)];
+                    expected_information[(place(k), place(l))] =
+                        flat * 2.0 * shared * shared - deep * b[(k, k)] * b[(l, l)];
+                }
+            }
+            assert!((gradient - expected).amax() < 1e-12, "{p} modes, {f} parameters");
+            assert!((information - expected_information).amax() < 1e-12, "{p} modes, {f} parameters");
+        }
+    }
+
+    #[test]
+    fn densities_of_rows_add_up() {
+        let mut stream = stats::stream(1, "densities");
+        let mut row = |_| (50.0 * stream.random::<f64>(), stream.random_range(1..5), stream.random::<f64>());
+        let rows: Vec<(f64, usize, f64)> = (0..500).map(&mut row).collect();
+        for tails in TAILS {
+            let density = Density::new(tails, 4);
+            let each: f64 = rows.iter().map(|(q, m, half)| density.log(*q, *m, *half)).sum();
+            assert!((density.total(&rows) - each).abs() < 1e-9 * each.abs(), "{tails}");
+        }
+    }
+}
