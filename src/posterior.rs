@@ -12,6 +12,7 @@ pub const EDGE: f64 = 0.01;
 pub struct PosteriorSamples {
     theta: DMatrix<f64>,
     draws: usize,
+    simulations: usize,
 }
 
 impl PosteriorSamples {
@@ -21,7 +22,19 @@ impl PosteriorSamples {
     /// When the number of rows is no multiple of `draws`: a bug.
     pub fn new(theta: DMatrix<f64>, draws: usize) -> Self {
         assert!(draws > 0 && theta.nrows().is_multiple_of(draws), "{} rows of {draws} draws each", theta.nrows());
-        Self { theta, draws }
+        Self { theta, draws, simulations: 0 }
+    }
+
+    /// The same, weighed or moved by so many simulations.
+    #[must_use]
+    pub const fn after(mut self, simulations: usize) -> Self {
+        self.simulations = simulations;
+        self
+    }
+
+    /// Simulations that weighed or moved the samples; 0 where they are those of a flow as it drew them.
+    pub const fn simulations(&self) -> usize {
+        self.simulations
     }
 
     /// Number of measurements n.
@@ -54,6 +67,7 @@ impl PosteriorSamples {
         let source = |row: usize| row / draws * self.draws + row % draws;
         let rows = self.measurements() * draws;
         Self::new(DMatrix::from_fn(rows, self.theta.ncols(), |row, column| self.theta[(source(row), column)]), draws)
+            .after(self.simulations)
     }
 
     /// These samples of each measurement, then those of `further`.
@@ -72,6 +86,7 @@ impl PosteriorSamples {
             }
         };
         Self::new(DMatrix::from_fn(self.measurements() * draws, self.theta.ncols(), value), draws)
+            .after(self.simulations + further.simulations)
     }
 
     /// Posterior mean of each measurement, `[n, d]`.

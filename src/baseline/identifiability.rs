@@ -94,9 +94,13 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
             },
         });
     }
-    let samples = baseline.infer(&observations, DRAWS, seed)?;
+    // Without noise the simulation makes points of the draws, which would leave rounding errors to be told apart.
+    let theta = match baseline.manifest().conditions.noise_range {
+        Some(_) => baseline.infer(&observations, DRAWS, seed)?.theta().clone(),
+        None => baseline.propose(&observations, DRAWS, seed)?.theta,
+    };
     let d = space.len();
-    let unit = |row: usize, column: usize| space.as_slice()[column].to_unit(samples.theta()[(row, column)]);
+    let unit = |row: usize, column: usize| space.as_slice()[column].to_unit(theta[(row, column)]);
     let mut covariance = DMatrix::<f64>::zeros(d, d);
     for point in 0..POINTS {
         let rows = point * DRAWS..(point + 1) * DRAWS;

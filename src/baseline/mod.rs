@@ -7,6 +7,7 @@ pub mod library;
 pub mod manifest;
 pub mod nearest;
 pub mod observation;
+mod project;
 mod resample;
 pub mod start;
 pub mod train;
@@ -230,9 +231,11 @@ impl Baseline {
             if observation.possible_sizes.is_empty() { &mut known } else { &mut blind }.push(row);
         }
         let mut theta = DMatrix::zeros(observations.len() * draws, self.space().len());
+        let mut simulations = 0;
         let of_known: Vec<Observation> = known.iter().map(|row| observations[*row].clone()).collect();
         if !known.is_empty() {
             let samples = self.infer_known(&of_known, draws, seed)?;
+            simulations += samples.simulations();
             for (place, row) in known.iter().enumerate() {
                 for draw in 0..draws {
                     theta.set_row(row * draws + draw, &samples.theta().row(place * draws + draw));
@@ -247,6 +250,7 @@ impl Baseline {
             let expanded: Vec<Observation> =
                 rows.iter().flat_map(|row| at_possible_sizes(&observations[*row])).collect();
             let samples = self.infer_known(&expanded, each, seed)?;
+            simulations += samples.simulations();
             let mut first = 0;
             for row in rows {
                 let count = observations[*row].possible_sizes.len();
@@ -259,11 +263,11 @@ impl Baseline {
                 first += count;
             }
         }
-        Ok(PosteriorSamples::new(theta, draws))
+        Ok(PosteriorSamples::new(theta, draws).after(simulations))
     }
 
-    /// Samples where all covariates are known: the flow's draws, set right by the simulation where there is noise to weigh
-    /// them by.
+    /// Samples where all covariates are known: the flow's draws, set right by the simulation, which weighs them where there is
+    /// noise and moves them where there is none.
     fn infer_known(
         &self,
         observations: &[Observation],
@@ -273,22 +277,32 @@ impl Baseline {
         if self.starts_at_fit() {
             return Ok(PosteriorSamples::new(self.propose_from_fit(observations, draws, seed)?.theta, draws));
         }
-        if !self.is_weighed() {
-            return Ok(PosteriorSamples::new(self.propose(observations, draws, seed)?.theta, draws));
+        if self.is_weighed() {
+            let proposals = self.propose(observations, PROPOSALS * draws, seed)?;
+            let theta = resample::resample(&self.simulator, observations, &proposals, draws, seed);
+            return Ok(PosteriorSamples::new(theta, draws).after(proposals.theta.nrows()));
         }
-        let proposals = self.propose(observations, PROPOSALS * draws, seed)?;
-        let theta = resample::resample(&self.simulator, observations, &proposals, draws, seed);
-        Ok(PosteriorSamples::new(theta, draws))
+        let mut theta = self.propose(observations, draws, seed)?.theta;
+        let simulations = match self.manifest.conditions.noise_range {
+            None if self.is_set_right() => project::project(&self.simulator, observations, &mut theta),
+            _ => 0,
+        };
+        Ok(PosteriorSamples::new(theta, draws).after(simulations))
     }
 
-    /// Whether the simulation weighs the flow's draws: not without noise; not where it depends on numbers of effects that are
-    /// themselves uncertain, over which the flow has learnt to average; not where it would take longer than anybody waits; and not
-    /// where the flow starts at the best fit, which the simulation has had its say in: of a hundred parameters, weights would
-    /// leave a single draw.
+    /// Whether the simulation weighs the flow's draws: not without noise, of which there is none to weigh them by.
     fn is_weighed(&self) -> bool {
+        self.manifest.conditions.noise_range.is_some() && self.is_set_right()
+    }
+
+    /// Whether the simulation sets the flow's draws right: not where it depends on numbers of effects that are themselves
+    /// uncertain, over which the flow has learnt to average; not where it would take longer than anybody waits; and not where the
+    /// flow starts at the best fit, which the simulation has had its say in: of a hundred parameters, weights would leave a single
+    /// draw.
+    fn is_set_right(&self) -> bool {
         let certain = self.simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));
         let quick = self.simulator.structure().is_none_or(|structure| structure.freedoms() <= MOST_FREEDOMS_WEIGHED);
-        self.manifest.conditions.noise_range.is_some() && certain && quick && !self.starts_at_fit()
+        certain && quick && !self.starts_at_fit()
     }
 
     /// Logarithm of the posterior density of `draws` rows of `theta` for each observation, in the unit box of the prior and up

@@ -77,81 +77,172 @@ fn nearest_by_frequencies(
     start: &[f64],
 ) -> Result<Nearest, physics::Error> {
     let simulator = &observation.simulator(simulator);
-    let parameters = simulator.space().as_slice();
-    let present: Vec<usize> = (0..simulator.modes()).filter(|&i| observation.frequencies_hz[i].is_some()).collect();
-    let measured = |mode: usize| observation.frequencies_hz[mode].expect("only present modes are asked for");
-    let relative_std: Vec<f64> = present
-        .iter()
-        .map(|&mode| observation.std_hz(simulator, mode).map_or(1.0, |std| std / measured(mode)).max(RESOLUTION))
-        .collect();
-    let theta = |u: &DVector<f64>| -> Vec<f64> { parameters.iter().zip(u).map(|(p, u)| p.from_unit(*u)).collect() };
-    let residual = |frequencies: &[f64]| {
-        let one = |(&mode, std): (&usize, &f64)| (measured(mode) / frequencies[mode]).ln() / std;
-        DVector::from_iterator(present.len(), present.iter().zip(&relative_std).map(one))
-    };
-    let mut u =
-        DVector::from_iterator(start.len(), parameters.iter().zip(start).map(|(p, x)| p.to_unit(*x).clamp(0.0, 1.0)));
-    let mut frequencies = simulator.frequencies_hz(&theta(&u))?;
-    let mut error = residual(&frequencies);
+    let search = Search::new(simulator, observation, RESOLUTION);
+    let (present, parameters) = (search.modes.len(), simulator.space().len());
     // What is not known of the effects may be anything: such a measurement tests nothing.
     let known = observation.possible_sizes.is_empty();
-    let determined = known && present.len() > parameters.len();
-    let reached = |error: &DVector<f64>| {
-        error.iter().zip(&relative_std).all(|(r, std)| r.abs() * std <= FLOW_ACCURACY + NOISE_MULTIPLE * std)
-    };
-    let (mut at_edge, mut absorbed) = (0, if known { present.len().min(parameters.len()) } else { present.len() });
-    let mut projector = DMatrix::zeros(present.len(), present.len());
-    if known && (determined || !reached(&error)) {
-        let mut damping = 1e-3;
+    let determined = known && present > parameters;
+    let mut found = search.at(search.unit(start))?;
+    let (mut at_edge, mut absorbed) = (0, if known { present.min(parameters) } else { present });
+    let mut projector = DMatrix::zeros(present, present);
+    if known && (determined || !search.reaches(&found)) {
+        found = search.descend(found)?;
+        let slopes = search.slopes(&found)?;
+        let free = found.free(&slopes);
+        at_edge = parameters - free.len();
+        absorbed = 0;
+        if determined || free.is_empty() {
+            projector = DMatrix::identity(present, present);
+        }
+        if !free.is_empty() {
+            let svd = slopes.select_columns(&free).svd(determined, false);
+            absorbed = svd.singular_values.iter().filter(|strength| **strength > ABSORBING).count();
+            let directions = svd.u.iter().flat_map(|u| u.column_iter()).zip(&svd.singular_values);
+            for (direction, _) in directions.filter(|(_, strength)| **strength > ABSORBING) {
+                projector -= direction * direction.transpose();
+            }
+        }
+    }
+    let tested = known && (determined || at_edge > 0 || !search.reaches(&found));
+    let chi_squared = if tested { found.error.norm_squared() } else { 0.0 };
+    let (mut standardised_residuals, mut expanded) =
+        (DVector::zeros(simulator.modes()), DMatrix::zeros(simulator.modes(), simulator.modes()));
+    for (row, &mode) in search.modes.iter().enumerate() {
+        standardised_residuals[mode] = if known { found.error[row] } else { 0.0 };
+        for (column, &other) in search.modes.iter().enumerate() {
+            expanded[(mode, other)] = projector[(row, column)];
+        }
+    }
+    // Where nothing should be left over and something is, the measurement lies beyond what the simulation can give (a fold
+    // of the map, not an edge of the box): that is told like an edge.
+    let beyond = usize::from(chi_squared > 0.0 && !search.reaches(&found));
+    Ok(Nearest {
+        chi_squared,
+        degrees_of_freedom: present.saturating_sub(absorbed).max(beyond),
+        frequencies_hz: found.frequencies_hz,
+        standardised_residuals,
+        projector: expanded,
+    })
+}
+
+/// The frequencies of a measurement, to be looked for in the unit box of the prior.
+pub(super) struct Search<'a> {
+    simulator: &'a Simulator,
+    /// The modes present,
+    modes: Vec<usize>,
+    /// their frequencies, Hz,
+    measured_hz: Vec<f64>,
+    /// and the relative standard deviations of their noise.
+    relative_std: Vec<f64>,
+}
+
+/// A point of the unit box.
+struct Point {
+    /// Where it is.
+    u: DVector<f64>,
+    /// All its frequencies, Hz.
+    frequencies_hz: Vec<f64>,
+    /// (ln f_i − ln f_i(x))/s_i of the modes present.
+    error: DVector<f64>,
+    /// Simulations on the way here.
+    simulations: usize,
+}
+
+/// Where a search ended.
+pub(super) struct Descent {
+    /// Parameters, `[d]`.
+    pub theta: Vec<f64>,
+    /// How far the worst of its frequencies is off, relative.
+    pub off: f64,
+    /// Simulations that it took.
+    pub simulations: usize,
+}
+
+impl Point {
+    /// Parameters that are not at an edge which they want to leave; `slopes` as of [`Search::slopes`].
+    fn free(&self, slopes: &DMatrix<f64>) -> Vec<usize> {
+        let descent = slopes.tr_mul(&self.error);
+        let leaves = |i: usize| (self.u[i] <= 0.0 && descent[i] < 0.0) || (self.u[i] >= 1.0 && descent[i] > 0.0);
+        (0..self.u.len()).filter(|&i| !leaves(i)).collect()
+    }
+}
+
+impl<'a> Search<'a> {
+    /// Of a measurement by a simulation under its conditions; what is left of a search that has converged is a hundredth of
+    /// `resolution` (relative), or of the noise where that is more.
+    pub(super) fn new(simulator: &'a Simulator, observation: &Observation, resolution: f64) -> Self {
+        let frequencies = observation.frequencies_hz.iter().enumerate();
+        let (modes, measured_hz): (Vec<usize>, Vec<f64>) =
+            frequencies.filter_map(|(mode, f)| f.map(|f| (mode, f))).unzip();
+        let relative = |(&mode, f): (&usize, &f64)| {
+            observation.std_hz(simulator, mode).map_or(1.0, |std| std / f).max(resolution)
+        };
+        let relative_std = modes.iter().zip(&measured_hz).map(relative).collect();
+        Self { simulator, modes, measured_hz, relative_std }
+    }
+
+    /// Parameters in the unit box, those beyond it at its edge.
+    fn unit(&self, theta: &[f64]) -> DVector<f64> {
+        let parameters = self.simulator.space().iter();
+        DVector::from_iterator(theta.len(), parameters.zip(theta).map(|(p, x)| p.to_unit(*x).clamp(0.0, 1.0)))
+    }
+
+    /// The parameters of a point.
+    fn theta(&self, u: &DVector<f64>) -> Vec<f64> {
+        self.simulator.space().iter().zip(u).map(|(p, u)| p.from_unit(*u)).collect()
+    }
+
+    fn at(&self, u: DVector<f64>) -> Result<Point, physics::Error> {
+        let frequencies_hz = self.simulator.frequencies_hz(&self.theta(&u))?;
+        let one = |(i, measured): (usize, &f64)| (measured / frequencies_hz[self.modes[i]]).ln() / self.relative_std[i];
+        let error = DVector::from_iterator(self.modes.len(), self.measured_hz.iter().enumerate().map(one));
+        Ok(Point { u, frequencies_hz, error, simulations: 1 })
+    }
+
+    /// d ln f/du over s, `[modes present, d]`: the box is the unit cube, the errors count in standard deviations.
+    fn slopes(&self, point: &Point) -> Result<DMatrix<f64>, physics::Error> {
+        let jacobian = self.simulator.jacobian(&self.theta(&point.u))?;
+        let parameters = self.simulator.space().as_slice();
+        Ok(DMatrix::from_fn(self.modes.len(), parameters.len(), |row, column| {
+            let (mode, width) = (self.modes[row], parameters[column].upper - parameters[column].lower);
+            jacobian[(mode, column)] * width / (point.frequencies_hz[mode] * self.relative_std[row])
+        }))
+    }
+
+    /// Whether a point gives the measurement, as near as a flow comes, beyond its noise.
+    fn reaches(&self, point: &Point) -> bool {
+        let near = |(error, std): (&f64, &f64)| error.abs() * std <= FLOW_ACCURACY + NOISE_MULTIPLE * std;
+        point.error.iter().zip(&self.relative_std).all(near)
+    }
+
+    /// The minimum of the errors that lies downhill from a point, by projected Levenberg–Marquardt.
+    fn descend(&self, start: Point) -> Result<Point, physics::Error> {
+        let (mut point, mut damping) = (start, 1e-3);
+        let mut simulations = point.simulations;
+        let mut slopes = self.slopes(&point)?;
         for _ in 0..ITERATIONS {
-            let jacobian = simulator.jacobian(&theta(&u))?;
-            // d ln f / du over s: the box becomes the unit cube, the residuals count in standard deviations.
-            let scaled = DMatrix::from_fn(present.len(), u.len(), |row, column| {
-                let width = parameters[column].upper - parameters[column].lower;
-                jacobian[(present[row], column)] * width / (frequencies[present[row]] * relative_std[row])
-            });
-            let descent = scaled.transpose() * &error;
             // A parameter at an edge that wants to leave stays there and out of the step of the others.
-            let free: Vec<usize> = (0..u.len())
-                .filter(|&i| !((u[i] <= 0.0 && descent[i] < 0.0) || (u[i] >= 1.0 && descent[i] > 0.0)))
-                .collect();
-            at_edge = u.len() - free.len();
+            let free = point.free(&slopes);
             if free.is_empty() {
-                absorbed = 0;
-                projector = DMatrix::identity(present.len(), present.len());
                 break;
             }
-            let columns = scaled.select_columns(&free);
-            if determined {
-                let svd = columns.clone().svd(true, false);
-                projector = DMatrix::identity(present.len(), present.len());
-                absorbed = 0;
-                for (direction, strength) in svd.u.iter().flat_map(|u| u.column_iter()).zip(svd.singular_values.iter())
-                {
-                    if *strength > ABSORBING {
-                        projector -= direction * direction.transpose();
-                        absorbed += 1;
-                    }
-                }
-            } else {
-                absorbed = columns.singular_values().iter().filter(|s| **s > ABSORBING).count();
-            }
-            let mut normal = columns.transpose() * &columns;
+            let columns = slopes.select_columns(&free);
+            let mut normal = columns.tr_mul(&columns);
             for i in 0..free.len() {
                 normal[(i, i)] += damping * (normal[(i, i)] + 1e-12);
             }
-            let Some(step) = normal.cholesky().map(|c| c.solve(&descent.select_rows(&free))) else { break };
-            let mut next = u.clone();
+            let Some(step) = normal.cholesky().map(|c| c.solve(&columns.tr_mul(&point.error))) else { break };
+            let mut u = point.u.clone();
             for (i, &column) in free.iter().enumerate() {
-                next[column] = (u[column] + step[i]).clamp(0.0, 1.0);
+                u[column] = (u[column] + step[i]).clamp(0.0, 1.0);
             }
-            let moved = (&next - &u).amax();
-            let next_frequencies = simulator.frequencies_hz(&theta(&next))?;
-            let next_error = residual(&next_frequencies);
-            let gain = error.norm_squared() - next_error.norm_squared();
+            let moved = (&u - &point.u).amax();
+            let next = self.at(u)?;
+            simulations += 1;
+            let gain = point.error.norm_squared() - next.error.norm_squared();
             if gain > 0.0 {
-                (u, frequencies, error) = (next, next_frequencies, next_error);
-                damping = (damping / 5.0).max(1e-12);
+                slopes = self.slopes(&next)?;
+                (point, damping) = (next, (damping / 5.0).max(1e-12));
             } else {
                 damping *= 5.0;
             }
@@ -159,26 +250,16 @@ fn nearest_by_frequencies(
                 break;
             }
         }
+        Ok(Point { simulations, ..point })
     }
-    let tested = known && (determined || at_edge > 0 || !reached(&error));
-    let chi_squared = if tested { error.norm_squared() } else { 0.0 };
-    let (mut standardised_residuals, mut expanded) =
-        (DVector::zeros(simulator.modes()), DMatrix::zeros(simulator.modes(), simulator.modes()));
-    for (row, &mode) in present.iter().enumerate() {
-        standardised_residuals[mode] = if known { error[row] } else { 0.0 };
-        for (column, &other) in present.iter().enumerate() {
-            expanded[(mode, other)] = projector[(row, column)];
-        }
+
+    /// The minimum of the errors that lies downhill from parameters `[d]`.
+    ///
+    /// # Errors
+    /// [`physics::Error`], which a checked prior rules out.
+    pub(super) fn descend_from(&self, theta: &[f64]) -> Result<Descent, physics::Error> {
+        let point = self.descend(self.at(self.unit(theta))?)?;
+        let off = point.error.iter().zip(&self.relative_std).map(|(error, std)| (error * std).abs()).fold(0.0, f64::max);
+        Ok(Descent { theta: self.theta(&point.u), off, simulations: point.simulations })
     }
-    // Where nothing should be left over and something is, the measurement lies beyond what the simulation can give (a fold
-    // of the map, not an edge of the box): that is told like an edge.
-    let beyond = usize::from(chi_squared > 0.0 && !reached(&error));
-    let degrees_of_freedom = present.len().saturating_sub(absorbed).max(beyond);
-    Ok(Nearest {
-        frequencies_hz: frequencies,
-        chi_squared,
-        degrees_of_freedom,
-        standardised_residuals,
-        projector: expanded,
-    })
 }

@@ -10,7 +10,6 @@ use crate::assessment::Assessment;
 use crate::baseline::Baseline;
 use crate::damage::{QuantityAssessment, QuantityKind, UndamagedQuantity, UndamagedState};
 use crate::parameter::DamageDirection;
-use crate::quantity::Timestamp;
 use crate::store::{NewChartPoint, FIT_SERIES};
 use crate::trust::{Code, Effect};
 
@@ -42,7 +41,6 @@ pub fn points(
     baseline: &Baseline,
     assessment: &Assessment,
     undamaged: Option<&UndamagedState>,
-    measured: (Timestamp, Timestamp),
     settings: &AlarmSettings,
     known: &KnownLimits,
 ) -> Vec<NewChartPoint> {
@@ -57,7 +55,6 @@ pub fn points(
         points.push(NewChartPoint {
             series: FIT_SERIES.to_owned(),
             undamaged_version: 0,
-            measured,
             point: ChartPoint::fit(rejected),
             probability_limit: None,
             settings: fit_settings(settings),
@@ -72,7 +69,6 @@ pub fn points(
         points.push(NewChartPoint {
             series: quantity.name.clone(),
             undamaged_version: state.version,
-            measured,
             point: ChartPoint::damage(shift, &limits, !assessment.trust.moves_charts()),
             probability_limit: chart::probability_limit(reference, limits.single, within, n),
             settings: *settings,

@@ -176,22 +176,28 @@ impl Monitor {
         self.events.publish(News::Structure { structure: structure.clone() });
     }
 
-    /// Tells of the alarms that were opened, ended or withdrawn since the last look.
-    pub(super) async fn tell_alarms(&self, structure: &StructureId) {
-        for news in self.look_at_alarms(structure).await {
+    /// Tells of the alarms that were opened, ended or withdrawn since the last look; those that last.
+    pub(super) async fn tell_alarms(&self, structure: &StructureId) -> Vec<Episode> {
+        let (news, open) = self.look_at_alarms(structure).await;
+        for news in news {
             self.events.publish(news);
         }
+        open
     }
 
-    /// Takes in the alarms of a structure; what is new.
-    pub(super) async fn look_at_alarms(&self, structure: &StructureId) -> Vec<News> {
+    /// Takes in the alarms of a structure; what is new, and those that last.
+    pub(super) async fn look_at_alarms(&self, structure: &StructureId) -> (Vec<News>, Vec<Episode>) {
         let Known { newest, open } = self.known_alarms.of(structure);
         let open: Vec<i64> = open.into_iter().collect();
         match self.store.episodes_since(structure, newest, &open).await {
-            Ok(episodes) => self.known_alarms.learn(structure, &episodes),
+            Ok(mut episodes) => {
+                let news = self.known_alarms.learn(structure, &episodes);
+                episodes.retain(|episode| episode.state() == "open");
+                (news, episodes)
+            }
             Err(failure) => {
                 error!(structure.id = %structure, error = %failure, "Could not look for changed alarms of {structure}: {failure}");
-                Vec::new()
+                Default::default()
             }
         }
     }

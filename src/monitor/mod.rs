@@ -426,13 +426,23 @@ impl Monitor {
             }
             return Ok(Ingested { view: self.view(record).await?, replayed });
         }
-        if let Err(failure) = self.assess_stored(watched, record.clone(), place).await {
-            // The batch is stored, and whoever sent it may not send it again.
-            self.resume_until_done(structure);
-            return Err(failure);
-        }
-        let (state, failure) = self.store.state_of_batch(&structure, &record.batch_id).await?;
-        Ok(Ingested { view: self.view(BatchRecord { state, failure, ..record }).await?, replayed })
+        let stands = match self.assess_stored(watched, record.clone(), place).await {
+            Ok(stands) => stands,
+            Err(failure) => {
+                // The batch is stored, and whoever sent it may not send it again.
+                self.resume_until_done(structure);
+                return Err(failure);
+            }
+        };
+        let view = match stands {
+            // What was stored, without reading it back.
+            Some((assessment, charts)) if !replayed => {
+                let record = BatchRecord { state: BatchState::Assessed, ..record };
+                self.view_of(record, Some(assessment), charts).await?
+            }
+            _ => self.batch(&structure, &record.batch_id).await?,
+        };
+        Ok(Ingested { view, replayed })
     }
 
     /// One batch with its current assessment.
@@ -446,8 +456,20 @@ impl Monitor {
     /// A batch with what was made of it.
     async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
         let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
-        let watched = self.structure(structure)?;
         let assessment = self.store.assessment(structure, batch_id).await?;
+        let charts = self.store.chart_points(structure, batch_id).await?;
+        self.view_of(record, assessment, charts).await
+    }
+
+    /// A batch with this made of it.
+    async fn view_of(
+        &self,
+        record: BatchRecord,
+        assessment: Option<Assessment>,
+        charts: Vec<StoredChartPoint>,
+    ) -> Result<BatchView, Error> {
+        let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
+        let watched = self.structure(structure)?;
         let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
         let next_step = match (&assessment, &watched.baseline) {
             (None, Err(reason)) => Some(reason.clone()),
@@ -456,7 +478,6 @@ impl Monitor {
             }
             _ => None,
         };
-        let charts = self.store.chart_points(structure, batch_id).await?;
         Ok(BatchView { record, assessment, charts, next_step })
     }
 
@@ -485,15 +506,7 @@ impl Monitor {
 
     /// Logs alarms that were raised since the last look, each once, and tells of all that changed.
     async fn report_episodes(&self, structure: &StructureId) {
-        self.tell_alarms(structure).await;
-        let episodes = match self.store.episodes(structure, None, true, 20).await {
-            Ok(episodes) => episodes,
-            Err(failure) => {
-                error!(structure.id = %structure, error = %failure, "Could not look for new alarms of {structure}: {failure}");
-                return;
-            }
-        };
-        for episode in episodes {
+        for episode in self.tell_alarms(structure).await {
             let key = (structure.clone(), episode.number);
             if !self.reported.lock().expect("no holder of this lock panics").insert(key) {
                 continue;

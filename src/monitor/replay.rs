@@ -12,7 +12,7 @@ use std::time::Duration;
 use futures_util::{stream, StreamExt as _, TryStreamExt as _};
 use tracing::{error, warn};
 
-use super::task::Computed;
+use super::task::{Computed, Settled};
 use super::{Error, Monitor};
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
@@ -113,7 +113,7 @@ impl Monitor {
         let mut stored = pin!(stored.try_buffered(together));
         while let Some(stored) = stored.try_next().await? {
             let Some(stored) = stored else { continue };
-            if let Some(task) = self.settle(stored).await? {
+            if let Settled::GoOn(task) = self.settle(stored).await? {
                 self.finish(task).await?;
             }
         }

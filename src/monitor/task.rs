@@ -14,7 +14,7 @@ use crate::assessment::{Assessment, BatchState};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedState;
 use crate::quantity::{Hertz, StructureId};
-use crate::store::{BatchRecord, NewChartPoint, UndamagedRecord};
+use crate::store::{BatchRecord, NewChartPoint, StoredAssessment, StoredChartPoint, UndamagedRecord};
 
 /// A batch on its way, and what it is assessed with.
 pub(super) struct Task {
@@ -29,41 +29,77 @@ pub(super) struct Task {
 /// A batch that was computed, and under which undamaged state.
 pub(super) struct Computed {
     task: Task,
-    undamaged_version: Option<u32>,
+    seen: Seen,
     seconds: f64,
     /// The assessment with its points on the charts, or why there is none.
     outcome: Result<(Assessment, Vec<NewChartPoint>), String>,
 }
 
+/// Versions of the undamaged state when a batch was computed.
+#[derive(Clone, Copy)]
+struct Seen {
+    /// The newest, 0 where there was none,
+    newest: u32,
+    /// and the one it was compared with.
+    compared_with: Option<u32>,
+}
+
 /// A batch whose result was stored, unless its structure has another version by now.
 pub(super) struct Stored {
     task: Task,
-    undamaged_version: Option<u32>,
-    state: BatchState,
-    stored: bool,
+    seen: Seen,
+    outcome: Outcome,
+}
+
+enum Outcome {
+    Assessed(Box<Assessment>, StoredAssessment),
+    Failed,
+    /// Not stored.
+    OfAnotherVersion,
+}
+
+/// A stored result.
+pub(super) enum Settled {
+    /// It stands: the assessment as it was stored, with the points of the batch on the charts.
+    Stands(Box<Assessment>, Vec<StoredChartPoint>),
+    /// There is none, or not yet.
+    Without,
+    /// Its baseline or undamaged state became another meanwhile.
+    GoOn(Task),
+}
+
+impl Task {
+    /// Whether the batch is compared with an undamaged state: one that was taken with its baseline and without the batch.
+    fn is_comparable(&self, undamaged: &UndamagedRecord) -> bool {
+        undamaged.model_digest == *self.baseline.digest() && !undamaged.batches.contains(&self.record.batch_id)
+    }
 }
 
 impl Monitor {
-    /// Assesses a stored batch and stores the result, or the reason why there is none.
+    /// Assesses a stored batch and stores the result, or the reason why there is none: the assessment with the points of the
+    /// batch on the charts.
     pub(super) async fn assess_stored(
         &self,
         watched: Arc<Watched>,
         record: BatchRecord,
         place: Place,
-    ) -> Result<(), Error> {
+    ) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
         let task = self.task(watched, record, place).await?;
         self.finish(task).await
     }
 
     /// Goes on with a task until its result stands.
-    pub(super) async fn finish(&self, task: Task) -> Result<(), Error> {
-        let mut next = Some(task);
-        while let Some(task) = next {
+    pub(super) async fn finish(&self, task: Task) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
+        let mut task = task;
+        loop {
             let computed = self.compute(task).await?;
             let stored = self.store_computed(computed).await?;
-            next = self.settle(stored).await?;
+            task = match self.settle(stored).await? {
+                Settled::GoOn(task) => task,
+                Settled::Stands(assessment, charts) => return Ok(Some((*assessment, charts))),
+                Settled::Without => return Ok(None),
+            };
         }
-        Ok(())
     }
 
     /// The task of a stored batch.
@@ -77,8 +113,10 @@ impl Monitor {
 
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
-        let undamaged = self.comparable(&task).await?;
-        let undamaged_version = undamaged.as_ref().map(|record| record.state.version);
+        let undamaged = self.store.undamaged(&task.record.batch.structure).await?;
+        let newest = undamaged.as_ref().map_or(0, |record| record.state.version);
+        let undamaged = undamaged.filter(|record| task.is_comparable(record));
+        let seen = Seen { newest, compared_with: undamaged.as_ref().map(|record| record.state.version) };
         let started = Instant::now();
         let draws = self.draws(&task.baseline, &task.record);
         let (baseline, record, previous) =
@@ -88,8 +126,7 @@ impl Monitor {
             let undamaged: Option<&UndamagedState> = undamaged.as_deref().map(|record| &record.state);
             let context = Context { undamaged, previous: previous.as_deref() };
             let assessment = assess::assess(&baseline, &record.batch.measurements, context, draws)?;
-            let measured = record.batch.time_span();
-            let points = charts::points(&baseline, &assessment, undamaged, measured, &settings, &known);
+            let points = charts::points(&baseline, &assessment, undamaged, &settings, &known);
             Ok::<_, assess::Error>((assessment, points))
         };
         let (structure, batch) = (task.record.batch.structure.as_str(), &task.record.batch_id);
@@ -99,57 +136,79 @@ impl Monitor {
             Ok(Err(error)) => Err(error.to_string()),
             Err(panicked) => Err(panicked.to_string()),
         };
-        Ok(Computed { task, undamaged_version, seconds: started.elapsed().as_secs_f64(), outcome })
+        Ok(Computed { task, seen, seconds: started.elapsed().as_secs_f64(), outcome })
     }
 
     /// Stores what was computed. It is queued at once: results are stored in the order of the calls, also where the ends are
     /// waited for later.
     pub(super) fn store_computed(&self, computed: Computed) -> impl Future<Output = Result<Stored, Error>> + Send {
-        let Computed { task, undamaged_version, seconds, outcome } = computed;
+        let Computed { task, seen, seconds, outcome } = computed;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
-        let (stored, state) = match outcome {
+        let stored = match outcome {
             Ok((assessment, points)) => {
                 metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                 report(structure, id, &assessment, seconds);
-                (Ok(self.store.insert_assessment(structure, id, &assessment, points)), BatchState::Assessed)
+                let insert = self.store.insert_assessment(structure, id, &assessment, points);
+                Ok((Box::new(assessment), insert))
             }
             Err(reason) => {
                 metrics::counter!("modalwatch_assessments_failed_total").increment(1);
                 warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
                 let version = task.watched.simulator.digest();
-                (Err(self.store.mark_failed(structure, id, version, &reason)), BatchState::Failed)
+                Err(self.store.mark_failed(structure, id, version, &reason))
             }
         };
         async move {
-            let stored = match stored {
-                Ok(insert) => insert.await?,
-                Err(mark) => mark.await?,
+            let outcome = match stored {
+                Ok((mut assessment, insert)) => match insert.await? {
+                    Some(stored) => {
+                        assessment.assessed_at = stored.assessed_at;
+                        Outcome::Assessed(assessment, stored)
+                    }
+                    None => Outcome::OfAnotherVersion,
+                },
+                Err(mark) => match mark.await? {
+                    true => Outcome::Failed,
+                    false => Outcome::OfAnotherVersion,
+                },
             };
-            Ok(Stored { task, undamaged_version, state, stored })
+            Ok(Stored { task, seen, outcome })
         }
     }
 
     /// Tells of a stored result. A task to go on with where it does not stand.
-    pub(super) async fn settle(&self, stored: Stored) -> Result<Option<Task>, Error> {
-        let Stored { mut task, undamaged_version, state, stored } = stored;
-        let structure = &task.record.batch.structure;
-        if !stored {
-            // The structure has another version by now: the batch waits for an assessment under that.
-            self.resume_later(structure.clone());
-            return Ok(None);
+    pub(super) async fn settle(&self, stored: Stored) -> Result<Settled, Error> {
+        let Stored { mut task, seen, outcome } = stored;
+        let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
+        let (assessment, stored) = match outcome {
+            Outcome::Assessed(assessment, stored) => (assessment, stored),
+            Outcome::Failed => {
+                self.tell_batch(structure, id, BatchState::Failed);
+                return Ok(Settled::Without);
+            }
+            Outcome::OfAnotherVersion => {
+                // The batch waits for an assessment under the present version.
+                self.resume_later(structure.clone());
+                return Ok(Settled::Without);
+            }
+        };
+        self.tell_batch(structure, id, BatchState::Assessed);
+        if stored.alarms_changed {
+            self.report_episodes(structure).await;
         }
-        self.tell_batch(structure, &task.record.batch_id, state);
-        if state == BatchState::Failed {
-            return Ok(None);
+        if let Some(newer) = self.swapped_since(&task.watched, &task.baseline) {
+            task.baseline = newer;
+            return Ok(Settled::GoOn(task));
         }
-        self.report_episodes(structure).await;
         // A state declared while this was computed did not find the batch assessed, and so did not send it back: it is
         // compared now.
-        let swapped = self.swapped_since(&task.watched, &task.baseline);
-        let same_model = swapped.is_none();
-        task.baseline = swapped.unwrap_or(task.baseline);
-        let present = self.comparable(&task).await?.map(|record| record.state.version);
-        Ok((!same_model || present != undamaged_version).then_some(task))
+        if stored.newest_undamaged != seen.newest {
+            let present = self.store.undamaged(structure).await?.filter(|record| task.is_comparable(record));
+            if present.map(|record| record.state.version) != seen.compared_with {
+                return Ok(Settled::GoOn(task));
+            }
+        }
+        Ok(Settled::Stands(assessment, stored.charts))
     }
 
     /// The baseline that took the place of another for the same version of the structure: a batch that was begun with the old
@@ -158,15 +217,6 @@ impl Monitor {
         let present = self.structure(watched.simulator.id()).ok()?;
         let newer = present.baseline.as_ref().ok().filter(|baseline| baseline.digest() != used.digest())?;
         (present.simulator.digest() == watched.simulator.digest()).then(|| Arc::clone(newer))
-    }
-
-    /// The undamaged state a batch is compared with: the newest, if it was taken with its baseline and without the batch.
-    async fn comparable(&self, task: &Task) -> Result<Option<Arc<UndamagedRecord>>, Error> {
-        let newest = self.store.undamaged(&task.record.batch.structure).await?;
-        let fits = |u: &Arc<UndamagedRecord>| {
-            u.model_digest == *task.baseline.digest() && !u.batches.contains(&task.record.batch_id)
-        };
-        Ok(newest.filter(fits))
     }
 
     pub(super) fn draws(&self, baseline: &Baseline, record: &BatchRecord) -> Draws {

@@ -128,14 +128,12 @@ impl Bench<'_> {
         let observations: Vec<Observation> =
             measurements.iter().filter_map(|m| self.baseline.admit(m).observation).collect();
         let started = Instant::now();
-        self.baseline.infer(&observations, DRAWS, seed)?;
+        let runs = self.baseline.infer(&observations, DRAWS, seed)?.simulations();
         let seconds = started.elapsed().as_secs_f64();
         let draws = Draws { per_measurement: DRAWS, for_population: DRAWS, seed };
         let batch = assess::draw(self.baseline, &measurements, None, draws)?;
         let samples = (0..self.simulator().space().len()).map(|k| batch.posterior.column(k)).collect();
-        // Each of twice the samples is weighed by the simulation where there is noise to weigh it by.
-        let runs = self.simulator().is_noisy().then_some(2 * DRAWS * observations.len());
-        Ok(Found { seconds, ..of_samples(samples, DRAWS, runs) })
+        Ok(Found { seconds, ..of_samples(samples, DRAWS, Some(runs)) })
     }
 }
 

@@ -6,13 +6,26 @@ use std::sync::LazyLock;
 
 use sqlx::{FromRow, SqliteConnection};
 
-use super::alarm::{chart, NewChartPoint};
+use super::chart::{chart, Charted, Charts, NewChartPoint, StoredChartPoint};
 use super::rows::{insert_statements, parts};
 use super::{bad_row, from_blob, plotted, timestamp, to_blob, Error, Store};
 use crate::assessment::Assessment;
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
-use crate::quantity::{Digest, StructureId};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::Trust;
+
+/// An assessment that was stored.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StoredAssessment {
+    /// The time it was stored under.
+    pub assessed_at: Timestamp,
+    /// The points of its batch on the charts.
+    pub charts: Vec<StoredChartPoint>,
+    /// Whether an alarm was opened, changed or withdrawn.
+    pub alarms_changed: bool,
+    /// Newest undamaged state of the structure when it was stored, 0 where there is none.
+    pub newest_undamaged: u32,
+}
 
 #[derive(FromRow)]
 struct AssessmentRow {
@@ -64,7 +77,7 @@ struct QuantityRow {
 
 /// Statements that insert quantities; the first four columns are common to all rows.
 static INSERT_QUANTITIES: LazyLock<Vec<String>> =
-    LazyLock::new(|| insert_statements("quantity_assessment", 29, &[0, 1, 2, 3]));
+    LazyLock::new(|| insert_statements("insert into quantity_assessment", 29, &[0, 1, 2, 3]));
 
 /// Orders the assessments of a batch; the current one comes first.
 pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
@@ -79,7 +92,7 @@ pub(super) const IS_CURRENT: &str = "not exists (
 impl Store {
     /// Stores an assessment with its points on the alarm charts and marks its batch as assessed; storing it again changes
     /// nothing. An assessment under a version of the structure that is no longer the present one is not stored: the batch
-    /// waits for one under that. Whether it was stored.
+    /// waits for one under that. `None` where it was not stored.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -89,19 +102,26 @@ impl Store {
         batch_id: &str,
         assessment: &Assessment,
         charted: Vec<NewChartPoint>,
-    ) -> impl Future<Output = Result<bool, Error>> + Send + 'static {
+    ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.write(move |connection| {
             Box::pin(async move {
                 let Some(place) = place_of(connection, &structure, &id, &a).await? else {
-                    return Ok(false);
+                    return Ok(None);
                 };
                 let assessed_at = timestamp("assessment", place.assessed_at_us)?;
                 if place.taken {
                     remove(connection, &structure, &id, &a).await?;
                 }
                 insert(connection, &structure, &id, &a, place.assessed_at_us).await?;
-                chart(connection, &structure, &id, charted, assessed_at).await?;
+                let batch = Charted {
+                    structure: &structure,
+                    place: (place.measured_to_us, id.clone()),
+                    now: assessed_at,
+                    maintained: place.maintained,
+                    newest_undamaged: place.newest_undamaged,
+                };
+                let Charts { points: charts, alarms_changed } = chart(connection, &batch, charted).await?;
                 sqlx::query(
                     "update measurement_batch set state = 'assessed', failure = null
                      where structure_id = ? and batch_id = ?",
@@ -110,7 +130,8 @@ impl Store {
                 .bind(&id)
                 .execute(&mut *connection)
                 .await?;
-                Ok(true)
+                let newest_undamaged = place.newest_undamaged;
+                Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged }))
             })
         })
     }
@@ -120,7 +141,6 @@ impl Store {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn assessment(&self, structure: &StructureId, batch_id: &str) -> Result<Option<Assessment>, Error> {
-        fault_point!("store::read", |_| Err(bad_row("assessment")(&"a fault")));
         let mut found = self.current_assessments(structure, &[batch_id.to_owned()], None).await?;
         Ok(found.remove(batch_id))
     }
@@ -186,9 +206,15 @@ struct Place {
     assessed_at_us: i64,
     /// Whether one of the same trained baseline and undamaged state is there.
     taken: bool,
+    /// When its batch ended, µs,
+    measured_to_us: i64,
+    /// and whether it touches a maintenance window.
+    maintained: bool,
+    /// Newest undamaged state, 0 where there is none.
+    newest_undamaged: u32,
 }
 
-/// The place of an assessment; `None` when it is of a version of the structure that is not the present one.
+/// The place of an assessment; `None` when it is of a version of the structure that is not the present one, or of no batch.
 async fn place_of(
     connection: &mut SqliteConnection,
     structure: &str,
@@ -196,12 +222,18 @@ async fn place_of(
     a: &Assessment,
 ) -> Result<Option<Place>, Error> {
     let given = a.assessed_at.micros();
-    let (present, taken, same, others): (bool, bool, bool, Option<i64>) = sqlx::query_as(
-        "select exists (select 1 from structure where structure_id = ?1 and digest = ?6),
-                coalesce(max(model_digest = ?3 and undamaged_version = ?4), 0),
-                coalesce(max(model_digest = ?3 and undamaged_version = ?4 and assessed_at_us = ?5), 0),
-                max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4))
-         from assessment where structure_id = ?1 and batch_id = ?2",
+    type Found = (bool, bool, bool, Option<i64>, i64, bool, u32);
+    let found: Option<Found> = sqlx::query_as(
+        "select present, taken, same, others, measured_to_us,
+                exists (select 1 from maintenance_window where structure_id = ?1 and from_us <= measured_to_us
+                    and to_us > measured_from_us),
+                (select coalesce(max(version), 0) from undamaged_state where structure_id = ?1)
+         from (select exists (select 1 from structure where structure_id = ?1 and digest = ?6) as present,
+                      coalesce(max(model_digest = ?3 and undamaged_version = ?4), 0) as taken,
+                      coalesce(max(model_digest = ?3 and undamaged_version = ?4 and assessed_at_us = ?5), 0) as same,
+                      max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4)) as others
+               from assessment where structure_id = ?1 and batch_id = ?2)
+         cross join measurement_batch where structure_id = ?1 and batch_id = ?2",
     )
     .bind(structure)
     .bind(batch_id)
@@ -209,10 +241,13 @@ async fn place_of(
     .bind(a.undamaged_version.unwrap_or(0))
     .bind(given)
     .bind(a.structure_digest.as_str())
-    .fetch_one(&mut *connection)
+    .fetch_optional(&mut *connection)
     .await?;
+    let Some((true, taken, same, others, measured_to_us, maintained, newest_undamaged)) = found else {
+        return Ok(None);
+    };
     let assessed_at_us = if same { given } else { others.map_or(given, |latest| given.max(latest + 1)) };
-    Ok(present.then_some(Place { assessed_at_us, taken }))
+    Ok(Some(Place { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged }))
 }
 
 /// Removes the assessment that another takes the place of.

@@ -144,25 +144,6 @@ impl Store {
         }))
     }
 
-    /// How far a stored batch has come, and why its assessment failed.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], also for an unknown batch; [`Error::Row`].
-    pub async fn state_of_batch(
-        &self,
-        structure: &StructureId,
-        batch_id: &str,
-    ) -> Result<(BatchState, Option<String>), Error> {
-        fault_point!("store::read", |_| Err(bad_row("batch")(&"a fault")));
-        let (state, failure): (String, Option<String>) =
-            sqlx::query_as("select state, failure from measurement_batch where structure_id = ? and batch_id = ?")
-                .bind(structure.as_str())
-                .bind(batch_id)
-                .fetch_one(&self.reader)
-                .await?;
-        Ok((batch_state(&state)?, failure))
-    }
-
     /// Frequencies of the last measurement of a source before a time.
     ///
     /// # Errors
@@ -173,6 +154,7 @@ impl Store {
         source: &str,
         before: Timestamp,
     ) -> Result<Option<Vec<Option<Hertz>>>, Error> {
+        fault_point!("store::read", |_| Err(bad_row("measurement")(&"a fault")));
         let row: Option<(Vec<u8>,)> = sqlx::query_as(
             "select frequency_hz from measurement where structure_id = ? and source = ? and measured_at_us < ?
              order by measured_at_us desc limit 1",
@@ -286,7 +268,7 @@ async fn find_stored(
 }
 
 /// Statements that insert measurements; structure, batch and source are common to all rows.
-static INSERT_MEASUREMENTS: LazyLock<Vec<String>> = LazyLock::new(|| insert_statements("measurement", 10, &[0, 1, 3]));
+static INSERT_MEASUREMENTS: LazyLock<Vec<String>> = LazyLock::new(|| insert_statements("insert into measurement", 10, &[0, 1, 3]));
 
 async fn insert(
     connection: &mut SqliteConnection,

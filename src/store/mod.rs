@@ -11,6 +11,7 @@ mod assessment;
 mod audit;
 pub mod backup;
 mod batch;
+mod chart;
 mod diagnosis;
 mod failure;
 mod figures;
@@ -55,11 +56,11 @@ use crate::quantity::StructureId;
 use crate::volume;
 use writer::{Work, Writer};
 
-pub use alarm::{
-    Acknowledgement, Episode, MaintenanceWindow, NewChartPoint, StoredChartPoint, ALARM_KINDS, FIT_SERIES,
-};
+pub use alarm::{Acknowledgement, Episode, MaintenanceWindow, ALARM_KINDS, FIT_SERIES};
+pub use assessment::StoredAssessment;
 pub use audit::{AuditEntry, AuditQuery, NewAuditEntry};
 pub use batch::{BatchRecord, InsertBatch};
+pub use chart::{NewChartPoint, StoredChartPoint};
 pub use diagnosis::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
 pub use figures::{Figures, FolderFigures};
 pub use history::{Exceedance, HistoryEntry, HistoryQuery};
@@ -292,6 +293,10 @@ impl Store {
             MigrateError::VersionMissing(found) => Error::SchemaTooNew { path: path.clone(), found, known: newest() },
             other => Error::Migration(other),
         })?;
+        // Savepoints keep the pages that they may have to restore in a temporary file once they are many: a file made, written and
+        // removed for nearly every transaction. Not before the migrations, which may sort a whole table.
+        sqlx::query("pragma temp_store = memory").execute(&writer).await?;
+        writer.set_connect_options(options.clone().pragma("temp_store", "memory"));
         let reader = SqlitePoolOptions::new()
             .max_connections(READERS)
             .connect_with(options.read_only(true).row_buffer_size(ROWS_AT_A_TIME))

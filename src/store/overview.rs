@@ -181,7 +181,7 @@ impl Store {
         let rows: Vec<(String, String)> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
         let mut states: BTreeMap<String, Vec<State>> = BTreeMap::new();
         for (structure, state) in rows {
-            states.entry(structure).or_default().push(super::alarm::state_of(&state)?);
+            states.entry(structure).or_default().push(super::chart::state_of(&state)?);
         }
         Ok(states)
     }

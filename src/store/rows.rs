@@ -5,11 +5,11 @@ use std::ops::Range;
 /// Rows of the largest statement.
 const MOST_ROWS: usize = 64;
 
-/// Statements that insert 1, 2, 4 … rows into a table: few statements, which stay prepared, fit any number of rows.
+/// Statements that insert 1, 2, 4 … rows, each beginning with `into`: few statements, which stay prepared, fit any number of rows.
 ///
 /// The parameters are first the `common` columns, given by their places, which are the same in all rows; then the others, row
 /// by row.
-pub(super) fn insert_statements(table: &str, columns: usize, common: &[usize]) -> Vec<String> {
+pub(super) fn insert_statements(into: &str, columns: usize, common: &[usize]) -> Vec<String> {
     let own = columns - common.len();
     let row = |row: usize| {
         let mut next = common.len() + own * row;
@@ -26,7 +26,7 @@ pub(super) fn insert_statements(table: &str, columns: usize, common: &[usize]) -
     };
     let statement = |power: u32| {
         let rows: Vec<String> = (0..1_usize << power).map(row).collect();
-        format!("insert into {table} values {}", rows.join(", "))
+        format!("{into} values {}", rows.join(", "))
     };
     (0..=MOST_ROWS.ilog2()).map(statement).collect()
 }
@@ -60,7 +60,7 @@ mod tests {
 
     #[test]
     fn common_columns_keep_their_parameter_and_the_others_count_on() {
-        let statements = insert_statements("t", 3, &[0, 2]);
+        let statements = insert_statements("insert into t", 3, &[0, 2]);
         assert_eq!(statements[1], "insert into t values (?1, ?3, ?2), (?1, ?4, ?2)");
     }
 }

@@ -125,6 +125,7 @@ impl Store {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn undamaged(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+        fault_point!("store::read", |_| Err(bad_row("undamaged state")(&"a fault")));
         let (newest,): (Option<u32>,) =
             sqlx::query_as("select max(version) from undamaged_state where structure_id = ?")
                 .bind(structure.as_str())

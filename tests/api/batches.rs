@@ -297,6 +297,11 @@ async fn damage_becomes_one_alarm_which_somebody_sees() {
         let k2 = answer["charts"].as_array().unwrap().iter().find(|c| c["chart"] == "k2").unwrap();
         assert_eq!(k2["state"], "alarming", "{answer}");
         assert!(k2["shift"].as_f64() > k2["shift_limit"].as_f64());
+        // The answer is made of what was stored, without reading it back: whoever reads it finds the same.
+        let read = service.read(&format!("{BATCHES}/{}", answer["batch"].as_str().unwrap())).await;
+        for part in ["state", "assessment", "charts", "next_step"] {
+            assert_eq!(read[part], answer[part], "{part}");
+        }
     }
     let alarms = service.read("/v1/structures/three-dof/alarms").await;
     let item = &alarms["items"][0];

@@ -25,7 +25,7 @@ async fn assess(
     let settings = AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() };
     let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, held: false };
     let series = "k1".to_owned();
-    let point = NewChartPoint { series, undamaged_version: 1, measured, point, probability_limit: Some(0.3), settings };
+    let point = NewChartPoint { series, undamaged_version: 1, point, probability_limit: Some(0.3), settings };
     store.insert_assessment(&bridge(), id, &assessment("m", Some(1), measured.1), vec![point]).await.unwrap();
 }
 
