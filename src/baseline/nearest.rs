@@ -174,9 +174,8 @@ impl<'a> Search<'a> {
         let frequencies = observation.frequencies_hz.iter().enumerate();
         let (modes, measured_hz): (Vec<usize>, Vec<f64>) =
             frequencies.filter_map(|(mode, f)| f.map(|f| (mode, f))).unzip();
-        let relative = |(&mode, f): (&usize, &f64)| {
-            observation.std_hz(simulator, mode).map_or(1.0, |std| std / f).max(resolution)
-        };
+        let relative =
+            |(&mode, f): (&usize, &f64)| observation.std_hz(simulator, mode).map_or(1.0, |std| std / f).max(resolution);
         let relative_std = modes.iter().zip(&measured_hz).map(relative).collect();
         Self { simulator, modes, measured_hz, relative_std }
     }
@@ -259,7 +258,8 @@ impl<'a> Search<'a> {
     /// [`physics::Error`], which a checked prior rules out.
     pub(super) fn descend_from(&self, theta: &[f64]) -> Result<Descent, physics::Error> {
         let point = self.descend(self.at(self.unit(theta))?)?;
-        let off = point.error.iter().zip(&self.relative_std).map(|(error, std)| (error * std).abs()).fold(0.0, f64::max);
+        let off =
+            point.error.iter().zip(&self.relative_std).map(|(error, std)| (error * std).abs()).fold(0.0, f64::max);
         Ok(Descent { theta: self.theta(&point.u), off, simulations: point.simulations })
     }
 }

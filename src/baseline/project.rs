@@ -75,7 +75,7 @@ mod tests {
     #[test]
     fn draws_go_to_the_points_that_give_the_measurement() {
         // Two points of the prior with the same frequencies, found by another program (many starts of Newton's method).
-        let (one, other) = ([6.91421786, 3.02971603, 3.14523917], [6.7656613, 3.14859795, 3.13757711]);
+        let (one, other) = ([6.914_217_86, 3.029_716_03, 3.145_239_17], [6.765_661_3, 3.148_597_95, 3.137_577_11]);
         let frequencies_hz = three_dof().frequencies_hz(&one).unwrap();
         let draws = [[6.95, 3.0, 3.15], [6.72, 3.19, 3.13], one];
         let (theta, simulations) = moved(exact(&frequencies_hz), &draws);
@@ -95,18 +95,21 @@ mod tests {
         let frequencies_hz = three_dof().frequencies_hz(&truth).unwrap();
         let starts: Vec<[f64; 3]> =
             (0..40).map(|i| [7.0 - 0.02 * f64::from(i), 3.0 + 0.015 * f64::from(i), 3.2]).collect();
-        let (theta, _) = moved(exact(&frequencies_hz), &starts);
-        for row in 0..theta.nrows() {
-            let there = three_dof().frequencies_hz(&theta.row(row).iter().copied().collect::<Vec<_>>()).unwrap();
-            let off = there.iter().zip(&frequencies_hz).map(|(f, y)| (f / y - 1.0).abs()).fold(0.0, f64::max);
-            assert!(off <= GIVEN, "{row}: {off:e}");
-        }
+        let short = |theta: &DMatrix<f64>| {
+            let off = |row: usize| {
+                let there = three_dof().frequencies_hz(&theta.row(row).iter().copied().collect::<Vec<_>>()).unwrap();
+                there.iter().zip(&frequencies_hz).map(|(f, y)| (f / y - 1.0).abs()).fold(0.0, f64::max)
+            };
+            (0..theta.nrows()).filter(|row| off(*row) > GIVEN).count()
+        };
+        let alone: usize = starts.iter().map(|start| short(&moved(exact(&frequencies_hz), &[*start]).0)).sum();
+        assert!(0 < alone && alone < starts.len(), "{alone} of the draws end short of it by themselves");
+        assert_eq!(short(&moved(exact(&frequencies_hz), &starts).0), 0);
     }
 
     #[test]
     fn a_measurement_that_nothing_gives_ends_inside_the_prior() {
-        let beyond: Vec<f64> =
-            three_dof().frequencies_hz(&[7.0, 7.0, 7.0]).unwrap().iter().map(|f| 1.02 * f).collect();
+        let beyond: Vec<f64> = three_dof().frequencies_hz(&[7.0, 7.0, 7.0]).unwrap().iter().map(|f| 1.02 * f).collect();
         let (theta, _) = moved(exact(&beyond), &[[6.0, 6.5, 6.8], [5.0, 5.0, 5.0]]);
         assert!(theta.iter().all(|value| (3.0..=7.0).contains(value)), "{theta}");
         // Both are at the nearest point, as near as the frequencies tell.

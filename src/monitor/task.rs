@@ -167,10 +167,13 @@ impl Monitor {
                     }
                     None => Outcome::OfAnotherVersion,
                 },
-                Err(mark) => match mark.await? {
-                    true => Outcome::Failed,
-                    false => Outcome::OfAnotherVersion,
-                },
+                Err(mark) => {
+                    if mark.await? {
+                        Outcome::Failed
+                    } else {
+                        Outcome::OfAnotherVersion
+                    }
+                }
             };
             Ok(Stored { task, seen, outcome })
         }

@@ -214,6 +214,17 @@ struct Place {
     newest_undamaged: u32,
 }
 
+#[derive(FromRow)]
+struct PlaceRow {
+    /// Time of the assessment of the same trained baseline and undamaged state, µs,
+    own_us: Option<i64>,
+    /// and of the newest of the others.
+    others_us: Option<i64>,
+    measured_to_us: i64,
+    maintained: bool,
+    newest_undamaged: u32,
+}
+
 /// The place of an assessment; `None` when it is of a version of the structure that is not the present one, or of no batch.
 async fn place_of(
     connection: &mut SqliteConnection,
@@ -222,32 +233,30 @@ async fn place_of(
     a: &Assessment,
 ) -> Result<Option<Place>, Error> {
     let given = a.assessed_at.micros();
-    type Found = (bool, bool, bool, Option<i64>, i64, bool, u32);
-    let found: Option<Found> = sqlx::query_as(
-        "select present, taken, same, others, measured_to_us,
+    let found: Option<PlaceRow> = sqlx::query_as(
+        "select own_us, others_us, measured_to_us,
                 exists (select 1 from maintenance_window where structure_id = ?1 and from_us <= measured_to_us
-                    and to_us > measured_from_us),
-                (select coalesce(max(version), 0) from undamaged_state where structure_id = ?1)
-         from (select exists (select 1 from structure where structure_id = ?1 and digest = ?6) as present,
-                      coalesce(max(model_digest = ?3 and undamaged_version = ?4), 0) as taken,
-                      coalesce(max(model_digest = ?3 and undamaged_version = ?4 and assessed_at_us = ?5), 0) as same,
-                      max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4)) as others
+                    and to_us > measured_from_us) as maintained,
+                (select coalesce(max(version), 0) from undamaged_state where structure_id = ?1) as newest_undamaged
+         from (select max(assessed_at_us) filter (where model_digest = ?3 and undamaged_version = ?4) as own_us,
+                      max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4)) as others_us
                from assessment where structure_id = ?1 and batch_id = ?2)
-         cross join measurement_batch where structure_id = ?1 and batch_id = ?2",
+         cross join measurement_batch where structure_id = ?1 and batch_id = ?2
+             and exists (select 1 from structure where structure_id = ?1 and digest = ?5)",
     )
     .bind(structure)
     .bind(batch_id)
     .bind(a.model_digest.as_str())
     .bind(a.undamaged_version.unwrap_or(0))
-    .bind(given)
     .bind(a.structure_digest.as_str())
     .fetch_optional(&mut *connection)
     .await?;
-    let Some((true, taken, same, others, measured_to_us, maintained, newest_undamaged)) = found else {
+    let Some(PlaceRow { own_us, others_us, measured_to_us, maintained, newest_undamaged }) = found else {
         return Ok(None);
     };
-    let assessed_at_us = if same { given } else { others.map_or(given, |latest| given.max(latest + 1)) };
-    Ok(Some(Place { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged }))
+    let behind = others_us.map_or(given, |latest| given.max(latest + 1));
+    let assessed_at_us = if own_us == Some(given) { given } else { behind };
+    Ok(Some(Place { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
 }
 
 /// Removes the assessment that another takes the place of.

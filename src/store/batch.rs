@@ -268,7 +268,8 @@ async fn find_stored(
 }
 
 /// Statements that insert measurements; structure, batch and source are common to all rows.
-static INSERT_MEASUREMENTS: LazyLock<Vec<String>> = LazyLock::new(|| insert_statements("insert into measurement", 10, &[0, 1, 3]));
+static INSERT_MEASUREMENTS: LazyLock<Vec<String>> =
+    LazyLock::new(|| insert_statements("insert into measurement", 10, &[0, 1, 3]));
 
 async fn insert(
     connection: &mut SqliteConnection,

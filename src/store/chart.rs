@@ -95,9 +95,8 @@ impl PointRow {
     /// Takes on what it means behind the points before it; whether that is something new.
     fn follow(&mut self, series: &mut Series) -> bool {
         let status = series.take(&self.point());
-        let same = (status.ewma - self.ewma).abs() < SAME
-            && status.above == self.above
-            && status.state.as_str() == self.state;
+        let same =
+            (status.ewma - self.ewma).abs() < SAME && status.above == self.above && status.state.as_str() == self.state;
         (self.ewma, self.above) = (status.ewma, status.above);
         status.state.as_str().clone_into(&mut self.state);
         !same
@@ -182,11 +181,7 @@ pub(super) async fn chart(
     Ok(Charts { points, alarms_changed })
 }
 
-async fn insert_points(
-    connection: &mut SqliteConnection,
-    batch: &Charted<'_>,
-    placed: &[Placed],
-) -> Result<(), Error> {
+async fn insert_points(connection: &mut SqliteConnection, batch: &Charted<'_>, placed: &[Placed]) -> Result<(), Error> {
     let new: Vec<&Placed> = placed.iter().filter(|placed| placed.new).collect();
     for (statement, part) in parts(new.len()) {
         let mut insert = sqlx::query(INSERT_POINTS[statement].as_str())
@@ -215,11 +210,7 @@ async fn insert_points(
 /// they make.
 ///
 /// It ends where the points come out as they were: the moving average forgets, and so does the count of points above.
-async fn place(
-    connection: &mut SqliteConnection,
-    batch: &Charted<'_>,
-    new: &NewChartPoint,
-) -> Result<Placed, Error> {
+async fn place(connection: &mut SqliteConnection, batch: &Charted<'_>, new: &NewChartPoint) -> Result<Placed, Error> {
     let undamaged_version = new.undamaged_version;
     let memory = Series::memory(&new.settings);
     let mut about: Vec<PointRow> = sqlx::query_as(SELECT_ABOUT.as_str())
