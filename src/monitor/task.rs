@@ -179,7 +179,7 @@ impl Monitor {
         }
     }
 
-    /// Tells of a stored result. A task to go on with where it does not stand.
+    /// Tells of a stored result; whether it stands.
     pub(super) async fn settle(&self, stored: Stored) -> Result<Settled, Error> {
         let Stored { mut task, seen, outcome } = stored;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
