@@ -91,10 +91,10 @@ mod tests {
     #[test]
     fn a_draw_that_ends_short_of_the_measurement_takes_the_place_of_one_that_does_not() {
         // The twin of this point lies beyond the prior: from behind the fold, the way down ends at an edge.
-        let truth = [6.96, 3.02, 3.2];
+        let truth = [6.62, 3.306, 3.787];
         let frequencies_hz = three_dof().frequencies_hz(&truth).unwrap();
-        let starts: Vec<[f64; 3]> =
-            (0..40).map(|i| [7.0 - 0.02 * f64::from(i), 3.0 + 0.015 * f64::from(i), 3.2]).collect();
+        let towards_the_twin = |i: u32| [6.62 + 0.02 * f64::from(i), 3.306 - 0.016 * f64::from(i), 3.787];
+        let starts: Vec<[f64; 3]> = (1..=30).map(|i| towards_the_twin(i).map(|x| x.clamp(3.0, 7.0))).collect();
         let short = |theta: &DMatrix<f64>| {
             let off = |row: usize| {
                 let there = three_dof().frequencies_hz(&theta.row(row).iter().copied().collect::<Vec<_>>()).unwrap();
