@@ -5,9 +5,10 @@
 //! ```
 //!
 //! Without noise the exact posterior of a measurement is the point that it was simulated at, so that every distance of a draw from
-//! it is an error, but for the few measurements that another point of the prior gives too. Prints the time of the training alone (simulations and checks are beside it), the held-out
-//! negative log-likelihood in the unit box of the prior, the gross outliers among the draws, and how far hyperparameters of
-//! fifty measurements with ten draws each lie from those of their population, against those of the exact posterior.
+//! it is an error, but for the few measurements that another point of the prior gives too. Prints the time of the training alone
+//! (simulations and checks are beside it), the held-out negative log-likelihood in the unit box of the prior, the gross outliers
+//! among the draws, and how far hyperparameters of fifty measurements with ten draws each lie from those of their population,
+//! against those of the exact posterior.
 
 use std::collections::BTreeSet;
 use std::path::Path;

@@ -121,8 +121,8 @@ impl Bench<'_> {
     }
 
     fn cinn(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
-        // Times are those of the flow alone; the samples come by the service's way, which moves measurements beyond the
-        // prior box to its nearest point first.
+        // Times are those of the samples alone, without the service's checks; what is compared comes by its whole way, which moves
+        // measurements beyond the prior box to its nearest point first.
         let rows: Vec<Vec<f64>> = data.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
         let measurements = at_intervals(&rows, Timestamp::from_micros(START_US)?, 1, None)?;
         let observations: Vec<Observation> =
@@ -307,7 +307,7 @@ pub fn times(training: (f64, usize), found: &[Vec<(f64, Option<usize>)>; 3], pap
             ..one(Method::Cinn, "training", training.0, paper[2], None)
         },
         Time {
-            note: format!("{note}, 10 samples each; the flow alone, without the service's checks"),
+            note: format!("{note}, 10 samples each, without the service's checks"),
             ..one(Method::Cinn, "inference", median(2), paper[3], runs(2))
         },
     ]
