@@ -79,19 +79,20 @@ pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation
     let each = theta.nrows() / observations.len().max(1);
     let of = |(row, observation): (usize, &Observation)| {
         let simulator = observation.simulator(simulator);
-        let one = |place: usize| {
-            let theta: Vec<f64> = theta.row(row * each + place).iter().copied().collect();
-            log_likelihood(&simulator, observation, &theta)
-        };
-        (0..each).map(one).collect::<Vec<f64>>()
+        let frequencies_hz = simulator.frequencies_of_rows_hz(theta, row * each..(row + 1) * each);
+        let runs = frequencies_hz.chunks_exact(simulator.modes());
+        runs.map(|frequencies_hz| log_likelihood(&simulator, observation, frequencies_hz)).collect::<Vec<f64>>()
     };
     observations.par_iter().with_min_len(AT_A_TIME).enumerate().flat_map_iter(of).collect()
 }
 
-fn log_likelihood(simulator: &Simulator, observation: &Observation, theta: &[f64]) -> f64 {
-    let Ok(frequencies) = simulator.frequencies_hz(theta) else { return f64::NEG_INFINITY };
+/// `frequencies_hz`: of one run, NaN where there are none.
+fn log_likelihood(simulator: &Simulator, observation: &Observation, frequencies_hz: &[f64]) -> f64 {
+    if frequencies_hz.iter().any(|f| f.is_nan()) {
+        return f64::NEG_INFINITY;
+    }
     let one = |(mode, measured): (usize, &Option<f64>)| {
-        let f = frequencies[mode];
+        let f = frequencies_hz[mode];
         let std_hz = simulator.std_hz(mode, f) * observation.noise_multiple[mode];
         measured.map_or(0.0, |y| -0.5 * ((y - f) / std_hz).powi(2) - std_hz.ln())
     };

@@ -1,8 +1,8 @@
-//! Loops over the samples of sixteen measurements at a time, one in each lane, compiled once for each width of vectors
-//! (`pulp::with_simd`).
+//! Loops over the samples of sixteen measurements at a time, one in each lane, or of fewer, each of which has several lanes;
+//! compiled once for each width of vectors (`pulp::with_simd`).
 //!
 //! Single precision, about the centre of each measurement's own samples: what is lost is lost of differences between samples of
-//! one posterior, however far away the population lies. Nothing is summed over lanes, so that the bits are the same on every
+//! one posterior, however far away the population lies. Lanes are summed one by one, so that the bits are the same on every
 //! processor.
 
 use std::ops::Range;
@@ -19,14 +19,19 @@ pub(super) struct Lanes(pub [f32; LANES]);
 
 impl Lanes {
     pub const ZERO: Self = Self([0.0; LANES]);
+
+    /// The sum of some.
+    pub fn of(&self, lanes: impl Iterator<Item = usize>) -> f64 {
+        lanes.map(|lane| f64::from(self.0[lane])).sum()
+    }
 }
 
-/// Weights of the samples of some measurements under a normal population, the greatest of each 1.
+/// Weights of the samples of some measurements under a normal population, the greatest of each measurement 1.
 #[derive(Clone, Copy)]
 pub(super) struct Weighed {
-    /// Logarithm of what the weights were divided by.
+    /// Logarithm of what the weights were divided by, the same in all lanes of a measurement.
     pub largest: Lanes,
-    /// Sum of the weights.
+    /// Sum of the weights of each lane.
     pub sum: Lanes,
 }
 
@@ -36,7 +41,8 @@ pub(super) struct Weighed {
 ///  ln w_s = offset_s + Σ_k x_sk (x_sk square_k + linear_k)
 /// ```
 ///
-/// `deviations`: x of each parameter; `squares`: −1/2σ² of each; `linears`: (μ − c)/σ² of each, c the centre.
+/// `deviations`: x of each parameter; `squares`: −1/2σ² of each; `linears`: (μ − c)/σ² of each, c the centre. A measurement has
+/// every lane `width` further.
 #[pulp::with_simd(weigh = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn weigh_simd<S: pulp::Simd>(
@@ -45,6 +51,7 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
     deviations: &[&[Lanes]],
     squares: &[f32],
     linears: &[Lanes],
+    width: usize,
 ) -> Weighed {
     let (mut largest, mut sum) = (Lanes::ZERO, Lanes::ZERO);
     // Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
@@ -59,15 +66,16 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
             }
         }
         let most = in_fours(simd, weights, &part, f32::NEG_INFINITY, |a, b| simd.max_f32s(a, b));
-        for weights in weights.iter_mut() {
-            let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
-            *weight = simd.sub_f32s(*weight, most);
-        }
         S::as_mut_simd_f32s(&mut largest.0[part]).0[0] = most;
     }
+    let mut most = [f32::NEG_INFINITY; LANES];
+    for (lane, own) in largest.0.iter().enumerate() {
+        most[lane % width] = most[lane % width].max(*own);
+    }
+    largest.0 = std::array::from_fn(|lane| most[lane % width]);
     for weights in weights.iter_mut() {
-        for weight in &mut weights.0 {
-            *weight = exp_f32(*weight);
+        for (weight, largest) in weights.0.iter_mut().zip(&largest.0) {
+            *weight = exp_f32(*weight - largest);
         }
     }
     for first in (0..LANES).step_by(S::F32_LANES) {
@@ -101,18 +109,14 @@ fn in_fours<S: pulp::Simd>(
     combine(combine(rows[0], rows[1]), combine(rows[2], rows[3]))
 }
 
-/// A sample of each measurement by its weight; `shares`, from 0 to below 1, is how much of all weight comes before it.
-#[pulp::with_simd(choose = pulp::Arch::new())]
+/// How many samples of each lane come before as much weight as `targets`.
+#[pulp::with_simd(count_before = pulp::Arch::new())]
 #[inline(always)]
-pub(super) fn choose_simd<S: pulp::Simd>(_: S, weights: &[Lanes], sum: &Lanes, shares: &Lanes) -> [u32; LANES] {
-    let mut targets = [0.0_f32; LANES];
-    for ((target, sum), share) in targets.iter_mut().zip(&sum.0).zip(&shares.0) {
-        *target = sum * share;
-    }
+pub(super) fn count_before_simd<S: pulp::Simd>(_: S, weights: &[Lanes], targets: &Lanes) -> [u32; LANES] {
     // Counting what ends before the target leaves the processor nothing to guess.
     let (mut passed, mut places) = ([0.0_f32; LANES], [0_u32; LANES]);
-    for weights in &weights[..weights.len().saturating_sub(1)] {
-        for (((weight, passed), place), target) in weights.0.iter().zip(&mut passed).zip(&mut places).zip(&targets) {
+    for weights in weights {
+        for (((weight, passed), place), target) in weights.0.iter().zip(&mut passed).zip(&mut places).zip(&targets.0) {
             *passed += weight;
             *place += u32::from(*passed <= *target);
         }
@@ -120,7 +124,7 @@ pub(super) fn choose_simd<S: pulp::Simd>(_: S, weights: &[Lanes], sum: &Lanes, s
     places
 }
 
-/// Σ w x and Σ w x² of each measurement.
+/// Σ w x and Σ w x² of each lane.
 #[pulp::with_simd(moments = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn moments_simd<S: pulp::Simd>(_: S, weights: &[Lanes], x: &[Lanes]) -> (Lanes, Lanes) {
@@ -163,14 +167,15 @@ mod tests {
             let mut weights: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| offset(s, lane))).collect();
             let square = (-0.5 / (std * std)) as f32;
             let linear = lanes(&|lane| off(lane) / (std * std));
-            let found = weigh(&mut weights, &[&deviations], &[square], &[linear]);
+            let found = weigh(&mut weights, &[&deviations], &[square], &[linear], LANES);
             let moments = moments(&weights, &deviations);
             let shares = 20_000_u32;
             let mut counts = vec![0.0; count * LANES];
             for i in 0..shares {
                 let share = ((f64::from(i) + 0.5) / f64::from(shares)) as f32;
-                for (lane, place) in choose(&weights, &found.sum, &Lanes([share; LANES])).iter().enumerate() {
-                    counts[*place as usize * LANES + lane] += 1.0;
+                let targets = Lanes(found.sum.0.map(|sum| share * sum));
+                for (lane, place) in count_before(&weights, &targets).iter().enumerate() {
+                    counts[(*place as usize).min(count - 1) * LANES + lane] += 1.0;
                 }
             }
             for lane in 0..LANES {

@@ -10,6 +10,7 @@
 //! The pool of all samples counts the noise twice, once in where each posterior sits and once in its width; here it
 //! counts not at all. Source: Hogg, Myers & Bovy (2010).
 
+mod block;
 mod kernel;
 
 use nalgebra::{DMatrix, DVector};
@@ -17,7 +18,8 @@ use rand::Rng as _;
 use rand_distr::{Gamma, StandardNormal};
 use rayon::prelude::*;
 
-use self::kernel::{choose, exponentials, moments, weigh, Lanes, Weighed, LANES};
+use self::block::Block;
+use self::kernel::{exponentials, moments, weigh, Lanes, Weighed};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, Stream};
@@ -334,15 +336,15 @@ struct State {
     std: Vec<f64>,
 }
 
-/// Samples in the unit box, those of sixteen measurements side by side (a block); what is left over of the last block is 0.
+/// Samples in the unit box, those of several measurements side by side.
 struct Problem {
     /// Mean of the samples of each measurement, `[measurement·parameters + parameter]`.
     centres: Vec<f64>,
-    /// What each sample lies off that, `[parameter][block·draws + draw]`.
+    /// What each sample lies off that, `[parameter][place]`; what is left over of the last block is 0.
     deviations: Vec<Vec<Lanes>>,
-    /// Logarithms of the weights that the samples have by themselves, the greatest of each measurement 0,
-    /// `[block·draws + draw]`.
+    /// Logarithms of the weights that the samples have by themselves, the greatest of each measurement 0, `[place]`.
     offsets: Vec<Lanes>,
+    blocks: Vec<Block>,
     measurements: usize,
     draws: usize,
     /// Least σ of each column that the samples can resolve.
@@ -353,10 +355,12 @@ struct Problem {
     noisy: bool,
 }
 
-/// Weights of the samples of a block, and room for what they are made of.
+/// Weights of all samples under a population, and room for what they are made of.
 struct Weights {
-    /// `[draws]`
+    /// `[place]`
     values: Vec<Lanes>,
+    /// `[block]`
+    blocks: Vec<Weighed>,
     squares: Vec<f32>,
     linears: Vec<Lanes>,
 }
@@ -383,12 +387,15 @@ impl Problem {
         let noisy = means.iter().zip(&within).any(hides);
         // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
         let floor = within.iter().map(|within| (0.25 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
+        let blocks = Block::all(measurements, draws);
         let side_by_side = |value: &dyn Fn(usize, usize) -> f64| {
-            let mut all = vec![Lanes::ZERO; measurements.div_ceil(LANES) * draws];
-            for measurement in 0..measurements {
-                for draw in 0..draws {
-                    let place = measurement / LANES * draws + draw;
-                    all[place].0[measurement % LANES] = value(measurement, draw) as f32;
+            let mut all = vec![Lanes::ZERO; blocks.last().map_or(0, |block| block.places.end)];
+            for block in &blocks {
+                for measurement in block.measurements.clone() {
+                    for draw in 0..draws {
+                        let (place, lane) = block.place(measurement, draw);
+                        all[place].0[lane] = value(measurement, draw) as f32;
+                    }
                 }
             }
             all
@@ -404,7 +411,7 @@ impl Problem {
         };
         let offsets = log_weights.map_or_else(|| side_by_side(&|_, _| 0.0), relative);
         let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
-        Self { centres, deviations, offsets, measurements, draws, floor, within, noisy }
+        Self { centres, deviations, offsets, blocks, measurements, draws, floor, within, noisy }
     }
 
     fn centres(&self, measurement: usize) -> &[f64] {
@@ -412,42 +419,39 @@ impl Problem {
         &self.centres[measurement * d..(measurement + 1) * d]
     }
 
-    /// First measurement of each block, and how many there are in it.
-    fn blocks(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
-        (0..self.measurements).step_by(LANES).map(|first| (first, LANES.min(self.measurements - first)))
-    }
-
     fn room(&self) -> Weights {
         let d = self.deviations.len();
-        Weights { values: vec![Lanes::ZERO; self.draws], squares: vec![0.0; d], linears: vec![Lanes::ZERO; d] }
+        Weights {
+            values: vec![Lanes::ZERO; self.offsets.len()],
+            blocks: vec![Weighed { largest: Lanes::ZERO, sum: Lanes::ZERO }; self.blocks.len()],
+            squares: vec![0.0; d],
+            linears: vec![Lanes::ZERO; d],
+        }
     }
 
-    /// Places of the samples of the block that begins with measurement `first`.
-    fn places(&self, first: usize) -> std::ops::Range<usize> {
-        let block = first / LANES;
-        block * self.draws..(block + 1) * self.draws
-    }
-
-    /// Weights of the samples of a block under a population.
+    /// Weights of all samples under a population.
     ///
     /// ```text
     ///  ln w_s = offset_s − Σ_k ½((x_sk − μ_k)/σ_k)² + ½((c_k − μ_k)/σ_k)²
     /// ```
-    fn weigh(&self, (first, count): (usize, usize), state: &State, weights: &mut Weights) -> Weighed {
-        let d = self.deviations.len();
-        for k in 0..d {
-            let precision = 1.0 / (state.std[k] * state.std[k]);
-            weights.squares[k] = (-0.5 * precision) as f32;
-            for lane in 0..count {
-                let off = state.mean[k] - self.centres[(first + lane) * d + k];
-                weights.linears[k].0[lane] = (off * precision) as f32;
-            }
-            weights.linears[k].0[count..].fill(0.0);
+    fn weigh(&self, state: &State, weights: &mut Weights) {
+        let precisions: Vec<f64> = state.std.iter().map(|std| std.powi(-2)).collect();
+        for (square, precision) in weights.squares.iter_mut().zip(&precisions) {
+            *square = (-0.5 * precision) as f32;
         }
-        let places = self.places(first);
-        weights.values.copy_from_slice(&self.offsets[places.clone()]);
-        let deviations: Vec<&[Lanes]> = self.deviations.iter().map(|all| &all[places.clone()]).collect();
-        weigh(&mut weights.values, &deviations, &weights.squares, &weights.linears)
+        weights.values.copy_from_slice(&self.offsets);
+        for (block, weighed) in self.blocks.iter().zip(&mut weights.blocks) {
+            for (measurement, lanes) in block.lanes() {
+                let off = state.mean.iter().zip(self.centres(measurement)).zip(&precisions);
+                for (linear, ((mean, centre), precision)) in weights.linears.iter_mut().zip(off) {
+                    lanes.clone().for_each(|lane| linear.0[lane] = ((mean - centre) * precision) as f32);
+                }
+            }
+            let places = block.places.clone();
+            let deviations: Vec<&[Lanes]> = self.deviations.iter().map(|all| &all[places.clone()]).collect();
+            let values = &mut weights.values[places];
+            *weighed = weigh(values, &deviations, &weights.squares, &weights.linears, block.width);
+        }
     }
 
     fn maximise(&self) -> State {
@@ -462,16 +466,16 @@ impl Problem {
         let mut weights = self.room();
         for _ in 0..EM_ITERATIONS {
             let mut sums = vec![(0.0, 0.0, 0.0); d];
-            for block in self.blocks() {
-                let weighed = self.weigh(block, &state, &mut weights);
-                let (from, count) = block;
+            self.weigh(&state, &mut weights);
+            for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
+                let places = block.places.clone();
                 for ((k, deviations), sums) in self.deviations.iter().enumerate().zip(&mut sums) {
-                    let (first, second) = moments(&weights.values, &deviations[self.places(from)]);
-                    for lane in 0..count {
-                        let sum = f64::from(weighed.sum.0[lane]);
-                        let (first, second) = (f64::from(first.0[lane]) / sum, f64::from(second.0[lane]) / sum);
+                    let (first, second) = moments(&weights.values[places.clone()], &deviations[places.clone()]);
+                    for (measurement, lanes) in block.lanes() {
+                        let sum = weighed.sum.of(lanes.clone());
+                        let (first, second) = (first.of(lanes.clone()) / sum, second.of(lanes) / sum);
                         // About the last mean: differences of large squares would lose a small spread.
-                        let off = self.centres[(from + lane) * d + k] - state.mean[k];
+                        let off = self.centres(measurement)[k] - state.mean[k];
                         sums.0 += off + first;
                         sums.1 += second + 2.0 * off * first + off * off;
                         sums.2 += (second - first * first).max(0.0);
@@ -498,27 +502,30 @@ impl Problem {
 
     fn effective_sample_size(&self, state: &State) -> f64 {
         let (mut weights, mut all) = (self.room(), 0.0);
-        for block in self.blocks() {
-            let weighed = self.weigh(block, state, &mut weights);
-            for lane in 0..block.1 {
-                let squares: f64 = weights.values.iter().map(|w| f64::from(w.0[lane] * w.0[lane])).sum();
-                all += f64::from(weighed.sum.0[lane]).powi(2) / squares;
+        self.weigh(state, &mut weights);
+        for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
+            let values = &weights.values[block.places.clone()];
+            for (_, lanes) in block.lanes() {
+                let squares =
+                    lanes.clone().flat_map(|lane| values.iter().map(move |w| f64::from(w.0[lane] * w.0[lane])));
+                all += weighed.sum.of(lanes).powi(2) / squares.sum::<f64>();
             }
         }
         all / self.measurements as f64
     }
 
-    /// ln L(μ, σ) up to a constant.
-    fn log_likelihood(&self, state: &State, weights: &mut Weights) -> f64 {
+    /// ln L(μ, σ) up to a constant; `weights` under the same population.
+    fn log_likelihood(&self, state: &State, weights: &Weights) -> f64 {
         // One logarithm for many measurements: the product of their sums, each from 1 to the number of draws.
         let (mut likelihood, mut product) = (0.0, 1.0_f64);
-        for block in self.blocks() {
-            let weighed = self.weigh(block, state, weights);
-            for lane in 0..block.1 {
-                let population = self.centres(block.0 + lane).iter().zip(&state.mean).zip(&state.std);
+        for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
+            for (lane, measurement) in block.measurements.clone().enumerate() {
+                let population = self.centres(measurement).iter().zip(&state.mean).zip(&state.std);
                 let of_centre: f64 = population.map(|((c, mean), std)| ((c - mean) / std).powi(2)).sum();
                 likelihood += f64::from(weighed.largest.0[lane]) - 0.5 * of_centre;
-                product *= f64::from(weighed.sum.0[lane]);
+            }
+            for (_, lanes) in block.lanes() {
+                product *= weighed.sum.of(lanes);
                 if product > 1e200 {
                     likelihood += product.ln();
                     product = 1.0;
@@ -530,12 +537,14 @@ impl Problem {
 
     /// `draws` states of a Markov chain that begins at `point`.
     fn chain(&self, point: &State, draws: usize, mut stream: Stream) -> Vec<State> {
-        let (mut state, mut weights) = (point.clone(), self.room());
+        let (mut state, mut weights, mut others) = (point.clone(), self.room(), self.room());
         let mut kept = Vec::with_capacity(draws);
+        self.weigh(&state, &mut weights);
         for sweep in 0..BURN_IN + draws {
-            self.sweep(&mut state, &mut weights, &mut stream);
+            self.sweep(&mut state, &weights, &mut stream);
+            self.weigh(&state, &mut weights);
             if self.noisy && sweep.is_multiple_of(2) {
-                self.collapsed(&mut state, &mut weights, &mut stream);
+                self.collapsed(&mut state, &mut weights, &mut others, &mut stream);
             }
             if sweep >= BURN_IN {
                 kept.push(state.clone());
@@ -544,8 +553,9 @@ impl Problem {
         kept
     }
 
-    /// One Metropolis step for each parameter on the likelihood with all samples in it.
-    fn collapsed(&self, state: &mut State, weights: &mut Weights, stream: &mut Stream) {
+    /// One Metropolis step for each parameter on the likelihood with all samples in it. `weights` are those under the state, and
+    /// stay so; `others` are room for those under another.
+    fn collapsed(&self, state: &mut State, weights: &mut Weights, others: &mut Weights, stream: &mut Stream) {
         let mut current = self.log_likelihood(state, weights);
         for k in 0..self.deviations.len() {
             // Steps of several sizes: how wide the likelihood is depends on how much the noise hides.
@@ -560,7 +570,8 @@ impl Problem {
             if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
                 continue;
             }
-            let likelihood = self.log_likelihood(&next, weights);
+            self.weigh(&next, others);
+            let likelihood = self.log_likelihood(&next, others);
             // The step is symmetric in ln σ but its size depends on σ, and σ is uniform a priori.
             let back = size * (1.0 + self.within[k] / next.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
             let moved = (next.std[k] / state.std[k]).ln();
@@ -572,26 +583,22 @@ impl Problem {
             if threshold.ln() < likelihood - current + moved + sizes + shifts {
                 *state = next;
                 current = likelihood;
+                std::mem::swap(weights, others);
             }
         }
     }
 
-    /// One sweep of the Gibbs sampler.
-    fn sweep(&self, state: &mut State, weights: &mut Weights, stream: &mut Stream) {
+    /// One sweep of the Gibbs sampler; `weights` are those under the state.
+    fn sweep(&self, state: &mut State, weights: &Weights, stream: &mut Stream) {
         let n = self.measurements as f64;
+        // Place and lane of the sample of each measurement.
         let mut chosen = Vec::with_capacity(self.measurements);
-        for block in self.blocks() {
-            let weighed = self.weigh(block, state, weights);
-            let mut shares = Lanes::ZERO;
-            shares.0[..block.1].fill_with(|| stream.random());
-            let places = choose(&weights.values, &weighed.sum, &shares);
-            chosen.extend_from_slice(&places[..block.1]);
+        for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
+            block.choose(&weights.values, weighed, || stream.random(), &mut chosen);
         }
-        let d = self.deviations.len();
         for (k, deviations) in self.deviations.iter().enumerate() {
-            let value = |(measurement, draw): (usize, &u32)| {
-                let place = measurement / LANES * self.draws + *draw as usize;
-                self.centres[measurement * d + k] + f64::from(deviations[place].0[measurement % LANES])
+            let value = |(measurement, (place, lane)): (usize, &(usize, usize))| {
+                self.centres(measurement)[k] + f64::from(deviations[*place].0[*lane])
             };
             let values: Vec<f64> = chosen.iter().enumerate().map(value).collect();
             let centre = stats::mean(&values);

@@ -1,9 +1,10 @@
 //! The bounded queue in front of the processor: computing never runs on the async threads, and never piles up.
 
+use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{oneshot, OwnedSemaphorePermit, Semaphore};
 
 /// How much may be computed and may wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -31,7 +32,7 @@ pub struct QueueFull;
 #[error("the computation panicked")]
 pub struct Panicked;
 
-/// Runs computations on blocking threads, a few at a time.
+/// Runs computations on threads of their own, a few at a time.
 #[derive(Clone)]
 pub struct Compute {
     places: Arc<Semaphore>,
@@ -97,12 +98,18 @@ impl Compute {
 }
 
 impl Place {
-    /// Runs `work` on a blocking thread as soon as one is free.
+    /// Runs `work` on a computing thread as soon as one is free.
     ///
     /// # Errors
     /// [`Panicked`] when `work` panicked.
     pub async fn run<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Panicked> {
         let _thread = self.threads.acquire().await.expect("the semaphore is never closed");
-        tokio::task::spawn_blocking(work).await.map_err(|_| Panicked)
+        let (found, answer) = oneshot::channel();
+        // Among the threads that its parallel loops share: from any other, each loop would be handed over and waited for.
+        rayon::spawn(move || {
+            // Whoever asked may be gone.
+            let _ = found.send(catch_unwind(AssertUnwindSafe(work)));
+        });
+        answer.await.ok().and_then(Result::ok).ok_or(Panicked)
     }
 }

@@ -44,6 +44,7 @@ pub use detail::{BatchDetail, ModeDetail, ParameterDetail};
 pub use diagnoses::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
 use events::{Events, KnownAlarms};
 pub use models::Reloaded;
+use task::Task;
 pub use watched::Watched;
 
 /// How batches are taken and assessed.
@@ -406,27 +407,32 @@ impl Monitor {
         let structure = batch.structure.clone();
         let watched = self.structure(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
-        let (record, replayed) = match self.store.insert_batch(&batch, &batch_id, received_at).await? {
-            InsertBatch::Inserted => {
+        let (record, previous) = match self.store.insert_batch(&batch, &batch_id, received_at).await? {
+            InsertBatch::Inserted { content_digest, previous } => {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
                 // What was stored, without reading all of it back.
-                let (content_digest, state) = (batch.content_digest(), BatchState::Received);
-                (BatchRecord { batch_id, batch, content_digest, received_at, state, failure: None }, false)
+                let state = BatchState::Received;
+                (BatchRecord { batch_id, batch, content_digest, received_at, state, failure: None }, Some(previous))
             }
-            InsertBatch::Replayed(id) => (self.stored(&structure, &id).await?, true),
+            InsertBatch::Replayed(id) => (self.stored(&structure, &id).await?, None),
             InsertBatch::KeyConflict { batch_id } => return Err(Error::KeyConflict { batch: batch_id }),
             InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
                 return Err(Error::MeasurementConflict { ordinal, measured_at, batch: batch_id });
             }
         };
+        let replayed = previous.is_none();
         if record.state != BatchState::Received || watched.baseline.is_err() {
             if !replayed {
                 self.tell_batch(&structure, &record.batch_id, record.state);
             }
             return Ok(Ingested { view: self.view(record).await?, replayed });
         }
-        let stands = match self.assess_stored(watched, record.clone(), place).await {
+        let task = match previous {
+            Some(previous) => Task::new(watched, record.clone(), previous, place),
+            None => self.task(watched, record.clone(), place).await,
+        };
+        let stands = match async { self.finish(task?).await }.await {
             Ok(stands) => stands,
             Err(failure) => {
                 // The batch is stored, and whoever sent it may not send it again.

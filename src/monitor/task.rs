@@ -1,4 +1,4 @@
-//! The way of one stored batch: computed on a blocking thread, stored, told; and again where its baseline or undamaged state
+//! The way of one stored batch: computed off the async threads, stored, told; and again where its baseline or undamaged state
 //! became another meanwhile.
 
 use std::future::Future;
@@ -29,25 +29,18 @@ pub(super) struct Task {
 /// A batch that was computed, and under which undamaged state.
 pub(super) struct Computed {
     task: Task,
-    seen: Seen,
+    /// Newest version of the undamaged state then, 0 where there was none.
+    newest_undamaged: u32,
     seconds: f64,
     /// The assessment with its points on the charts, or why there is none.
     outcome: Result<(Assessment, Vec<NewChartPoint>), String>,
 }
 
-/// Versions of the undamaged state when a batch was computed.
-#[derive(Clone, Copy)]
-struct Seen {
-    /// The newest, 0 where there was none,
-    newest: u32,
-    /// and the one it was compared with.
-    compared_with: Option<u32>,
-}
-
 /// A batch whose result was stored, unless its structure has another version by now.
 pub(super) struct Stored {
     task: Task,
-    seen: Seen,
+    /// As in [`Computed`].
+    newest_undamaged: u32,
     outcome: Outcome,
 }
 
@@ -69,6 +62,17 @@ pub(super) enum Settled {
 }
 
 impl Task {
+    /// The task of a stored batch; `previous` are the frequencies of the measurement before it, of the same source.
+    pub(super) fn new(
+        watched: Arc<Watched>,
+        record: BatchRecord,
+        previous: Option<Vec<Option<Hertz>>>,
+        place: Place,
+    ) -> Result<Self, Error> {
+        let baseline = baseline_of(&record.batch.structure, &watched)?;
+        Ok(Self { watched, baseline, record: Arc::new(record), previous: Arc::new(previous), place })
+    }
+
     /// Whether the batch is compared with an undamaged state: one that was taken with its baseline and without the batch.
     fn is_comparable(&self, undamaged: &UndamagedRecord) -> bool {
         undamaged.model_digest == *self.baseline.digest() && !undamaged.batches.contains(&self.record.batch_id)
@@ -76,19 +80,8 @@ impl Task {
 }
 
 impl Monitor {
-    /// Assesses a stored batch and stores the result, or the reason why there is none: the assessment with the points of the
-    /// batch on the charts.
-    pub(super) async fn assess_stored(
-        &self,
-        watched: Arc<Watched>,
-        record: BatchRecord,
-        place: Place,
-    ) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
-        let task = self.task(watched, record, place).await?;
-        self.finish(task).await
-    }
-
-    /// Goes on with a task until its result stands.
+    /// Goes on with a task until its result stands: the assessment with the points of the batch on the charts, as they were
+    /// stored; `None` where the reason why there is none was.
     pub(super) async fn finish(&self, task: Task) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
         let mut task = task;
         loop {
@@ -104,19 +97,17 @@ impl Monitor {
 
     /// The task of a stored batch.
     pub(super) async fn task(&self, watched: Arc<Watched>, record: BatchRecord, place: Place) -> Result<Task, Error> {
-        let structure = &record.batch.structure;
-        let baseline = baseline_of(structure, &watched)?;
-        let (from, _) = record.batch.time_span();
-        let previous = Arc::new(self.store.frequencies_before(structure, &record.batch.source, from).await?);
-        Ok(Task { watched, baseline, record: Arc::new(record), previous, place })
+        let (batch, (from, _)) = (&record.batch, record.batch.time_span());
+        let previous = self.store.frequencies_before(&batch.structure, &batch.source, from).await?;
+        Task::new(watched, record, previous, place)
     }
 
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
-        let undamaged = self.store.undamaged(&task.record.batch.structure).await?;
-        let newest = undamaged.as_ref().map_or(0, |record| record.state.version);
+        // Where it is not the newest any more, the batch is computed again (`settle`).
+        let undamaged = self.store.undamaged_before(&task.record.batch.structure).await?;
+        let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
-        let seen = Seen { newest, compared_with: undamaged.as_ref().map(|record| record.state.version) };
         let started = Instant::now();
         let draws = self.draws(&task.baseline, &task.record);
         let (baseline, record, previous) =
@@ -136,13 +127,13 @@ impl Monitor {
             Ok(Err(error)) => Err(error.to_string()),
             Err(panicked) => Err(panicked.to_string()),
         };
-        Ok(Computed { task, seen, seconds: started.elapsed().as_secs_f64(), outcome })
+        Ok(Computed { task, newest_undamaged, seconds: started.elapsed().as_secs_f64(), outcome })
     }
 
     /// Stores what was computed. It is queued at once: results are stored in the order of the calls, also where the ends are
     /// waited for later.
     pub(super) fn store_computed(&self, computed: Computed) -> impl Future<Output = Result<Stored, Error>> + Send {
-        let Computed { task, seen, seconds, outcome } = computed;
+        let Computed { task, newest_undamaged, seconds, outcome } = computed;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let stored = match outcome {
             Ok((assessment, points)) => {
@@ -175,13 +166,13 @@ impl Monitor {
                     }
                 }
             };
-            Ok(Stored { task, seen, outcome })
+            Ok(Stored { task, newest_undamaged, outcome })
         }
     }
 
     /// Tells of a stored result; whether it stands.
     pub(super) async fn settle(&self, stored: Stored) -> Result<Settled, Error> {
-        let Stored { mut task, seen, outcome } = stored;
+        let Stored { mut task, newest_undamaged, outcome } = stored;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let (assessment, stored) = match outcome {
             Outcome::Assessed(assessment, stored) => (assessment, stored),
@@ -205,9 +196,9 @@ impl Monitor {
         }
         // A state declared while this was computed did not find the batch assessed, and so did not send it back: it is
         // compared now.
-        if stored.newest_undamaged != seen.newest {
+        if stored.newest_undamaged != newest_undamaged {
             let present = self.store.undamaged(structure).await?.filter(|record| task.is_comparable(record));
-            if present.map(|record| record.state.version) != seen.compared_with {
+            if present.map(|record| record.state.version) != assessment.undamaged_version {
                 return Ok(Settled::GoOn(task));
             }
         }

@@ -6,6 +6,7 @@ pub mod effect;
 pub mod eigen;
 pub mod modes;
 pub mod shapes;
+pub mod side_by_side;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;

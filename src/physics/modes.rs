@@ -9,7 +9,7 @@ use super::eigen::{eigen, eigenvalues};
 use super::{Error, Form, Structure};
 
 /// Below this share of the largest eigenvalue, the smallest is rounding: the structure is a mechanism.
-const SINGULAR: f64 = 1e-12;
+pub(super) const SINGULAR: f64 = 1e-12;
 
 /// Relative gap below which two eigenvalues count as one: rounding moves them by some 1e-13.
 pub(super) const REPEATED: f64 = 1e-8;
@@ -129,8 +129,8 @@ pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencyS
 }
 
 /// A = R⁻¹ K R⁻ᵀ with M = R Rᵀ, whose eigenvalues are those of K φ = λ M φ; φ = R⁻ᵀ v.
-struct Scaled {
-    stiffness: DMatrix<f64>,
+pub(super) struct Scaled {
+    pub stiffness: DMatrix<f64>,
     mass_root: MassRoot,
 }
 
@@ -141,7 +141,7 @@ enum MassRoot {
 }
 
 impl Scaled {
-    fn new(structure: &Structure, changes: &[(usize, f64)]) -> Result<Self, Error> {
+    pub fn new(structure: &Structure, changes: &[(usize, f64)]) -> Result<Self, Error> {
         let mut stiffness = stiffness_matrix_with(structure, changes);
         let mass = mass_matrix(structure);
         let n = mass.nrows();

@@ -8,12 +8,13 @@ mod check;
 pub mod definition;
 pub mod effect;
 pub mod law;
+mod many;
 pub mod population;
 pub mod shapes;
 pub mod table;
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use nalgebra::DMatrix;
 use rand::Rng as _;
@@ -111,6 +112,8 @@ struct Parts {
     definition: StructureDefinition,
     digest: Digest,
     checked: check::Checked,
+    /// Made when it is first asked for.
+    side_by_side: OnceLock<Option<many::Runs>>,
 }
 
 /// Frequencies under effects and their derivatives.
@@ -167,7 +170,7 @@ impl Simulator {
         let checked = check::check(&definition).map_err(|problems| DefinitionError { problems })?;
         let digest = definition.digest();
         let sizes = effect::typical_sizes(&checked.effects).into();
-        Ok(Self { parts: Arc::new(Parts { definition, digest, checked }), sizes })
+        Ok(Self { parts: Arc::new(Parts { definition, digest, checked, side_by_side: OnceLock::new() }), sizes })
     }
 
     /// Sizes of the effects at all values that covariates which are missing may have; those of several effects go through
@@ -182,7 +185,10 @@ impl Simulator {
         let parts = &self.parts;
         let checked = check::Checked { effects: Vec::new(), ..parts.checked.clone() };
         let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
-        Self { parts: Arc::new(Parts { definition, digest, checked }), sizes: Arc::new([]) }
+        Self {
+            parts: Arc::new(Parts { definition, digest, checked, side_by_side: OnceLock::new() }),
+            sizes: Arc::new([]),
+        }
     }
 
     /// Effects of the structure file.

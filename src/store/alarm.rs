@@ -91,27 +91,18 @@ struct EpisodeRow {
     acknowledgement_note: Option<String>,
 }
 
-/// True when the time from the first to the second touches a maintenance window.
-async fn in_maintenance(
-    connection: &mut SqliteConnection,
-    structure: &str,
-    (from, to): (Timestamp, Timestamp),
-) -> Result<bool, Error> {
-    let (found,): (bool,) = sqlx::query_as(
-        "select exists (select 1 from maintenance_window where structure_id = ?1 and from_us <= ?2 and to_us > ?3)",
-    )
-    .bind(structure)
-    .bind(to.micros())
-    .bind(from.micros())
-    .fetch_one(&mut *connection)
-    .await?;
-    Ok(found)
+/// Kind of the alarms of a series.
+pub(super) fn kind_of(series: &str) -> &'static str {
+    match series {
+        FIT_SERIES => "simulation_does_not_fit",
+        SILENCE_SERIES => "silence",
+        _ => "damage",
+    }
 }
 
 pub(super) async fn insert_episode(
     connection: &mut SqliteConnection,
     structure: &str,
-    kind: &str,
     series: &str,
     (version, opened_at, batch, ended_at, peak): (u32, i64, Option<&str>, Option<i64>, f64),
     now: Timestamp,
@@ -123,7 +114,7 @@ pub(super) async fn insert_episode(
          from alarm_episode where structure_id = ?1",
     )
     .bind(structure)
-    .bind(kind)
+    .bind(kind_of(series))
     .bind(series)
     .bind(version)
     .bind(opened_at)
@@ -249,7 +240,7 @@ impl Store {
                 match (lasting, since) {
                     (None, Some(since)) => {
                         let row = (0, since.micros(), None, None, 0.0);
-                        insert_episode(connection, &id, "silence", SILENCE_SERIES, row, now).await?;
+                        insert_episode(connection, &id, SILENCE_SERIES, row, now).await?;
                         Ok(true)
                     }
                     (Some((number,)), None) => {
@@ -300,7 +291,14 @@ impl Store {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn is_in_maintenance(&self, structure: &StructureId, at: Timestamp) -> Result<bool, Error> {
-        in_maintenance(&mut *self.reader.acquire().await?, structure.as_str(), (at, at)).await
+        let (found,): (bool,) = sqlx::query_as(
+            "select exists (select 1 from maintenance_window where structure_id = ?1 and from_us <= ?2 and to_us > ?2)",
+        )
+        .bind(structure.as_str())
+        .bind(at.micros())
+        .fetch_one(&self.reader)
+        .await?;
+        Ok(found)
     }
 
     /// Maintenance windows of a structure, newest first, at most 1000.

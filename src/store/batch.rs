@@ -13,10 +13,15 @@ use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 
 /// What became of a batch.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum InsertBatch {
     /// It is stored.
-    Inserted,
+    Inserted {
+        /// Digest of what was measured.
+        content_digest: Digest,
+        /// Frequencies of the last measurement of its source before it.
+        previous: Option<Vec<Option<Hertz>>>,
+    },
     /// It had been stored before under this id.
     Replayed(String),
     /// Its key belongs to a batch of other content; nothing was stored.
@@ -89,11 +94,11 @@ impl Store {
         self.write(move |connection| {
             Box::pin(async move {
                 let digest = batch.content_digest();
-                if let Some(known) = find_stored(connection, &batch, &digest).await? {
-                    return Ok(known);
+                let found = find_stored(connection, &batch, digest).await?;
+                if let InsertBatch::Inserted { content_digest, .. } = &found {
+                    insert(connection, &batch, content_digest, &id, received_at).await?;
                 }
-                insert(connection, &batch, &digest, &id, received_at).await?;
-                Ok(InsertBatch::Inserted)
+                Ok(found)
             })
         })
         .await
@@ -215,56 +220,67 @@ impl Store {
     }
 }
 
+/// What is stored of a batch that came in.
+#[derive(FromRow)]
+struct FoundRow {
+    structure_is_known: bool,
+    /// The batch of its key.
+    key_batch: Option<String>,
+    key_digest: Option<String>,
+    /// The batch that has one of its measurements, and which.
+    ordinal: Option<i64>,
+    holder_batch: Option<String>,
+    holder_digest: Option<String>,
+    /// Frequencies of the last measurement of its source before it.
+    previous: Option<Vec<u8>>,
+}
+
+/// What becomes of a batch; one that is to be inserted is not stored yet.
 async fn find_stored(
     connection: &mut SqliteConnection,
     batch: &MeasurementBatch,
-    digest: &Digest,
-) -> Result<Option<InsertBatch>, Error> {
+    digest: Digest,
+) -> Result<InsertBatch, Error> {
     let structure = batch.structure.as_str();
-    let (exists,): (bool,) = sqlx::query_as("select exists (select 1 from structure where structure_id = ?)")
-        .bind(structure)
-        .fetch_one(&mut *connection)
-        .await?;
-    if !exists {
-        return Err(Error::UnknownStructure(structure.to_owned()));
-    }
-    if let Some(key) = &batch.idempotency_key {
-        let known: Option<(String, String)> = sqlx::query_as(
-            "select batch_id, content_digest from measurement_batch where structure_id = ? and idempotency_key = ?",
-        )
-        .bind(structure)
-        .bind(key)
-        .fetch_optional(&mut *connection)
-        .await?;
-        if let Some((batch_id, content)) = known {
-            let same = content == digest.as_str();
-            return Ok(Some(if same {
-                InsertBatch::Replayed(batch_id)
-            } else {
-                InsertBatch::KeyConflict { batch_id }
-            }));
-        }
-    }
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
-    let holder: Option<(i64, String, String)> = sqlx::query_as(
-        "select t.key, b.batch_id, b.content_digest from json_each(?3) t
-         cross join measurement m on m.structure_id = ?1 and m.source = ?2 and m.measured_at_us = t.value
-         join measurement_batch b on b.structure_id = m.structure_id and b.batch_id = m.batch_id
-         order by t.key limit 1",
+    let found: FoundRow = sqlx::query_as(
+        "select exists (select 1 from structure where structure_id = ?1) as structure_is_known,
+                k.batch_id as key_batch, k.content_digest as key_digest,
+                h.ordinal, h.batch_id as holder_batch, h.content_digest as holder_digest,
+                (select frequency_hz from measurement where structure_id = ?1 and source = ?2 and measured_at_us < ?5
+                    order by measured_at_us desc limit 1) as previous
+         from (select 1)
+         left join measurement_batch k on k.structure_id = ?1 and k.idempotency_key = ?4
+         left join (select t.key as ordinal, b.batch_id, b.content_digest from json_each(?3) t
+                    cross join measurement m on m.structure_id = ?1 and m.source = ?2 and m.measured_at_us = t.value
+                    join measurement_batch b on b.structure_id = m.structure_id and b.batch_id = m.batch_id
+                    order by t.key limit 1) h on true",
     )
     .bind(structure)
     .bind(&batch.source)
     .bind(serde_json::to_string(&times).map_err(|e| bad_row("batch")(&e))?)
-    .fetch_optional(&mut *connection)
+    .bind(&batch.idempotency_key)
+    .bind(batch.time_span().0.micros())
+    .fetch_one(&mut *connection)
     .await?;
-    // Equal digests mean equal measurements: if one of them is in that batch, all are.
-    Ok(holder.map(|(ordinal, batch_id, content)| {
+    if !found.structure_is_known {
+        return Err(Error::UnknownStructure(structure.to_owned()));
+    }
+    if let (Some(batch_id), Some(content)) = (found.key_batch, found.key_digest) {
+        let same = content == digest.as_str();
+        return Ok(if same { InsertBatch::Replayed(batch_id) } else { InsertBatch::KeyConflict { batch_id } });
+    }
+    if let (Some(ordinal), Some(batch_id), Some(content)) = (found.ordinal, found.holder_batch, found.holder_digest) {
+        // Equal digests mean equal measurements: if one of them is in that batch, all are.
         if content == digest.as_str() {
-            return InsertBatch::Replayed(batch_id);
+            return Ok(InsertBatch::Replayed(batch_id));
         }
         let ordinal = ordinal as usize;
-        InsertBatch::MeasurementConflict { ordinal, measured_at: batch.measurements[ordinal].measured_at, batch_id }
-    }))
+        let measured_at = batch.measurements[ordinal].measured_at;
+        return Ok(InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id });
+    }
+    let previous = found.previous.map(|blob| frequencies("measurement", &blob)).transpose()?;
+    Ok(InsertBatch::Inserted { content_digest: digest, previous })
 }
 
 /// Statements that insert measurements; structure, batch and source are common to all rows.
@@ -338,14 +354,13 @@ pub(super) async fn import(
     if let Some((content,)) = holder {
         return if content == digest.as_str() { Ok(false) } else { Err(other("a batch of other content")) };
     }
-    match find_stored(connection, batch, &digest).await? {
-        None => insert(connection, batch, &digest, batch_id, received_at).await.map(|()| true),
-        Some(
-            InsertBatch::Replayed(there)
-            | InsertBatch::KeyConflict { batch_id: there }
-            | InsertBatch::MeasurementConflict { batch_id: there, .. },
-        ) => Err(other(&there)),
-        Some(InsertBatch::Inserted) => unreachable!("looking for a batch stores none"),
+    match find_stored(connection, batch, digest).await? {
+        InsertBatch::Inserted { content_digest, .. } => {
+            insert(connection, batch, &content_digest, batch_id, received_at).await.map(|()| true)
+        }
+        InsertBatch::Replayed(there)
+        | InsertBatch::KeyConflict { batch_id: there }
+        | InsertBatch::MeasurementConflict { batch_id: there, .. } => Err(other(&there)),
     }
 }
 

@@ -8,7 +8,7 @@ use std::sync::LazyLock;
 use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
 
-use super::alarm::{insert_episode, FIT_SERIES, SILENCE_SERIES};
+use super::alarm::{insert_episode, kind_of};
 use super::rows::{insert_statements, parts};
 use super::{bad_row, timestamp, Error, Store};
 use crate::alarm::chart::{ChartPoint, Series};
@@ -18,6 +18,9 @@ use crate::quantity::{StructureId, Timestamp};
 
 /// Points read at a time.
 const PAGE: usize = 500;
+
+/// Charts whose points are read by one statement: SQLite joins some hundreds of parts, and each chart has two.
+const CHARTS_TOGETHER: usize = 32;
 
 /// Difference of moving averages that is none.
 const SAME: f64 = 1e-9;
@@ -109,17 +112,25 @@ pub(super) type Place = (i64, String);
 const POINT_COLUMNS: &str =
     "measured_to_us, batch_id, series, shift, shift_limit, ewma_limit, probability_limit, held, ewma, above, state";
 
-/// The points of a series that the state at a place comes from, and those from there on.
-static SELECT_ABOUT: LazyLock<String> = LazyLock::new(|| {
-    let of_series = "where structure_id = ?1 and undamaged_version = ?2 and series = ?3";
-    format!(
-        "select * from (select {POINT_COLUMNS} from chart_point {of_series} and (measured_to_us, batch_id) < (?4, ?5)
-             and held = 0 order by measured_to_us desc, batch_id desc limit ?6)
-         union all
-         select * from (select {POINT_COLUMNS} from chart_point {of_series} and (measured_to_us, batch_id) >= (?4, ?5)
-             order by measured_to_us, batch_id limit {PAGE})"
-    )
-});
+/// The points of some series that their states at a place come from, and those from there on: structure, time and batch are
+/// parameters 1 to 3, then come version and name of each series.
+///
+/// The limits stand in the text, since SQLite prepares a statement anew whenever a limit is bound.
+fn select_about(charts: &[NewChartPoint]) -> String {
+    let of_one = |(chart, new): (usize, &NewChartPoint)| {
+        let (version, series) = (4 + 2 * chart, 5 + 2 * chart);
+        let of_series = format!("where structure_id = ?1 and undamaged_version = ?{version} and series = ?{series}");
+        let memory = Series::memory(&new.settings);
+        format!(
+            "select * from (select {POINT_COLUMNS} from chart_point {of_series} and (measured_to_us, batch_id) < (?2, ?3)
+                 and held = 0 order by measured_to_us desc, batch_id desc limit {memory})
+             union all
+             select * from (select {POINT_COLUMNS} from chart_point {of_series} and (measured_to_us, batch_id) >= (?2, ?3)
+                 order by measured_to_us, batch_id limit {PAGE})"
+        )
+    };
+    charts.iter().enumerate().map(of_one).collect::<Vec<_>>().join(" union all ")
+}
 
 /// The points of a series behind a place.
 static SELECT_BEHIND: LazyLock<String> = LazyLock::new(|| {
@@ -171,14 +182,35 @@ pub(super) async fn chart(
 ) -> Result<Charts, Error> {
     let mut placed = Vec::new();
     // A state declared while this was computed has ended the charts of the one before.
-    for new in points.into_iter().filter(|new| [0, batch.newest_undamaged].contains(&new.undamaged_version)) {
-        placed.push(place(connection, batch, &new).await?);
+    let points = points.into_iter().filter(|new| [0, batch.newest_undamaged].contains(&new.undamaged_version));
+    for charts in points.collect::<Vec<_>>().chunks(CHARTS_TOGETHER) {
+        let mut about = about(connection, batch, charts).await?;
+        for new in charts {
+            let own = about.extract_if(.., |row| row.series == new.series).collect();
+            placed.push(place(connection, batch, new, own).await?);
+        }
     }
     placed.sort_by(|a, b| b.undamaged_version.cmp(&a.undamaged_version).then_with(|| a.row.series.cmp(&b.row.series)));
     insert_points(connection, batch, &placed).await?;
     let alarms_changed = placed.iter().any(|placed| placed.alarms_changed);
     let points = placed.into_iter().map(|placed| stored_point(placed.row)).collect::<Result<_, _>>()?;
     Ok(Charts { points, alarms_changed })
+}
+
+/// The stored points that the states of some charts at the place of a batch come from, and those from there on.
+async fn about(
+    connection: &mut SqliteConnection,
+    batch: &Charted<'_>,
+    charts: &[NewChartPoint],
+) -> Result<Vec<PointRow>, Error> {
+    let mut select = sqlx::query_as(sqlx::AssertSqlSafe(select_about(charts)))
+        .bind(batch.structure)
+        .bind(batch.place.0)
+        .bind(&batch.place.1);
+    for new in charts {
+        select = select.bind(new.undamaged_version).bind(&new.series);
+    }
+    Ok(select.fetch_all(&mut *connection).await?)
 }
 
 async fn insert_points(connection: &mut SqliteConnection, batch: &Charted<'_>, placed: &[Placed]) -> Result<(), Error> {
@@ -207,21 +239,17 @@ async fn insert_points(connection: &mut SqliteConnection, batch: &Charted<'_>, p
 }
 
 /// Finds what a new point means behind those before it, and goes through the series behind it: states, and the episodes that
-/// they make.
+/// they make. `about`: the stored points about it.
 ///
 /// It ends where the points come out as they were: the moving average forgets, and so does the count of points above.
-async fn place(connection: &mut SqliteConnection, batch: &Charted<'_>, new: &NewChartPoint) -> Result<Placed, Error> {
+async fn place(
+    connection: &mut SqliteConnection,
+    batch: &Charted<'_>,
+    new: &NewChartPoint,
+    mut about: Vec<PointRow>,
+) -> Result<Placed, Error> {
     let undamaged_version = new.undamaged_version;
     let memory = Series::memory(&new.settings);
-    let mut about: Vec<PointRow> = sqlx::query_as(SELECT_ABOUT.as_str())
-        .bind(batch.structure)
-        .bind(new.undamaged_version)
-        .bind(&new.series)
-        .bind(batch.place.0)
-        .bind(&batch.place.1)
-        .bind(memory as i64)
-        .fetch_all(&mut *connection)
-        .await?;
     about.sort_by_cached_key(PointRow::place);
     let mut page = about.split_off(about.partition_point(|row| row.place() < batch.place));
     let before = about;
@@ -346,37 +374,34 @@ impl Episodes {
         inside: bool,
         amended: bool,
     ) -> Result<Self, Error> {
-        let kind = kind_of(&new.series);
         let mut episodes = Self { stored: Vec::new(), running: None, running_end: None, found: Vec::new(), inside };
+        // Parameters of both: the series, and the place in it.
+        macro_rules! of_series {
+            ($select:literal) => {
+                sqlx::query_as($select)
+                    .bind(batch.structure)
+                    .bind(kind_of(&new.series))
+                    .bind(&new.series)
+                    .bind(new.undamaged_version)
+                    .bind(batch.place.0)
+                    .bind(&batch.place.1)
+            };
+        }
         if amended {
-            episodes.stored = sqlx::query_as(
+            let select = of_series!(
                 "select episode, opened_at_us, opened_batch, ended_at_us, withdrawn from alarm_episode
                  where structure_id = ? and kind = ? and series = ? and undamaged_version = ?
-                   and (opened_at_us, opened_batch) >= (?, ?) order by opened_at_us, opened_batch",
-            )
-            .bind(batch.structure)
-            .bind(kind)
-            .bind(&new.series)
-            .bind(new.undamaged_version)
-            .bind(batch.place.0)
-            .bind(&batch.place.1)
-            .fetch_all(&mut *connection)
-            .await?;
+                   and (opened_at_us, opened_batch) >= (?, ?) order by opened_at_us, opened_batch"
+            );
+            episodes.stored = select.fetch_all(&mut *connection).await?;
         }
         if inside {
-            episodes.running = sqlx::query_as(
+            let select = of_series!(
                 "select episode, peak_shift from alarm_episode
                  where structure_id = ? and kind = ? and series = ? and undamaged_version = ? and withdrawn = 0
-                   and (opened_at_us, opened_batch) < (?, ?) order by opened_at_us desc, opened_batch desc limit 1",
-            )
-            .bind(batch.structure)
-            .bind(kind)
-            .bind(&new.series)
-            .bind(new.undamaged_version)
-            .bind(batch.place.0)
-            .bind(&batch.place.1)
-            .fetch_optional(&mut *connection)
-            .await?;
+                   and (opened_at_us, opened_batch) < (?, ?) order by opened_at_us desc, opened_batch desc limit 1"
+            );
+            episodes.running = select.fetch_optional(&mut *connection).await?;
         }
         Ok(episodes)
     }
@@ -456,7 +481,7 @@ impl Episodes {
                 continue;
             }
             let row = (new.undamaged_version, found.opened_at, Some(found.batch.as_str()), found.ended_at, found.peak);
-            insert_episode(connection, structure, kind_of(&new.series), &new.series, row, batch.now).await?;
+            insert_episode(connection, structure, &new.series, row, batch.now).await?;
         }
         for (number, ..) in self.stored {
             sqlx::query("update alarm_episode set withdrawn = 1 where structure_id = ? and episode = ?")
@@ -466,14 +491,6 @@ impl Episodes {
                 .await?;
         }
         Ok(any)
-    }
-}
-
-fn kind_of(series: &str) -> &'static str {
-    match series {
-        FIT_SERIES => "simulation_does_not_fit",
-        SILENCE_SERIES => "silence",
-        _ => "damage",
     }
 }
 

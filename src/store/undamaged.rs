@@ -1,6 +1,5 @@
 //! Undamaged states: versions that never change.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use sqlx::FromRow;
@@ -132,16 +131,29 @@ impl Store {
                 .fetch_one(&self.reader)
                 .await?;
         let Some(newest) = newest else { return Ok(None) };
-        let known = |all: &BTreeMap<StructureId, Arc<UndamagedRecord>>| {
-            all.get(structure).filter(|record| record.state.version == newest).map(Arc::clone)
-        };
-        if let Some(record) = known(&self.undamaged.lock().expect("no holder of this lock panics")) {
+        if let Some(record) = self.known_undamaged(structure).filter(|record| record.state.version == newest) {
             return Ok(Some(record));
         }
         let Some(record) = self.read_undamaged(structure).await?.map(Arc::new) else { return Ok(None) };
         let mut all = self.undamaged.lock().expect("no holder of this lock panics");
         all.insert(structure.clone(), Arc::clone(&record));
         Ok(Some(record))
+    }
+
+    /// As [`Self::undamaged`], but a state that was read before is not looked for again: the newest may be another by now, which
+    /// who stores what was made of it is told ([`super::StoredAssessment::newest_undamaged`]).
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn undamaged_before(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+        match self.known_undamaged(structure) {
+            Some(record) => Ok(Some(record)),
+            None => self.undamaged(structure).await,
+        }
+    }
+
+    fn known_undamaged(&self, structure: &StructureId) -> Option<Arc<UndamagedRecord>> {
+        self.undamaged.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
     }
 
     async fn read_undamaged(&self, structure: &StructureId) -> Result<Option<UndamagedRecord>, Error> {

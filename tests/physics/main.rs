@@ -5,6 +5,7 @@
 mod beam;
 mod definition;
 mod effect;
+mod side_by_side;
 mod table;
 
 use std::f64::consts::PI;

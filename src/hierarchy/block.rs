@@ -1,0 +1,145 @@
+//! Which measurement stands in which lanes: sixteen side by side, one in each, and those left over in several lanes each, so that
+//! few of the vectors' numbers stand for nothing.
+
+use std::iter::StepBy;
+use std::ops::Range;
+
+use super::kernel::{count_before, Lanes, Weighed, LANES};
+
+/// Measurements side by side.
+#[derive(Debug, Clone)]
+pub(super) struct Block {
+    pub measurements: Range<usize>,
+    /// Where their samples stand.
+    pub places: Range<usize>,
+    /// Lanes from one of a measurement to its next; sixteen where it has but one.
+    pub width: usize,
+}
+
+impl Block {
+    /// The blocks of so many measurements with so many samples each.
+    pub fn all(measurements: usize, draws: usize) -> Vec<Self> {
+        let mut places = 0;
+        let one = |first: usize| {
+            let own = first..(first + LANES).min(measurements);
+            // Each has as many lanes as there is room for and as share its samples evenly.
+            let mut parts = 1;
+            while 2 * parts * own.len() <= LANES && draws.is_multiple_of(2 * parts) {
+                parts *= 2;
+            }
+            let here = places..places + draws / parts;
+            places = here.end;
+            Self { measurements: own, places: here, width: LANES / parts }
+        };
+        (0..measurements).step_by(LANES).map(one).collect()
+    }
+
+    /// The measurements with their lanes.
+    pub fn lanes(&self) -> impl Iterator<Item = (usize, StepBy<Range<usize>>)> {
+        let width = self.width;
+        let lanes = move |(first, measurement): (usize, usize)| (measurement, (first..LANES).step_by(width));
+        self.measurements.clone().enumerate().map(lanes)
+    }
+
+    /// Place and lane of a sample of one of the measurements.
+    pub fn place(&self, measurement: usize, draw: usize) -> (usize, usize) {
+        let each = self.places.len();
+        (self.places.start + draw % each, measurement - self.measurements.start + draw / each * self.width)
+    }
+
+    /// A sample of each measurement by its weight (`values`, `[place]`): `share`, from 0 to below 1, tells for one after the
+    /// other how much of all weight comes before it. Appends place and lane of each.
+    pub fn choose(
+        &self,
+        values: &[Lanes],
+        weighed: &Weighed,
+        mut share: impl FnMut() -> f32,
+        chosen: &mut Vec<(usize, usize)>,
+    ) {
+        let mut targets = Lanes::ZERO;
+        for (_, lanes) in self.lanes() {
+            let mut left = share() * weighed.sum.of(lanes.clone()) as f32;
+            for lane in lanes {
+                targets.0[lane] = left;
+                left -= weighed.sum.0[lane];
+            }
+        }
+        let counts = count_before(&values[self.places.clone()], &targets);
+        let draws = self.places.len() * LANES / self.width;
+        for (measurement, lanes) in self.lanes() {
+            let before: usize = lanes.map(|lane| counts[lane] as usize).sum();
+            // Rounding may leave nothing behind the target.
+            chosen.push(self.place(measurement, before.min(draws - 1)));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::super::kernel::weigh;
+    use super::*;
+
+    const SIZES: [(usize, usize); 8] = [(1, 64), (3, 10), (4, 64), (5, 7), (9, 64), (16, 64), (20, 64), (50, 16)];
+
+    #[test]
+    fn every_sample_has_a_place_of_its_own() {
+        for (measurements, draws) in SIZES {
+            let mut seen = BTreeSet::new();
+            let blocks = Block::all(measurements, draws);
+            for block in &blocks {
+                for (measurement, lanes) in block.lanes() {
+                    let lanes: Vec<usize> = lanes.collect();
+                    for draw in 0..draws {
+                        let (place, lane) = block.place(measurement, draw);
+                        assert!(block.places.contains(&place) && lanes.contains(&lane), "{measurement}, {draw}");
+                        assert!(seen.insert((place, lane)), "{measurements} measurements: {place}, {lane} twice");
+                    }
+                }
+            }
+            assert_eq!(seen.len(), measurements * draws);
+            assert_eq!(blocks.last().unwrap().measurements.end, measurements);
+        }
+        // Four are left over of twenty: they take a quarter of the steps.
+        assert_eq!(Block::all(20, 64).last().unwrap().places, 64..80);
+    }
+
+    #[test]
+    fn samples_are_chosen_by_their_weight_in_however_many_lanes() {
+        for (measurements, draws) in SIZES {
+            let exponent = |measurement: usize, draw: usize| (draw as f64 * 1.3 - measurement as f64).cos() * 2.0;
+            for block in Block::all(measurements, draws) {
+                let mut values = vec![Lanes::ZERO; block.places.end];
+                for measurement in block.measurements.clone() {
+                    for draw in 0..draws {
+                        let (place, lane) = block.place(measurement, draw);
+                        values[place].0[lane] = exponent(measurement, draw) as f32;
+                    }
+                }
+                let weighed = weigh(&mut values[block.places.clone()], &[], &[], &[], block.width);
+                let mut counts = vec![[0.0; LANES]; block.places.end];
+                let shares = 10_000_u32;
+                for i in 0..shares {
+                    let mut chosen = Vec::new();
+                    block.choose(&values, &weighed, || ((f64::from(i) + 0.5) / f64::from(shares)) as f32, &mut chosen);
+                    assert_eq!(chosen.len(), block.measurements.len());
+                    chosen.into_iter().for_each(|(place, lane)| counts[place][lane] += 1.0);
+                }
+                for (measurement, lanes) in block.lanes() {
+                    let all: f64 = (0..draws).map(|draw| exponent(measurement, draw).exp()).sum();
+                    let largest = (0..draws).map(|draw| exponent(measurement, draw)).fold(f64::NEG_INFINITY, f64::max);
+                    // Single precision: 6e-8, some operations, and the sum of up to 64.
+                    let (found, expected) = (weighed.sum.of(lanes), all / largest.exp());
+                    assert!((found / expected - 1.0).abs() < 1e-5, "{measurements}: {found}, expected {expected}");
+                    for draw in 0..draws {
+                        let (place, lane) = block.place(measurement, draw);
+                        let expected = exponent(measurement, draw).exp() / all * f64::from(shares);
+                        // Through all shares each comes as often as it weighs, to within one at both of its ends.
+                        assert!((counts[place][lane] - expected).abs() < 2.5, "{measurement}, {draw}: {expected}");
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,180 @@
+//! Natural frequencies of a small structure at many stiffnesses, eight of them at a time, one in each lane of a vector.
+//!
+//! Posterior samples are weighed by thousands of runs of the same few masses: alone, each costs mostly its assembly and the
+//! branches of its iteration.
+
+use std::f64::consts::PI;
+
+use super::modes::{Scaled, SINGULAR};
+use super::Structure;
+
+/// Degrees of freedom up to which this is used; the work of a sweep grows with their cube.
+pub const MOST_FREEDOMS: usize = 8;
+
+/// Runs side by side: the numbers of the widest vector.
+const LANES: usize = 8;
+
+/// Sweeps of the iteration, which doubles its digits with each from the third on or so.
+const MOST_SWEEPS: usize = 15;
+
+/// What lies off the diagonal, relative to all, when the iteration ends: it moves an eigenvalue by the square of this over the
+/// gap to the next.
+const NEGLIGIBLE: f64 = 1e-14;
+
+/// A number of each run; on a line of the cache.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Lanes([f64; LANES]);
+
+/// The lower triangle of a symmetric matrix of each run.
+type Matrices = [[Lanes; MOST_FREEDOMS]; MOST_FREEDOMS];
+
+/// A structure some of whose stiffnesses change from run to run.
+///
+/// ```text
+///  A(k) = A_0 + Σ_s k_s A_s,    A_0, A_s: R⁻¹ K R⁻ᵀ of the other springs, and of one unit of spring s;   M = R Rᵀ
+/// ```
+#[derive(Debug, Clone)]
+pub struct SideBySide {
+    freedoms: usize,
+    modes: usize,
+    /// Lower triangle of A_0, row by row.
+    fixed: Vec<f64>,
+    /// Those of each A_s.
+    units: Vec<Vec<f64>>,
+}
+
+impl SideBySide {
+    /// The lowest `modes` frequencies of a structure, `springs` (their indices) of which change. `None` for one that has more
+    /// than [`MOST_FREEDOMS`] or fewer than `modes` degrees of freedom, or one without a mass.
+    pub fn new(structure: &Structure, springs: &[usize], modes: usize) -> Option<Self> {
+        let freedoms = structure.freedoms();
+        if freedoms > MOST_FREEDOMS || modes > freedoms {
+            return None;
+        }
+        let lower = |stiffness: &dyn Fn(usize, f64) -> f64| {
+            let all = structure.springs().iter().enumerate();
+            let changes: Vec<(usize, f64)> = all.map(|(spring, s)| (spring, stiffness(spring, s.n_per_m))).collect();
+            let scaled = Scaled::new(structure, &changes).ok()?.stiffness;
+            let entries = (0..freedoms).flat_map(|row| (0..=row).map(move |column| (row, column)));
+            Some(entries.map(|entry| scaled[entry]).collect::<Vec<f64>>())
+        };
+        let fixed = lower(&|spring, own| if springs.contains(&spring) { 0.0 } else { own })?;
+        let unit = |changed: &usize| lower(&|spring, _| f64::from(u8::from(spring == *changed)));
+        let units = springs.iter().map(unit).collect::<Option<_>>()?;
+        Some(Self { freedoms, modes, fixed, units })
+    }
+
+    /// Natural frequencies, Hz, ascending, `[runs·modes]`, those of one run together; NaN for a run with a stiffness that is
+    /// negative or not finite, or that makes a mechanism. `n_per_m`: stiffnesses of the springs that change, run by run.
+    ///
+    /// # Panics
+    /// When no spring changes, or not one stiffness of each is given: a bug.
+    pub fn frequencies_hz(&self, n_per_m: &[f64]) -> Vec<f64> {
+        let springs = self.units.len();
+        assert!(n_per_m.len().is_multiple_of(springs), "{} stiffnesses of {springs} springs", n_per_m.len());
+        let mut frequencies = Vec::with_capacity(n_per_m.len() / springs * self.modes);
+        for runs in n_per_m.chunks(LANES * springs) {
+            let mut matrices = [[Lanes([0.0; LANES]); MOST_FREEDOMS]; MOST_FREEDOMS];
+            // Lanes that are left over repeat the last run.
+            let count = runs.len() / springs;
+            let stiffness =
+                |spring: usize| Lanes(std::array::from_fn(|lane| runs[lane.min(count - 1) * springs + spring]));
+            let stiffnesses: Vec<Lanes> = (0..springs).map(stiffness).collect();
+            assemble(&mut matrices, &self.fixed, &self.units, &stiffnesses);
+            diagonalise(&mut matrices, self.freedoms);
+            for lane in 0..count {
+                let given = &runs[lane * springs..(lane + 1) * springs];
+                let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
+                let mut all: [f64; MOST_FREEDOMS] = std::array::from_fn(|i| matrices[i][i].0[lane]);
+                let eigenvalues = &mut all[..self.freedoms];
+                eigenvalues.sort_unstable_by(f64::total_cmp);
+                let (smallest, largest) = (eigenvalues[0], eigenvalues[self.freedoms - 1]);
+                let tied = valid && smallest > SINGULAR * largest && largest.is_finite();
+                let frequency = |eigenvalue: &f64| if tied { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
+                frequencies.extend(eigenvalues[..self.modes].iter().map(frequency));
+            }
+        }
+        frequencies
+    }
+}
+
+/// A(k) of each run.
+#[pulp::with_simd(assemble = pulp::Arch::new())]
+#[inline(always)]
+fn assemble_simd<S: pulp::Simd>(
+    _: S,
+    matrices: &mut Matrices,
+    fixed: &[f64],
+    units: &[Vec<f64>],
+    stiffnesses: &[Lanes],
+) {
+    let lower = matrices.iter_mut().enumerate().flat_map(|(row, entries)| &mut entries[..=row]);
+    for (place, (entry, fixed)) in lower.zip(fixed).enumerate() {
+        let mut sum = [*fixed; LANES];
+        for (unit, stiffnesses) in units.iter().zip(stiffnesses) {
+            let unit = unit[place];
+            for (sum, stiffness) in sum.iter_mut().zip(&stiffnesses.0) {
+                *sum += unit * stiffness;
+            }
+        }
+        entry.0 = sum;
+    }
+}
+
+/// Leaves the eigenvalues on the diagonals, by Jacobi's rotations in cyclic order.
+///
+/// ```text
+///  t = sgn(d)·2a_pq / (|d| + √(d² + 4a_pq²)),   d = a_qq − a_pp,   c = 1/√(1 + t²),   s = t c
+///  a_pp −= t a_pq,   a_qq += t a_pq,   (a_rp, a_rq) ← (c a_rp − s a_rq, s a_rp + c a_rq),   a_pq ← 0
+/// ```
+///
+/// Without branches, and the same operations in every lane. Source: Golub & Van Loan (2013), Matrix Computations, §8.5.
+#[pulp::with_simd(diagonalise = pulp::Arch::new())]
+#[inline(always)]
+fn diagonalise_simd<S: pulp::Simd>(_: S, a: &mut Matrices, n: usize) {
+    // Keeps 0/0 away where nothing is to be rotated.
+    const LEAST: f64 = f64::MIN_POSITIVE;
+    for _ in 0..MOST_SWEEPS {
+        let (mut off, mut all) = ([0.0; LANES], [0.0; LANES]);
+        for row in 0..n {
+            for column in 0..row {
+                for (off, entry) in off.iter_mut().zip(&a[row][column].0) {
+                    *off += entry * entry;
+                }
+            }
+            for (all, entry) in all.iter_mut().zip(&a[row][row].0) {
+                *all += entry * entry;
+            }
+        }
+        // What is no number does not hold the others up.
+        if !off.iter().zip(&all).any(|(off, all)| *off > NEGLIGIBLE * NEGLIGIBLE * all) {
+            return;
+        }
+        for q in 1..n {
+            for p in 0..q {
+                let (mut first, mut last, between) = (a[p][p].0, a[q][q].0, a[q][p].0);
+                let (mut cosine, mut sine) = ([0.0; LANES], [0.0; LANES]);
+                for lane in 0..LANES {
+                    let (d, b) = (last[lane] - first[lane], 2.0 * between[lane]);
+                    let t = b.copysign(b * d) / (d.abs() + (d * d + b * b).sqrt() + LEAST);
+                    cosine[lane] = 1.0 / (1.0 + t * t).sqrt();
+                    sine[lane] = t * cosine[lane];
+                    first[lane] -= t * between[lane];
+                    last[lane] += t * between[lane];
+                }
+                (a[p][p].0, a[q][q].0, a[q][p].0) = (first, last, [0.0; LANES]);
+                for r in (0..n).filter(|r| *r != p && *r != q) {
+                    let (of_p, of_q) = ((r.max(p), r.min(p)), (r.max(q), r.min(q)));
+                    let (mut left, mut right) = (a[of_p.0][of_p.1].0, a[of_q.0][of_q.1].0);
+                    for lane in 0..LANES {
+                        let (x, y) = (left[lane], right[lane]);
+                        left[lane] = cosine[lane] * x - sine[lane] * y;
+                        right[lane] = sine[lane] * x + cosine[lane] * y;
+                    }
+                    (a[of_p.0][of_p.1].0, a[of_q.0][of_q.1].0) = (left, right);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,109 @@
+//! Runs side by side against the same runs one by one.
+
+use modalwatch::baseline::library::find_structure;
+use modalwatch::physics::side_by_side::{SideBySide, MOST_FREEDOMS};
+use modalwatch::physics::{natural_frequencies_with, Node, Structure};
+use modalwatch::stats;
+use nalgebra::DMatrix;
+use rand::Rng as _;
+
+use super::{chain, mass, random_structure, spring};
+
+/// Both are exact to rounding: some 1e-15 of the largest eigenvalue, which here is at most a thousand times the smallest.
+const ROUNDING: f64 = 1e-11;
+
+fn agree(found: f64, expected: f64) -> bool {
+    (found / expected - 1.0).abs() < ROUNDING
+}
+
+/// Stiffnesses of `runs` runs, of each of the springs.
+fn stiffnesses(structure: &Structure, springs: &[usize], runs: usize, seed: u64) -> Vec<f64> {
+    let mut stream = stats::stream(seed, "stiffnesses");
+    let one = |spring: &usize, factor: f64| structure.springs()[*spring].n_per_m * factor;
+    (0..runs).flat_map(|_| springs.iter().map(|s| one(s, stream.random_range(0.3..3.0))).collect::<Vec<_>>()).collect()
+}
+
+fn as_one_by_one(structure: &Structure, springs: &[usize], runs: usize, seed: u64) {
+    let given = stiffnesses(structure, springs, runs, seed);
+    let modes = structure.freedoms();
+    let found = SideBySide::new(structure, springs, modes).unwrap().frequencies_hz(&given);
+    assert_eq!(found.len(), runs * modes);
+    for (run, found) in found.chunks(modes).enumerate() {
+        let own = &given[run * springs.len()..(run + 1) * springs.len()];
+        let changes: Vec<(usize, f64)> = springs.iter().copied().zip(own.iter().copied()).collect();
+        let expected = natural_frequencies_with(structure, &changes, modes).unwrap();
+        for (found, expected) in found.iter().zip(&expected) {
+            assert!(agree(*found, *expected), "seed {seed}, run {run}: {found} Hz, expected {expected} Hz");
+        }
+    }
+}
+
+#[test]
+fn random_structures_have_the_frequencies_that_they_have_one_by_one() {
+    for seed in 0..40 {
+        let structure = random_structure(seed);
+        let changing: Vec<usize> =
+            (0..structure.springs().len()).filter(|s| !(s + seed as usize).is_multiple_of(3)).collect();
+        // Full vectors, and some that are not.
+        as_one_by_one(&structure, &changing, 1 + seed as usize, seed);
+    }
+    for freedoms in 1..=MOST_FREEDOMS {
+        as_one_by_one(&chain(freedoms, 0.7, 1300.0), &(0..freedoms).collect::<Vec<_>>(), 19, 7);
+    }
+    assert!(SideBySide::new(&chain(MOST_FREEDOMS + 1, 0.7, 1300.0), &[0], 1).is_none());
+    assert!(SideBySide::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
+}
+
+#[test]
+fn equal_eigenvalues_come_out_equal() {
+    // Three masses on springs of their own, two of them alike, far apart from the third.
+    let own = |i: usize| spring(i, Node::Ground, Node::Freedom(i), 4.0);
+    let structure = Structure::new((0..3).map(|i| mass(i, 1.0)).collect(), (0..3).map(own).collect()).unwrap();
+    let found = SideBySide::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
+    let hz = |n_per_m: f64| n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
+    for (found, expected) in found.iter().zip([hz(4.0), hz(4.0), hz(4.0e6)]) {
+        assert!(agree(*found, expected), "{found} Hz, expected {expected} Hz");
+    }
+}
+
+#[test]
+fn a_run_without_frequencies_spoils_no_other() {
+    let structure = chain(3, 0.5, 100.0);
+    let runs = SideBySide::new(&structure, &[0, 1, 2], 2).unwrap();
+    let good = [80.0, 90.0, 110.0];
+    let alone = runs.frequencies_hz(&good);
+    // A mechanism, and stiffnesses that are none.
+    for bad in [[0.0, 90.0, 110.0], [80.0, -1.0, 110.0], [80.0, f64::NAN, 110.0], [f64::INFINITY, 1.0, 1.0]] {
+        let found = runs.frequencies_hz(&[good, bad, good].concat());
+        assert!(found[2..4].iter().all(|f| f.is_nan()), "{bad:?}: {found:?}");
+        for at in [0, 1, 4, 5] {
+            assert!(agree(found[at], alone[at % 2]), "{bad:?}: {found:?}, alone {alone:?}");
+        }
+    }
+}
+
+#[test]
+fn rows_of_parameters_have_the_frequencies_of_a_single_run() {
+    for name in ["three-dof", "rig", "ruler-frame-4dof"] {
+        let simulator = find_structure(name).unwrap();
+        let mut stream = stats::stream(3, name);
+        let parameters = simulator.space().as_slice();
+        let mut theta = DMatrix::from_fn(21, parameters.len(), |_, column| {
+            stream.random_range(parameters[column].lower..parameters[column].upper)
+        });
+        theta[(5, 0)] = -1.0;
+        let modes = simulator.modes();
+        let found = simulator.frequencies_of_rows_hz(&theta, 2..21);
+        assert_eq!(found.len(), 19 * modes, "{name}");
+        for (row, found) in (2..21).zip(found.chunks(modes)) {
+            let single = simulator.frequencies_hz(&theta.row(row).iter().copied().collect::<Vec<_>>());
+            let Ok(single) = single else {
+                assert!(found.iter().all(|f| f.is_nan()), "{name}, row {row}: {found:?}");
+                continue;
+            };
+            for (found, expected) in found.iter().zip(&single) {
+                assert!(agree(*found, *expected), "{name}, row {row}: {found} Hz, expected {expected} Hz");
+            }
+        }
+    }
+}
