@@ -110,14 +110,18 @@ mod tests {
         for (measurements, draws) in SIZES {
             let exponent = |measurement: usize, draw: usize| (draw as f64 * 1.3 - measurement as f64).cos() * 2.0;
             for block in Block::all(measurements, draws) {
-                let mut values = vec![Lanes::ZERO; block.places.end];
+                let mut offsets = vec![Lanes::ZERO; block.places.end];
                 for measurement in block.measurements.clone() {
                     for draw in 0..draws {
                         let (place, lane) = block.place(measurement, draw);
-                        values[place].0[lane] = exponent(measurement, draw) as f32;
+                        offsets[place].0[lane] = exponent(measurement, draw) as f32;
                     }
                 }
-                let weighed = weigh(&mut values[block.places.clone()], &[], &[], &[], block.width);
+                // All samples at their centre: the weights are those that they have by themselves.
+                let (centred, mut values) = (vec![Lanes::ZERO; block.places.len()], offsets.clone());
+                let (places, linears) = (block.places.clone(), [Lanes::ZERO]);
+                let (own, offsets) = (&mut values[places.clone()], &offsets[places]);
+                let weighed = weigh(own, offsets, &[&centred], &[0.0], &linears, block.width);
                 let mut counts = vec![[0.0; LANES]; block.places.end];
                 let shares = 10_000_u32;
                 for i in 0..shares {

@@ -35,34 +35,39 @@ pub(super) struct Weighed {
     pub sum: Lanes,
 }
 
-/// w_s from the logarithms of what the samples weigh without the population (`weights`, one entry a sample).
+/// w_s, one entry a sample.
 ///
 /// ```text
 ///  ln w_s = offset_s + Σ_k x_sk (x_sk square_k + linear_k)
 /// ```
 ///
-/// `deviations`: x of each parameter; `squares`: −1/2σ² of each; `linears`: (μ − c)/σ² of each, c the centre. A measurement has
-/// every lane `width` further.
+/// `offsets`: logarithms of what the samples weigh without the population; `deviations`: x of each parameter; `squares`: −1/2σ²
+/// of each; `linears`: (μ − c)/σ² of each, c the centre. A measurement has every lane `width` further.
 #[pulp::with_simd(weigh = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn weigh_simd<S: pulp::Simd>(
     simd: S,
     weights: &mut [Lanes],
+    offsets: &[Lanes],
     deviations: &[&[Lanes]],
     squares: &[f32],
     linears: &[Lanes],
     width: usize,
 ) -> Weighed {
-    let (mut largest, mut sum) = (Lanes::ZERO, Lanes::ZERO);
+    let mut largest = Lanes::ZERO;
     // Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
     for first in (0..LANES).step_by(S::F32_LANES) {
         let part = first..first + S::F32_LANES;
-        for ((deviations, square), linear) in deviations.iter().zip(squares).zip(linears) {
-            let (square, linear) = (simd.splat_f32s(*square), S::as_simd_f32s(&linear.0[part.clone()]).0[0]);
-            for (weights, x) in weights.iter_mut().zip(*deviations) {
+        let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
+        for (k, deviations) in deviations.iter().enumerate() {
+            let (square, linear) = (simd.splat_f32s(squares[k]), of(&linears[k]));
+            let added = |x: &Lanes, to: S::f32s| {
+                let x = of(x);
+                simd.mul_add_f32s(x, simd.mul_add_f32s(x, square, linear), to)
+            };
+            for ((weights, offset), x) in weights.iter_mut().zip(offsets).zip(*deviations) {
                 let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
-                let x = S::as_simd_f32s(&x.0[part.clone()]).0[0];
-                *weight = simd.mul_add_f32s(x, simd.mul_add_f32s(x, square, linear), *weight);
+                *weight = added(x, if k == 0 { of(offset) } else { *weight });
             }
         }
         let most = in_fours(simd, weights, &part, f32::NEG_INFINITY, |a, b| simd.max_f32s(a, b));
@@ -73,17 +78,18 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
         most[lane % width] = most[lane % width].max(*own);
     }
     largest.0 = std::array::from_fn(|lane| most[lane % width]);
-    for weights in weights.iter_mut() {
-        for (weight, largest) in weights.0.iter_mut().zip(&largest.0) {
-            *weight = exp_f32(*weight - largest);
+    // Four sums that do not wait for each other.
+    let mut sums = [Lanes::ZERO; 4];
+    for four in weights.chunks_mut(4) {
+        for (weights, sum) in four.iter_mut().zip(&mut sums) {
+            for ((weight, largest), sum) in weights.0.iter_mut().zip(&largest.0).zip(&mut sum.0) {
+                *weight = exp_f32(*weight - largest);
+                *sum += *weight;
+            }
         }
     }
-    for first in (0..LANES).step_by(S::F32_LANES) {
-        let part = first..first + S::F32_LANES;
-        let all = in_fours(simd, weights, &part, 0.0, |a, b| simd.add_f32s(a, b));
-        S::as_mut_simd_f32s(&mut sum.0[part]).0[0] = all;
-    }
-    Weighed { largest, sum }
+    let sum = std::array::from_fn(|lane| (sums[0].0[lane] + sums[1].0[lane]) + (sums[2].0[lane] + sums[3].0[lane]));
+    Weighed { largest, sum: Lanes(sum) }
 }
 
 /// The lanes `part` of all entries combined, in four rows that do not wait for each other.
@@ -164,10 +170,11 @@ mod tests {
             let offset = |sample: usize, lane: usize| (sample as f64 * 1.3 - lane as f64).cos();
             let lanes = |f: &dyn Fn(usize) -> f64| -> Lanes { Lanes(std::array::from_fn(|lane| f(lane) as f32)) };
             let deviations: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| x(s, lane))).collect();
-            let mut weights: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| offset(s, lane))).collect();
+            let offsets: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| offset(s, lane))).collect();
+            let mut weights = vec![Lanes::ZERO; count];
             let square = (-0.5 / (std * std)) as f32;
             let linear = lanes(&|lane| off(lane) / (std * std));
-            let found = weigh(&mut weights, &[&deviations], &[square], &[linear], LANES);
+            let found = weigh(&mut weights, &offsets, &[&deviations], &[square], &[linear], LANES);
             let moments = moments(&weights, &deviations);
             let shares = 20_000_u32;
             let mut counts = vec![0.0; count * LANES];

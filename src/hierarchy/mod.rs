@@ -361,6 +361,8 @@ struct Weights {
     values: Vec<Lanes>,
     /// `[block]`
     blocks: Vec<Weighed>,
+    /// Σ ((c − μ)/σ)² over parameters and measurements.
+    of_centres: f64,
     squares: Vec<f32>,
     linears: Vec<Lanes>,
 }
@@ -424,6 +426,7 @@ impl Problem {
         Weights {
             values: vec![Lanes::ZERO; self.offsets.len()],
             blocks: vec![Weighed { largest: Lanes::ZERO, sum: Lanes::ZERO }; self.blocks.len()],
+            of_centres: 0.0,
             squares: vec![0.0; d],
             linears: vec![Lanes::ZERO; d],
         }
@@ -439,18 +442,20 @@ impl Problem {
         for (square, precision) in weights.squares.iter_mut().zip(&precisions) {
             *square = (-0.5 * precision) as f32;
         }
-        weights.values.copy_from_slice(&self.offsets);
+        weights.of_centres = 0.0;
         for (block, weighed) in self.blocks.iter().zip(&mut weights.blocks) {
             for (measurement, lanes) in block.lanes() {
                 let off = state.mean.iter().zip(self.centres(measurement)).zip(&precisions);
                 for (linear, ((mean, centre), precision)) in weights.linears.iter_mut().zip(off) {
-                    lanes.clone().for_each(|lane| linear.0[lane] = ((mean - centre) * precision) as f32);
+                    let off = mean - centre;
+                    weights.of_centres += off * off * precision;
+                    lanes.clone().for_each(|lane| linear.0[lane] = (off * precision) as f32);
                 }
             }
             let places = block.places.clone();
             let deviations: Vec<&[Lanes]> = self.deviations.iter().map(|all| &all[places.clone()]).collect();
-            let values = &mut weights.values[places];
-            *weighed = weigh(values, &deviations, &weights.squares, &weights.linears, block.width);
+            let (values, offsets) = (&mut weights.values[places.clone()], &self.offsets[places]);
+            *weighed = weigh(values, offsets, &deviations, &weights.squares, &weights.linears, block.width);
         }
     }
 
@@ -517,14 +522,10 @@ impl Problem {
     /// ln L(μ, σ) up to a constant; `weights` under the same population.
     fn log_likelihood(&self, state: &State, weights: &Weights) -> f64 {
         // One logarithm for many measurements: the product of their sums, each from 1 to the number of draws.
-        let (mut likelihood, mut product) = (0.0, 1.0_f64);
+        let (mut likelihood, mut product) = (-0.5 * weights.of_centres, 1.0_f64);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
-            for (lane, measurement) in block.measurements.clone().enumerate() {
-                let population = self.centres(measurement).iter().zip(&state.mean).zip(&state.std);
-                let of_centre: f64 = population.map(|((c, mean), std)| ((c - mean) / std).powi(2)).sum();
-                likelihood += f64::from(weighed.largest.0[lane]) - 0.5 * of_centre;
-            }
-            for (_, lanes) in block.lanes() {
+            for (first, (_, lanes)) in block.lanes().enumerate() {
+                likelihood += f64::from(weighed.largest.0[first]);
                 product *= weighed.sum.of(lanes);
                 if product > 1e200 {
                     likelihood += product.ln();

@@ -2,12 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::future::Future;
-use std::sync::LazyLock;
 
 use sqlx::{FromRow, SqliteConnection};
 
 use super::chart::{chart, Charted, Charts, NewChartPoint, StoredChartPoint};
-use super::rows::{insert_statements, parts};
+use super::rows::{parts, InsertStatements};
 use super::{bad_row, from_blob, plotted, timestamp, to_blob, Error, Store};
 use crate::assessment::Assessment;
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
@@ -76,8 +75,8 @@ struct QuantityRow {
 }
 
 /// Statements that insert quantities; the first four columns are common to all rows.
-static INSERT_QUANTITIES: LazyLock<Vec<String>> =
-    LazyLock::new(|| insert_statements("insert into quantity_assessment", 29, &[0, 1, 2, 3]));
+static INSERT_QUANTITIES: InsertStatements =
+    InsertStatements::new("insert into quantity_assessment", 29, &[0, 1, 2, 3]);
 
 /// Orders the assessments of a batch; the current one comes first.
 pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
@@ -122,14 +121,6 @@ impl Store {
                     newest_undamaged: place.newest_undamaged,
                 };
                 let Charts { points: charts, alarms_changed } = chart(connection, &batch, charted).await?;
-                sqlx::query(
-                    "update measurement_batch set state = 'assessed', failure = null
-                     where structure_id = ? and batch_id = ?",
-                )
-                .bind(&structure)
-                .bind(&id)
-                .execute(&mut *connection)
-                .await?;
                 let newest_undamaged = place.newest_undamaged;
                 Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged }))
             })
@@ -282,6 +273,7 @@ async fn remove(
     Ok(())
 }
 
+/// Inserts an assessment and marks its batch as assessed.
 async fn insert(
     connection: &mut SqliteConnection,
     structure: &str,
@@ -291,7 +283,10 @@ async fn insert(
 ) -> Result<(), Error> {
     let version = a.undamaged_version.unwrap_or(0);
     let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
-    sqlx::query("insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
+    // Two statements, handed over together; each takes the parameters behind those of the one before.
+    let insert = "insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?);
+         update measurement_batch set state = 'assessed', failure = null where structure_id = ? and batch_id = ?";
+    sqlx::query(insert)
         .bind(structure)
         .bind(batch_id)
         .bind(a.model_digest.as_str())
@@ -307,10 +302,12 @@ async fn insert(
         .bind(a.effective_sample_size)
         .bind(trust)
         .bind(plotted::pack(a))
+        .bind(structure)
+        .bind(batch_id)
         .execute(&mut *connection)
         .await?;
-    for (statement, rows) in parts(a.quantities.len()) {
-        let mut insert = sqlx::query(INSERT_QUANTITIES[statement].as_str())
+    for rows in parts(a.quantities.len()) {
+        let mut insert = sqlx::query(INSERT_QUANTITIES.of(rows.len()))
             .bind(structure)
             .bind(batch_id)
             .bind(a.model_digest.as_str())

@@ -1,12 +1,11 @@
 //! Batches and their measurements.
 
 use std::future::Future;
-use std::sync::LazyLock;
 
 use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
 
-use super::rows::{insert_statements, parts};
+use super::rows::{parts, InsertStatements};
 use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
 use crate::assessment::BatchState;
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
@@ -284,8 +283,7 @@ async fn find_stored(
 }
 
 /// Statements that insert measurements; structure, batch and source are common to all rows.
-static INSERT_MEASUREMENTS: LazyLock<Vec<String>> =
-    LazyLock::new(|| insert_statements("insert into measurement", 10, &[0, 1, 3]));
+static INSERT_MEASUREMENTS: InsertStatements = InsertStatements::new("insert into measurement", 10, &[0, 1, 3]);
 
 async fn insert(
     connection: &mut SqliteConnection,
@@ -312,8 +310,8 @@ async fn insert(
     .execute(&mut *connection)
     .await?;
     let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("measurement")(&e));
-    for (statement, rows) in parts(batch.measurements.len()) {
-        let mut insert = sqlx::query(INSERT_MEASUREMENTS[statement].as_str())
+    for rows in parts(batch.measurements.len()) {
+        let mut insert = sqlx::query(INSERT_MEASUREMENTS.of(rows.len()))
             .bind(batch.structure.as_str())
             .bind(batch_id)
             .bind(&batch.source);

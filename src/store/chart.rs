@@ -9,7 +9,7 @@ use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
 
 use super::alarm::{insert_episode, kind_of};
-use super::rows::{insert_statements, parts};
+use super::rows::{parts, InsertStatements};
 use super::{bad_row, timestamp, Error, Store};
 use crate::alarm::chart::{ChartPoint, Series};
 use crate::alarm::machine::State;
@@ -141,8 +141,7 @@ static SELECT_BEHIND: LazyLock<String> = LazyLock::new(|| {
 });
 
 /// Statements that insert points; structure, time and batch are common to all rows.
-static INSERT_POINTS: LazyLock<Vec<String>> =
-    LazyLock::new(|| insert_statements("insert or replace into chart_point", 13, &[0, 3, 4]));
+static INSERT_POINTS: InsertStatements = InsertStatements::new("insert or replace into chart_point", 13, &[0, 3, 4]);
 
 /// A batch whose points are to be stored.
 pub(super) struct Charted<'a> {
@@ -215,11 +214,9 @@ async fn about(
 
 async fn insert_points(connection: &mut SqliteConnection, batch: &Charted<'_>, placed: &[Placed]) -> Result<(), Error> {
     let new: Vec<&Placed> = placed.iter().filter(|placed| placed.new).collect();
-    for (statement, part) in parts(new.len()) {
-        let mut insert = sqlx::query(INSERT_POINTS[statement].as_str())
-            .bind(batch.structure)
-            .bind(batch.place.0)
-            .bind(&batch.place.1);
+    for part in parts(new.len()) {
+        let mut insert =
+            sqlx::query(INSERT_POINTS.of(part.len())).bind(batch.structure).bind(batch.place.0).bind(&batch.place.1);
         for Placed { undamaged_version, row, .. } in &new[part] {
             insert = insert
                 .bind(undamaged_version)

@@ -1,44 +1,71 @@
 //! Many rows by few statements: what a statement costs lies mostly in handing it over.
 
 use std::ops::Range;
+use std::sync::OnceLock;
 
 /// Rows of the largest statement.
 const MOST_ROWS: usize = 64;
 
-/// Statements that insert 1, 2, 4 … rows, each beginning with `into`: few statements, which stay prepared, fit any number of rows.
+/// Up to so many rows go into one statement, whatever their number; beyond, full statements and half ones leave few of them to
+/// be kept prepared.
+const ANY_NUMBER: usize = MOST_ROWS / 2;
+
+/// Statements that insert rows, one for each number of them, made when they are first asked for.
 ///
 /// The parameters are first the `common` columns, given by their places, which are the same in all rows; then the others, row
 /// by row.
-pub(super) fn insert_statements(into: &str, columns: usize, common: &[usize]) -> Vec<String> {
-    let own = columns - common.len();
-    let row = |row: usize| {
-        let mut next = common.len() + own * row;
-        let mut parameter = |column| {
-            let shared = common.iter().position(|place| *place == column);
+pub(super) struct InsertStatements {
+    into: &'static str,
+    columns: usize,
+    common: &'static [usize],
+    of_rows: [OnceLock<String>; MOST_ROWS],
+}
+
+impl InsertStatements {
+    /// Statements that begin with `into`.
+    pub const fn new(into: &'static str, columns: usize, common: &'static [usize]) -> Self {
+        Self { into, columns, common, of_rows: [const { OnceLock::new() }; MOST_ROWS] }
+    }
+
+    /// The statement of so many rows.
+    ///
+    /// # Panics
+    /// For none, or more than one statement takes: a bug.
+    pub fn of(&self, rows: usize) -> &str {
+        self.of_rows[rows - 1].get_or_init(|| {
+            let rows: Vec<String> = (0..rows).map(|row| self.row(row)).collect();
+            format!("{} values {}", self.into, rows.join(", "))
+        })
+    }
+
+    fn row(&self, row: usize) -> String {
+        let mut next = self.common.len() + (self.columns - self.common.len()) * row;
+        let parameter = |column| {
+            let shared = self.common.iter().position(|place| *place == column);
             let number = shared.unwrap_or_else(|| {
                 next += 1;
                 next - 1
             });
             format!("?{}", number + 1)
         };
-        let parameters: Vec<String> = (0..columns).map(&mut parameter).collect();
+        let parameters: Vec<String> = (0..self.columns).map(parameter).collect();
         format!("({})", parameters.join(", "))
-    };
-    let statement = |power: u32| {
-        let rows: Vec<String> = (0..1_usize << power).map(row).collect();
-        format!("{into} values {}", rows.join(", "))
-    };
-    (0..=MOST_ROWS.ilog2()).map(statement).collect()
+    }
 }
 
-/// Which rows go into which of those statements.
-pub(super) fn parts(rows: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
+/// Which rows go into one statement each.
+pub(super) fn parts(rows: usize) -> impl Iterator<Item = Range<usize>> {
     let mut first = 0;
     std::iter::from_fn(move || {
-        let power = (rows - first).min(MOST_ROWS).checked_ilog2()?;
-        let part = first..first + (1 << power);
+        let count = match rows - first {
+            0 => return None,
+            MOST_ROWS.. => MOST_ROWS,
+            ANY_NUMBER.. => ANY_NUMBER,
+            rest => rest,
+        };
+        let part = first..first + count;
         first = part.end;
-        Some((power as usize, part))
+        Some(part)
     })
 }
 
@@ -50,8 +77,9 @@ mod tests {
     fn the_parts_are_all_rows_in_their_order() {
         for rows in 0..300 {
             let mut next = 0;
-            for (power, part) in parts(rows) {
-                assert_eq!((part.start, part.len()), (next, 1 << power));
+            for part in parts(rows) {
+                assert_eq!(part.start, next);
+                assert!((1..=MOST_ROWS).contains(&part.len()), "{part:?}");
                 next = part.end;
             }
             assert_eq!(next, rows);
@@ -60,7 +88,8 @@ mod tests {
 
     #[test]
     fn common_columns_keep_their_parameter_and_the_others_count_on() {
-        let statements = insert_statements("insert into t", 3, &[0, 2]);
-        assert_eq!(statements[1], "insert into t values (?1, ?3, ?2), (?1, ?4, ?2)");
+        let statements = InsertStatements::new("insert into t", 3, &[0, 2]);
+        assert_eq!(statements.of(1), "insert into t values (?1, ?3, ?2)");
+        assert_eq!(statements.of(2), "insert into t values (?1, ?3, ?2), (?1, ?4, ?2)");
     }
 }

@@ -189,15 +189,17 @@ async fn in_transaction(
         }
     };
     let alone = together.len() == 1;
-    let mut lost = None;
+    let (mut savepoint, mut lost) = (FIRST_SAVEPOINT, None);
     for Waiting { piece, caller, .. } in together {
         let outcome = match lost {
             Some(_) => Ok(()),
-            None => one(&mut transaction, piece, alone).await.unwrap_or_else(|error| {
+            None if alone => caught(piece, &mut transaction).await,
+            None => one(&mut transaction, piece, savepoint).await.unwrap_or_else(|error| {
                 lost = Some(error);
                 Ok(())
             }),
         };
+        savepoint = NEXT_SAVEPOINT;
         done.push(Done { caller, outcome });
     }
     if let Some(error) = lost {
@@ -219,24 +221,24 @@ async fn begin(connection: &mut SqliteConnection) -> Result<Transaction<'_, Sqli
     Ok(connection.begin_with("begin immediate").await?)
 }
 
-/// Does one piece of work behind a savepoint, if it is not alone. The inner result is that of the work; the outer one is an
-/// error when the whole transaction is lost.
-async fn one(transaction: &mut Transaction<'_, Sqlite>, piece: Piece, alone: bool) -> Result<Result<(), Error>, Error> {
-    if alone {
-        return Ok(caught(piece, transaction).await);
-    }
-    let mut savepoint = transaction.begin().await?;
-    match caught(piece, &mut savepoint).await {
-        Ok(()) => {
-            savepoint.commit().await?;
-            Ok(Ok(()))
-        }
-        Err(error) => match savepoint.rollback().await {
-            Ok(()) => Ok(Err(error)),
-            // SQLite has rolled back everything, or nobody knows what it did.
-            Err(failed) if error.disk_cause().is_none() => Err(failed.into()),
-            Err(_) => Err(error),
-        },
+/// Statements that set the savepoint of a piece: of the first, and of one behind another. A commit ends the last.
+const FIRST_SAVEPOINT: &str = "savepoint piece";
+const NEXT_SAVEPOINT: &str = "release piece; savepoint piece";
+
+/// Does one piece of work behind a savepoint. The inner result is that of the work; the outer one is an error when the whole
+/// transaction is lost.
+async fn one(
+    transaction: &mut Transaction<'_, Sqlite>,
+    piece: Piece,
+    savepoint: &'static str,
+) -> Result<Result<(), Error>, Error> {
+    sqlx::query(savepoint).execute(&mut **transaction).await?;
+    let Err(error) = caught(piece, transaction).await else { return Ok(Ok(())) };
+    match sqlx::query("rollback to piece").execute(&mut **transaction).await {
+        Ok(_) => Ok(Err(error)),
+        // SQLite has rolled back everything, or nobody knows what it did.
+        Err(failed) if error.disk_cause().is_none() => Err(failed.into()),
+        Err(_) => Err(error),
     }
 }
 
