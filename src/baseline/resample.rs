@@ -15,7 +15,7 @@ use crate::stats;
 const EFFECTIVE: f64 = 0.5;
 
 /// Observations of one task: fewer cost more in handing over than they take.
-const AT_A_TIME: usize = 16;
+const AT_A_TIME: usize = 8;
 
 /// Draws of a flow, and what they are weighed by.
 pub(super) struct Proposals {

@@ -77,6 +77,7 @@ impl Block {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
+    use std::f64::consts::LOG2_E;
 
     use super::super::kernel::weigh;
     use super::*;
@@ -114,7 +115,7 @@ mod tests {
                 for measurement in block.measurements.clone() {
                     for draw in 0..draws {
                         let (place, lane) = block.place(measurement, draw);
-                        offsets[place].0[lane] = exponent(measurement, draw) as f32;
+                        offsets[place].0[lane] = (exponent(measurement, draw) * LOG2_E) as f32;
                     }
                 }
                 // All samples at their centre: the weights are those that they have by themselves.

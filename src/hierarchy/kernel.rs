@@ -5,6 +5,7 @@
 //! one posterior, however far away the population lies. Lanes are summed one by one, so that the bits are the same on every
 //! processor.
 
+use std::f64::consts::LOG2_E;
 use std::ops::Range;
 
 use crate::stats::exp_f32;
@@ -29,20 +30,23 @@ impl Lanes {
 /// Weights of the samples of some measurements under a normal population, the greatest of each measurement 1.
 #[derive(Clone, Copy)]
 pub(super) struct Weighed {
-    /// Logarithm of what the weights were divided by, the same in all lanes of a measurement.
+    /// Logarithm to base 2 of what the weights were divided by, the same in all lanes of a measurement.
     pub largest: Lanes,
     /// Sum of the weights of each lane.
     pub sum: Lanes,
 }
 
+/// Parameters whose terms are added in one pass.
+const TOGETHER: usize = 4;
+
 /// w_s, one entry a sample.
 ///
 /// ```text
-///  ln w_s = offset_s + Σ_k x_sk (x_sk square_k + linear_k)
+///  log₂ w_s = offset_s + Σ_k x_sk (x_sk square_k + linear_k)
 /// ```
 ///
 /// `offsets`: logarithms of what the samples weigh without the population; `deviations`: x of each parameter; `squares`: −1/2σ²
-/// of each; `linears`: (μ − c)/σ² of each, c the centre. A measurement has every lane `width` further.
+/// of each; `linears`: (μ − c)/σ² of each, c the centre; all of them times log₂ e. A measurement has every lane `width` further.
 #[pulp::with_simd(weigh = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn weigh_simd<S: pulp::Simd>(
@@ -55,21 +59,19 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
     width: usize,
 ) -> Weighed {
     let mut largest = Lanes::ZERO;
-    // Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
+    for (k, some) in deviations.chunks(TOGETHER).enumerate() {
+        let (squares, linears) = (&squares[TOGETHER * k..], &linears[TOGETHER * k..]);
+        let to = (k == 0).then_some(offsets);
+        match *some {
+            [a] => add_terms(simd, weights, to, [a], squares, linears),
+            [a, b] => add_terms(simd, weights, to, [a, b], squares, linears),
+            [a, b, c] => add_terms(simd, weights, to, [a, b, c], squares, linears),
+            [a, b, c, d] => add_terms(simd, weights, to, [a, b, c, d], squares, linears),
+            _ => unreachable!("chunks are no longer"),
+        }
+    }
     for first in (0..LANES).step_by(S::F32_LANES) {
         let part = first..first + S::F32_LANES;
-        let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
-        for (k, deviations) in deviations.iter().enumerate() {
-            let (square, linear) = (simd.splat_f32s(squares[k]), of(&linears[k]));
-            let added = |x: &Lanes, to: S::f32s| {
-                let x = of(x);
-                simd.mul_add_f32s(x, simd.mul_add_f32s(x, square, linear), to)
-            };
-            for ((weights, offset), x) in weights.iter_mut().zip(offsets).zip(*deviations) {
-                let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
-                *weight = added(x, if k == 0 { of(offset) } else { *weight });
-            }
-        }
         let most = in_fours(simd, weights, &part, f32::NEG_INFINITY, |a, b| simd.max_f32s(a, b));
         S::as_mut_simd_f32s(&mut largest.0[part]).0[0] = most;
     }
@@ -80,16 +82,72 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
     largest.0 = std::array::from_fn(|lane| most[lane % width]);
     // Four sums that do not wait for each other.
     let mut sums = [Lanes::ZERO; 4];
-    for four in weights.chunks_mut(4) {
-        for (weights, sum) in four.iter_mut().zip(&mut sums) {
-            for ((weight, largest), sum) in weights.0.iter_mut().zip(&largest.0).zip(&mut sum.0) {
-                *weight = exp_f32(*weight - largest);
-                *sum += *weight;
-            }
+    let add_power = |weights: &mut Lanes, sum: &mut Lanes| {
+        for ((weight, largest), sum) in weights.0.iter_mut().zip(&largest.0).zip(&mut sum.0) {
+            *weight = power_of_two(*weight - largest);
+            *sum += *weight;
         }
+    };
+    let (fours, rest) = weights.as_chunks_mut::<4>();
+    for [a, b, c, d] in fours {
+        let [of_a, of_b, of_c, of_d] = &mut sums;
+        add_power(a, of_a);
+        add_power(b, of_b);
+        add_power(c, of_c);
+        add_power(d, of_d);
     }
+    rest.iter_mut().for_each(|weights| add_power(weights, &mut sums[0]));
     let sum = std::array::from_fn(|lane| (sums[0].0[lane] + sums[1].0[lane]) + (sums[2].0[lane] + sums[3].0[lane]));
     Weighed { largest, sum: Lanes(sum) }
+}
+
+/// Adds the terms of K parameters to the logarithms `to`, or else to those that stand in `weights` already.
+///
+/// Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
+#[inline(always)]
+fn add_terms<S: pulp::Simd, const K: usize>(
+    simd: S,
+    weights: &mut [Lanes],
+    to: Option<&[Lanes]>,
+    deviations: [&[Lanes]; K],
+    squares: &[f32],
+    linears: &[Lanes],
+) {
+    // One length for all: what is read in the loop is known to be there.
+    let deviations = deviations.map(|x| &x[..weights.len()]);
+    let to = to.map(|to| &to[..weights.len()]);
+    for first in (0..LANES).step_by(S::F32_LANES) {
+        let part = first..first + S::F32_LANES;
+        let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
+        let terms: [(S::f32s, S::f32s); K] = std::array::from_fn(|k| (simd.splat_f32s(squares[k]), of(&linears[k])));
+        for (sample, weights) in weights.iter_mut().enumerate() {
+            let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
+            let mut sum = to.map_or(*weight, |to| of(&to[sample]));
+            for (x, (square, linear)) in deviations.iter().zip(terms) {
+                let x = of(&x[sample]);
+                sum = simd.mul_add_f32s(x, simd.mul_add_f32s(x, square, linear), sum);
+            }
+            *weight = sum;
+        }
+    }
+}
+
+/// 2ˣ for x up to 0, with a relative error below 3e-7; 2⁻¹²⁶ for all below.
+///
+/// The nearest whole number goes into the exponent, the rest by a polynomial for |r| ≤ ½.
+#[inline(always)]
+fn power_of_two(x: f32) -> f32 {
+    // Adding 1.5·2²³ rounds to the nearest whole number and leaves it in the lowest bits.
+    const ROUND: f32 = 12_582_912.0;
+    let x = x.max(-126.0);
+    let shifted = x + ROUND;
+    let r = x - (shifted - ROUND);
+    let polynomial = r.mul_add(1.326_472_7e-3, 9.671_513e-3);
+    let polynomial = r.mul_add(polynomial, 5.550_733_6e-2);
+    let polynomial = r.mul_add(polynomial, 2.402_224_2e-1);
+    let polynomial = r.mul_add(polynomial, 6.931_47e-1);
+    let polynomial = r.mul_add(polynomial, 1.0);
+    polynomial * f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
 }
 
 /// The lanes `part` of all entries combined, in four rows that do not wait for each other.
@@ -115,19 +173,47 @@ fn in_fours<S: pulp::Simd>(
     combine(combine(rows[0], rows[1]), combine(rows[2], rows[3]))
 }
 
+/// (μ − c)/σ² · log₂ e of each parameter and lane into `linears`; returns Σ_k ((μ − c)/σ)² of each lane.
+///
+/// `centres`: c of each parameter, `[parameter]`; `precisions`: 1/σ².
+#[pulp::with_simd(off_centre = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn off_centre_simd<S: pulp::Simd>(
+    _: S,
+    linears: &mut [Lanes],
+    centres: &[[f64; LANES]],
+    means: &[f64],
+    precisions: &[f64],
+) -> [f64; LANES] {
+    let mut squared = [0.0; LANES];
+    for (((linears, centres), mean), precision) in linears.iter_mut().zip(centres).zip(means).zip(precisions) {
+        for ((linear, centre), squared) in linears.0.iter_mut().zip(centres).zip(&mut squared) {
+            let off = mean - centre;
+            *squared += off * off * precision;
+            *linear = (LOG2_E * off * precision) as f32;
+        }
+    }
+    squared
+}
+
 /// How many samples of each lane come before as much weight as `targets`.
 #[pulp::with_simd(count_before = pulp::Arch::new())]
 #[inline(always)]
-pub(super) fn count_before_simd<S: pulp::Simd>(_: S, weights: &[Lanes], targets: &Lanes) -> [u32; LANES] {
+pub(super) fn count_before_simd<S: pulp::Simd>(simd: S, weights: &[Lanes], targets: &Lanes) -> [f32; LANES] {
     // Counting what ends before the target leaves the processor nothing to guess.
-    let (mut passed, mut places) = ([0.0_f32; LANES], [0_u32; LANES]);
-    for weights in weights {
-        for (((weight, passed), place), target) in weights.0.iter().zip(&mut passed).zip(&mut places).zip(&targets.0) {
-            *passed += weight;
-            *place += u32::from(*passed <= *target);
+    let mut counts = Lanes::ZERO;
+    let (one, none) = (simd.splat_f32s(1.0), simd.splat_f32s(0.0));
+    for first in (0..LANES).step_by(S::F32_LANES) {
+        let part = first..first + S::F32_LANES;
+        let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
+        let (target, mut passed, mut count) = (of(targets), none, none);
+        for weights in weights {
+            passed = simd.add_f32s(passed, of(weights));
+            count = simd.add_f32s(count, simd.select_f32s(simd.less_than_or_equal_f32s(passed, target), one, none));
         }
+        S::as_mut_simd_f32s(&mut counts.0[part.clone()]).0[0] = count;
     }
-    places
+    counts.0
 }
 
 /// Σ w x and Σ w x² of each lane.
@@ -170,10 +256,10 @@ mod tests {
             let offset = |sample: usize, lane: usize| (sample as f64 * 1.3 - lane as f64).cos();
             let lanes = |f: &dyn Fn(usize) -> f64| -> Lanes { Lanes(std::array::from_fn(|lane| f(lane) as f32)) };
             let deviations: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| x(s, lane))).collect();
-            let offsets: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| offset(s, lane))).collect();
+            let offsets: Vec<Lanes> = (0..count).map(|s| lanes(&|lane| LOG2_E * offset(s, lane))).collect();
             let mut weights = vec![Lanes::ZERO; count];
-            let square = (-0.5 / (std * std)) as f32;
-            let linear = lanes(&|lane| off(lane) / (std * std));
+            let square = (-0.5 * LOG2_E / (std * std)) as f32;
+            let linear = lanes(&|lane| LOG2_E * off(lane) / (std * std));
             let found = weigh(&mut weights, &offsets, &[&deviations], &[square], &[linear], LANES);
             let moments = moments(&weights, &deviations);
             let shares = 20_000_u32;
@@ -196,7 +282,7 @@ mod tests {
                 }
                 let sum: f64 = expected.iter().sum();
                 assert!((f64::from(found.sum.0[lane]) / sum - 1.0).abs() < 1e-4, "{count}");
-                let log_sum = f64::from(found.largest.0[lane]) - 0.5 * (off(lane) / std).powi(2) + sum.ln();
+                let log_sum = f64::from(found.largest.0[lane]) / LOG2_E - 0.5 * (off(lane) / std).powi(2) + sum.ln();
                 assert!((log_sum - largest - sum.ln()).abs() < 2e-4, "{count}");
                 let direct = |power: i32| -> f64 { (0..count).map(|s| expected[s] * x(s, lane).powi(power)).sum() };
                 assert!((f64::from(moments.0 .0[lane]) - direct(1)).abs() < 1e-4 * sum, "{count}");
@@ -206,6 +292,46 @@ mod tests {
                     let expected =
                         f64::from(weights[sample].0[lane]) / f64::from(found.sum.0[lane]) * f64::from(shares);
                     assert!((counts[sample * LANES + lane] - expected).abs() < 3.0, "{count}: {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn powers_of_two_are_right_to_single_precision() {
+        for i in 0..=2_000_000_u32 {
+            let x = -126.0 * (f64::from(i) / 2e6) as f32;
+            let relative = f64::from(power_of_two(x)) / f64::from(x).exp2() - 1.0;
+            assert!(relative.abs() < 3e-7, "2^{x}: {relative}");
+        }
+        assert!(power_of_two(f32::NEG_INFINITY) < 1.2e-38 && power_of_two(-1e9) < 1.2e-38);
+    }
+
+    #[test]
+    fn as_many_parameters_as_there_are_add_their_terms() {
+        for parameters in 1..=9_usize {
+            let x = |k: usize, sample: usize, lane: usize| ((k + 2 * sample + 5 * lane) as f64).sin();
+            let (square, linear) =
+                (|k: usize| -0.3 - 0.1 * k as f64, |k: usize, lane: usize| ((k + lane) as f64).cos());
+            let lanes = |f: &dyn Fn(usize) -> f64| -> Lanes { Lanes(std::array::from_fn(|lane| f(lane) as f32)) };
+            let column = |k: usize| (0..7).map(|sample| lanes(&|lane| x(k, sample, lane))).collect::<Vec<_>>();
+            let columns: Vec<Vec<Lanes>> = (0..parameters).map(column).collect();
+            let deviations: Vec<&[Lanes]> = columns.iter().map(Vec::as_slice).collect();
+            let squares: Vec<f32> = (0..parameters).map(|k| square(k) as f32).collect();
+            let linears: Vec<Lanes> = (0..parameters).map(|k| lanes(&|lane| linear(k, lane))).collect();
+            // Two lanes each: eight measurements.
+            let (mut weights, offsets) = (vec![Lanes::ZERO; 7], vec![Lanes::ZERO; 7]);
+            let found = weigh(&mut weights, &offsets, &deviations, &squares, &linears, 8);
+            for lane in 0..8 {
+                let term =
+                    |k: usize, s: usize, lane: usize| x(k, s, lane) * (x(k, s, lane) * square(k) + linear(k, lane));
+                let exponent = |s: usize, lane: usize| (0..parameters).map(|k| term(k, s, lane)).sum::<f64>();
+                let both = |s: usize| exponent(s, lane).max(exponent(s, lane + 8));
+                let largest = (0..7).map(both).fold(f64::NEG_INFINITY, f64::max);
+                for own in [lane, lane + 8] {
+                    assert!((f64::from(found.largest.0[own]) - largest).abs() < 1e-5, "{parameters}, {own}");
+                    let sum: f64 = (0..7).map(|s| (exponent(s, own) - largest).exp2()).sum();
+                    assert!((f64::from(found.sum.0[own]) / sum - 1.0).abs() < 1e-5, "{parameters}, {own}");
                 }
             }
         }

@@ -13,13 +13,15 @@
 mod block;
 mod kernel;
 
+use std::f64::consts::{LN_2, LOG2_E};
+
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::{Gamma, StandardNormal};
 use rayon::prelude::*;
 
 use self::block::Block;
-use self::kernel::{exponentials, moments, weigh, Lanes, Weighed};
+use self::kernel::{exponentials, moments, off_centre, weigh, Lanes, Weighed, LANES};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, Stream};
@@ -340,9 +342,11 @@ struct State {
 struct Problem {
     /// Mean of the samples of each measurement, `[measurement·parameters + parameter]`.
     centres: Vec<f64>,
+    /// The same in the lanes of each block, `[block·parameters + parameter]`.
+    lane_centres: Vec<[f64; LANES]>,
     /// What each sample lies off that, `[parameter][place]`; what is left over of the last block is 0.
     deviations: Vec<Vec<Lanes>>,
-    /// Logarithms of the weights that the samples have by themselves, the greatest of each measurement 0, `[place]`.
+    /// Logarithms to base 2 of the weights that the samples have by themselves, the greatest of each measurement 0, `[place]`.
     offsets: Vec<Lanes>,
     blocks: Vec<Block>,
     measurements: usize,
@@ -409,11 +413,19 @@ impl Problem {
         let relative = |weights: &[f64]| {
             let largest: Vec<f64> =
                 weights.chunks(draws).map(|own| own.iter().copied().fold(f64::NEG_INFINITY, f64::max)).collect();
-            side_by_side(&|measurement, draw| weights[measurement * draws + draw] - largest[measurement])
+            side_by_side(&|measurement, draw| LOG2_E * (weights[measurement * draws + draw] - largest[measurement]))
         };
         let offsets = log_weights.map_or_else(|| side_by_side(&|_, _| 0.0), relative);
         let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
-        Self { centres, deviations, offsets, blocks, measurements, draws, floor, within, noisy }
+        let in_lanes = |block: &Block, own: &Vec<f64>| {
+            let mut all = [0.0; LANES];
+            for (measurement, lanes) in block.lanes() {
+                lanes.for_each(|lane| all[lane] = own[measurement]);
+            }
+            all
+        };
+        let lane_centres = blocks.iter().flat_map(|block| means.iter().map(|own| in_lanes(block, own))).collect();
+        Self { centres, lane_centres, deviations, offsets, blocks, measurements, draws, floor, within, noisy }
     }
 
     fn centres(&self, measurement: usize) -> &[f64] {
@@ -440,18 +452,14 @@ impl Problem {
     fn weigh(&self, state: &State, weights: &mut Weights) {
         let precisions: Vec<f64> = state.std.iter().map(|std| std.powi(-2)).collect();
         for (square, precision) in weights.squares.iter_mut().zip(&precisions) {
-            *square = (-0.5 * precision) as f32;
+            *square = (-0.5 * LOG2_E * precision) as f32;
         }
         weights.of_centres = 0.0;
-        for (block, weighed) in self.blocks.iter().zip(&mut weights.blocks) {
-            for (measurement, lanes) in block.lanes() {
-                let off = state.mean.iter().zip(self.centres(measurement)).zip(&precisions);
-                for (linear, ((mean, centre), precision)) in weights.linears.iter_mut().zip(off) {
-                    let off = mean - centre;
-                    weights.of_centres += off * off * precision;
-                    lanes.clone().for_each(|lane| linear.0[lane] = (off * precision) as f32);
-                }
-            }
+        let d = self.deviations.len();
+        for ((block, centres), weighed) in self.blocks.iter().zip(self.lane_centres.chunks(d)).zip(&mut weights.blocks)
+        {
+            let squared = off_centre(&mut weights.linears, centres, &state.mean, &precisions);
+            weights.of_centres += squared[..block.measurements.len()].iter().sum::<f64>();
             let places = block.places.clone();
             let deviations: Vec<&[Lanes]> = self.deviations.iter().map(|all| &all[places.clone()]).collect();
             let (values, offsets) = (&mut weights.values[places.clone()], &self.offsets[places]);
@@ -525,7 +533,7 @@ impl Problem {
         let (mut likelihood, mut product) = (-0.5 * weights.of_centres, 1.0_f64);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
             for (first, (_, lanes)) in block.lanes().enumerate() {
-                likelihood += f64::from(weighed.largest.0[first]);
+                likelihood += LN_2 * f64::from(weighed.largest.0[first]);
                 product *= weighed.sum.of(lanes);
                 if product > 1e200 {
                     likelihood += product.ln();
