@@ -1,7 +1,8 @@
 //! The service over loopback, each batch on disk before its 201. `cargo bench --bench service`
 //!
 //! - `latency`: posts of 50 measurements, assessed, open loop: post number i starts at i/rate, whether or not the one before was
-//!   answered, so a slow answer does not hide the ones behind it.
+//!   answered, so a slow answer does not hide the ones behind it. Beside it what the disk alone takes: two bare SQLite commits
+//!   for each post, as often.
 //! - `sustained`: posts of 20 measurements, assessed, as many as the service takes from 32 clients.
 //! - `storing`: the same without an assessment, beside bare SQLite commits of the same rows on the same disk.
 //!
@@ -185,6 +186,8 @@ async fn latency(rate: u32, seconds: u32) {
     // A service that cannot keep up fills its queue and refuses: the quantiles then are those of the others only.
     println!("  {}; {refused} refused", quantiles(latencies_ms));
     println!("  {:.1} ms of processor time a batch", 1e3 * service.processor_s() / f64::from(rate * seconds));
+    let bare_ms = bare_pairs(service.folder.path(), rate, seconds).await;
+    println!("  two bare SQLite commits of the same rows, as often: {}", quantiles(bare_ms));
     println!("  peak resident memory of the service: {}", service.peak());
 }
 
@@ -219,37 +222,49 @@ async fn storing(seconds: u32) {
     println!("  ratio {:.2} (bare to service)", bare / per_second);
 }
 
-/// Commits a second of the rows of a batch, one transaction each, on the disk of a folder: the same tables, WAL, synced in full,
-/// one statement a table, no service.
-async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
-    let folder = tempfile::tempdir_in(beside).expect("a temporary folder");
-    // The tables are those of a store.
-    Store::open(folder.path()).await.expect("a store").close().await;
-    let options = SqliteConnectOptions::new()
-        .filename(folder.path().join("modalwatch.sqlite"))
-        .foreign_keys(true)
-        .synchronous(SqliteSynchronous::Full);
-    let mut connection = SqliteConnection::connect_with(&options).await.expect("a connection");
-    let plain = "insert into structure values ('plain', '{}', 'digest', 0, 0)";
-    sqlx::query(plain).execute(&mut connection).await.expect("a structure");
-    let rows: Vec<String> =
-        (0..SMALL).map(|i| format!("('plain', ?1, {i}, 'logger', ?2 + {i}, ?3, null, '{{}}', '{{}}', null)")).collect();
-    let measurements = format!("insert into measurement values {}", rows.join(", "));
-    let frequencies = [0.5_f64, 0.9, 1.2].map(f64::to_le_bytes).concat();
-    let (started, mut commits) = (Instant::now(), 0_u32);
-    while started.elapsed() < Duration::from_secs(u64::from(seconds)) {
-        let (id, at) = (format!("01890000-0000-7000-8000-{commits:012}"), i64::from(commits) * 1_000_000);
-        let mut transaction = connection.begin_with("begin immediate").await.expect("a transaction");
+/// A bare connection to the tables of a store: WAL, synced in full, one statement a table, no service.
+struct Bare {
+    connection: SqliteConnection,
+    insert_measurements: String,
+    measurements: usize,
+    commits: u32,
+    _folder: tempfile::TempDir,
+}
+
+impl Bare {
+    /// On the disk of a folder, for batches of so many measurements.
+    async fn open(beside: &Path, measurements: usize) -> Self {
+        let folder = tempfile::tempdir_in(beside).expect("a temporary folder");
+        Store::open(folder.path()).await.expect("a store").close().await;
+        let options = SqliteConnectOptions::new()
+            .filename(folder.path().join("modalwatch.sqlite"))
+            .foreign_keys(true)
+            .synchronous(SqliteSynchronous::Full);
+        let mut connection = SqliteConnection::connect_with(&options).await.expect("a connection");
+        let plain = "insert into structure values ('plain', '{}', 'digest', 0, 0)";
+        sqlx::query(plain).execute(&mut connection).await.expect("a structure");
+        let row = |i| format!("('plain', ?1, {i}, 'logger', ?2 + {i}, ?3, null, '{{}}', '{{}}', null)");
+        let rows: Vec<String> = (0..measurements).map(row).collect();
+        let insert_measurements = format!("insert into measurement values {}", rows.join(", "));
+        Self { connection, insert_measurements, measurements, commits: 0, _folder: folder }
+    }
+
+    /// Commits the rows of one more batch.
+    async fn commit(&mut self) {
+        let (id, at) = (format!("01890000-0000-7000-8000-{:012}", self.commits), i64::from(self.commits) * 1_000_000);
+        let frequencies = [0.5_f64, 0.9, 1.2].map(f64::to_le_bytes).concat();
+        let mut transaction = self.connection.begin_with("begin immediate").await.expect("a transaction");
         sqlx::query(
-            "insert into measurement_batch values ('plain', ?1, 'logger', null, ?2, ?3, ?3, ?3, 20, 'received', null)",
+            "insert into measurement_batch values ('plain', ?1, 'logger', null, ?2, ?3, ?3, ?3, ?4, 'received', null)",
         )
         .bind(&id)
         .bind("d".repeat(64))
         .bind(at)
+        .bind(self.measurements as i64)
         .execute(&mut *transaction)
         .await
         .expect("a batch");
-        sqlx::query(sqlx::AssertSqlSafe(measurements.clone()))
+        sqlx::query(sqlx::AssertSqlSafe(self.insert_measurements.clone()))
             .bind(&id)
             .bind(at)
             .bind(&frequencies)
@@ -257,11 +272,33 @@ async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
             .await
             .expect("its measurements");
         transaction.commit().await.expect("a commit");
-        commits += 1;
+        self.commits += 1;
     }
-    let per_second = f64::from(commits) / started.elapsed().as_secs_f64();
-    connection.close().await.expect("it closes");
-    per_second
+}
+
+/// Bare commits a second, one transaction after another.
+async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
+    let mut bare = Bare::open(beside, SMALL).await;
+    let started = Instant::now();
+    while started.elapsed() < Duration::from_secs(u64::from(seconds)) {
+        bare.commit().await;
+    }
+    f64::from(bare.commits) / started.elapsed().as_secs_f64()
+}
+
+/// What two bare commits take, ms, begun `rate` times a second: what a post cannot do without.
+async fn bare_pairs(beside: &Path, rate: u32, seconds: u32) -> Vec<f64> {
+    let mut bare = Bare::open(beside, LARGE).await;
+    let started = Instant::now();
+    let mut latencies_ms = Vec::new();
+    for i in 0..rate * seconds {
+        let due = started + Duration::from_secs(1) * i / rate;
+        tokio::time::sleep_until(due.into()).await;
+        bare.commit().await;
+        bare.commit().await;
+        latencies_ms.push(due.elapsed().as_secs_f64() * 1e3);
+    }
+    latencies_ms
 }
 
 fn quantiles(mut latencies_ms: Vec<f64>) -> String {
