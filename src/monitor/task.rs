@@ -105,7 +105,7 @@ impl Monitor {
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
         // Where it is not the newest any more, the batch is computed again (`settle`).
-        let undamaged = self.store.undamaged_before(&task.record.batch.structure).await?;
+        let undamaged = self.store.undamaged_as_read(&task.record.batch.structure).await?;
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
         let started = Instant::now();

@@ -278,7 +278,9 @@ async fn find_stored(
         let measured_at = batch.measurements[ordinal].measured_at;
         return Ok(InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id });
     }
-    let previous = found.previous.map(|blob| frequencies("measurement", &blob)).transpose()?;
+    // What comes in is stored, whatever became of what is there.
+    let readable = |blob: Vec<u8>| frequencies("measurement", &blob).inspect_err(|e| tracing::warn!("{e}")).ok();
+    let previous = found.previous.and_then(readable);
     Ok(InsertBatch::Inserted { content_digest: digest, previous })
 }
 

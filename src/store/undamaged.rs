@@ -37,9 +37,10 @@ impl Store {
         batch_ids: &[String],
         now: Timestamp,
     ) -> Result<u32, Error> {
-        let (structure, state) = (structure.to_string(), state.clone());
+        let (id, state) = (structure, state.clone());
+        let structure = structure.to_string();
         let (digest, batches) = (model_digest.to_string(), batch_ids.to_vec());
-        self.write(move |connection| {
+        let written = self.write(move |connection| {
             Box::pin(async move {
                 let (version,): (u32,) =
                     sqlx::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = ?")
@@ -115,8 +116,11 @@ impl Store {
                     .await?;
                 Ok(version)
             })
-        })
-        .await
+        });
+        let version = written.await?;
+        // The next who asks is told of this one.
+        self.undamaged.lock().expect("no holder of this lock panics").remove(id);
+        Ok(version)
     }
 
     /// The newest undamaged state of a structure. Read once: a version never changes.
@@ -140,12 +144,13 @@ impl Store {
         Ok(Some(record))
     }
 
-    /// As [`Self::undamaged`], but a state that was read before is not looked for again: the newest may be another by now, which
-    /// who stores what was made of it is told ([`super::StoredAssessment::newest_undamaged`]).
+    /// As [`Self::undamaged`], but a state that was read already is not asked for again. It can be that another was declared since
+    /// by a transaction that has not returned: whoever stores what was made of this one is told
+    /// ([`super::StoredAssessment::newest_undamaged`]).
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn undamaged_before(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+    pub async fn undamaged_as_read(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
         match self.known_undamaged(structure) {
             Some(record) => Ok(Some(record)),
             None => self.undamaged(structure).await,
