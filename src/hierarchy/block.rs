@@ -129,7 +129,9 @@ mod tests {
                     let mut chosen = Vec::new();
                     block.choose(&values, &weighed, || ((f64::from(i) + 0.5) / f64::from(shares)) as f32, &mut chosen);
                     assert_eq!(chosen.len(), block.measurements.len());
-                    chosen.into_iter().for_each(|(place, lane)| counts[place][lane] += 1.0);
+                    for (place, lane) in chosen {
+                        counts[place][lane] += 1.0;
+                    }
                 }
                 for (measurement, lanes) in block.lanes() {
                     let all: f64 = (0..draws).map(|draw| exponent(measurement, draw).exp()).sum();

@@ -96,7 +96,9 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
         add_power(c, of_c);
         add_power(d, of_d);
     }
-    rest.iter_mut().for_each(|weights| add_power(weights, &mut sums[0]));
+    for weights in rest {
+        add_power(weights, &mut sums[0]);
+    }
     let sum = std::array::from_fn(|lane| (sums[0].0[lane] + sums[1].0[lane]) + (sums[2].0[lane] + sums[3].0[lane]));
     Weighed { largest, sum: Lanes(sum) }
 }
@@ -146,7 +148,7 @@ fn power_of_two(x: f32) -> f32 {
     let polynomial = r.mul_add(1.326_472_7e-3, 9.671_513e-3);
     let polynomial = r.mul_add(polynomial, 5.550_733_6e-2);
     let polynomial = r.mul_add(polynomial, 2.402_224_2e-1);
-    let polynomial = r.mul_add(polynomial, 6.931_47e-1);
+    let polynomial = r.mul_add(polynomial, std::f32::consts::LN_2);
     let polynomial = r.mul_add(polynomial, 1.0);
     polynomial * f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
 }

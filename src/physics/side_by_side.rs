@@ -137,13 +137,13 @@ fn diagonalise_simd<S: pulp::Simd>(_: S, a: &mut Matrices, n: usize) {
     const LEAST: f64 = f64::MIN_POSITIVE;
     for _ in 0..MOST_SWEEPS {
         let (mut off, mut all) = ([0.0; LANES], [0.0; LANES]);
-        for row in 0..n {
-            for column in 0..row {
-                for (off, entry) in off.iter_mut().zip(&a[row][column].0) {
+        for (row, entries) in a[..n].iter().enumerate() {
+            for entry in &entries[..row] {
+                for (off, entry) in off.iter_mut().zip(&entry.0) {
                     *off += entry * entry;
                 }
             }
-            for (all, entry) in all.iter_mut().zip(&a[row][row].0) {
+            for (all, entry) in all.iter_mut().zip(&entries[row].0) {
                 *all += entry * entry;
             }
         }
