@@ -28,7 +28,7 @@ const SAME: f64 = 1e-9;
 /// A batch on a chart, to be stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewChartPoint {
-    /// Parameter of a damage chart, or [`FIT_SERIES`].
+    /// Parameter of a damage chart, or [`super::FIT_SERIES`].
     pub series: String,
     /// Undamaged state it is compared with; 0 for the fit.
     pub undamaged_version: u32,
@@ -47,7 +47,7 @@ pub struct StoredChartPoint {
     pub batch_id: String,
     /// When it ended.
     pub measured_to: Timestamp,
-    /// Parameter, or [`FIT_SERIES`].
+    /// Parameter, or [`super::FIT_SERIES`].
     pub series: String,
     /// Shift towards damage, standard errors.
     pub shift: f64,
