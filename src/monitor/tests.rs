@@ -28,11 +28,15 @@ fn measured_hz(row: usize) -> Vec<Option<Hertz>> {
     exact.into_iter().map(|f| Hertz::new(f).ok()).collect()
 }
 
-/// Batch `number`: three measurements at times of its own.
+/// Measurements of a batch: more than are inserted by one statement.
+const MEASUREMENTS: usize = 33;
+
+/// Batch `number`, at times of its own.
 fn batch(number: usize) -> MeasurementBatch {
     let one = |i: usize| ModalMeasurement {
-        measured_at: Timestamp::from_micros(1_767_225_600_000_000 + (3 * number + i) as i64 * 1_000_000).unwrap(),
-        frequencies_hz: measured_hz(3 * number + i),
+        measured_at: Timestamp::from_micros(1_767_225_600_000_000 + (MEASUREMENTS * number + i) as i64 * 1_000_000)
+            .unwrap(),
+        frequencies_hz: measured_hz(MEASUREMENTS * number + i),
         std_hz: None,
         mode_shapes: None,
         covariates: BTreeMap::new(),
@@ -42,7 +46,7 @@ fn batch(number: usize) -> MeasurementBatch {
         structure: structure(),
         source: "logger".to_owned(),
         idempotency_key: Some(format!("key-{number}")),
-        measurements: (0..3).map(one).collect(),
+        measurements: (0..MEASUREMENTS).map(one).collect(),
     }
 }
 
@@ -69,7 +73,7 @@ async fn stored(monitor: &Monitor) -> Vec<String> {
     let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
     let items = monitor.store().history(&structure(), &query).await.unwrap();
     for item in &items {
-        assert_eq!((item.state, item.measurement_count), (BatchState::Assessed, 3), "{}", item.batch_id);
+        assert_eq!((item.state, item.measurement_count), (BatchState::Assessed, MEASUREMENTS), "{}", item.batch_id);
         assert!(item.assessment.is_some());
         // Compares the measurements with their digest.
         monitor.store().batch(&structure(), &item.batch_id).await.unwrap().unwrap();
@@ -93,15 +97,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
     let faults = Faults::arm();
     let monitor = open(folder.path()).await;
     let (mut number, mut failures) = (0, 0);
-    // With the calls that each has at least; all measurements of a batch are inserted by one statement.
-    let points = [
-        ("store::begin", 2),
-        ("store::measurement", 1),
-        ("store::commit", 2),
-        ("store::committed", 2),
-        ("store::read", 2),
-    ];
-    for (point, least) in points {
+    for point in ["store::begin", "store::measurement", "store::commit", "store::committed", "store::read"] {
         // Once as an error, once as a panic, and as an error that stays until somebody mends it.
         for (action, stays) in [("1*return", false), ("1*panic", false), ("return", true)] {
             let (mut call, mut elsewhere) = (0, 0);
@@ -111,7 +107,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
                 let Err(error) = outcome else {
                     faults.clear(point);
                     number += 1;
-                    if call < least {
+                    if call < 2 {
                         // What goes on with batches two seconds after an earlier fault has met this one.
                         elsewhere += 1;
                         assert!(elsewhere < 10, "{point} is called {call} times only");
