@@ -68,8 +68,17 @@ pub fn standard_error(reference: &ChartReference, within: f64, measurements: usi
     let variance = reference.std.powi(2);
     let here = (variance + within - reference.within).max(LEAST_VARIANCE * variance);
     let between = reference.between_batches_std.powi(2);
-    let undamaged = variance / reference.measurements as f64 + between / reference.batches.max(1) as f64;
-    (here / measurements as f64 + between + undamaged).sqrt()
+    (here / measurements as f64 + between + undamaged_variance(reference)).sqrt()
+}
+
+/// Share of [`standard_error`]² that comes from the undamaged state and is the same in all batches.
+pub fn shared(reference: &ChartReference, within: f64, measurements: usize) -> f64 {
+    (undamaged_variance(reference) / standard_error(reference, within, measurements).powi(2)).clamp(0.0, 1.0)
+}
+
+fn undamaged_variance(reference: &ChartReference) -> f64 {
+    let between = reference.between_batches_std.powi(2);
+    reference.std.powi(2) / reference.measurements as f64 + between / reference.batches.max(1) as f64
 }
 
 /// The probability of damage at which the mean of a batch stands on the limit, if its spread is the undamaged one: the

@@ -1,5 +1,7 @@
 //! Limits of the charts, by simulation of healthy operation.
 
+use std::f64::consts::FRAC_PI_2;
+
 use rand::Rng as _;
 use rand_distr::{ChiSquared, StandardNormal};
 use rayon::prelude::*;
@@ -22,10 +24,13 @@ pub const CLIP: f64 = 4.0;
 /// Charts of one structure that are simulated together; more are taken as several such structures.
 const MOST_CHARTS: usize = 6;
 
+/// Shared parts ρ = sin²θ for which limits are simulated, at the same random numbers and at equal steps of θ from 0 to π/2.
+const NODES: usize = 16;
+
 /// What the limits depend on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Situation {
-    /// Share of the variance of a shift that comes from the undamaged state and is the same in all batches.
+    /// Share ρ of the variance of a shift that comes from the undamaged state and is the same in all batches.
     pub shared: f64,
     /// Degrees of freedom of the undamaged standard deviation.
     pub degrees_of_freedom: usize,
@@ -42,7 +47,8 @@ pub struct Limits {
     pub ewma: f64,
 }
 
-/// Limits at which healthy operation has as many early false alarms as if they came at random, one in `mean_run_batches`.
+/// Limits at which healthy operation has as many early false alarms as if they came at random, one in `mean_run_batches`; for
+/// every shared part ρ of the variance, which changes with the size of a batch.
 ///
 /// ```text
 ///  shift of batch t:  z_t = (√ρ e + √(1 − ρ) ε_t)/s,    e, ε_t ~ N(0, 1) for each chart,   s² ~ χ²_ν/ν
@@ -55,100 +61,136 @@ pub struct Limits {
 /// share makes alarms come together, which alone would lower the limit: what is known less never gets a lower limit than
 /// with ρ = 0. Both charts get limits that would have twice the wanted run alone; a common factor then makes both together
 /// right.
-pub fn limits(situation: Situation, settings: &AlarmSettings) -> Limits {
-    let known = simulated(Situation { shared: 0.0, ..situation }, settings);
-    let found = if situation.shared > 0.0 { simulated(situation, settings) } else { known };
-    Limits { single: found.single.max(known.single), ewma: found.ewma.max(known.ewma) }
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LimitCurve {
+    nodes: [Limits; NODES],
 }
 
-fn simulated(situation: Situation, settings: &AlarmSettings) -> Limits {
-    let charts = situation.charts.clamp(1, MOST_CHARTS);
-    let wanted = settings.mean_run_batches * situation.charts.max(1) as f64 / charts as f64;
-    let longest = (EARLY * wanted).ceil().max(1.0) as usize;
-    let operations = (BATCHES / (longest * charts)).clamp(300, MOST_OPERATIONS);
-    let one = |operation: usize| {
-        let mut stream = stats::stream(operation as u64, "healthy operation");
-        records(situation, charts, settings, longest, &mut stream)
-    };
-    let records: Vec<Records> = (0..operations).into_par_iter().map(one).collect();
-    let early = |single: f64, ewma: f64| {
-        let alarmed = |r: &&Records| r.single > single || r.ewma > ewma;
-        records.iter().filter(alarmed).count() as f64 / operations as f64
-    };
-    let share = |wanted: f64| 1.0 - (-(longest as f64) / wanted).exp();
-    let both = settings.ewma_weight > 0.0;
-    let alone = if both { share(2.0 * wanted) } else { share(wanted) };
-    let single = bisect(|limit| early(limit, f64::INFINITY) > alone);
-    if !both {
-        return Limits { single, ewma: f64::INFINITY };
+impl LimitCurve {
+    /// Simulates healthy operation of `charts` charts whose undamaged standard deviations have ν `degrees_of_freedom`.
+    pub fn simulate(degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings) -> Self {
+        let wanted_charts = charts.max(1);
+        let charts = wanted_charts.min(MOST_CHARTS);
+        let wanted = settings.mean_run_batches * wanted_charts as f64 / charts as f64;
+        let longest = (EARLY * wanted).ceil().max(1.0) as usize;
+        let operations = (BATCHES / (longest * charts)).clamp(300, MOST_OPERATIONS);
+        let one = |operation: usize| {
+            let mut stream = stats::stream(operation as u64, "healthy operation");
+            records(degrees_of_freedom, charts, settings, longest, &mut stream)
+        };
+        let records: Vec<Records> = (0..operations).into_par_iter().map(one).collect();
+        let share = |wanted: f64| 1.0 - (-(longest as f64) / wanted).exp();
+        let nodes: Vec<Limits> = (0..NODES)
+            .into_par_iter()
+            .map(|node| {
+                // The level that a share of the operations exceeds.
+                let level = |statistic: &dyn Fn(&Records) -> f64, share: f64| {
+                    let mut all: Vec<f64> = records.iter().map(statistic).collect();
+                    let exceeding = (share * operations as f64) as usize;
+                    let (_, level, _) = all.select_nth_unstable_by(exceeding, |a, b| b.total_cmp(a));
+                    level.max(f64::MIN_POSITIVE)
+                };
+                let (of_single, of_ewma) =
+                    (|r: &Records| f64::from(r.single[node]), |r: &Records| f64::from(r.ewma[node]));
+                if settings.ewma_weight == 0.0 {
+                    return Limits { single: level(&of_single, share(wanted)), ewma: f64::INFINITY };
+                }
+                let alone = share(2.0 * wanted);
+                let (single, ewma) = (level(&of_single, alone), level(&of_ewma, alone));
+                let of_both = |r: &Records| (of_single(r) / single).max(of_ewma(r) / ewma);
+                let factor = level(&of_both, share(wanted));
+                Limits { single: factor * single, ewma: factor * ewma }
+            })
+            .collect();
+        Self { nodes: nodes.try_into().expect("one for each node") }
     }
-    let ewma = bisect(|limit| early(f64::INFINITY, limit) > alone);
-    let factor = bisect(|factor| early(factor * single, factor * ewma) > share(wanted));
-    Limits { single: factor * single, ewma: factor * ewma }
+
+    /// The limits where a share ρ of the variance comes from the undamaged state: by the cubic in θ through the four simulated
+    /// ones about it, mirrored at θ = 0, as e and −e are alike.
+    pub fn at(&self, shared: f64) -> Limits {
+        let place = shared.clamp(0.0, 1.0).sqrt().asin() / FRAC_PI_2 * (NODES - 1) as f64;
+        let first = (place as isize - 1).min(NODES as isize - 4);
+        let about = [0, 1, 2, 3].map(|k| first + k);
+        let weights = about.map(|a| {
+            let others = about.iter().filter(|b| **b != a);
+            others.map(|&b| (place - b as f64) / (a - b) as f64).product::<f64>()
+        });
+        let unshared = &self.nodes[0];
+        let cubic = |of: fn(&Limits) -> f64| {
+            let nodes = about.map(|node| of(&self.nodes[node.unsigned_abs()]));
+            let found: f64 = nodes.iter().zip(&weights).map(|(node, weight)| node * weight).sum();
+            found.max(of(unshared))
+        };
+        // Without a moving average its limit is infinite everywhere, and differences of it are no numbers.
+        let ewma = if unshared.ewma.is_finite() { cubic(|l| l.ewma) } else { f64::INFINITY };
+        Limits { single: cubic(|l| l.single), ewma }
+    }
 }
 
-/// Largest statistics of one operation.
+/// The limits in one situation.
+pub fn limits(situation: Situation, settings: &AlarmSettings) -> Limits {
+    LimitCurve::simulate(situation.degrees_of_freedom, situation.charts, settings).at(situation.shared)
+}
+
+/// Largest statistics of one operation, for each shared part.
 struct Records {
-    single: f64,
-    ewma: f64,
+    single: [f32; NODES],
+    ewma: [f32; NODES],
 }
 
 fn records(
-    situation: Situation,
+    degrees_of_freedom: usize,
     charts: usize,
     settings: &AlarmSettings,
     longest: usize,
     stream: &mut Stream,
 ) -> Records {
-    let degrees = situation.degrees_of_freedom.max(1) as f64;
+    let degrees = degrees_of_freedom.max(1) as f64;
     let chi_squared = ChiSquared::new(degrees).expect("degrees of freedom are positive");
-    let errors: Vec<(f64, f64)> = (0..charts)
-        .map(|_| {
-            let e: f64 = stream.sample(StandardNormal);
-            let s = (stream.sample(chi_squared) / degrees).sqrt();
-            (situation.shared.sqrt() * e, s)
-        })
-        .collect();
-    let own = (1.0 - situation.shared).sqrt();
-    let weight = settings.ewma_weight;
-    let (mut averages, mut windows) = (vec![0.0; charts], vec![vec![f64::NEG_INFINITY; settings.window]; charts]);
-    let mut found = Records { single: f64::NEG_INFINITY, ewma: f64::NEG_INFINITY };
-    let mut sorted = Vec::with_capacity(settings.window);
-    for batch in 1..=longest {
-        for (chart, (shared, s)) in errors.iter().enumerate() {
-            let z = (shared + own * stream.sample::<f64, _>(StandardNormal)) / s;
-            averages[chart] = (1.0 - weight) * averages[chart] + weight * z.clamp(-CLIP, CLIP);
-            found.ewma = found.ewma.max(averages[chart]);
+    let mut found = Records { single: [f32::NEG_INFINITY; NODES], ewma: [f32::NEG_INFINITY; NODES] };
+    for _ in 0..charts {
+        let e: f64 = stream.sample(StandardNormal);
+        let s = (stream.sample(chi_squared) / degrees).sqrt();
+        // z = shared + own·ε; in single precision, of which the vectors hold twice as many.
+        let angle: [f64; NODES] = std::array::from_fn(|node| node as f64 / (NODES - 1) as f64 * FRAC_PI_2);
+        let (shared, own) = (angle.map(|a| (a.sin() * e / s) as f32), angle.map(|a| (a.cos() / s) as f32));
+        let (mut average, mut largest) = ([0.0_f32; NODES], [f32::NEG_INFINITY; NODES]);
+        let (weight, keep) = (settings.ewma_weight as f32, 1.0 - settings.ewma_weight as f32);
+        // k of m above a limit: the k-th largest of the window is, and the newest with it. Larger ε is larger z.
+        let mut highest = f32::NEG_INFINITY;
+        let mut window = vec![f32::NEG_INFINITY; settings.window];
+        let mut sorted = Vec::with_capacity(settings.window);
+        for batch in 0..longest {
+            let epsilon = stream.sample::<f64, _>(StandardNormal) as f32;
+            for node in 0..NODES {
+                let z = shared[node] + own[node] * epsilon;
+                average[node] = keep * average[node] + weight * z.clamp(-CLIP as f32, CLIP as f32);
+                largest[node] = largest[node].max(average[node]);
+            }
             if settings.window == 1 {
-                found.single = found.single.max(z);
+                highest = highest.max(epsilon);
             } else {
-                // k of m above a limit: the k-th largest of the window is, and the newest with it.
-                windows[chart][batch % settings.window] = z;
-                sorted.clone_from(&windows[chart]);
+                window[batch % settings.window] = epsilon;
+                sorted.clone_from(&window);
                 sorted.sort_by(|a, b| b.total_cmp(a));
-                found.single = found.single.max(z.min(sorted[settings.needed - 1]));
+                highest = highest.max(epsilon.min(sorted[settings.needed - 1]));
+            }
+        }
+        for node in 0..NODES {
+            found.ewma[node] = found.ewma[node].max(largest[node]);
+            // A run too short for k points has none, also where ε counts nothing.
+            if highest > f32::NEG_INFINITY {
+                found.single[node] = found.single[node].max(shared[node] + own[node] * highest);
             }
         }
     }
     found
 }
 
-/// Least value at which `too_low` no longer holds.
-fn bisect(too_low: impl Fn(f64) -> bool) -> f64 {
-    let (mut low, mut high) = (0.0, 40.0);
-    for _ in 0..40 {
-        let middle = 0.5 * (low + high);
-        if too_low(middle) {
-            low = middle;
-        } else {
-            high = middle;
-        }
-    }
-    high
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::chart::{ChartPoint, Series};
+    use super::super::machine::State;
     use super::*;
 
     fn settings(mean_run_batches: f64) -> AlarmSettings {
@@ -183,5 +225,49 @@ mod tests {
         let one = limits(situation, &settings(300.0)).single;
         let two = limits(situation, &AlarmSettings { needed: 2, window: 3, ..settings(300.0) }).single;
         assert!(two < one - 0.5 && two > 1.0, "{two} and {one}");
+    }
+
+    /// Share of operations with an alarm within `longest` batches, by the charts themselves and random numbers of their own.
+    fn early(situation: Situation, limits: &Limits, settings: &AlarmSettings, operations: u64, longest: usize) -> f64 {
+        let chi_squared = ChiSquared::new(situation.degrees_of_freedom as f64).unwrap();
+        let alarms = |operation: u64| {
+            let mut stream = stats::stream(operation, "test: early alarms");
+            (0..situation.charts).any(|_| {
+                let e: f64 = stream.sample(StandardNormal);
+                let s = (stream.sample(chi_squared) / situation.degrees_of_freedom as f64).sqrt();
+                let mut series = Series::new(*settings);
+                (0..longest).any(|_| {
+                    let epsilon: f64 = stream.sample(StandardNormal);
+                    let z = (situation.shared.sqrt() * e + (1.0 - situation.shared).sqrt() * epsilon) / s;
+                    series.take(&ChartPoint::damage(z, limits, false)).state == State::Alarming
+                })
+            })
+        };
+        (0..operations).into_par_iter().filter(|&operation| alarms(operation)).count() as f64 / operations as f64
+    }
+
+    #[test]
+    fn between_the_simulated_shared_parts_healthy_operation_alarms_as_rarely_as_wanted() {
+        let operations = 40_000;
+        for settings in [
+            AlarmSettings { mean_run_batches: 300.0, ..AlarmSettings::default() },
+            AlarmSettings { mean_run_batches: 300.0, needed: 2, window: 3, ..AlarmSettings::default() },
+        ] {
+            let curve = LimitCurve::simulate(60, 2, &settings);
+            let wanted = 1.0 - (-EARLY).exp();
+            // Of the operations here and of those behind the limits.
+            let error = (wanted * (1.0 - wanted) * (1.0 / operations as f64 + 1.0 / MOST_OPERATIONS as f64)).sqrt();
+            // In the middle between those that are simulated.
+            for place in [0.5, 1.5, 2.5, 4.5, 7.5, 10.5, 13.5, 14.5] {
+                let shared = (place / (NODES - 1) as f64 * FRAC_PI_2).sin().powi(2);
+                let limits = curve.at(shared);
+                let situation = Situation { shared, degrees_of_freedom: 60, charts: 2 };
+                let found = early(situation, &limits, &settings, operations, 30);
+                assert!(found < wanted + 4.0 * error, "{shared}: {found}");
+                // Where the limit of ρ = 0 is the higher one, single shifts alarm less often, and the moving average has its half.
+                let least = if limits.single == curve.at(0.0).single { 0.5 * wanted } else { wanted };
+                assert!(found > least - 4.0 * error, "{shared}: {found}");
+            }
+        }
     }
 }

@@ -4,35 +4,42 @@ use std::collections::HashMap;
 use std::sync::Mutex;
 
 use crate::alarm::chart::{self, fit_settings, ChartPoint};
-use crate::alarm::limits::{limits, Limits, Situation};
+use crate::alarm::limits::LimitCurve;
 use crate::alarm::AlarmSettings;
 use crate::assessment::Assessment;
 use crate::baseline::Baseline;
-use crate::damage::{QuantityAssessment, QuantityKind, UndamagedQuantity, UndamagedState};
+use crate::damage::{UndamagedQuantity, UndamagedState};
 use crate::parameter::DamageDirection;
 use crate::store::{NewChartPoint, FIT_SERIES};
 use crate::trust::{Code, Effect};
 
-/// Steps of the shared part of the variance between which the limits hardly move.
-const STEPS: f64 = 40.0;
+/// Degrees of freedom beyond which the undamaged standard deviation counts as known.
+const MANY_DEGREES: usize = 2_000;
 
-/// Limits found so far: simulating them takes a tenth of a second.
+/// Limits found so far, by degrees of freedom and number of charts: simulating them keeps all cores busy for 40 ms, which batches behind would wait.
 #[derive(Default)]
 pub struct KnownLimits {
-    found: Mutex<HashMap<(u32, usize, usize), Limits>>,
+    found: Mutex<HashMap<(usize, usize), LimitCurve>>,
 }
 
 impl KnownLimits {
-    fn get(&self, situation: Situation, settings: &AlarmSettings) -> Limits {
-        let rounded = (situation.shared * STEPS).round();
-        let key = (rounded as u32, situation.degrees_of_freedom.min(2_000), situation.charts);
-        let known = || self.found.lock().expect("no holder of this lock panics").get(&key).copied();
-        if let Some(known) = known() {
-            return known;
+    /// Simulates what batches will need that are compared with this state, before one of them waits for it.
+    pub fn prepare(&self, baseline: &Baseline, state: &UndamagedState, settings: &AlarmSettings) {
+        let watched = watched(baseline, state);
+        for (quantity, _) in &watched {
+            self.get(quantity.reference.degrees_of_freedom, watched.len(), settings);
         }
-        let found = limits(Situation { shared: rounded / STEPS, ..situation }, settings);
-        self.found.lock().expect("no holder of this lock panics").insert(key, found);
-        found
+    }
+
+    fn get(&self, degrees_of_freedom: usize, charts: usize, settings: &AlarmSettings) -> LimitCurve {
+        let key = (degrees_of_freedom.clamp(1, MANY_DEGREES), charts);
+        let found = || self.found.lock().expect("no holder of this lock panics");
+        let known = found().get(&key).copied();
+        // Without the lock, which others would wait for: of two that simulate the same, the results are the same.
+        known.unwrap_or_else(|| {
+            let simulated = LimitCurve::simulate(key.0, key.1, settings);
+            *found().entry(key).or_insert(simulated)
+        })
     }
 }
 
@@ -61,13 +68,15 @@ pub fn points(
         });
     }
     let Some(state) = undamaged.filter(|_| assessment.trust.accepted()) else { return points };
-    let watched = watched(baseline, assessment, state);
-    for (quantity, reference, direction) in &watched {
+    let watched = watched(baseline, state);
+    for (reference, direction) in &watched {
+        let Some(quantity) = assessment.quantities.iter().find(|q| q.name == reference.name) else { continue };
         let (mean, within, n) = (quantity.pooled.mean, quantity.pooled.within, assessment.measurements_used);
         let Some(shift) = chart::shift(&reference.reference, *direction, mean, within, n) else { continue };
-        let limits = known.get(situation(reference, within, n, watched.len()), settings);
+        let curve = known.get(reference.reference.degrees_of_freedom, watched.len(), settings);
+        let limits = curve.at(chart::shared(&reference.reference, within, n));
         points.push(NewChartPoint {
-            series: quantity.name.clone(),
+            series: reference.name.clone(),
             undamaged_version: state.version,
             point: ChartPoint::damage(shift, &limits, !assessment.trust.moves_charts()),
             probability_limit: chart::probability_limit(reference, limits.single, within, n),
@@ -78,31 +87,14 @@ pub fn points(
 }
 
 /// Parameters and groups that have a damaged side; a spring that follows a parameter would only repeat it.
-fn watched<'a>(
-    baseline: &Baseline,
-    assessment: &'a Assessment,
-    state: &'a UndamagedState,
-) -> Vec<(&'a QuantityAssessment, &'a UndamagedQuantity, DamageDirection)> {
-    let direction = |q: &QuantityAssessment| -> Option<DamageDirection> {
-        let column = match q.kind {
-            QuantityKind::Parameter if q.group.is_none() => baseline.space().position(&q.name)?,
-            QuantityKind::Group => baseline.groups().iter().find(|g| g.name == q.name)?.columns[0],
-            _ => return None,
+fn watched<'a>(baseline: &Baseline, state: &'a UndamagedState) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
+    let (space, groups) = (baseline.space(), baseline.groups());
+    let direction = |name: &str| {
+        let column = match groups.iter().find(|group| group.name == name) {
+            Some(group) => group.columns[0],
+            None => space.position(name).filter(|column| !groups.iter().any(|g| g.columns.contains(column)))?,
         };
-        Some(baseline.space().as_slice()[column].damage).filter(|d| *d != DamageDirection::None)
+        Some(space.as_slice()[column].damage).filter(|d| *d != DamageDirection::None)
     };
-    let reference = |q: &QuantityAssessment| state.quantities.iter().find(|u| u.name == q.name);
-    assessment.quantities.iter().filter_map(|q| Some((q, reference(q)?, direction(q)?))).collect()
-}
-
-fn situation(quantity: &UndamagedQuantity, within: f64, measurements: usize, charts: usize) -> Situation {
-    let reference = &quantity.reference;
-    let error = chart::standard_error(reference, within, measurements);
-    let between = reference.between_batches_std.powi(2);
-    let undamaged = reference.std.powi(2) / reference.measurements as f64 + between / reference.batches.max(1) as f64;
-    Situation {
-        shared: (undamaged / error.powi(2)).clamp(0.0, 1.0),
-        degrees_of_freedom: reference.degrees_of_freedom.max(1),
-        charts,
-    }
+    state.quantities.iter().filter_map(|quantity| Some((quantity, direction(&quantity.name)?))).collect()
 }

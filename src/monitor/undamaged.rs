@@ -86,11 +86,14 @@ impl Monitor {
         }
         let drawn: Vec<Draws> = records.iter().map(|record| self.draws(&baseline, record)).collect();
         let model_digest = baseline.digest().clone();
+        let (known_limits, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
         let taken = place
             .run(move || {
                 let batches: Vec<_> =
                     records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
-                assess::undamaged_state(&baseline, &batches, threshold_probability)
+                let state = assess::undamaged_state(&baseline, &batches, threshold_probability)?;
+                known_limits.prepare(&baseline, &state, &settings);
+                Ok(state)
             })
             .await;
         let state = taken.map_err(|_| Error::Panicked)?.map_err(|error| match error {
