@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 
@@ -406,7 +407,7 @@ pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedState>) -
             damage,
         }
     };
-    samples.iter().map(one).collect()
+    samples.par_iter().map(one).collect()
 }
 
 fn compare(sample: &QuantitySamples, state: &UndamagedState) -> Option<Damage> {

@@ -15,6 +15,7 @@ pub mod train;
 use candle_core::{DType, Device, Tensor};
 use nalgebra::{DMatrix, DVector};
 use rand::RngCore as _;
+use rayon::prelude::*;
 
 use crate::flow::{checkpoint, Flow};
 use crate::measurement::shape::unit_shape;
@@ -351,30 +352,26 @@ impl Baseline {
                 real.extend(x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?);
                 log_q.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
             }
+            from_real_line(&mut real, &mut log_q, &self.training_space);
             for (place, values) in real.chunks_exact(d).enumerate() {
                 let row = pending[place / count] as usize;
                 if filled[row] == draws {
                     continue;
                 }
-                let mut draw = Vec::with_capacity(d);
-                let mut log_q = log_q[place];
-                for (value, (wide, parameter)) in values.iter().zip(self.training_space.iter().zip(self.space())) {
-                    let unit = logistic(*value);
-                    let value = wide.from_unit(unit);
+                let mut inside = true;
+                for (value, parameter) in values.iter().zip(self.space()) {
                     if !value.is_finite() {
                         return Err(InferenceError::NotFinite { row: place, parameter: parameter.name.clone() });
                     }
-                    log_q -= (unit * (1.0 - unit)).max(f64::MIN_POSITIVE).ln();
-                    let inside = parameter.prior().contains(&value);
-                    if inside || round == ROUNDS {
-                        draw.push(value.clamp(parameter.lower, parameter.upper));
-                        moved[row] |= !inside;
-                    }
+                    inside &= parameter.prior().contains(value);
                 }
-                if draw.len() == d {
+                if inside || round == ROUNDS {
                     let target = row * draws + filled[row];
-                    draw.iter().enumerate().for_each(|(column, value)| theta[(target, column)] = *value);
-                    log_density[target] = log_q;
+                    for (column, (value, parameter)) in values.iter().zip(self.space()).enumerate() {
+                        theta[(target, column)] = value.clamp(parameter.lower, parameter.upper);
+                    }
+                    moved[row] |= !inside;
+                    log_density[target] = log_q[place];
                     filled[row] += 1;
                 }
             }
@@ -627,6 +624,36 @@ fn logistic(x: f64) -> f64 {
 fn training_space(prior: &ParameterSpace, conditions: &manifest::Conditions) -> ParameterSpace {
     let wide = |(p, [lower, upper]): (&Parameter, &[f64; 2])| Parameter { lower: *lower, upper: *upper, ..p.clone() };
     ParameterSpace::new(prior.iter().zip(&conditions.training_box).map(wide).collect())
+}
+
+/// Draws that are taken off the real line together.
+const OFF_THE_LINE: usize = 512;
+
+/// Draws x of the real line to θ of the box `space`, and their log-densities to those of the unit box.
+///
+/// ```text
+///  u = 1/(1 + e⁻ˣ),    ln q ← ln q − Σ ln u(1 − u) = ln q + Σ |x| + 2 ln Π (1 + e^−|x|)
+/// ```
+fn from_real_line(values: &mut [f64], log_density: &mut [f64], space: &ParameterSpace) {
+    let d = space.len();
+    let parts = values.par_chunks_mut(OFF_THE_LINE * d).zip(log_density.par_chunks_mut(OFF_THE_LINE));
+    parts.for_each(|(values, log_density)| {
+        for (values, log_q) in values.chunks_exact_mut(d).zip(log_density) {
+            let mut product = 1.0_f64;
+            for (value, parameter) in values.iter_mut().zip(space) {
+                let e = (-value.abs()).exp();
+                *log_q += value.abs();
+                product *= 1.0 + e;
+                if product > 1e200 {
+                    *log_q += 2.0 * product.ln();
+                    product = 1.0;
+                }
+                let unit = if *value < 0.0 { e / (1.0 + e) } else { 1.0 / (1.0 + e) };
+                *value = parameter.from_unit(unit);
+            }
+            *log_q += 2.0 * product.ln();
+        }
+    });
 }
 
 /// θ of the box `space` to the real line by the logit of its position, f64 `[n, d]`.

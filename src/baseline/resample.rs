@@ -69,8 +69,8 @@ pub(super) fn resample(
             None => rows.take(draws).collect(),
         }
     };
-    let chosen: Vec<Vec<usize>> = (0..observations.len()).map(choose).collect();
-    let places: Vec<usize> = chosen.into_iter().flatten().collect();
+    let rows = (0..observations.len()).into_par_iter().with_min_len(AT_A_TIME);
+    let places: Vec<usize> = rows.flat_map_iter(choose).collect();
     DMatrix::from_fn(places.len(), d, |row, column| proposals.theta[(places[row], column)])
 }
 

@@ -79,7 +79,7 @@ mod tests {
     use std::collections::BTreeSet;
     use std::f64::consts::LOG2_E;
 
-    use super::super::kernel::weigh;
+    use super::super::kernel::{weigh, Terms};
     use super::*;
 
     const SIZES: [(usize, usize); 8] = [(1, 64), (3, 10), (4, 64), (5, 7), (9, 64), (16, 64), (20, 64), (50, 16)];
@@ -122,7 +122,9 @@ mod tests {
                 let (centred, mut values) = (vec![Lanes::ZERO; block.places.len()], offsets.clone());
                 let (places, linears) = (block.places.clone(), [Lanes::ZERO]);
                 let (own, offsets) = (&mut values[places.clone()], &offsets[places]);
-                let weighed = weigh(own, offsets, &[&centred], &[0.0], &linears, block.width);
+                let terms = Terms { to: offsets, deviations: &[&centred], squares: &[0.0], linears: &linears };
+                let mut logarithms = own.to_vec();
+                let weighed = weigh(own, &mut logarithms, &terms, block.width, &Lanes([-1e4; LANES]));
                 let mut counts = vec![[0.0; LANES]; block.places.end];
                 let shares = 10_000_u32;
                 for i in 0..shares {

@@ -27,11 +27,12 @@ impl Lanes {
     }
 }
 
-/// Weights of the samples of some measurements under a normal population, the greatest of each measurement 1.
+/// Weights of the samples of some measurements under a normal population.
 #[derive(Clone, Copy)]
 pub(super) struct Weighed {
-    /// Logarithm to base 2 of what the weights were divided by, the same in all lanes of a measurement.
-    pub largest: Lanes,
+    /// Logarithm to base 2 of what the weights were divided by, the same in all lanes of a measurement: that of the greatest, or
+    /// of what it was before.
+    pub divisor: Lanes,
     /// Sum of the weights of each lane.
     pub sum: Lanes,
 }
@@ -39,102 +40,128 @@ pub(super) struct Weighed {
 /// Parameters whose terms are added in one pass.
 const TOGETHER: usize = 4;
 
-/// w_s, one entry a sample.
+/// Sums of weights for which an old divisor is near enough: far from what single precision cannot hold.
+const NEAR_ENOUGH: std::ops::RangeInclusive<f32> = 1e-12..=1e12;
+
+/// What the logarithms of weights are made of.
 ///
 /// ```text
-///  log₂ w_s = offset_s + Σ_k x_sk (x_sk square_k + linear_k)
+///  log₂ w_s = to_s + Σ_k x_sk (x_sk square_k + linear_k)
 /// ```
-///
-/// `offsets`: logarithms of what the samples weigh without the population; `deviations`: x of each parameter; `squares`: −1/2σ²
-/// of each; `linears`: (μ − c)/σ² of each, c the centre; all of them times log₂ e. A measurement has every lane `width` further.
+pub(super) struct Terms<'a> {
+    /// Logarithms to base 2 that the terms are added to, one entry a sample.
+    pub to: &'a [Lanes],
+    /// x of each parameter.
+    pub deviations: &'a [&'a [Lanes]],
+    /// Of each parameter: −1/2σ², times log₂ e.
+    pub squares: &'a [f32],
+    /// Of each parameter: (μ − c)/σ², c the centre, times log₂ e.
+    pub linears: &'a [Lanes],
+}
+
+/// `weights` and their logarithms, one entry a sample. A measurement has every lane `width` further. What they are divided by is
+/// `divisor` where it is near enough to the greatest.
 #[pulp::with_simd(weigh = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn weigh_simd<S: pulp::Simd>(
     simd: S,
     weights: &mut [Lanes],
-    offsets: &[Lanes],
-    deviations: &[&[Lanes]],
-    squares: &[f32],
-    linears: &[Lanes],
+    logarithms: &mut [Lanes],
+    terms: &Terms<'_>,
     width: usize,
+    divisor: &Lanes,
 ) -> Weighed {
-    let mut largest = Lanes::ZERO;
-    for (k, some) in deviations.chunks(TOGETHER).enumerate() {
-        let (squares, linears) = (&squares[TOGETHER * k..], &linears[TOGETHER * k..]);
-        let to = (k == 0).then_some(offsets);
+    for (k, some) in terms.deviations.chunks(TOGETHER).enumerate() {
+        let (squares, linears) = (&terms.squares[TOGETHER * k..], &terms.linears[TOGETHER * k..]);
+        let to = (k == 0).then_some(terms.to);
         match *some {
-            [a] => add_terms(simd, weights, to, [a], squares, linears),
-            [a, b] => add_terms(simd, weights, to, [a, b], squares, linears),
-            [a, b, c] => add_terms(simd, weights, to, [a, b, c], squares, linears),
-            [a, b, c, d] => add_terms(simd, weights, to, [a, b, c, d], squares, linears),
+            [a] => add_terms(simd, logarithms, to, [a], squares, linears),
+            [a, b] => add_terms(simd, logarithms, to, [a, b], squares, linears),
+            [a, b, c] => add_terms(simd, logarithms, to, [a, b, c], squares, linears),
+            [a, b, c, d] => add_terms(simd, logarithms, to, [a, b, c, d], squares, linears),
             _ => unreachable!("chunks are no longer"),
         }
     }
+    let sum = powers(weights, logarithms, divisor);
+    let mut sums = [0.0; LANES];
+    sum.0.iter().enumerate().for_each(|(lane, sum)| sums[lane % width] += sum);
+    if sums[..width].iter().all(|sum| NEAR_ENOUGH.contains(sum)) {
+        return Weighed { divisor: *divisor, sum };
+    }
+    let mut largest = Lanes::ZERO;
     for first in (0..LANES).step_by(S::F32_LANES) {
         let part = first..first + S::F32_LANES;
-        let most = in_fours(simd, weights, &part, f32::NEG_INFINITY, |a, b| simd.max_f32s(a, b));
+        let most = in_fours(simd, logarithms, &part, f32::NEG_INFINITY, |a, b| simd.max_f32s(a, b));
         S::as_mut_simd_f32s(&mut largest.0[part]).0[0] = most;
     }
     let mut most = [f32::NEG_INFINITY; LANES];
     for (lane, own) in largest.0.iter().enumerate() {
         most[lane % width] = most[lane % width].max(*own);
     }
-    largest.0 = std::array::from_fn(|lane| most[lane % width]);
+    let divisor = Lanes(std::array::from_fn(|lane| most[lane % width]));
+    Weighed { divisor, sum: powers(weights, logarithms, &divisor) }
+}
+
+/// Weights of these logarithms, divided; the sum of each lane.
+#[inline(always)]
+fn powers(weights: &mut [Lanes], logarithms: &[Lanes], divisor: &Lanes) -> Lanes {
+    let logarithms = &logarithms[..weights.len()];
     // Four sums that do not wait for each other.
     let mut sums = [Lanes::ZERO; 4];
-    let add_power = |weights: &mut Lanes, sum: &mut Lanes| {
-        for ((weight, largest), sum) in weights.0.iter_mut().zip(&largest.0).zip(&mut sum.0) {
-            *weight = power_of_two(*weight - largest);
+    let add_power = |weights: &mut Lanes, logarithms: &Lanes, sum: &mut Lanes| {
+        let all = weights.0.iter_mut().zip(&logarithms.0).zip(divisor.0.iter().zip(&mut sum.0));
+        for ((weight, logarithm), (divisor, sum)) in all {
+            *weight = power_of_two(*logarithm - divisor);
             *sum += *weight;
         }
     };
     let (fours, rest) = weights.as_chunks_mut::<4>();
-    for [a, b, c, d] in fours {
+    let (logarithms_of_fours, logarithms_of_rest) = logarithms.as_chunks::<4>();
+    for ([a, b, c, d], [log_a, log_b, log_c, log_d]) in fours.iter_mut().zip(logarithms_of_fours) {
         let [of_a, of_b, of_c, of_d] = &mut sums;
-        add_power(a, of_a);
-        add_power(b, of_b);
-        add_power(c, of_c);
-        add_power(d, of_d);
+        add_power(a, log_a, of_a);
+        add_power(b, log_b, of_b);
+        add_power(c, log_c, of_c);
+        add_power(d, log_d, of_d);
     }
-    for weights in rest {
-        add_power(weights, &mut sums[0]);
+    for (weights, logarithms) in rest.iter_mut().zip(logarithms_of_rest) {
+        add_power(weights, logarithms, &mut sums[0]);
     }
-    let sum = std::array::from_fn(|lane| (sums[0].0[lane] + sums[1].0[lane]) + (sums[2].0[lane] + sums[3].0[lane]));
-    Weighed { largest, sum: Lanes(sum) }
+    Lanes(std::array::from_fn(|lane| (sums[0].0[lane] + sums[1].0[lane]) + (sums[2].0[lane] + sums[3].0[lane])))
 }
 
-/// Adds the terms of K parameters to the logarithms `to`, or else to those that stand in `weights` already.
+/// Adds the terms of K parameters to the logarithms `to`, or else to those that stand in `logarithms` already.
 ///
 /// Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
 #[inline(always)]
 fn add_terms<S: pulp::Simd, const K: usize>(
     simd: S,
-    weights: &mut [Lanes],
+    logarithms: &mut [Lanes],
     to: Option<&[Lanes]>,
     deviations: [&[Lanes]; K],
     squares: &[f32],
     linears: &[Lanes],
 ) {
     // One length for all: what is read in the loop is known to be there.
-    let deviations = deviations.map(|x| &x[..weights.len()]);
-    let to = to.map(|to| &to[..weights.len()]);
+    let deviations = deviations.map(|x| &x[..logarithms.len()]);
+    let to = to.map(|to| &to[..logarithms.len()]);
     for first in (0..LANES).step_by(S::F32_LANES) {
         let part = first..first + S::F32_LANES;
         let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
         let terms: [(S::f32s, S::f32s); K] = std::array::from_fn(|k| (simd.splat_f32s(squares[k]), of(&linears[k])));
-        for (sample, weights) in weights.iter_mut().enumerate() {
-            let weight = &mut S::as_mut_simd_f32s(&mut weights.0[part.clone()]).0[0];
-            let mut sum = to.map_or(*weight, |to| of(&to[sample]));
+        for (sample, logarithms) in logarithms.iter_mut().enumerate() {
+            let own = &mut S::as_mut_simd_f32s(&mut logarithms.0[part.clone()]).0[0];
+            let mut sum = to.map_or(*own, |to| of(&to[sample]));
             for (x, (square, linear)) in deviations.iter().zip(terms) {
                 let x = of(&x[sample]);
                 sum = simd.mul_add_f32s(x, simd.mul_add_f32s(x, square, linear), sum);
             }
-            *weight = sum;
+            *own = sum;
         }
     }
 }
 
-/// 2ˣ for x from −100 to 0, with a relative error below 3e-7; 2⁻¹⁰⁰ for all below: nothing beside a weight of 1, and still far
+/// 2ˣ for x from −100 to 100, with a relative error below 3e-7; 2⁻¹⁰⁰ for all below: nothing beside a weight of 1, and still far
 /// from numbers that processors take long over, also times squares of deviations.
 ///
 /// The nearest whole number goes into the exponent, the rest by a polynomial for |r| ≤ ½.
@@ -142,7 +169,7 @@ fn add_terms<S: pulp::Simd, const K: usize>(
 fn power_of_two(x: f32) -> f32 {
     // Adding 1.5·2²³ rounds to the nearest whole number and leaves it in the lowest bits.
     const ROUND: f32 = 12_582_912.0;
-    let x = x.max(-100.0);
+    let x = x.clamp(-100.0, 100.0);
     let shifted = x + ROUND;
     let r = x - (shifted - ROUND);
     let polynomial = r.mul_add(1.326_472_7e-3, 9.671_513e-3);
@@ -176,25 +203,23 @@ fn in_fours<S: pulp::Simd>(
     combine(combine(rows[0], rows[1]), combine(rows[2], rows[3]))
 }
 
-/// (μ − c)/σ² · log₂ e of each parameter and lane into `linears`; returns Σ_k ((μ − c)/σ)² of each lane.
+/// (μ − c)/σ² · log₂ e of each lane into `linear`; returns ((μ − c)/σ)² of each.
 ///
-/// `centres`: c of each parameter, `[parameter]`; `precisions`: 1/σ².
+/// `centres`: c of each lane; `precision`: 1/σ².
 #[pulp::with_simd(off_centre = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn off_centre_simd<S: pulp::Simd>(
     _: S,
-    linears: &mut [Lanes],
-    centres: &[[f64; LANES]],
-    means: &[f64],
-    precisions: &[f64],
+    linear: &mut Lanes,
+    centres: &[f64; LANES],
+    mean: f64,
+    precision: f64,
 ) -> [f64; LANES] {
     let mut squared = [0.0; LANES];
-    for (((linears, centres), mean), precision) in linears.iter_mut().zip(centres).zip(means).zip(precisions) {
-        for ((linear, centre), squared) in linears.0.iter_mut().zip(centres).zip(&mut squared) {
-            let off = mean - centre;
-            *squared += off * off * precision;
-            *linear = (LOG2_E * off * precision) as f32;
-        }
+    for ((linear, centre), squared) in linear.0.iter_mut().zip(centres).zip(&mut squared) {
+        let off = mean - centre;
+        *squared = off * off * precision;
+        *linear = (LOG2_E * off * precision) as f32;
     }
     squared
 }
@@ -263,7 +288,10 @@ mod tests {
             let mut weights = vec![Lanes::ZERO; count];
             let square = (-0.5 * LOG2_E / (std * std)) as f32;
             let linear = lanes(&|lane| LOG2_E * off(lane) / (std * std));
-            let found = weigh(&mut weights, &offsets, &[&deviations], &[square], &[linear], LANES);
+            let terms = Terms { to: &offsets, deviations: &[&deviations], squares: &[square], linears: &[linear] };
+            let mut logarithms = weights.clone();
+            // From a divisor that is far from near enough.
+            let found = weigh(&mut weights, &mut logarithms, &terms, LANES, &Lanes([1e4; LANES]));
             let moments = moments(&weights, &deviations);
             let shares = 20_000_u32;
             let mut counts = vec![0.0; count * LANES];
@@ -285,7 +313,7 @@ mod tests {
                 }
                 let sum: f64 = expected.iter().sum();
                 assert!((f64::from(found.sum.0[lane]) / sum - 1.0).abs() < 1e-4, "{count}");
-                let log_sum = f64::from(found.largest.0[lane]) / LOG2_E - 0.5 * (off(lane) / std).powi(2) + sum.ln();
+                let log_sum = f64::from(found.divisor.0[lane]) / LOG2_E - 0.5 * (off(lane) / std).powi(2) + sum.ln();
                 assert!((log_sum - largest - sum.ln()).abs() < 2e-4, "{count}");
                 let direct = |power: i32| -> f64 { (0..count).map(|s| expected[s] * x(s, lane).powi(power)).sum() };
                 assert!((f64::from(moments.0 .0[lane]) - direct(1)).abs() < 1e-4 * sum, "{count}");
@@ -303,7 +331,7 @@ mod tests {
     #[test]
     fn powers_of_two_are_right_to_single_precision() {
         for i in 0..=2_000_000_u32 {
-            let x = -100.0 * (f64::from(i) / 2e6) as f32;
+            let x = 100.0 - 200.0 * (f64::from(i) / 2e6) as f32;
             let relative = f64::from(power_of_two(x)) / f64::from(x).exp2() - 1.0;
             assert!(relative.abs() < 3e-7, "2^{x}: {relative}");
         }
@@ -324,7 +352,16 @@ mod tests {
             let linears: Vec<Lanes> = (0..parameters).map(|k| lanes(&|lane| linear(k, lane))).collect();
             // Two lanes each: eight measurements.
             let (mut weights, offsets) = (vec![Lanes::ZERO; 7], vec![Lanes::ZERO; 7]);
-            let found = weigh(&mut weights, &offsets, &deviations, &squares, &linears, 8);
+            let terms = Terms { to: &offsets, deviations: &deviations, squares: &squares, linears: &linears };
+            let mut logarithms = weights.clone();
+            let found = weigh(&mut weights, &mut logarithms, &terms, 8, &Lanes([-100.0; LANES]));
+            // Another divisor that is near enough stays, and divides.
+            let (others, near) = (&mut weights.clone(), Lanes(std::array::from_fn(|lane| found.divisor.0[lane] + 3.0)));
+            let again = weigh(others, &mut logarithms, &terms, 8, &near);
+            assert_eq!(again.divisor, near);
+            for (weights, others) in weights.iter().zip(others) {
+                weights.0.iter().zip(others.0).for_each(|(own, other)| assert!((own - 8.0 * other).abs() < 1e-6));
+            }
             for lane in 0..8 {
                 let term =
                     |k: usize, s: usize, lane: usize| x(k, s, lane) * (x(k, s, lane) * square(k) + linear(k, lane));
@@ -332,7 +369,7 @@ mod tests {
                 let both = |s: usize| exponent(s, lane).max(exponent(s, lane + 8));
                 let largest = (0..7).map(both).fold(f64::NEG_INFINITY, f64::max);
                 for own in [lane, lane + 8] {
-                    assert!((f64::from(found.largest.0[own]) - largest).abs() < 1e-5, "{parameters}, {own}");
+                    assert!((f64::from(found.divisor.0[own]) - largest).abs() < 1e-5, "{parameters}, {own}");
                     let sum: f64 = (0..7).map(|s| (exponent(s, own) - largest).exp2()).sum();
                     assert!((f64::from(found.sum.0[own]) / sum - 1.0).abs() < 1e-5, "{parameters}, {own}");
                 }

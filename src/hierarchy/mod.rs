@@ -21,7 +21,7 @@ use rand_distr::{Gamma, StandardNormal};
 use rayon::prelude::*;
 
 use self::block::Block;
-use self::kernel::{exponentials, moments, off_centre, weigh, Lanes, Weighed, LANES};
+use self::kernel::{exponentials, moments, off_centre, weigh, Lanes, Terms, Weighed, LANES};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, Stream};
@@ -146,7 +146,7 @@ pub fn interval(draws: &[f64]) -> [f64; 2] {
 /// ```
 ///
 /// Where noise hides much of the spread, the chosen samples hold σ where it is and the Gibbs sampler hardly moves; there a
-/// Metropolis step on L(μ, σ) itself, one parameter after the other, goes with every second sweep.
+/// Metropolis step on L(μ, σ) itself, one such parameter after the other, goes with every second sweep.
 ///
 /// Priors: μ uniform in the prior box, σ uniform up to half the width of the prior (Gelman 2006). The second
 /// term of σ² is ours, the restricted likelihood of a normal population: it gives back what the fitted mean has absorbed,
@@ -269,7 +269,7 @@ pub fn proposals(
 ) -> (PosteriorSamples, Vec<f64>) {
     let (d, parameters) = (space.len(), space.as_slice());
     let width = |k: usize| parameters[k].upper - parameters[k].lower;
-    let within = Problem::new(samples, None, space).within;
+    let within = within(&unit_columns(samples, space), samples.draws());
     let mean = DVector::from_fn(d, |k, _| parameters[k].to_unit(found.parameters[k].mean));
     let precision = DMatrix::from_fn(d, d, |i, j| {
         // A first estimate of nearly nothing must leave room to look for another.
@@ -314,8 +314,9 @@ pub fn proposals(
                 points.push(parameters[k].from_unit(position.clamp(0.0, 1.0)));
             }
             let squared: f64 = stretched.iter().map(|z| z * z).sum();
-            let density = |(width, volume): (&f64, f64)| volume * (-0.5 * squared / (width * width)).exp();
-            let density: f64 = WIDTHS.iter().zip(volumes).map(density).sum();
+            // Right to 3e-7 of itself, which is far more than its use needs.
+            let power = |width: &f64| f64::from(stats::exp_f32((-0.5 * squared / (width * width)) as f32));
+            let density: f64 = WIDTHS.iter().zip(volumes).map(|(width, volume)| volume * power(width)).sum();
             // Beyond the prior nothing is possible.
             log_density.push(if inside { density.ln() - log_volume } else { IMPOSSIBLE });
         }
@@ -355,67 +356,83 @@ struct Problem {
     floor: Vec<f64>,
     /// Mean posterior standard deviation of one measurement, for each column.
     within: Vec<f64>,
-    /// True when that is much of the spread of some column.
-    noisy: bool,
+    /// Columns of whose spread that is much.
+    noisy: Vec<usize>,
 }
 
 /// Weights of all samples under a population, and room for what they are made of.
 struct Weights {
     /// `[place]`
     values: Vec<Lanes>,
+    /// Their logarithms to base 2, not divided, `[place]`.
+    logarithms: Vec<Lanes>,
     /// `[block]`
     blocks: Vec<Weighed>,
-    /// Σ ((c − μ)/σ)² over parameters and measurements.
-    of_centres: f64,
+    /// Σ ((c − μ)/σ)² over the measurements, `[parameter]`.
+    of_centres: Vec<f64>,
     squares: Vec<f32>,
     linears: Vec<Lanes>,
+}
+
+/// The samples of each parameter in the unit box.
+fn unit_columns(samples: &PosteriorSamples, space: &ParameterSpace) -> Vec<Vec<f64>> {
+    let unit = |(column, p): (usize, &crate::parameter::Parameter)| -> Vec<f64> {
+        samples.theta().column(column).iter().map(|x| p.to_unit(*x)).collect()
+    };
+    space.iter().enumerate().map(unit).collect()
+}
+
+/// Mean posterior standard deviation of one measurement, for each column.
+fn within(columns: &[Vec<f64>], draws: usize) -> Vec<f64> {
+    let variance = |chunk: &[f64]| {
+        let centre = stats::mean(chunk);
+        chunk.iter().map(|x| (x - centre).powi(2)).sum::<f64>() / chunk.len() as f64
+    };
+    let within = |column: &Vec<f64>| {
+        let variances = column.chunks(draws).map(variance);
+        (variances.sum::<f64>() * draws as f64 / column.len() as f64).sqrt()
+    };
+    columns.iter().map(within).collect()
 }
 
 impl Problem {
     fn new(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Self {
         let (draws, measurements) = (samples.draws(), samples.measurements());
-        let unit = |(column, p): (usize, &crate::parameter::Parameter)| -> Vec<f64> {
-            samples.theta().column(column).iter().map(|x| p.to_unit(*x)).collect()
-        };
-        let columns: Vec<Vec<f64>> = space.iter().enumerate().map(unit).collect();
-        let within = |column: &Vec<f64>| {
-            let variance = |chunk: &[f64]| {
-                let centre = stats::mean(chunk);
-                chunk.iter().map(|x| (x - centre).powi(2)).sum::<f64>() / chunk.len() as f64
-            };
-            (column.chunks(draws).map(variance).sum::<f64>() / measurements as f64).sqrt()
-        };
-        let within: Vec<f64> = columns.iter().map(within).collect();
+        let columns = unit_columns(samples, space);
+        let within = within(&columns, draws);
         let means = |column: &Vec<f64>| -> Vec<f64> { column.chunks(draws).map(stats::mean).collect() };
         let means: Vec<Vec<f64>> = columns.iter().map(means).collect();
-        let hides =
-            |(means, within): (&Vec<f64>, &f64)| stats::sample_std(means).is_none_or(|spread| *within > NOISY * spread);
-        let noisy = means.iter().zip(&within).any(hides);
+        let hides = |(means, within): &(&Vec<f64>, &f64)| {
+            stats::sample_std(means).is_none_or(|spread| **within > NOISY * spread)
+        };
+        let noisy = means.iter().zip(&within).enumerate().filter(|(_, column)| hides(column));
+        let noisy = noisy.map(|(column, _)| column).collect();
         // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
         let floor = within.iter().map(|within| (0.25 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
         let blocks = Block::all(measurements, draws);
-        let side_by_side = |value: &dyn Fn(usize, usize) -> f64| {
-            let mut all = vec![Lanes::ZERO; blocks.last().map_or(0, |block| block.places.end)];
+        let places = blocks.last().map_or(0, |block| block.places.end);
+        // Each value less that of its measurement, times a factor.
+        let side_by_side = |values: &[f64], centres: &[f64], factor: f64| {
+            let mut all = vec![Lanes::ZERO; places];
             for block in &blocks {
                 for measurement in block.measurements.clone() {
-                    for draw in 0..draws {
+                    let own = &values[measurement * draws..(measurement + 1) * draws];
+                    for (draw, value) in own.iter().enumerate() {
                         let (place, lane) = block.place(measurement, draw);
-                        all[place].0[lane] = value(measurement, draw) as f32;
+                        all[place].0[lane] = (factor * (value - centres[measurement])) as f32;
                     }
                 }
             }
             all
         };
-        let off_centre = |(column, means): (&Vec<f64>, &Vec<f64>)| {
-            side_by_side(&|measurement, draw| column[measurement * draws + draw] - means[measurement])
-        };
-        let deviations = columns.iter().zip(&means).map(off_centre).collect();
+        let off_centre = |(column, means): (&Vec<f64>, &Vec<f64>)| side_by_side(column, means, 1.0);
+        let deviations: Vec<Vec<Lanes>> = columns.iter().zip(&means).map(off_centre).collect();
         let relative = |weights: &[f64]| {
             let largest: Vec<f64> =
                 weights.chunks(draws).map(|own| own.iter().copied().fold(f64::NEG_INFINITY, f64::max)).collect();
-            side_by_side(&|measurement, draw| LOG2_E * (weights[measurement * draws + draw] - largest[measurement]))
+            side_by_side(weights, &largest, LOG2_E)
         };
-        let offsets = log_weights.map_or_else(|| side_by_side(&|_, _| 0.0), relative);
+        let offsets = log_weights.map_or_else(|| vec![Lanes::ZERO; places], relative);
         let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
         let in_lanes = |block: &Block, own: &Vec<f64>| {
             let mut all = [0.0; LANES];
@@ -437,8 +454,9 @@ impl Problem {
         let d = self.deviations.len();
         Weights {
             values: vec![Lanes::ZERO; self.offsets.len()],
-            blocks: vec![Weighed { largest: Lanes::ZERO, sum: Lanes::ZERO }; self.blocks.len()],
-            of_centres: 0.0,
+            logarithms: vec![Lanes::ZERO; self.offsets.len()],
+            blocks: vec![Weighed { divisor: Lanes::ZERO, sum: Lanes::ZERO }; self.blocks.len()],
+            of_centres: vec![0.0; d],
             squares: vec![0.0; d],
             linears: vec![Lanes::ZERO; d],
         }
@@ -450,20 +468,44 @@ impl Problem {
     ///  ln w_s = offset_s − Σ_k ½((x_sk − μ_k)/σ_k)² + ½((c_k − μ_k)/σ_k)²
     /// ```
     fn weigh(&self, state: &State, weights: &mut Weights) {
+        let Weights { values, logarithms, blocks, of_centres, squares, linears } = weights;
         let precisions: Vec<f64> = state.std.iter().map(|std| std.powi(-2)).collect();
-        for (square, precision) in weights.squares.iter_mut().zip(&precisions) {
+        for (square, precision) in squares.iter_mut().zip(&precisions) {
             *square = (-0.5 * LOG2_E * precision) as f32;
         }
-        weights.of_centres = 0.0;
+        of_centres.fill(0.0);
         let d = self.deviations.len();
-        for ((block, centres), weighed) in self.blocks.iter().zip(self.lane_centres.chunks(d)).zip(&mut weights.blocks)
-        {
-            let squared = off_centre(&mut weights.linears, centres, &state.mean, &precisions);
-            weights.of_centres += squared[..block.measurements.len()].iter().sum::<f64>();
+        for ((block, centres), weighed) in self.blocks.iter().zip(self.lane_centres.chunks(d)).zip(blocks) {
+            for (k, (linear, centres)) in linears.iter_mut().zip(centres).enumerate() {
+                let squared = off_centre(linear, centres, state.mean[k], precisions[k]);
+                of_centres[k] += squared[..block.measurements.len()].iter().sum::<f64>();
+            }
             let places = block.places.clone();
             let deviations: Vec<&[Lanes]> = self.deviations.iter().map(|all| &all[places.clone()]).collect();
-            let (values, offsets) = (&mut weights.values[places.clone()], &self.offsets[places]);
-            *weighed = weigh(values, offsets, &deviations, &weights.squares, &weights.linears, block.width);
+            let terms = Terms { to: &self.offsets[places.clone()], deviations: &deviations, squares, linears };
+            let (values, logarithms) = (&mut values[places.clone()], &mut logarithms[places]);
+            *weighed = weigh(values, logarithms, &terms, block.width, &weighed.divisor);
+        }
+    }
+
+    /// As [`Self::weigh`] under `next`, which differs from `state` in parameter k only; `weights` are those under `state`.
+    fn weigh_changed(&self, k: usize, (state, weights): (&State, &Weights), next: &State, others: &mut Weights) {
+        let [before, after] = [state, next].map(|state| (state.mean[k], state.std[k].powi(-2)));
+        let square = (-0.5 * LOG2_E * (after.1 - before.1)) as f32;
+        others.of_centres.clone_from(&weights.of_centres);
+        others.of_centres[k] = 0.0;
+        for (index, (block, old)) in self.blocks.iter().zip(&weights.blocks).enumerate() {
+            let centres = &self.lane_centres[index * self.deviations.len() + k];
+            let (mut linear, mut old_linear) = (Lanes::ZERO, Lanes::ZERO);
+            off_centre(&mut old_linear, centres, before.0, before.1);
+            let squared = off_centre(&mut linear, centres, after.0, after.1);
+            others.of_centres[k] += squared[..block.measurements.len()].iter().sum::<f64>();
+            linear.0.iter_mut().zip(old_linear.0).for_each(|(own, old)| *own -= old);
+            let places = block.places.clone();
+            let (to, deviations) = (&weights.logarithms[places.clone()], &self.deviations[k][places.clone()]);
+            let terms = Terms { to, deviations: &[deviations], squares: &[square], linears: &[linear] };
+            let (values, logarithms) = (&mut others.values[places.clone()], &mut others.logarithms[places]);
+            others.blocks[index] = weigh(values, logarithms, &terms, block.width, &old.divisor);
         }
     }
 
@@ -529,13 +571,13 @@ impl Problem {
 
     /// ln L(μ, σ) up to a constant; `weights` under the same population.
     fn log_likelihood(&self, state: &State, weights: &Weights) -> f64 {
-        // One logarithm for many measurements: the product of their sums, each from 1 to the number of draws.
-        let (mut likelihood, mut product) = (-0.5 * weights.of_centres, 1.0_f64);
+        // One logarithm for many measurements: the product of their sums.
+        let (mut likelihood, mut product) = (-0.5 * weights.of_centres.iter().sum::<f64>(), 1.0_f64);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
             for (first, (_, lanes)) in block.lanes().enumerate() {
-                likelihood += LN_2 * f64::from(weighed.largest.0[first]);
+                likelihood += LN_2 * f64::from(weighed.divisor.0[first]);
                 product *= weighed.sum.of(lanes);
-                if product > 1e200 {
+                if !(1e-200..=1e200).contains(&product) {
                     likelihood += product.ln();
                     product = 1.0;
                 }
@@ -552,7 +594,7 @@ impl Problem {
         for sweep in 0..BURN_IN + draws {
             self.sweep(&mut state, &weights, &mut stream);
             self.weigh(&state, &mut weights);
-            if self.noisy && sweep.is_multiple_of(2) {
+            if !self.noisy.is_empty() && sweep.is_multiple_of(2) {
                 self.collapsed(&mut state, &mut weights, &mut others, &mut stream);
             }
             if sweep >= BURN_IN {
@@ -562,11 +604,11 @@ impl Problem {
         kept
     }
 
-    /// One Metropolis step for each parameter on the likelihood with all samples in it. `weights` are those under the state, and
+    /// One Metropolis step for each noisy parameter on the likelihood with all samples in it. `weights` are those under the state, and
     /// stay so; `others` are room for those under another.
     fn collapsed(&self, state: &mut State, weights: &mut Weights, others: &mut Weights, stream: &mut Stream) {
         let mut current = self.log_likelihood(state, weights);
-        for k in 0..self.deviations.len() {
+        for &k in &self.noisy {
             // Steps of several sizes: how wide the likelihood is depends on how much the noise hides.
             let size = [0.3, 1.0, 2.0][stream.random_range(0..3)];
             let spread = ((state.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
@@ -579,7 +621,7 @@ impl Problem {
             if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
                 continue;
             }
-            self.weigh(&next, others);
+            self.weigh_changed(k, (state, weights), &next, others);
             let likelihood = self.log_likelihood(&next, others);
             // The step is symmetric in ln σ but its size depends on σ, and σ is uniform a priori.
             let back = size * (1.0 + self.within[k] / next.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
@@ -656,4 +698,56 @@ fn draw_std(squares: f64, n: f64, floor: f64, stream: &mut Stream) -> f64 {
     });
     let place = cell.unwrap_or(GRID - 1) as f64 + stream.random::<f64>();
     (low + place * step).exp().clamp(floor, WIDEST)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_likelihood_is_the_same_whichever_way_a_population_was_reached() {
+        let parameter = |name: &str| crate::parameter::Parameter {
+            name: name.to_owned(),
+            unit: "N/m".to_owned(),
+            lower: 0.0,
+            upper: 1.0,
+            damage: crate::parameter::DamageDirection::Decrease,
+        };
+        let space = ParameterSpace::new(["a", "b", "c"].map(parameter).to_vec());
+        let (measurements, draws) = (21, 16);
+        let mut stream = stats::stream(1, "test: populations");
+        let theta = DMatrix::from_fn(measurements * draws, 3, |_, k| {
+            0.5 + [0.02, 0.1, 0.05][k] * stream.sample::<f64, _>(StandardNormal)
+        });
+        let samples = PosteriorSamples::new(theta.clone(), draws);
+        let problem = Problem::new(&samples, None, &space);
+        let state = |mean: [f64; 3], std: [f64; 3]| State { mean: mean.to_vec(), std: std.to_vec() };
+        let direct = |state: &State| -> f64 {
+            let density = |row: usize| -> f64 {
+                let one = |k: usize| {
+                    let z = (theta[(row, k)] - state.mean[k]) / state.std[k];
+                    (-0.5 * z * z).exp() / state.std[k]
+                };
+                (0..3).map(one).product()
+            };
+            (0..measurements).map(|j| (j * draws..(j + 1) * draws).map(density).sum::<f64>().ln()).sum()
+        };
+        let start = state([0.5, 0.5, 0.5], [0.05, 0.1, 0.03]);
+        let (mut weights, mut others) = (problem.room(), problem.room());
+        problem.weigh(&start, &mut weights);
+        let of_start = problem.log_likelihood(&start, &weights);
+        // A small step, and one so large that what the weights were divided by is of no use any more.
+        for (k, next) in [(1, state([0.5, 0.48, 0.5], [0.05, 0.07, 0.03])), (2, state([0.5; 3], [0.05, 0.1, 0.001]))] {
+            problem.weigh_changed(k, (&start, &weights), &next, &mut others);
+            let changed = problem.log_likelihood(&next, &others) - of_start;
+            let mut anew = problem.room();
+            problem.weigh(&next, &mut anew);
+            let weighed = problem.log_likelihood(&next, &anew) - of_start;
+            let expected = direct(&next) - direct(&start);
+            // Logarithms of up to some hundreds for each measurement, in single precision: 6e-8 of each.
+            let tolerance = 1e-6 * (expected.abs() + measurements as f64);
+            assert!((changed - expected).abs() < tolerance, "{k}: {changed}, expected {expected}");
+            assert!((weighed - expected).abs() < tolerance, "{k}: {weighed}, expected {expected}");
+        }
+    }
 }

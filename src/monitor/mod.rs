@@ -25,6 +25,7 @@ use std::sync::{Arc, Mutex, RwLock};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
+use tokio::sync::oneshot;
 use tracing::{error, warn, Instrument as _};
 
 use crate::alarm::AlarmSettings;
@@ -246,6 +247,12 @@ pub struct BatchView {
     pub next_step: Option<String>,
 }
 
+/// What was done for a batch while it was being stored.
+enum Begun {
+    Computed(Box<task::Computed>),
+    Not(compute::Place),
+}
+
 /// A batch taken in.
 pub struct Ingested {
     /// The batch.
@@ -407,48 +414,71 @@ impl Monitor {
         let structure = batch.structure.clone();
         let watched = self.structure(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
-        let (record, previous) = match self.store.insert_batch(&batch, &batch_id, received_at).await? {
-            InsertBatch::Inserted { content_digest, previous } => {
+        let (foreseen, outcome) = oneshot::channel();
+        let insert = self.store.insert_batch_foreseen(&batch, &batch_id, received_at, foreseen);
+        let record = |content_digest: &Digest| BatchRecord {
+            batch_id: batch_id.clone(),
+            batch: batch.clone(),
+            content_digest: content_digest.clone(),
+            received_at,
+            state: BatchState::Received,
+            failure: None,
+        };
+        // While it is on its way to the disk. Nothing of it is stored or told before the batch is there.
+        let compute = async {
+            match outcome.await {
+                Ok(InsertBatch::Inserted { content_digest, previous }) if watched.baseline.is_ok() => {
+                    let task = Task::new(Arc::clone(&watched), record(&content_digest), previous, place)?;
+                    Ok(Begun::Computed(Box::new(self.compute(task).await?)))
+                }
+                _ => Ok(Begun::Not(place)),
+            }
+        };
+        let (inserted, begun) = tokio::join!(insert, compute);
+        match inserted? {
+            InsertBatch::Inserted { content_digest, .. } => {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
                 // What was stored, without reading all of it back.
-                let state = BatchState::Received;
-                (BatchRecord { batch_id, batch, content_digest, received_at, state, failure: None }, Some(previous))
+                let record = record(&content_digest);
+                let stands = match begun {
+                    Ok(Begun::Computed(computed)) => self.finish_computed(*computed).await,
+                    Ok(Begun::Not(_)) => {
+                        self.tell_batch(&structure, &batch_id, record.state);
+                        return Ok(Ingested { view: self.view(record).await?, replayed: false });
+                    }
+                    Err(failure) => Err(failure),
+                };
+                let view = match self.or_resumed(&structure, stands)? {
+                    Some((assessment, charts)) => {
+                        let record = BatchRecord { state: BatchState::Assessed, ..record };
+                        self.view_of(record, Some(assessment), charts).await?
+                    }
+                    None => self.batch(&structure, &batch_id).await?,
+                };
+                Ok(Ingested { view, replayed: false })
             }
-            InsertBatch::Replayed(id) => (self.stored(&structure, &id).await?, None),
-            InsertBatch::KeyConflict { batch_id } => return Err(Error::KeyConflict { batch: batch_id }),
+            InsertBatch::Replayed(id) => {
+                let record = self.stored(&structure, &id).await?;
+                if let (BatchState::Received, true, Ok(Begun::Not(place))) =
+                    (record.state, watched.baseline.is_ok(), begun)
+                {
+                    let stands = async { self.finish(self.task(watched, record, place).await?).await }.await;
+                    self.or_resumed(&structure, stands)?;
+                    return Ok(Ingested { view: self.batch(&structure, &id).await?, replayed: true });
+                }
+                Ok(Ingested { view: self.view(record).await?, replayed: true })
+            }
+            InsertBatch::KeyConflict { batch_id } => Err(Error::KeyConflict { batch: batch_id }),
             InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
-                return Err(Error::MeasurementConflict { ordinal, measured_at, batch: batch_id });
+                Err(Error::MeasurementConflict { ordinal, measured_at, batch: batch_id })
             }
-        };
-        let replayed = previous.is_none();
-        if record.state != BatchState::Received || watched.baseline.is_err() {
-            if !replayed {
-                self.tell_batch(&structure, &record.batch_id, record.state);
-            }
-            return Ok(Ingested { view: self.view(record).await?, replayed });
         }
-        let task = match previous {
-            Some(previous) => Task::new(watched, record.clone(), previous, place),
-            None => self.task(watched, record.clone(), place).await,
-        };
-        let stands = match async { self.finish(task?).await }.await {
-            Ok(stands) => stands,
-            Err(failure) => {
-                // The batch is stored, and whoever sent it may not send it again.
-                self.resume_until_done(structure);
-                return Err(failure);
-            }
-        };
-        let view = match stands {
-            // What was stored, without reading it back.
-            Some((assessment, charts)) if !replayed => {
-                let record = BatchRecord { state: BatchState::Assessed, ..record };
-                self.view_of(record, Some(assessment), charts).await?
-            }
-            _ => self.batch(&structure, &record.batch_id).await?,
-        };
-        Ok(Ingested { view, replayed })
+    }
+
+    /// The result of a stored batch. Where there is none, the batch is tried again later: whoever sent it may not send it again.
+    fn or_resumed<T>(&self, structure: &StructureId, result: Result<T, Error>) -> Result<T, Error> {
+        result.inspect_err(|_| self.resume_until_done(structure.clone()))
     }
 
     /// One batch with its current assessment.

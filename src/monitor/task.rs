@@ -83,12 +83,20 @@ impl Monitor {
     /// Goes on with a task until its result stands: the assessment with the points of the batch on the charts, as they were
     /// stored; `None` where the reason why there is none was.
     pub(super) async fn finish(&self, task: Task) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
-        let mut task = task;
+        let computed = self.compute(task).await?;
+        self.finish_computed(computed).await
+    }
+
+    /// The rest of [`Self::finish`].
+    pub(super) async fn finish_computed(
+        &self,
+        computed: Computed,
+    ) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
+        let mut computed = computed;
         loop {
-            let computed = self.compute(task).await?;
             let stored = self.store_computed(computed).await?;
-            task = match self.settle(stored).await? {
-                Settled::GoOn(task) => task,
+            computed = match self.settle(stored).await? {
+                Settled::GoOn(task) => self.compute(task).await?,
                 Settled::Stands(assessment, charts) => return Ok(Some((*assessment, charts))),
                 Settled::Without => return Ok(None),
             };

@@ -21,7 +21,7 @@ use crate::store::{Delivery, DeliveryState, Error, Settlement, WebhookRecord};
 const LONGEST_WAIT: Duration = Duration::from_mins(1);
 
 /// Shortest time between two looks: a burst of batches is one look.
-const SHORTEST_WAIT: Duration = Duration::from_millis(20);
+const SHORTEST_WAIT: Duration = Duration::from_millis(200);
 
 /// Pause after the store failed. What was sent and could not be noted is sent again, so not at once.
 const PAUSE_AFTER_FAILURE: Duration = Duration::from_secs(10);

@@ -4,6 +4,7 @@ use std::future::Future;
 
 use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
+use tokio::sync::oneshot;
 
 use super::rows::{parts, InsertStatements};
 use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
@@ -89,18 +90,35 @@ impl Store {
         batch_id: &str,
         received_at: Timestamp,
     ) -> Result<InsertBatch, Error> {
+        let (foreseen, _) = oneshot::channel();
+        self.insert_batch_foreseen(batch, batch_id, received_at, foreseen).await
+    }
+
+    /// As [`Self::insert_batch`]; what will become of the batch if nothing fails is `foreseen` before it is on the disk, for what
+    /// can be begun meanwhile.
+    ///
+    /// # Errors
+    /// As [`Self::insert_batch`].
+    pub fn insert_batch_foreseen(
+        &self,
+        batch: &MeasurementBatch,
+        batch_id: &str,
+        received_at: Timestamp,
+        foreseen: oneshot::Sender<InsertBatch>,
+    ) -> impl Future<Output = Result<InsertBatch, Error>> + Send + 'static {
         let (batch, id) = (batch.clone(), batch_id.to_owned());
         self.write(move |connection| {
             Box::pin(async move {
                 let digest = batch.content_digest();
                 let found = find_stored(connection, &batch, digest).await?;
+                // Nobody may wait for it.
+                let _ = foreseen.send(found.clone());
                 if let InsertBatch::Inserted { content_digest, .. } = &found {
                     insert(connection, &batch, content_digest, &id, received_at).await?;
                 }
                 Ok(found)
             })
         })
-        .await
     }
 
     /// One batch with its measurements.

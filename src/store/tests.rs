@@ -213,6 +213,24 @@ async fn a_known_key_decides_and_then_the_measurements() {
 }
 
 #[tokio::test]
+async fn what_is_foreseen_of_a_batch_holds_only_when_it_is_on_the_disk() {
+    let (store, _folder) = open().await;
+    let given = batch("s", 0, None);
+    let faults = crate::fault::Faults::arm();
+    faults.set("store::commit", "1*return");
+    let (foreseen, outcome) = tokio::sync::oneshot::channel();
+    let inserted = store.insert_batch_foreseen(&given, "b", at(0), foreseen).await;
+    assert!(matches!(outcome.await, Ok(InsertBatch::Inserted { .. })), "it was told before the commit");
+    assert!(inserted.is_err());
+    assert_eq!(store.batch(&bridge(), "b").await.unwrap(), None);
+    faults.clear("store::commit");
+    let (foreseen, outcome) = tokio::sync::oneshot::channel();
+    let inserted = store.insert_batch_foreseen(&given, "b", at(0), foreseen).await.unwrap();
+    assert_eq!(outcome.await.unwrap(), inserted);
+    assert_eq!(store.batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
+}
+
+#[tokio::test]
 async fn a_comparison_under_an_earlier_baseline_does_not_keep_a_batch_from_the_next() {
     let (store, _folder) = open().await;
     for id in ["b0", "b1"] {
