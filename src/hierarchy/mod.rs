@@ -314,9 +314,8 @@ pub fn proposals(
                 points.push(parameters[k].from_unit(position.clamp(0.0, 1.0)));
             }
             let squared: f64 = stretched.iter().map(|z| z * z).sum();
-            // Right to 3e-7 of itself, which is far more than its use needs.
-            let power = |width: &f64| f64::from(stats::exp_f32((-0.5 * squared / (width * width)) as f32));
-            let density: f64 = WIDTHS.iter().zip(volumes).map(|(width, volume)| volume * power(width)).sum();
+            let density = |(width, volume): (&f64, f64)| volume * (-0.5 * squared / (width * width)).exp();
+            let density: f64 = WIDTHS.iter().zip(volumes).map(density).sum();
             // Beyond the prior nothing is possible.
             log_density.push(if inside { density.ln() - log_volume } else { IMPOSSIBLE });
         }
