@@ -16,7 +16,8 @@ use crate::trust::{Code, Effect};
 /// Degrees of freedom beyond which the undamaged standard deviation counts as known.
 const MANY_DEGREES: usize = 2_000;
 
-/// Limits found so far, by degrees of freedom and number of charts: simulating them keeps all cores busy for 40 ms, which batches behind would wait.
+/// Limits found so far, by degrees of freedom and number of charts: simulating them keeps all cores busy for some hundredths of a
+/// second, and batches would wait for them.
 #[derive(Default)]
 pub struct KnownLimits {
     found: Mutex<HashMap<(usize, usize), LimitCurve>>,
