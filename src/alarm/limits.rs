@@ -74,9 +74,12 @@ impl LimitCurve {
         let wanted = settings.mean_run_batches * wanted_charts as f64 / charts as f64;
         let longest = (EARLY * wanted).ceil().max(1.0) as usize;
         let operations = (BATCHES / (longest * charts)).clamp(300, MOST_OPERATIONS);
+        // √ρ and √(1 − ρ).
+        let angle = |node: usize| node as f64 / (NODES - 1) as f64 * FRAC_PI_2;
+        let shares: [(f64, f64); NODES] = std::array::from_fn(|node| angle(node).sin_cos());
         let one = |operation: usize| {
             let mut stream = stats::stream(operation as u64, "healthy operation");
-            records(degrees_of_freedom, charts, settings, longest, &mut stream)
+            records(&shares, degrees_of_freedom, charts, settings, longest, &mut stream)
         };
         let records: Vec<Records> = (0..operations).into_par_iter().map(one).collect();
         let share = |wanted: f64| 1.0 - (-(longest as f64) / wanted).exp();
@@ -139,6 +142,7 @@ struct Records {
 }
 
 fn records(
+    shares: &[(f64, f64); NODES],
     degrees_of_freedom: usize,
     charts: usize,
     settings: &AlarmSettings,
@@ -152,8 +156,7 @@ fn records(
         let e: f64 = stream.sample(StandardNormal);
         let s = (stream.sample(chi_squared) / degrees).sqrt();
         // z = shared + own·ε; in single precision, of which the vectors hold twice as many.
-        let angle: [f64; NODES] = std::array::from_fn(|node| node as f64 / (NODES - 1) as f64 * FRAC_PI_2);
-        let (shared, own) = (angle.map(|a| (a.sin() * e / s) as f32), angle.map(|a| (a.cos() / s) as f32));
+        let (shared, own) = (shares.map(|(sin, _)| (sin * e / s) as f32), shares.map(|(_, cos)| (cos / s) as f32));
         let (mut average, mut largest) = ([0.0_f32; NODES], [f32::NEG_INFINITY; NODES]);
         let (weight, keep) = (settings.ewma_weight as f32, 1.0 - settings.ewma_weight as f32);
         // k of m above a limit: the k-th largest of the window is, and the newest with it. Larger ε is larger z.

@@ -8,7 +8,7 @@ use nalgebra::DMatrix;
 use serde::Serialize;
 
 use super::{named_numbers, write_whole};
-use crate::alarm::chart::standard_error;
+use crate::alarm::chart::{shared, standard_error};
 use crate::alarm::detection::{detection, Detection};
 use crate::alarm::limits::{limits, Limits, Situation};
 use crate::alarm::AlarmSettings;
@@ -130,7 +130,7 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     };
     let error = |k: usize| standard_error(&reference(k), noise_std[k].powi(2), args.measurements);
     // The same for all: batch and undamaged state have the same noise.
-    let shared = 1.0 / (1.0 + args.baseline as f64 / args.measurements as f64);
+    let shared = shared(&reference(watched[0]), noise_std[watched[0]].powi(2), args.measurements);
     let situation = Situation { shared, degrees_of_freedom: args.baseline - 1, charts: watched.len() };
     let limits = limits(situation, &settings);
     let found = detection(situation, &limits, &settings, args.within, args.seed);

@@ -416,10 +416,10 @@ impl Monitor {
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
         let (foreseen, outcome) = oneshot::channel();
         let insert = self.store.insert_batch_foreseen(&batch, &batch_id, received_at, foreseen);
-        let record = |content_digest: &Digest| BatchRecord {
+        let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
             batch_id: batch_id.clone(),
-            batch: batch.clone(),
-            content_digest: content_digest.clone(),
+            batch,
+            content_digest,
             received_at,
             state: BatchState::Received,
             failure: None,
@@ -428,7 +428,7 @@ impl Monitor {
         let compute = async {
             match outcome.await {
                 Ok(InsertBatch::Inserted { content_digest, previous }) if watched.baseline.is_ok() => {
-                    let task = Task::new(Arc::clone(&watched), record(&content_digest), previous, place)?;
+                    let task = Task::new(Arc::clone(&watched), record(batch.clone(), content_digest), previous, place)?;
                     Ok(Begun::Computed(Box::new(self.compute(task).await?)))
                 }
                 _ => Ok(Begun::Not(place)),
@@ -440,7 +440,7 @@ impl Monitor {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
                 // What was stored, without reading all of it back.
-                let record = record(&content_digest);
+                let record = record(batch, content_digest);
                 let stands = match begun {
                     Ok(Begun::Computed(computed)) => self.finish_computed(*computed).await,
                     Ok(Begun::Not(_)) => {
