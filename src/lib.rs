@@ -71,7 +71,8 @@
 //!   frequencies, AIAA Journal 26, 361–366, doi:10.2514/3.9897. Derivatives of eigenvalues.
 //! - D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
 //!   2166–2175. Populations from posterior samples. A. Gelman (2006), Prior distributions for variance parameters in
-//!   hierarchical models, Bayesian Analysis 1, 515–533. The prior of their spread.
+//!   hierarchical models, Bayesian Analysis 1, 515–533. The prior of their spread. T. A. Louis (1982), Finding the observed
+//!   information matrix when using the EM algorithm, J. R. Stat. Soc. B 44, 226–233. Where their draws are looked for.
 //! - S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
 //!   arXiv:1804.06788; P. Lemos et al. (2023), Sampling-based accuracy testing of posterior estimators for general
 //!   inference, ICML. Ranks and TARP.

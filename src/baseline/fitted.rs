@@ -49,7 +49,7 @@ impl Baseline {
         for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
             let located = self.locate(part)?;
             let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
-            let (x, own) = self.flow.sample(&context, draws, &mut stream)?;
+            let (x, own) = self.draw_from_flow(&context, draws, &mut stream)?;
             let x = x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?;
             log_density.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
             let drawn = x.chunks_exact(d * draws).zip(&located).enumerate();

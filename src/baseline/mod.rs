@@ -17,6 +17,7 @@ use nalgebra::{DMatrix, DVector};
 use rand::RngCore as _;
 use rayon::prelude::*;
 
+use crate::flow::sampler::Sampler;
 use crate::flow::{checkpoint, Flow};
 use crate::measurement::shape::unit_shape;
 use crate::measurement::ModalMeasurement;
@@ -24,7 +25,7 @@ use crate::parameter::{Parameter, ParameterSpace};
 use crate::posterior::PosteriorSamples;
 use crate::quantity::{Digest, Hertz};
 use crate::simulator::Simulator;
-use crate::stats;
+use crate::stats::{self, Stream};
 use identifiability::Group;
 use manifest::{Manifest, SelfTest, Whitening};
 use observation::{Admitted, Encoder, Observation};
@@ -135,6 +136,8 @@ pub enum InferenceError {
 /// A flow with its standardisers, its structure and its record.
 pub struct Baseline {
     flow: Flow,
+    /// The flow's weights as draws need them; `None` where they are not single precision.
+    sampler: Option<Sampler>,
     encoder: Encoder,
     simulator: Simulator,
     /// The box it was trained in, which its real line stands for.
@@ -196,8 +199,10 @@ impl Baseline {
             return Err(LoadError::Shape { what, found, expected });
         }
         let flow = checkpoint::from_bytes(weights, &manifest.architecture, DType::F32)?;
+        let sampler = Sampler::new(&flow).map_err(checkpoint::Error::from)?;
         let baseline = Self {
             flow,
+            sampler,
             encoder: Encoder::new(&manifest.whitening, &manifest.conditions),
             training_space: training_space(simulator.space(), &manifest.conditions),
             simulator: simulator.clone(),
@@ -224,8 +229,33 @@ impl Baseline {
         draws: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
+        self.infer_from(observations, draws, PROPOSALS, seed)
+    }
+
+    /// As [`Self::infer`], in nearly half the time: where the simulation weighs the draws, the flow makes but as many as are kept,
+    /// and those of much weight come repeatedly.
+    ///
+    /// # Errors
+    /// As [`Self::infer`].
+    pub fn infer_with_repeats(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        seed: u64,
+    ) -> Result<PosteriorSamples, InferenceError> {
+        self.infer_from(observations, draws, 1, seed)
+    }
+
+    /// As [`Self::infer`], from so many proposals for each draw.
+    fn infer_from(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        proposals: usize,
+        seed: u64,
+    ) -> Result<PosteriorSamples, InferenceError> {
         if observations.iter().all(|o| o.possible_sizes.is_empty()) {
-            return self.infer_known(observations, draws, seed);
+            return self.infer_known(observations, draws, proposals, seed);
         }
         let (mut known, mut blind): (Vec<usize>, Vec<usize>) = (Vec::new(), Vec::new());
         for (row, observation) in observations.iter().enumerate() {
@@ -235,7 +265,7 @@ impl Baseline {
         let mut simulations = 0;
         let of_known: Vec<Observation> = known.iter().map(|row| observations[*row].clone()).collect();
         if !known.is_empty() {
-            let samples = self.infer_known(&of_known, draws, seed)?;
+            let samples = self.infer_known(&of_known, draws, proposals, seed)?;
             simulations += samples.simulations();
             for (place, row) in known.iter().enumerate() {
                 for draw in 0..draws {
@@ -250,7 +280,7 @@ impl Baseline {
             let each = draws.div_ceil(values.min(draws.max(1)));
             let expanded: Vec<Observation> =
                 rows.iter().flat_map(|row| at_possible_sizes(&observations[*row])).collect();
-            let samples = self.infer_known(&expanded, each, seed)?;
+            let samples = self.infer_known(&expanded, each, proposals, seed)?;
             simulations += samples.simulations();
             let mut first = 0;
             for row in rows {
@@ -273,13 +303,14 @@ impl Baseline {
         &self,
         observations: &[Observation],
         draws: usize,
+        proposals: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
         if self.starts_at_fit() {
             return Ok(PosteriorSamples::new(self.propose_from_fit(observations, draws, seed)?.theta, draws));
         }
         if self.is_weighed() {
-            let proposals = self.propose(observations, PROPOSALS * draws, seed)?;
+            let proposals = self.propose(observations, proposals * draws, seed)?;
             let theta = resample::resample(&self.simulator, observations, &proposals, draws, seed);
             return Ok(PosteriorSamples::new(theta, draws).after(proposals.theta.nrows()));
         }
@@ -348,7 +379,7 @@ impl Baseline {
             let (mut real, mut log_q) = (Vec::new(), Vec::new());
             for part in pending.chunks((ROWS_AT_A_TIME / count).max(1)) {
                 let rows = Tensor::from_slice(part, part.len(), &Device::Cpu)?;
-                let (x, own) = self.flow.sample(&context.index_select(&rows, 0)?, count, &mut stream)?;
+                let (x, own) = self.draw_from_flow(&context.index_select(&rows, 0)?, count, &mut stream)?;
                 real.extend(x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?);
                 log_q.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
             }
@@ -447,7 +478,7 @@ impl Baseline {
             return self.log_density_from_fit(theta, observations);
         }
         let context = self.flow.summarise(&self.condition(observations)?)?;
-        let (drawn, _) = self.flow.sample(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
+        let (drawn, _) = self.draw_from_flow(&context, SHARE_DRAWS, &mut stats::stream(0, "share inside the prior"))?;
         let drawn = drawn.to_dtype(DType::F64)?.to_vec2::<f64>()?;
         let inside = |values: &&Vec<f64>| {
             let pairs = values.iter().zip(self.training_space.iter().zip(self.space()));
@@ -550,6 +581,19 @@ impl Baseline {
     /// SHA-256 of the manifest file, which holds that of the weights: the name of this baseline in every result.
     pub fn digest(&self) -> &Digest {
         &self.digest
+    }
+
+    /// As [`Flow::sample`], by the sampler that is kept.
+    fn draw_from_flow(
+        &self,
+        context: &Tensor,
+        draws: usize,
+        stream: &mut Stream,
+    ) -> Result<(Tensor, Tensor), candle_core::Error> {
+        match &self.sampler {
+            Some(sampler) => sampler.sample(context, draws, stream),
+            None => self.flow.sample(context, draws, stream),
+        }
     }
 
     fn condition(&self, observations: &[Observation]) -> Result<Tensor, InferenceError> {

@@ -1,8 +1,6 @@
 //! Draws of a flow set right by the simulation: sampling, importance, resampling.
 
 use nalgebra::DMatrix;
-use rand::seq::SliceRandom as _;
-use rand::Rng as _;
 use rayon::prelude::*;
 
 use super::observation::Observation;
@@ -65,7 +63,9 @@ pub(super) fn resample(
         let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
         let mut stream = stats::stream(seed, &format!("resampling {row}"));
         match weights(&log_weights) {
-            Some(weights) => systematic(&weights, draws, &mut stream).into_iter().map(|i| rows.start + i).collect(),
+            Some(weights) => {
+                stats::systematic(&weights, draws, &mut stream).into_iter().map(|i| rows.start + i).collect()
+            }
             None => rows.take(draws).collect(),
         }
     };
@@ -106,44 +106,12 @@ fn weights(log_weights: &[f64]) -> Option<Vec<f64>> {
         return None;
     }
     let weights: Vec<f64> = log_weights.iter().map(|w| (w - largest).exp()).collect();
-    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
-    (sum * sum / squares >= EFFECTIVE * weights.len() as f64).then_some(weights)
-}
-
-/// `draws` indices, each as often as its weight says to within one, in random order.
-fn systematic(weights: &[f64], draws: usize, stream: &mut stats::Stream) -> Vec<usize> {
-    let step = weights.iter().sum::<f64>() / draws as f64;
-    let offset: f64 = stream.random();
-    let (mut index, mut passed) = (0, 0.0);
-    let mut chosen: Vec<usize> = (0..draws)
-        .map(|draw| {
-            let target = (draw as f64 + offset) * step;
-            while index + 1 < weights.len() && passed + weights[index] <= target {
-                passed += weights[index];
-                index += 1;
-            }
-            index
-        })
-        .collect();
-    chosen.shuffle(stream);
-    chosen
+    (stats::effective_sample_size(&weights) >= EFFECTIVE * weights.len() as f64).then_some(weights)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn systematic_draws_come_as_often_as_their_weights_say() {
-        let weights = [0.5, 0.0, 2.0, 1.0, 0.5];
-        for seed in 0..20 {
-            let chosen = systematic(&weights, 400, &mut stats::stream(seed, "test"));
-            for (index, weight) in weights.iter().enumerate() {
-                let count = chosen.iter().filter(|i| **i == index).count() as f64;
-                assert!((count - 100.0 * weight).abs() <= 1.0, "{index}: {count}");
-            }
-        }
-    }
 
     #[test]
     fn weights_count_only_where_they_leave_half_of_the_draws() {

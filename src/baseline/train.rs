@@ -13,6 +13,7 @@ use super::manifest::{
 use super::observation::{measure, measure_shapes, Encoder, Observation};
 use super::start::starts_at_fit;
 use super::{to_real_line, Baseline, InferenceError};
+use crate::flow::sampler::Sampler;
 use crate::flow::train::{EpochReport, Pairs, Stopped, TrainSettings};
 use crate::flow::{checkpoint, weights, FlowSettings};
 use crate::quantity::Digest;
@@ -205,6 +206,7 @@ pub fn train(
         },
     };
     let draft = Baseline {
+        sampler: Sampler::new(&flow)?,
         flow,
         encoder,
         training_space: space,

@@ -3,8 +3,7 @@
 //! The body of a loop is compiled once for each width of vectors (`pulp::with_simd`), and what the processor has is chosen at
 //! its call; a closure would not do, since what is not inlined is compiled for the least of them.
 //!
-//! A tile is a slice of single-precision numbers, column by column; a column is one row of the batch, or one draw. Weights
-//! lie row by row, as in candle's tensors and in the weight files.
+//! A tile is a slice of single-precision numbers, column by column; a column is one row of the batch, or one draw.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par};
@@ -14,8 +13,8 @@ use crate::stats::{exp_f32, reciprocal_f32};
 /// W and b of a dense layer where they lie.
 #[derive(Clone, Copy)]
 pub(super) struct Layer<'a> {
-    /// W, `outputs × inputs`, row by row.
-    pub weight: &'a [f32],
+    /// W, `outputs × inputs`. Column by column it is multiplied as it lies; row by row it is copied for each product.
+    pub weight: MatRef<'a, f32>,
     /// b.
     pub bias: &'a [f32],
 }
@@ -26,7 +25,7 @@ impl Layer<'_> {
     }
 
     pub(super) fn inputs(&self) -> usize {
-        self.weight.len() / self.bias.len()
+        self.weight.ncols()
     }
 
     /// y = W·x, or y + W·x; the bias is left to the loop over the elements that follows.
@@ -43,19 +42,18 @@ impl Layer<'_> {
             return;
         }
         let count = y.len() / self.outputs();
-        let weight = MatRef::from_row_major_slice(self.weight, self.outputs(), self.inputs());
         let x = MatRef::from_column_major_slice(x, columns.len(), count);
         let y = MatMut::from_column_major_slice_mut(y, self.outputs(), count);
-        matmul(y, accumulation(add), weight.subcols(columns.start, columns.len()), x, 1.0, Par::Seq);
+        let weight = self.weight.subcols(columns.start, columns.len());
+        matmul(y, accumulation(add), weight, x, 1.0, Par::Seq);
     }
 
     /// Gradient of the layer's input from that of its product: dx = Wᵀ·dy.
     pub(super) fn input_gradient(&self, dy: &[f32], dx: &mut [f32]) {
         let count = dy.len() / self.outputs();
-        let transposed = MatRef::from_column_major_slice(self.weight, self.inputs(), self.outputs());
         let dy = MatRef::from_column_major_slice(dy, self.outputs(), count);
         let dx = MatMut::from_column_major_slice_mut(dx, self.inputs(), count);
-        matmul(dx, Accum::Replace, transposed, dy, 1.0, Par::Seq);
+        matmul(dx, Accum::Replace, self.weight.transpose(), dy, 1.0, Par::Seq);
     }
 }
 

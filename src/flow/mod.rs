@@ -30,6 +30,7 @@ use crate::stats::Stream;
 use context::ContextNetwork;
 use coupling::CouplingUnit;
 use permutation::Permutation;
+use sampler::Sampler;
 
 /// Size of a flow; part of the manifest, since it fixes the shapes of all weights.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -189,21 +190,18 @@ impl Flow {
     /// `draws` samples of x for each row of `context`, S(y) `[n, context]`, in the order of the rows: `[n·draws, d]`; and the
     /// log-density of each, nats, `[n·draws]`.
     ///
+    /// Reads all weights first; a [`Sampler`] that is kept draws the same without.
+    ///
     /// # Errors
     /// A candle error when the shape of `context` is another.
     pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<(Tensor, Tensor)> {
+        if let Some(sampler) = Sampler::new(self)? {
+            return sampler.sample(context, draws, stream);
+        }
         let (rows, features) = context.dims2()?;
-        let d = self.architecture.parameters;
-        let z = standard_normal(rows * draws, d, stream).to_dtype(self.dtype)?;
-        let (x, log_det) = if let Some(sampler) = sampler::Sampler::new(self)? {
-            let context = context.flatten_all()?.to_vec1()?;
-            let mut values = z.flatten_all()?.to_vec1()?;
-            let log_det = Tensor::new(sampler.inverse(&mut values, &context, features), &Device::Cpu)?;
-            (Tensor::from_vec(values, (rows * draws, d), &Device::Cpu)?, log_det)
-        } else {
-            let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?;
-            self.inverse(&z, &repeated.reshape((rows * draws, features))?)?
-        };
+        let z = standard_normal(rows * draws, self.architecture.parameters, stream).to_dtype(self.dtype)?;
+        let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?;
+        let (x, log_det) = self.inverse(&z, &repeated.reshape((rows * draws, features))?)?;
         Ok((x, log_density(&z, &log_det)?))
     }
 }

@@ -6,18 +6,20 @@
 
 use std::ops::Range;
 
-use candle_core::{DType, Result};
+use candle_core::{DType, Device, Result, Tensor};
+use faer::MatRef;
 use rayon::prelude::*;
 
 use super::coupling::Subnet;
 use super::dense::Dense;
 use super::kernel::{add_bias_and_silu, bounded_scales, Layer};
-use super::Flow;
+use super::{log_density, standard_normal, Flow};
+use crate::stats::Stream;
 
 /// Draws that pass the flow together: with width 64, the buffers of a tile fill half of a core's first-level cache.
 const TILE: usize = 64;
 
-/// The weights of a flow as plain numbers, read once for a call.
+/// The weights of a flow as plain numbers: of one that is not trained any more.
 pub struct Sampler {
     dimensions: usize,
     units: Vec<Unit>,
@@ -35,10 +37,16 @@ struct Unit {
 struct Net {
     passive: Range<usize>,
     active: Range<usize>,
-    input: (Vec<f32>, Vec<f32>),
-    hidden: (Vec<f32>, Vec<f32>),
-    output: (Vec<f32>, Vec<f32>),
+    input: Plain,
+    hidden: Plain,
+    output: Plain,
     clamp: f32,
+}
+
+/// Weight, column by column, and bias of a layer.
+struct Plain {
+    weight: Vec<f32>,
+    bias: Vec<f32>,
 }
 
 /// What a tile writes on its way.
@@ -75,6 +83,20 @@ impl Sampler {
         Ok(Some(Self { dimensions, units }))
     }
 
+    /// As [`Flow::sample`].
+    ///
+    /// # Errors
+    /// A candle error when the shape of `context` is another.
+    pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<(Tensor, Tensor)> {
+        let (rows, features) = context.dims2()?;
+        let z = standard_normal(rows * draws, self.dimensions, stream).to_dtype(DType::F32)?;
+        let context = context.flatten_all()?.to_vec1()?;
+        let mut values = z.flatten_all()?.to_vec1()?;
+        let log_det = Tensor::new(self.inverse(&mut values, &context, features), &Device::Cpu)?;
+        let x = Tensor::from_vec(values, (rows * draws, self.dimensions), &Device::Cpu)?;
+        Ok((x, log_density(&z, &log_det)?))
+    }
+
     /// z to x in place, and log|det ∂z/∂x| of each draw.
     ///
     /// `values`: the d numbers of each draw one after another; `context`: S(y) of each measurement one after another, each
@@ -108,7 +130,7 @@ impl Sampler {
 
     fn buffers(&self) -> Buffers {
         let nets = self.units.iter().flat_map(|unit| &unit.nets);
-        let width = nets.map(|net| net.hidden.1.len()).max().unwrap_or(0);
+        let width = nets.map(|net| net.hidden.bias.len()).max().unwrap_or(0);
         let buffer = |rows: usize| vec![0.0; rows * TILE];
         Buffers {
             of_context: buffer(width),
@@ -127,9 +149,9 @@ impl Net {
         Ok(Self {
             passive,
             active,
-            input: plain(subnet.input())?,
-            hidden: plain(subnet.hidden())?,
-            output: plain(subnet.output())?,
+            input: Plain::new(subnet.input())?,
+            hidden: Plain::new(subnet.hidden())?,
+            output: Plain::new(subnet.output())?,
             clamp: subnet.clamp() as f32,
         })
     }
@@ -144,9 +166,7 @@ impl Net {
         log_det: &mut [f32],
         buffers: &mut Buffers,
     ) {
-        let layer = |(weight, bias)| Layer { weight, bias };
-        let [input, hidden, output] =
-            [&self.input, &self.hidden, &self.output].map(|(weight, bias)| layer((weight.as_slice(), bias.as_slice())));
+        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(Plain::layer);
         let (count, width) = (log_det.len(), input.outputs());
         let (dimensions, passive, active) = (state.len() / count, self.passive.len(), self.active.len());
         let measurements = context.len() / (input.inputs() - passive);
@@ -189,7 +209,15 @@ impl Net {
     }
 }
 
-/// Weight, row by row, and bias of a layer.
-fn plain(layer: &Dense) -> Result<(Vec<f32>, Vec<f32>)> {
-    Ok((layer.weight().flatten_all()?.to_vec1()?, layer.bias().to_vec1()?))
+impl Plain {
+    fn new(layer: &Dense) -> Result<Self> {
+        let weight = layer.weight().t()?.flatten_all()?.to_vec1()?;
+        Ok(Self { weight, bias: layer.bias().to_vec1()? })
+    }
+
+    fn layer(&self) -> Layer<'_> {
+        let outputs = self.bias.len();
+        let weight = MatRef::from_column_major_slice(&self.weight, outputs, self.weight.len() / outputs);
+        Layer { weight, bias: &self.bias }
+    }
 }

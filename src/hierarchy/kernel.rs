@@ -51,8 +51,10 @@ const NEAR_ENOUGH: std::ops::RangeInclusive<f32> = 1e-12..=1e12;
 pub(super) struct Terms<'a> {
     /// Logarithms to base 2 that the terms are added to, one entry a sample.
     pub to: &'a [Lanes],
-    /// x of each parameter.
-    pub deviations: &'a [&'a [Lanes]],
+    /// x of each parameter, one entry a sample.
+    pub deviations: &'a [Vec<Lanes>],
+    /// Where the samples stand among those of all blocks.
+    pub places: Range<usize>,
     /// Of each parameter: −1/2σ², times log₂ e.
     pub squares: &'a [f32],
     /// Of each parameter: (μ − c)/σ², c the centre, times log₂ e.
@@ -73,12 +75,12 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
 ) -> Weighed {
     for (k, some) in terms.deviations.chunks(TOGETHER).enumerate() {
         let (squares, linears) = (&terms.squares[TOGETHER * k..], &terms.linears[TOGETHER * k..]);
-        let to = (k == 0).then_some(terms.to);
-        match *some {
-            [a] => add_terms(simd, logarithms, to, [a], squares, linears),
-            [a, b] => add_terms(simd, logarithms, to, [a, b], squares, linears),
-            [a, b, c] => add_terms(simd, logarithms, to, [a, b, c], squares, linears),
-            [a, b, c, d] => add_terms(simd, logarithms, to, [a, b, c, d], squares, linears),
+        let (to, places) = ((k == 0).then_some(terms.to), &terms.places);
+        match some {
+            [a] => add_terms(simd, logarithms, to, [a], places, squares, linears),
+            [a, b] => add_terms(simd, logarithms, to, [a, b], places, squares, linears),
+            [a, b, c] => add_terms(simd, logarithms, to, [a, b, c], places, squares, linears),
+            [a, b, c, d] => add_terms(simd, logarithms, to, [a, b, c, d], places, squares, linears),
             _ => unreachable!("chunks are no longer"),
         }
     }
@@ -138,12 +140,13 @@ fn add_terms<S: pulp::Simd, const K: usize>(
     simd: S,
     logarithms: &mut [Lanes],
     to: Option<&[Lanes]>,
-    deviations: [&[Lanes]; K],
+    deviations: [&Vec<Lanes>; K],
+    places: &Range<usize>,
     squares: &[f32],
     linears: &[Lanes],
 ) {
     // One length for all: what is read in the loop is known to be there.
-    let deviations = deviations.map(|x| &x[..logarithms.len()]);
+    let deviations = deviations.map(|x| &x[places.clone()][..logarithms.len()]);
     let to = to.map(|to| &to[..logarithms.len()]);
     for first in (0..LANES).step_by(S::F32_LANES) {
         let part = first..first + S::F32_LANES;
@@ -288,11 +291,13 @@ mod tests {
             let mut weights = vec![Lanes::ZERO; count];
             let square = (-0.5 * LOG2_E / (std * std)) as f32;
             let linear = lanes(&|lane| LOG2_E * off(lane) / (std * std));
-            let terms = Terms { to: &offsets, deviations: &[&deviations], squares: &[square], linears: &[linear] };
             let mut logarithms = weights.clone();
+            let columns = [deviations];
+            let terms =
+                Terms { to: &offsets, deviations: &columns, places: 0..count, squares: &[square], linears: &[linear] };
             // From a divisor that is far from near enough.
             let found = weigh(&mut weights, &mut logarithms, &terms, LANES, &Lanes([1e4; LANES]));
-            let moments = moments(&weights, &deviations);
+            let moments = moments(&weights, &columns[0]);
             let shares = 20_000_u32;
             let mut counts = vec![0.0; count * LANES];
             for i in 0..shares {
@@ -347,12 +352,12 @@ mod tests {
             let lanes = |f: &dyn Fn(usize) -> f64| -> Lanes { Lanes(std::array::from_fn(|lane| f(lane) as f32)) };
             let column = |k: usize| (0..7).map(|sample| lanes(&|lane| x(k, sample, lane))).collect::<Vec<_>>();
             let columns: Vec<Vec<Lanes>> = (0..parameters).map(column).collect();
-            let deviations: Vec<&[Lanes]> = columns.iter().map(Vec::as_slice).collect();
             let squares: Vec<f32> = (0..parameters).map(|k| square(k) as f32).collect();
             let linears: Vec<Lanes> = (0..parameters).map(|k| lanes(&|lane| linear(k, lane))).collect();
             // Two lanes each: eight measurements.
             let (mut weights, offsets) = (vec![Lanes::ZERO; 7], vec![Lanes::ZERO; 7]);
-            let terms = Terms { to: &offsets, deviations: &deviations, squares: &squares, linears: &linears };
+            let terms =
+                Terms { to: &offsets, deviations: &columns, places: 0..7, squares: &squares, linears: &linears };
             let mut logarithms = weights.clone();
             let found = weigh(&mut weights, &mut logarithms, &terms, 8, &Lanes([-100.0; LANES]));
             // Another divisor that is near enough stays, and divides.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use candle_core::{Device, Result, Tensor};
+use faer::MatRef;
 
 use crate::flow::kernel::Layer;
 use crate::flow::weights::Weights;
@@ -53,6 +54,8 @@ impl Layout {
 
 impl Place {
     pub(super) fn layer<'a>(&self, values: &'a [f32]) -> Layer<'a> {
-        Layer { weight: &values[self.weight.clone()], bias: &values[self.bias.clone()] }
+        // As in candle's tensors and in the weight files.
+        let weight = MatRef::from_row_major_slice(&values[self.weight.clone()], self.outputs, self.inputs);
+        Layer { weight, bias: &values[self.bias.clone()] }
     }
 }

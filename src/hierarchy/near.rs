@@ -1,0 +1,99 @@
+//! Samples near where the posterior of each measurement and the population behind the batch meet.
+
+use nalgebra::{DMatrix, DVector};
+use rand::Rng as _;
+use rayon::prelude::*;
+
+use super::problem::{unit_columns, within};
+use super::{Populations, WIDEST};
+use crate::parameter::ParameterSpace;
+use crate::posterior::PosteriorSamples;
+use crate::stats::{self, NormalQuantiles};
+
+/// Widths of the normal distributions that proposals come from, and the turns that eight proposals take among them: wide ones reach
+/// what a posterior has beyond its moments.
+const WIDTHS: [f64; 3] = [1.0, 1.6, 3.0];
+const TURNS: [usize; 8] = [0, 1, 0, 1, 0, 1, 0, 2];
+
+/// Samples near where posterior and population meet, for batches whose noise hides the spread: few samples of the posterior
+/// itself fall there. Returns them with the logarithm of their density in the unit box.
+///
+/// ```text
+///  r_j = Σ_w share_w N(x; c_j, w² C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
+/// ```
+///
+/// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them, its spread at least
+/// half that of one posterior. The points are of a scrambled Sobol' sequence, each measurement's its own, and take the widths
+/// in turn: they stand for an integral as well as several times as many random ones (Owen & Zhou 2000, Safe and effective
+/// importance sampling).
+pub fn proposals(
+    samples: &PosteriorSamples,
+    found: &Populations,
+    space: &ParameterSpace,
+    draws: usize,
+    seed: u64,
+) -> (PosteriorSamples, Vec<f64>) {
+    let (d, parameters) = (space.len(), space.as_slice());
+    let width = |k: usize| parameters[k].upper - parameters[k].lower;
+    let within = within(&unit_columns(samples, space), samples.draws());
+    let mean = DVector::from_fn(d, |k, _| parameters[k].to_unit(found.parameters[k].mean));
+    let precision = DMatrix::from_fn(d, d, |i, j| {
+        // A first estimate of nearly nothing must leave room to look for another.
+        let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(0.5 * within[i]).max(1e-6);
+        if i == j {
+            std.powi(-2)
+        } else {
+            0.0
+        }
+    });
+    let turn = |draw: usize| TURNS[draw % TURNS.len()];
+    // How many have each width, over its volume.
+    let volumes: [f64; WIDTHS.len()] = std::array::from_fn(|own| {
+        let count = (0..draws).filter(|draw| turn(*draw) == own).count();
+        count as f64 / draws as f64 / WIDTHS[own].powi(d as i32)
+    });
+    let quantiles = NormalQuantiles::shared();
+    let of_one = |(measurement, scrambling): (usize, u32)| {
+        let rows = measurement * samples.draws()..(measurement + 1) * samples.draws();
+        let unit = |row: usize, k: usize| parameters[k].to_unit(samples.theta()[(row, k)]);
+        let count = samples.draws() as f64;
+        let centre = DVector::from_fn(d, |k, _| rows.clone().map(|row| unit(row, k)).sum::<f64>() / count);
+        let deviations = DMatrix::from_fn(d, samples.draws(), |k, draw| unit(rows.start + draw, k) - centre[k]);
+        let covariance = DMatrix::identity(d, d) * 1e-12 + &deviations * deviations.transpose() / count;
+        let own = covariance.cholesky().map_or_else(|| DMatrix::identity(d, d) * 12.0, |c| c.inverse());
+        let together = (&own + &precision).cholesky().expect("a sum of positive definite matrices is one");
+        let (centre, covariance) = (together.solve(&(&own * &centre + &precision * &mean)), together.inverse());
+        let factor = covariance.cholesky().expect("the inverse of a positive definite matrix is one").unpack();
+        let log_volume: f64 = factor.diagonal().iter().map(|x| x.ln()).sum();
+        let (mut points, mut log_density) = (Vec::with_capacity(draws * d), Vec::with_capacity(draws));
+        let mut stretched = vec![0.0; d];
+        for draw in 0..draws {
+            // In the middle of its cell of 2⁻²⁴: no level is 0 or 1.
+            let level =
+                |k: usize| f64::from(sobol_burley::sample(draw as u32, k as u32, scrambling)) + 0.5_f64.powi(25);
+            for (k, stretched) in stretched.iter_mut().enumerate() {
+                *stretched = WIDTHS[turn(draw)] * quantiles.at(level(k));
+            }
+            let mut inside = true;
+            for k in 0..d {
+                let position = centre[k] + (0..=k).map(|l| factor[(k, l)] * stretched[l]).sum::<f64>();
+                inside &= (0.0..=1.0).contains(&position);
+                points.push(parameters[k].from_unit(position.clamp(0.0, 1.0)));
+            }
+            let squared: f64 = stretched.iter().map(|z| z * z).sum();
+            let density = |(width, volume): (&f64, f64)| volume * (-0.5 * squared / (width * width)).exp();
+            let density: f64 = WIDTHS.iter().zip(volumes).map(density).sum();
+            // Beyond the prior nothing is possible.
+            log_density.push(if inside { density.ln() - log_volume } else { IMPOSSIBLE });
+        }
+        (points, log_density)
+    };
+    let mut stream = stats::stream(seed, "population proposals");
+    let scramblings: Vec<u32> = (0..samples.measurements()).map(|_| stream.random()).collect();
+    let (points, log_density): (Vec<_>, Vec<_>) = scramblings.into_par_iter().enumerate().map(of_one).unzip();
+    let theta = DMatrix::from_row_iterator(samples.measurements() * draws, d, points.into_iter().flatten());
+    (PosteriorSamples::new(theta, draws), log_density.concat())
+}
+
+/// Logarithm of a density of a sample that counts for nothing.
+const IMPOSSIBLE: f64 = 1e9;
