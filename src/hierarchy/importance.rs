@@ -21,9 +21,11 @@ const AT_A_TIME: usize = 64;
 
 /// Widths that the points take in turns of eight, seven the first: the wide ones reach a tail that is longer than a normal one.
 const WIDTHS: [f64; 2] = [1.1, 2.5];
+
+/// Shares of the points that have them.
 const SHARES: [f64; 2] = [0.875, 0.125];
 
-/// Share of the points that the weights must leave effective.
+/// Share of the points that the weights must leave effective: the chain's 400 draws of a parameter that noise hides are worth fewer.
 const EFFECTIVE: f64 = 0.3;
 
 /// Fewest measurements: of fewer, σ has tails that no normal distribution of ln σ reaches, and the weights need not show it.
