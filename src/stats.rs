@@ -177,10 +177,16 @@ pub fn student_t_quantile(p: f64, degrees_of_freedom: usize) -> f64 {
     StudentsT::new(0.0, 1.0, nu).expect("scale and degrees of freedom are positive").inverse_cdf(p)
 }
 
-/// Effective number of weighed samples, (Σw)²/Σw².
-pub fn effective_sample_size(weights: &[f64]) -> f64 {
+/// Weights of these logarithms, the greatest 1; `None` where fewer than the share `effective` of the samples would count, by
+/// (Σw)²/Σw², or none has a weight.
+pub fn weights(log_weights: &[f64], effective: f64) -> Option<Vec<f64>> {
+    let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    if !largest.is_finite() {
+        return None;
+    }
+    let weights: Vec<f64> = log_weights.iter().map(|w| (w - largest).exp()).collect();
     let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
-    sum * sum / squares
+    (sum * sum / squares >= effective * weights.len() as f64).then_some(weights)
 }
 
 /// `draws` indices by systematic resampling: each as often as its weight says to within one, in random order.
@@ -280,5 +286,19 @@ mod tests {
             let found = NormalQuantiles::shared().at(p);
             assert!((found - normal_quantile(p)).abs() < 1e-5, "{p}: {found}");
         }
+    }
+
+    #[test]
+    fn weights_count_only_where_they_leave_half_of_the_draws() {
+        let usual = weights(&[0.0, 0.1, -0.1], 0.5).unwrap();
+        assert!((usual[1] / usual[2] - 0.2_f64.exp()).abs() < 1e-12);
+        // A few draws in a hump that is none weigh nothing, and change nothing for the others.
+        let mut leaked = vec![0.0; 98];
+        leaked.extend([-300.0, f64::NEG_INFINITY]);
+        let found = weights(&leaked, 0.5).unwrap();
+        assert!(found[..98].iter().all(|w| (w - 1.0).abs() < 1e-12) && found[98] < 1e-100 && found[99] <= 0.0);
+        let wild: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.3).collect();
+        assert!(weights(&wild, 0.5).is_none());
+        assert!(weights(&[f64::NEG_INFINITY; 3], 0.5).is_none());
     }
 }

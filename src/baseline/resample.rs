@@ -62,7 +62,7 @@ pub(super) fn resample(
         };
         let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
         let mut stream = stats::stream(seed, &format!("resampling {row}"));
-        match weights(&log_weights) {
+        match stats::weights(&log_weights, EFFECTIVE) {
             Some(weights) => {
                 stats::systematic(&weights, draws, &mut stream).into_iter().map(|i| rows.start + i).collect()
             }
@@ -97,33 +97,4 @@ fn log_likelihood(simulator: &Simulator, observation: &Observation, frequencies_
         measured.map_or(0.0, |y| -0.5 * ((y - f) / std_hz).powi(2) - std_hz.ln())
     };
     observation.frequencies_hz.iter().enumerate().map(one).sum()
-}
-
-/// Weights, the greatest 1; `None` where they would leave fewer than [`EFFECTIVE`] of the draws.
-fn weights(log_weights: &[f64]) -> Option<Vec<f64>> {
-    let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    if !largest.is_finite() {
-        return None;
-    }
-    let weights: Vec<f64> = log_weights.iter().map(|w| (w - largest).exp()).collect();
-    (stats::effective_sample_size(&weights) >= EFFECTIVE * weights.len() as f64).then_some(weights)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn weights_count_only_where_they_leave_half_of_the_draws() {
-        let usual = weights(&[0.0, 0.1, -0.1]).unwrap();
-        assert!((usual[1] / usual[2] - 0.2_f64.exp()).abs() < 1e-12);
-        // A few draws in a hump that is none weigh nothing, and change nothing for the others.
-        let mut leaked = vec![0.0; 98];
-        leaked.extend([-300.0, f64::NEG_INFINITY]);
-        let found = weights(&leaked).unwrap();
-        assert!(found[..98].iter().all(|w| (w - 1.0).abs() < 1e-12) && found[98] < 1e-100 && found[99] <= 0.0);
-        let wild: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.3).collect();
-        assert!(weights(&wild).is_none());
-        assert!(weights(&[f64::NEG_INFINITY; 3]).is_none());
-    }
 }

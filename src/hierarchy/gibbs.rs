@@ -70,7 +70,7 @@ impl Problem {
                 size * (1.0 + self.within[k] / state.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
             next.std[k] *= (ln_step * stream.sample::<f64, _>(StandardNormal)).exp();
             let threshold: f64 = stream.random();
-            if !(0.0..=1.0).contains(&next.mean[k]) || !(self.floor[k]..=WIDEST).contains(&next.std[k]) {
+            if !self.is_possible(&next, k) {
                 continue;
             }
             self.weigh_changed(k, (state, weights), &next, others);

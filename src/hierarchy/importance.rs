@@ -10,7 +10,8 @@ use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use super::problem::{Problem, State, Weights};
-use super::{DRAWS, WIDEST};
+use super::widths::Widths;
+use super::DRAWS;
 use crate::stats;
 
 /// Points that are weighed.
@@ -19,11 +20,9 @@ const POINTS: usize = 512;
 /// Points of one task.
 const AT_A_TIME: usize = 64;
 
-/// Widths that the points take in turns of eight, seven the first: the wide ones reach a tail that is longer than a normal one.
+/// Widths that the points have, and the turns that eight points take among them.
 const WIDTHS: [f64; 2] = [1.1, 2.5];
-
-/// Shares of the points that have them.
-const SHARES: [f64; 2] = [0.875, 0.125];
+const TURNS: [usize; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
 
 /// Share of the points that the weights must leave effective: the chain's 400 draws of a parameter that noise hides are worth fewer.
 const EFFECTIVE: f64 = 0.3;
@@ -50,8 +49,8 @@ pub(super) fn draws(problem: &Problem, point: &State, seed: u64) -> Option<Vec<S
     let centre = &covariance * (gradient + prior);
     let factor = covariance.cholesky()?.unpack();
     let mut stream = stats::stream(seed, "population draws");
-    let width = |place: usize| WIDTHS[usize::from(place % 8 == 7)];
-    let z = DMatrix::from_fn(2 * d, POINTS, |_, place| width(place) * stream.sample::<f64, _>(StandardNormal));
+    let widths = Widths::new(WIDTHS, TURNS, POINTS, 2 * d);
+    let z = DMatrix::from_fn(2 * d, POINTS, |_, place| widths.of(place) * stream.sample::<f64, _>(StandardNormal));
     let theta = &factor * &z;
     let state = |place: usize| {
         let (theta, centre) = (theta.column(place), &centre);
@@ -61,31 +60,20 @@ pub(super) fn draws(problem: &Problem, point: &State, seed: u64) -> Option<Vec<S
     };
     let log_weight = |room: &mut Weights, place: usize| {
         let state = state(place);
-        let inside =
-            |k: usize| (0.0..=1.0).contains(&state.mean[k]) && (problem.floor[k]..=WIDEST).contains(&state.std[k]);
-        if !(0..d).all(inside) {
+        if !(0..d).all(|k| problem.is_possible(&state, k)) {
             return f64::NEG_INFINITY;
         }
-        let squared = z.column(place).norm_squared();
-        let density =
-            |(width, share): (f64, f64)| share * (-0.5 * squared / (width * width)).exp() / width.powi(2 * d as i32);
-        let density: f64 = WIDTHS.into_iter().zip(SHARES).map(density).sum();
+        let log_density = widths.log_density(z.column(place).norm_squared());
         // From the same divisors whichever point was weighed before: the same bits however many threads there are.
         room.blocks.clone_from(&at_point.blocks);
         problem.weigh(&state, room);
         // σ, the weight's last factor.
-        problem.log_likelihood(&state, room) + theta.column(place).rows(d, d).sum() - density.ln()
+        problem.log_likelihood(&state, room) + theta.column(place).rows(d, d).sum() - log_density
     };
     let all = (0..POINTS).into_par_iter().with_min_len(AT_A_TIME);
     let log_weights: Vec<f64> = all.map_init(|| problem.room(), log_weight).collect();
-    let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let weights: Vec<f64> = log_weights.iter().map(|weight| (weight - largest).exp()).collect();
-    // Where no point is inside, all are NaN, and it is not enough either.
-    let enough = stats::effective_sample_size(&weights) >= EFFECTIVE * POINTS as f64;
-    enough.then(|| {
-        let chosen = stats::systematic(&weights, DRAWS, &mut stream);
-        chosen.into_iter().map(state).collect()
-    })
+    let weights = stats::weights(&log_weights, EFFECTIVE)?;
+    Some(stats::systematic(&weights, DRAWS, &mut stream).into_iter().map(state).collect())
 }
 
 /// Gradient of ln L and its information −∇∇ᵀ ln L, in (μ_k/σ̂_k, ln σ_k) at `point`, the means first; `weights` are those there.

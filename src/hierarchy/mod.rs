@@ -16,6 +16,7 @@ mod importance;
 mod kernel;
 mod near;
 mod problem;
+mod widths;
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;

@@ -5,13 +5,13 @@ use rand::Rng as _;
 use rayon::prelude::*;
 
 use super::problem::{unit_columns, within};
+use super::widths::Widths;
 use super::{Populations, WIDEST};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, NormalQuantiles};
 
-/// Widths of the normal distributions that proposals come from, and the turns that eight proposals take among them: wide ones reach
-/// what a posterior has beyond its moments.
+/// Widths of the normal distributions that proposals come from, and the turns that eight proposals take among them.
 const WIDTHS: [f64; 3] = [1.0, 1.6, 3.0];
 const TURNS: [usize; 8] = [0, 1, 0, 1, 0, 1, 0, 2];
 
@@ -46,12 +46,7 @@ pub fn proposals(
             0.0
         }
     });
-    let turn = |draw: usize| TURNS[draw % TURNS.len()];
-    // How many have each width, over its volume.
-    let volumes: [f64; WIDTHS.len()] = std::array::from_fn(|own| {
-        let count = (0..draws).filter(|draw| turn(*draw) == own).count();
-        count as f64 / draws as f64 / WIDTHS[own].powi(d as i32)
-    });
+    let widths = Widths::new(WIDTHS, TURNS, draws, d);
     let quantiles = NormalQuantiles::shared();
     let of_one = |(measurement, scrambling): (usize, u32)| {
         let rows = measurement * samples.draws()..(measurement + 1) * samples.draws();
@@ -72,7 +67,7 @@ pub fn proposals(
             let level =
                 |k: usize| f64::from(sobol_burley::sample(draw as u32, k as u32, scrambling)) + 0.5_f64.powi(25);
             for (k, stretched) in stretched.iter_mut().enumerate() {
-                *stretched = WIDTHS[turn(draw)] * quantiles.at(level(k));
+                *stretched = widths.of(draw) * quantiles.at(level(k));
             }
             let mut inside = true;
             for k in 0..d {
@@ -81,10 +76,8 @@ pub fn proposals(
                 points.push(parameters[k].from_unit(position.clamp(0.0, 1.0)));
             }
             let squared: f64 = stretched.iter().map(|z| z * z).sum();
-            let density = |(width, volume): (&f64, f64)| volume * (-0.5 * squared / (width * width)).exp();
-            let density: f64 = WIDTHS.iter().zip(volumes).map(density).sum();
             // Beyond the prior nothing is possible.
-            log_density.push(if inside { density.ln() - log_volume } else { IMPOSSIBLE });
+            log_density.push(if inside { widths.log_density(squared) - log_volume } else { IMPOSSIBLE });
         }
         (points, log_density)
     };

@@ -134,6 +134,11 @@ impl Problem {
         &self.centres[measurement * d..(measurement + 1) * d]
     }
 
+    /// Whether the prior and what the samples can resolve allow the population of parameter k.
+    pub(super) fn is_possible(&self, state: &State, k: usize) -> bool {
+        (0.0..=1.0).contains(&state.mean[k]) && (self.floor[k]..=WIDEST).contains(&state.std[k])
+    }
+
     pub(super) fn room(&self) -> Weights {
         let d = self.deviations.len();
         Weights {
