@@ -34,13 +34,13 @@ const HEADERS: [(HeaderName, &str); 3] = [
 
 /// The rendered pages by their name without `.md`.
 static PAGES: LazyLock<BTreeMap<String, Bytes>> = LazyLock::new(|| {
-    let page = |file: &str| {
+    let rendered = |file: &str| {
         let name = file.strip_suffix(".md")?.to_owned();
         let markdown = Files::get(file)?.data;
         let html = page(&name, &String::from_utf8_lossy(&markdown));
         Some((name, Bytes::from(html)))
     };
-    Files::iter().filter_map(|file| page(&file)).collect()
+    Files::iter().filter_map(|file| rendered(&file)).collect()
 });
 
 /// The routes below `/docs`, those of the API explorer and `/openapi.json`.
