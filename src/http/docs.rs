@@ -116,7 +116,10 @@ fn page(name: &str, markdown: &str) -> String {
 
 /// Comments and tags of the source; the pages are written without any that a reader should see.
 fn is_raw_html(event: &Event<'_>) -> bool {
-    matches!(event, Event::Html(_) | Event::InlineHtml(_) | Event::Start(Tag::HtmlBlock) | Event::End(TagEnd::HtmlBlock))
+    matches!(
+        event,
+        Event::Html(_) | Event::InlineHtml(_) | Event::Start(Tag::HtmlBlock) | Event::End(TagEnd::HtmlBlock)
+    )
 }
 
 /// Gives each heading the anchor that code hosts give it; returns the text of the first heading.

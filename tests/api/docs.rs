@@ -56,7 +56,9 @@ fn assert_links_lead_somewhere(file: &Path) {
 
 #[test]
 fn every_relative_link_leads_to_a_file_or_a_heading() {
-    for name in ["README.md", "CONTRIBUTING.md", "benches/README.md", "docker/README.md", "models/README.md", "tests/README.md"] {
+    for name in
+        ["README.md", "CONTRIBUTING.md", "benches/README.md", "docker/README.md", "models/README.md", "tests/README.md"]
+    {
         assert_links_lead_somewhere(&root().join(name));
     }
     for page in pages() {
@@ -97,7 +99,10 @@ async fn every_page_and_its_links_are_served_under_the_strict_policy() {
             }
         }
     }
-    assert!(linked.contains("alarms") && linked.contains("api-explorer/") && linked.contains("dashboard.png"), "{linked:?}");
+    assert!(
+        linked.contains("alarms") && linked.contains("api-explorer/") && linked.contains("dashboard.png"),
+        "{linked:?}"
+    );
     for target in linked {
         let answer = service.get(&format!("/docs/{target}")).send().await.unwrap();
         assert_eq!(answer.status(), 200, "/docs/{target}");
