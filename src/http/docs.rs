@@ -136,7 +136,7 @@ fn add_anchors(events: &mut [Event<'_>]) -> Option<String> {
             }
             Event::End(TagEnd::Heading(_)) => {
                 let Some((start, words)) = heading.take() else { continue };
-                let anchor = unused(anchor(&words), &mut taken);
+                let anchor = unused(&anchor(&words), &mut taken);
                 if let Event::Start(Tag::Heading { id, .. }) = &mut events[start] {
                     *id = Some(CowStr::from(anchor));
                 }
@@ -155,9 +155,9 @@ fn anchor(words: &str) -> String {
 }
 
 /// The anchor, with a number behind it when an earlier heading has it.
-fn unused(anchor: String, taken: &mut BTreeSet<String>) -> String {
+fn unused(anchor: &str, taken: &mut BTreeSet<String>) -> String {
     let numbered = (1..).map(|n| format!("{anchor}-{n}"));
-    let free = std::iter::once(anchor.clone()).chain(numbered).find(|candidate| !taken.contains(candidate));
+    let free = std::iter::once(anchor.to_owned()).chain(numbered).find(|candidate| !taken.contains(candidate));
     let free = free.expect("the numbers do not end");
     taken.insert(free.clone());
     free
