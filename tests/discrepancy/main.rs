@@ -4,6 +4,9 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod further;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod spectrum;
 mod world;
 
@@ -548,7 +551,7 @@ fn two_laboratories_differ_by_something_common_and_not_by_three_storeys() {
     let repository = Path::new(env!("CARGO_MANIFEST_DIR"));
     let data = repository.join("../shared/data/ruler-frame-4dof/ruler_frame_frequencies.csv");
     if !data.exists() {
-        println!("skipped: ../shared/data/ruler-frame-4dof is not on this machine");
+        needs::missing("the data ../shared/data/ruler-frame-4dof, which are not part of the repository");
         return;
     }
     let output = Command::new(env!("CARGO_BIN_EXE_modalwatch"))

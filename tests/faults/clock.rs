@@ -6,7 +6,8 @@ use std::time::Duration;
 use serde_json::{json, Value};
 
 use crate::helpers::{command, created, Service};
-use crate::kit::{audit, batch, body, history, post, ready, there, Acknowledged, BATCHES};
+use crate::kit::{audit, batch, body, history, post, ready, Acknowledged, BATCHES};
+use crate::needs;
 
 const LIBRARY: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
 
@@ -37,7 +38,7 @@ async fn wait_for_silence(service: &Service, wanted: usize) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_current() {
-    if !there(LIBRARY, "faketime") {
+    if !needs::installed(Path::new(LIBRARY)) {
         return;
     }
     let folder = tempfile::tempdir().unwrap();

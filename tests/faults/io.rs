@@ -5,7 +5,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use crate::helpers::{command, Service};
-use crate::kit::{all_assessed, audit, batch, post, ready, ready_again, there, Acknowledged};
+use crate::kit::{all_assessed, audit, batch, post, ready, ready_again, Acknowledged};
+use crate::needs;
 
 /// Batches posted under each kind of fault.
 const PER_CASE: usize = 16;
@@ -30,7 +31,7 @@ fn control(service: &Service, control: &Path, order: &str) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() {
-    if !there("/usr/bin/fiu-ctrl", "fiu-utils") {
+    if needs::program("fiu-ctrl").is_none() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -95,7 +96,7 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_start_on_a_failing_disk_says_so_or_works_and_loses_nothing() {
-    if !there("/usr/bin/fiu-ctrl", "fiu-utils") {
+    if needs::program("fiu-ctrl").is_none() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();

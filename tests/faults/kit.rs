@@ -224,15 +224,6 @@ pub fn open_files(pid: u32) -> usize {
     std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count()
 }
 
-/// Whether a file is there; where it is not, says what is skipped and what to install.
-pub fn there(path: &str, package: &str) -> bool {
-    let there = Path::new(path).exists();
-    if !there {
-        println!("skipped: {path} is not there (apt-get install {package})");
-    }
-    there
-}
-
 /// Lets a service write until its disk is full, where it would stop before.
 pub fn without_floor(command: &mut std::process::Command) -> &mut std::process::Command {
     let defaults = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch")).args(["config", "print"]).output();

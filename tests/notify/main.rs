@@ -9,6 +9,9 @@ mod filters;
 mod helpers;
 mod hostile;
 mod mqtt;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod receiver;
 mod tls;
 mod webhooks;
