@@ -413,8 +413,9 @@ fn hidden_effects_are_found_in_two_hundred_worlds() {
     let single = Tally::new(&judged, Kind::Single);
     assert!(single.share(|j| j.right) >= 0.95, "{} single effects in the right place", single.right());
     let (compared, inside) = single.sizes();
+    // A share of 182 scatters by 0.022 about 0.9: 3.5 times that below and 3.2 times above. The program reaches 0.874.
     let coverage = inside as f64 / compared as f64;
-    assert!((0.80..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
+    assert!((0.822..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
     assert!(single.median_gain() >= GAIN, "median gain {}", single.median_gain());
     for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.85), (Kind::Outside, 0.90)] {
         let tally = Tally::new(&judged, kind);

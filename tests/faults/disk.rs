@@ -232,7 +232,7 @@ async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_
     let after = std::fs::metadata(&log).unwrap().len();
     assert!(after <= grown + (2 << 20), "the log goes on growing: {grown}, then {after} bytes");
 
-    // A writer for a second is waited for.
+    // A writer for a second is waited for: that second is what is tested, nothing could end the wait earlier.
     sqlx::query("begin immediate").execute(&mut other).await.unwrap();
     let waiting = batch("waiting", 0, 5);
     let (answered, ()) = tokio::join!(post(&service, &waiting), async {

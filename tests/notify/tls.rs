@@ -142,6 +142,12 @@ async fn a_broker_may_ask_for_a_password_over_an_encrypted_connection() {
     // Without the authority the broker is a stranger, and hears no password.
     let other = tempfile::tempdir().unwrap();
     let stranger = start(other.path(), None);
-    tokio::time::sleep(std::time::Duration::from_secs(1)).await;
+    eventually("the refused certificate", async || {
+        let ready: Value = stranger.get("/readyz").send().await.unwrap().json().await.unwrap();
+        let finding =
+            ready["findings"].as_array().unwrap().iter().find(|finding| finding["code"] == "mqtt_unavailable");
+        finding.is_some_and(|finding| finding["message"].as_str().unwrap().contains("certificate")).then_some(())
+    })
+    .await;
     assert!(metric(&stranger, "modalwatch_mqtt_connected").await < 0.5);
 }
