@@ -97,7 +97,7 @@ impl Tree {
                     let krate = self.modules[module].krate;
                     let child = if let Some((_, items)) = &item.content {
                         let here = &self.modules[module];
-                        let (file, inner) = (here.file, [&here.inner[..], &[name.clone()]].concat());
+                        let (file, inner) = (here.file, [&here.inner[..], std::slice::from_ref(&name)].concat());
                         let child = self.add(file, inner, Some(module), krate);
                         self.read_items(root, &folder.join(&name), child, items);
                         child

@@ -388,15 +388,20 @@ fn hidden_effects_are_found_in_a_fixed_set_of_worlds() {
     let judged = judged(&singles.chain(others).collect::<Vec<_>>());
     report(&judged);
 
-    // The rates asked of many worlds, with the slack that few worlds need.
+    // Of two hundred worlds 95.5 % are right and 94.5 % gain enough: of 29, 27.7 ± 1.1 and 27.4 ± 1.2; the bounds are 0.6 and 1.9
+    // standard errors below.
     let single = Tally::new(&judged, Kind::Single);
     assert!(single.right() + 2 >= single.worlds(), "{} wrong places", single.worlds() - single.right());
+    // 90 % of 27: 24.3 ± 1.6, and the bound is 1.5 standard errors below. All 27 inside happen by chance in 6 % of such sets, so
+    // that there is no bound above; the test of two hundred worlds has one.
     let (compared, inside) = single.sizes();
-    assert!(inside >= 22, "{inside} of {compared} sizes inside");
+    assert!(compared >= 25 && inside >= 22, "{inside} of {compared} sizes inside");
     assert!(single.count(|j| j.gain >= GAIN) >= 25, "gains");
+    // Of sixty worlds each 60, 57 and 59 are right. Of 6, 5 and 4 that makes 6, 4.75 ± 0.5 and 3.93 ± 0.26: three standard errors
+    // below are 4.9 (were one of sixty wrong), 3.3 and 3.2.
     assert!(Tally::new(&judged, Kind::Nothing).right() >= 5, "something in nothing");
     assert!(Tally::new(&judged, Kind::Two).right() >= 4, "two effects");
-    assert!(Tally::new(&judged, Kind::Outside).right() >= 3, "confident wrong names");
+    assert_eq!(Tally::new(&judged, Kind::Outside).right(), 4, "confident wrong names");
 }
 
 #[test]
@@ -417,7 +422,9 @@ fn hidden_effects_are_found_in_two_hundred_worlds() {
     let coverage = inside as f64 / compared as f64;
     assert!((0.822..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
     assert!(single.median_gain() >= GAIN, "median gain {}", single.median_gain());
-    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.85), (Kind::Outside, 0.90)] {
+    // Shares of sixty: the program reaches 1, 0.95 ± 0.028 and 0.983 ± 0.017; three standard errors below, for nothing hidden
+    // three worlds.
+    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.866), (Kind::Outside, 0.93)] {
         let tally = Tally::new(&judged, kind);
         assert!(tally.share(|j| j.right) >= least, "{kind:?}: {} of {} right", tally.right(), tally.worlds());
     }
