@@ -60,7 +60,7 @@ fn batch(day: f64, k1_factor: f64, rng: &mut impl rand::Rng) -> Vec<Value> {
 
 /// Waits until a path of a diagnosis's answer is no longer "running".
 async fn finished(service: &Service, id: &str, pointer: &str) -> Value {
-    within(Duration::from_secs(600), pointer, async || {
+    within(Duration::from_mins(10), pointer, async || {
         let answer = service.read(&format!("/v1/diagnoses/{id}")).await;
         match answer.pointer(pointer).and_then(Value::as_str) {
             Some("running") | None => None,
@@ -83,7 +83,7 @@ async fn damage_alarms(service: &Service) -> Vec<(String, String)> {
 
 /// Waits until so many batches are assessed under the present version.
 async fn wait_until_assessed(service: &Service, batches: usize) {
-    within(Duration::from_secs(120), "the assessment of all batches", async || {
+    within(Duration::from_mins(2), "the assessment of all batches", async || {
         let history = service.read("/v1/structures/soft/history?limit=1000").await;
         let assessed = history["items"].as_array().unwrap().iter().filter(|i| i["state"] == "assessed").count();
         (assessed >= batches).then_some(())

@@ -66,7 +66,7 @@ fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
 
 /// Waits until the extension of the newest diagnosis has ended.
 async fn extension_ended(service: &Service) -> Value {
-    within(Duration::from_secs(180), "the end of the extension", async || {
+    within(Duration::from_mins(3), "the end of the extension", async || {
         let listed = service.read("/v1/structures/tiny/diagnoses").await;
         let path = format!("/v1/diagnoses/{}", listed["items"][0]["diagnosis"].as_str().unwrap());
         Some(service.read(&path).await).filter(|diagnosis| diagnosis["extension"]["state"] != "running")

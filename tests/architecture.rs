@@ -4,8 +4,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+#[path = "architecture/measures.rs"]
 mod measures;
+#[path = "architecture/paths.rs"]
 mod paths;
+#[path = "architecture/tree.rs"]
 mod tree;
 
 use std::collections::{BTreeMap, BTreeSet};
