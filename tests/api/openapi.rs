@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, measurements, problem, repository, spawn, Service};
+use crate::helpers::{command, created, eventually, measurements, problem, repository, spawn, Service};
 
 const METHODS: [&str; 5] = ["get", "put", "post", "delete", "patch"];
 
@@ -292,12 +292,10 @@ async fn a_real_answer_of_each_get_is_as_the_document_says() {
     let schema = response_schema(&document, "/v1/structures/{id}/diagnoses", "post", 202, "application/json");
     assert!(validator(&document, &schema).is_valid(&diagnosis), "{diagnosis:#}");
     let diagnosis = diagnosis["diagnosis"].as_str().unwrap();
-    for _ in 0..600 {
-        if service.read(&format!("/v1/diagnoses/{diagnosis}")).await["state"] != "running" {
-            break;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
+    eventually("the end of the diagnosis", async || {
+        (service.read(&format!("/v1/diagnoses/{diagnosis}")).await["state"] != "running").then_some(())
+    })
+    .await;
 
     let webhook = json!({ "url": "https://receiver.invalid/alarms", "enabled": false });
     let webhook = created(service.post("/v1/webhooks", &webhook).await).await;
