@@ -10,6 +10,7 @@ use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use data_encoding::HEXLOWER;
 use serde::Serialize;
 use serde_json::json;
 use sha2::{Digest as _, Sha256};
@@ -139,7 +140,9 @@ impl Monitor {
                 }
             }
             let last = match read.await {
-                Ok(Ok(())) => Ok(line_of(&Record::End(End { lines: count, sha256: hex(&hasher.finalize()) }))),
+                Ok(Ok(())) => {
+                    Ok(line_of(&Record::End(End { lines: count, sha256: HEXLOWER.encode(&hasher.finalize()) })))
+                }
                 Ok(Err(error)) => Err(Error::Store(error)),
                 Err(_) => Err(Error::Panicked),
             };
@@ -386,10 +389,6 @@ fn line_of(record: &Record) -> Vec<u8> {
     line
 }
 
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().concat()
-}
-
 /// Reads an archive to its end and gives back its head: first line, last line, number of lines, SHA-256, each line a record.
 fn check_whole(path: &Path) -> Result<Head, ImportError> {
     let not_whole = |what: &str| ImportError::NotWhole(what.to_owned());
@@ -433,7 +432,7 @@ fn each_line(path: &Path, mut take: impl FnMut(u64, Record) -> Result<(), Import
         let record: Record = serde_json::from_slice(&line)
             .map_err(|e| ImportError::Line { line: number, reason: format!("no record of an archive: {e}") })?;
         if let Record::End(end) = &record {
-            let found = hex(&hasher.finalize_reset());
+            let found = HEXLOWER.encode(&hasher.finalize_reset());
             if end.lines != number - 1 || end.sha256 != found {
                 let said = format!(
                     "it has {} lines with SHA-256 {found}, its last line says {} and {}",

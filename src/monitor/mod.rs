@@ -529,12 +529,12 @@ impl Monitor {
             }
             Some(undamaged) if model_digest.is_some_and(|digest| *digest != undamaged.model_digest) => format!(
                 "the undamaged state, version {}, was taken with another trained baseline: name undamaged batches again \
-                 by POST /v1/structures/{structure}/baseline",
+                 by POST /v1/structures/{structure}/reference",
                 undamaged.state.version
             ),
             Some(_) => "not compared with the undamaged state yet".to_owned(),
             None => format!(
-                "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/baseline \
+                "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/reference \
                  {{\"batches\": [\"{batch_id}\"]}}"
             ),
         })

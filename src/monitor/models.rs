@@ -99,7 +99,7 @@ impl Monitor {
             next_step = undamaged_version.is_none().then(|| {
                 format!(
                     "the undamaged state was taken with another baseline, so batches are compared with none: name undamaged \
-                     batches again by POST /v1/structures/{structure}/baseline"
+                     batches again by POST /v1/structures/{structure}/reference"
                 )
             });
         }

@@ -13,6 +13,7 @@ use std::fs::{self, File};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
+use data_encoding::HEXLOWER;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
@@ -498,8 +499,7 @@ fn sha256(path: &Path) -> Result<String, Error> {
             read => hasher.update(&chunk[..read]),
         }
     }
-    let digest: Vec<String> = hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-    Ok(digest.concat())
+    Ok(HEXLOWER.encode(&hasher.finalize()))
 }
 
 /// A rename is on disk only when its folder is.

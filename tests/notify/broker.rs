@@ -43,7 +43,7 @@ impl Broker {
         format!("mqtt://127.0.0.1:{}", self.port)
     }
 
-    /// Ends the broker; what it kept for its clients is lost.
+    /// Ends the broker; the messages that it kept for its clients are lost.
     pub fn stop(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();

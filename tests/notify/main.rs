@@ -1,4 +1,4 @@
-//! The real program, a receiver of webhooks and a real broker: what others are told, and what they tell us.
+//! The real program with a receiver of webhooks and a real MQTT broker.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -18,7 +18,7 @@ mod webhooks;
 
 use helpers::{eventually, Service};
 
-/// A figure of `/metrics`, by its name and labels as they are written there; 0 while it is not there.
+/// A value of `/metrics` by its name and labels as they are written there; 0 if it does not exist.
 async fn metric(service: &Service, name: &str) -> f64 {
     let text = service.get("/metrics").send().await.unwrap().text().await.unwrap();
     let value = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok());

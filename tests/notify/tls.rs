@@ -1,4 +1,4 @@
-//! Encrypted connections: to those whose certificate is trusted, and to nobody else.
+//! Encrypted connections are made only to servers whose certificate is trusted.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -50,7 +50,7 @@ impl axum::serve::Listener for TlsListener {
     async fn accept(&mut self) -> (Self::Io, Self::Addr) {
         loop {
             let (stream, address) = self.tcp.accept().await.unwrap();
-            // A client that does not trust us goes away in the middle.
+            // A client that does not trust the certificate disconnects during the handshake.
             if let Ok(stream) = self.acceptor.accept(stream).await {
                 return (stream, address);
             }
@@ -139,7 +139,7 @@ async fn a_broker_may_ask_for_a_password_over_an_encrypted_connection() {
     };
     eventually("the batch", stored).await;
 
-    // Without the authority the broker is a stranger, and hears no password.
+    // Without the authority the broker is not trusted and receives no password.
     let other = tempfile::tempdir().unwrap();
     let stranger = start(other.path(), None);
     eventually("the refused certificate", async || {

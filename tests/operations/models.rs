@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
+use data_encoding::HEXLOWER;
 use serde_json::{json, Value};
 use sha2::{Digest as _, Sha256};
 
@@ -35,8 +36,7 @@ fn put_manifest(models: &Path, manifest: &Value) {
 /// Puts weights there, and into the manifest what they are.
 fn put_weights(models: &Path, weights: &[u8]) {
     let mut manifest = manifest(models);
-    let digest: Vec<String> = Sha256::digest(weights).iter().map(|byte| format!("{byte:02x}")).collect();
-    manifest["weights_sha256"] = json!(digest.concat());
+    manifest["weights_sha256"] = json!(HEXLOWER.encode(&Sha256::digest(weights)));
     std::fs::write(models.join("three-dof/baseline.safetensors"), weights).unwrap();
     put_manifest(models, &manifest);
 }
@@ -212,7 +212,7 @@ async fn a_reload_may_leave_the_undamaged_state_to_a_person() {
     put_manifest(models.path(), &other);
     let swapped: Value = service.post(RELOAD, &json!({ "retake_undamaged": false })).await.json().await.unwrap();
     assert_eq!(swapped["undamaged_version"], Value::Null, "{swapped}");
-    assert!(swapped["next_step"].as_str().unwrap().contains("/baseline"), "{swapped}");
+    assert!(swapped["next_step"].as_str().unwrap().contains("/reference"), "{swapped}");
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 86_400 * 30)).await;
     assert_eq!(batch["assessment"]["undamaged_version"], Value::Null, "{batch}");
     problem(service.post("/v1/structures/bridge/model/reload", &json!({})).await, 404, "unknown_structure").await;
