@@ -23,8 +23,8 @@ fn targets(structure: &Structure) -> Vec<(Target, Vec<f64>)> {
         (Target::FrequencyScale(Some(1)), vec![SIZES[2]]),
         (Target::FrequencyOffset(None), vec![SIZES[2]]),
         (Target::FrequencyOffset(Some(0)), vec![-SIZES[2]]),
-        (Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)), vec![SIZES[3]]),
-        (Target::AddedSpring(Node::Ground, Node::Freedom(1)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Dof(0), Node::Dof(2)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Ground, Node::Dof(1)), vec![SIZES[3]]),
         (Target::Oscillator(1), vec![0.05, 0.2]),
     ]
 }
@@ -34,9 +34,9 @@ fn structure() -> Structure {
     let spring = |i: usize, from, to, n_per_m| Spring::between(format!("k{i}"), from, to, n_per_m);
     let masses = vec![mass(0, 0.7), mass(1, 0.5), mass(2, 0.3)];
     let springs = vec![
-        spring(0, Node::Ground, Node::Freedom(0), 4.0),
-        spring(1, Node::Freedom(0), Node::Freedom(1), 5.0),
-        spring(2, Node::Freedom(1), Node::Freedom(2), 6.0),
+        spring(0, Node::Ground, Node::Dof(0), 4.0),
+        spring(1, Node::Dof(0), Node::Dof(1), 5.0),
+        spring(2, Node::Dof(1), Node::Dof(2), 6.0),
     ];
     Structure::new(masses, springs).unwrap()
 }
@@ -65,15 +65,15 @@ fn an_effect_is_the_structure_with_it_built_in() {
     ));
     let tie = |from, to, n_per_m| Spring::between("new", from, to, n_per_m);
     assert!(close(
-        &under(Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)), &[1.5]),
-        &built(&|_, s| s.push(tie(Node::Freedom(0), Node::Freedom(2), 1.5)))
+        &under(Target::AddedSpring(Node::Dof(0), Node::Dof(2)), &[1.5]),
+        &built(&|_, s| s.push(tie(Node::Dof(0), Node::Dof(2), 1.5)))
     ));
     let (kg, hz) = (0.02, 0.4);
     assert!(close(
         &under(Target::Oscillator(1), &[kg, hz]),
         &built(&|m, s| {
             m.push(Mass::at("body", 3, kg));
-            s.push(tie(Node::Freedom(1), Node::Freedom(3), (std::f64::consts::TAU * hz).powi(2) * kg));
+            s.push(tie(Node::Dof(1), Node::Dof(3), (std::f64::consts::TAU * hz).powi(2) * kg));
         })
     ));
     let plain = natural_frequencies_hz(&base, 3).unwrap();
@@ -167,7 +167,7 @@ fn an_effect_of_a_file_acts_by_the_measurements_covariate() {
     let blind = simulator.effect_sizes(&BTreeMap::new());
     assert_eq!(blind.missing, ["temperature_c"]);
     assert!(blind.values[0].abs() < 1e-12);
-    assert_eq!(simulator.possible_sizes(&BTreeMap::new()).len(), 3);
+    assert_eq!(simulator.marginalised_sizes(&BTreeMap::new()).len(), 3);
     // The file comes back as it was.
     let again = StructureDefinition::parse_json(&simulator.definition().canonical_json()).unwrap();
     assert_eq!(again.digest(), *simulator.digest());
@@ -182,7 +182,7 @@ fn each_mistake_of_an_effect_is_named_with_its_place() {
         ("springs = [\"k2\"]", "added_spring = [\"m1\", \"m1\"]", "/effect/0/target", "to itself"),
         ("springs = [\"k2\"]", "mode_order = [1, 1]", "/effect/0/target", "2 different modes"),
         ("covariate = \"temperature_c\"\n", "covariate = \"wind\"\n", "/effect/0/covariate", "no [[covariate]]"),
-        ("covariate = \"temperature_c\"\n", "covariate = \"operator\"\n", "/effect/0/covariate", "other kind"),
+        ("covariate = \"temperature_c\"\n", "covariate = \"operator\"\n", "/effect/0/covariate", "of kind number"),
         ("covariate = \"temperature_c\"\n", "", "/effect/0/covariate", "needs a covariate"),
         ("law = \"linear\"", "law = \"lagged\"", "/effect/0/law", "history"),
         ("law = \"linear\"", "law = \"constant\"", "/effect/0/covariate", "no covariate"),

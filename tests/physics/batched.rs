@@ -1,7 +1,7 @@
 //! Runs side by side against the same runs one by one.
 
 use modalwatch::baseline::library::find_structure;
-use modalwatch::physics::side_by_side::{SideBySide, MOST_FREEDOMS};
+use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS};
 use modalwatch::physics::{natural_frequencies_with, Node, Structure};
 use modalwatch::stats;
 use nalgebra::DMatrix;
@@ -25,8 +25,8 @@ fn stiffnesses(structure: &Structure, springs: &[usize], runs: usize, seed: u64)
 
 fn as_one_by_one(structure: &Structure, springs: &[usize], runs: usize, seed: u64) {
     let given = stiffnesses(structure, springs, runs, seed);
-    let modes = structure.freedoms();
-    let found = SideBySide::new(structure, springs, modes).unwrap().frequencies_hz(&given);
+    let modes = structure.dofs();
+    let found = BatchedEigensolver::new(structure, springs, modes).unwrap().frequencies_hz(&given);
     assert_eq!(found.len(), runs * modes);
     for (run, found) in found.chunks(modes).enumerate() {
         let own = &given[run * springs.len()..(run + 1) * springs.len()];
@@ -47,19 +47,19 @@ fn random_structures_have_the_frequencies_that_they_have_one_by_one() {
         // Full vectors, and some that are not.
         as_one_by_one(&structure, &changing, 1 + seed as usize, seed);
     }
-    for freedoms in 1..=MOST_FREEDOMS {
-        as_one_by_one(&chain(freedoms, 0.7, 1300.0), &(0..freedoms).collect::<Vec<_>>(), 19, 7);
+    for dofs in 1..=MOST_DOFS {
+        as_one_by_one(&chain(dofs, 0.7, 1300.0), &(0..dofs).collect::<Vec<_>>(), 19, 7);
     }
-    assert!(SideBySide::new(&chain(MOST_FREEDOMS + 1, 0.7, 1300.0), &[0], 1).is_none());
-    assert!(SideBySide::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
+    assert!(BatchedEigensolver::new(&chain(MOST_DOFS + 1, 0.7, 1300.0), &[0], 1).is_none());
+    assert!(BatchedEigensolver::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
 }
 
 #[test]
 fn equal_eigenvalues_come_out_equal() {
     // Three masses on springs of their own, two of them alike, far apart from the third.
-    let own = |i: usize| spring(i, Node::Ground, Node::Freedom(i), 4.0);
+    let own = |i: usize| spring(i, Node::Ground, Node::Dof(i), 4.0);
     let structure = Structure::new((0..3).map(|i| mass(i, 1.0)).collect(), (0..3).map(own).collect()).unwrap();
-    let found = SideBySide::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
+    let found = BatchedEigensolver::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
     let hz = |n_per_m: f64| n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
     for (found, expected) in found.iter().zip([hz(4.0), hz(4.0), hz(4.0e6)]) {
         assert!(agree(*found, expected), "{found} Hz, expected {expected} Hz");
@@ -69,7 +69,7 @@ fn equal_eigenvalues_come_out_equal() {
 #[test]
 fn a_run_without_frequencies_spoils_no_other() {
     let structure = chain(3, 0.5, 100.0);
-    let runs = SideBySide::new(&structure, &[0, 1, 2], 2).unwrap();
+    let runs = BatchedEigensolver::new(&structure, &[0, 1, 2], 2).unwrap();
     let good = [80.0, 90.0, 110.0];
     let alone = runs.frequencies_hz(&good);
     // A mechanism, and stiffnesses that are none.
