@@ -93,7 +93,7 @@ proptest! {
     }
 }
 
-/// What spreadsheets and loggers do to a table: each of these is the same two measurements.
+/// Variants of a table that spreadsheets and loggers write: each contains the same two measurements.
 #[test]
 fn the_ways_a_table_is_written_are_read_alike() {
     let (covariates, space) = (covariates(), space());

@@ -1,4 +1,4 @@
-//! Runs side by side against the same runs one by one.
+//! The batched eigensolver compared with single runs.
 
 use modalwatch::baseline::library::find_structure;
 use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS};
@@ -9,14 +9,14 @@ use rand::Rng as _;
 
 use super::{chain, mass, random_structure, spring};
 
-/// Both are exact to rounding: some 1e-15 of the largest eigenvalue, which here is at most a thousand times the smallest.
+/// Both are exact to rounding, about 1e-15 of the largest eigenvalue, which here is at most a thousand times the smallest.
 const ROUNDING: f64 = 1e-11;
 
 fn agree(found: f64, expected: f64) -> bool {
     (found / expected - 1.0).abs() < ROUNDING
 }
 
-/// Stiffnesses of `runs` runs, of each of the springs.
+/// Random stiffnesses of the springs in each run.
 fn stiffnesses(structure: &Structure, springs: &[usize], runs: usize, seed: u64) -> Vec<f64> {
     let mut stream = stats::stream(seed, "stiffnesses");
     let one = |spring: &usize, factor: f64| structure.springs()[*spring].n_per_m * factor;
@@ -44,7 +44,7 @@ fn random_structures_have_the_frequencies_that_they_have_one_by_one() {
         let structure = random_structure(seed);
         let changing: Vec<usize> =
             (0..structure.springs().len()).filter(|s| !(s + seed as usize).is_multiple_of(3)).collect();
-        // Full vectors, and some that are not.
+        // Numbers of runs that are multiples of the number of lanes, and others.
         as_one_by_one(&structure, &changing, 1 + seed as usize, seed);
     }
     for dofs in 1..=MOST_DOFS {
@@ -56,7 +56,7 @@ fn random_structures_have_the_frequencies_that_they_have_one_by_one() {
 
 #[test]
 fn equal_eigenvalues_come_out_equal() {
-    // Three masses on springs of their own, two of them alike, far apart from the third.
+    // Three separate oscillators: two are equal, and the third has a much higher frequency.
     let own = |i: usize| spring(i, Node::Ground, Node::Dof(i), 4.0);
     let structure = Structure::new((0..3).map(|i| mass(i, 1.0)).collect(), (0..3).map(own).collect()).unwrap();
     let found = BatchedEigensolver::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
@@ -72,7 +72,7 @@ fn a_run_without_frequencies_spoils_no_other() {
     let runs = BatchedEigensolver::new(&structure, &[0, 1, 2], 2).unwrap();
     let good = [80.0, 90.0, 110.0];
     let alone = runs.frequencies_hz(&good);
-    // A mechanism, and stiffnesses that are none.
+    // A mechanism, and invalid stiffnesses.
     for bad in [[0.0, 90.0, 110.0], [80.0, -1.0, 110.0], [80.0, f64::NAN, 110.0], [f64::INFINITY, 1.0, 1.0]] {
         let found = runs.frequencies_hz(&[good, bad, good].concat());
         assert!(found[2..4].iter().all(|f| f.is_nan()), "{bad:?}: {found:?}");

@@ -79,10 +79,10 @@ fn an_effect_is_the_structure_with_it_built_in() {
     let plain = natural_frequencies_hz(&base, 3).unwrap();
     let scaled: Vec<f64> = plain.iter().map(|f| f * 1.01).collect();
     assert!(close(&under(Target::FrequencyScale(None), &[0.01]), &scaled));
-    // All springs by 1 + g and all masses by 1/(1 + g) do the same.
+    // Scaling all springs by 1 + g is equivalent to scaling all masses by 1/(1 + g).
     let all = Target::Springs(vec![0, 1, 2]);
     assert!(close(&under(all, &[0.2]), &under(Target::Masses(vec![0, 1, 2]), &[1.0 / 1.2 - 1.0])));
-    // A mode that was overlooked.
+    // A mode that was not identified.
     let order = respond(&base, 2, &[Target::ModeOrder(vec![0, 2])], &[]).unwrap().frequencies_hz;
     assert!(close(&order, &[plain[0], plain[2]]));
 }
@@ -159,16 +159,16 @@ fn an_effect_of_a_file_acts_by_the_measurements_covariate() {
     let softer = simulator.structure().unwrap().with_stiffness(&[(1, 18.0)]).unwrap();
     let warm = simulator.under(&sizes(20.0).values).frequencies_hz(&[10.0]).unwrap();
     assert!(close(&warm, &natural_frequencies_hz(&softer, 2).unwrap()));
-    // A sensor that hangs at 9999 counts as the end of what was seen, a tenth beyond, and is told.
+    // The value 9999 of a faulty sensor is clamped to a tenth beyond the range of the effect, and reported.
     let broken = sizes(9999.0);
     assert_eq!(broken.beyond, ["temperature_c"]);
     assert!((broken.values[0] + 0.24).abs() < 1e-12);
-    // Without the covariate: the mean, and all values that were seen.
+    // Without the covariate: the mean size, and the sizes at all values that the effect was learnt from.
     let blind = simulator.effect_sizes(&BTreeMap::new());
     assert_eq!(blind.missing, ["temperature_c"]);
     assert!(blind.values[0].abs() < 1e-12);
     assert_eq!(simulator.marginalised_sizes(&BTreeMap::new()).len(), 3);
-    // The file comes back as it was.
+    // The definition survives the round trip through JSON.
     let again = StructureDefinition::parse_json(&simulator.definition().canonical_json()).unwrap();
     assert_eq!(again.digest(), *simulator.digest());
 }

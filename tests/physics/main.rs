@@ -1,4 +1,4 @@
-//! Structures against closed forms, derivatives against finite differences, structure files against their mistakes.
+//! Structures compared with closed forms, derivatives with finite differences, and mistakes in structure files.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -25,14 +25,14 @@ fn spring(index: usize, from: Node, to: Node, n_per_m: f64) -> Spring {
     Spring::between(format!("k{index}"), from, to, n_per_m)
 }
 
-/// n equal masses in a row, the first tied to the ground.
+/// A chain of n equal masses, the first of which is connected to the ground.
 fn chain(n: usize, kg: f64, n_per_m: f64) -> Structure {
     let end = |i: usize| if i == 0 { Node::Ground } else { Node::Dof(i - 1) };
     let springs = (0..n).map(|i| spring(i, end(i), Node::Dof(i), n_per_m)).collect();
     Structure::new((0..n).map(|i| mass(i, kg)).collect(), springs).unwrap()
 }
 
-/// Every mass tied to the ground, and random springs between them.
+/// Masses that are all connected to the ground, with random springs between them.
 fn random_structure(seed: u64) -> Structure {
     let mut stream = stats::stream(seed, "test structure");
     let n = stream.random_range(2..6);
@@ -139,14 +139,14 @@ fn derivatives_agree_with_central_finite_differences() {
     }
 }
 
-/// Three equal masses in a ring, each tied to the ground: the upper two frequencies are equal.
+/// Three equal masses in a ring, each connected to the ground: the upper two frequencies are equal.
 fn ring() -> Structure {
     let mut springs: Vec<Spring> = (0..3).map(|i| spring(i, Node::Ground, Node::Dof(i), 4.0)).collect();
     springs.extend((0..3).map(|i| spring(3 + i, Node::Dof(i), Node::Dof((i + 1) % 3), 5.0)));
     Structure::new((0..3).map(|i| mass(i, 0.5)).collect(), springs).unwrap()
 }
 
-/// Two equal oscillators that do not touch.
+/// Two equal oscillators that are not coupled.
 fn pair() -> Structure {
     let springs = (0..2).map(|i| spring(i, Node::Ground, Node::Dof(i), 4.0)).collect();
     Structure::new((0..2).map(|i| mass(i, 0.5)).collect(), springs).unwrap()
@@ -173,7 +173,7 @@ fn at_repeated_frequencies_the_derivatives_are_the_right_hand_ones() {
             let heavier = with_mass(&structure, index, structure.masses()[index].kg + h);
             for (mode, f) in natural_frequencies_hz(&heavier, n).unwrap().iter().enumerate() {
                 let slope = (f - found.frequencies_hz[mode]) / h;
-                // The second derivative is some 10 Hz/kg², so a step of 1e-6 kg is off by some 1e-5.
+                // The second derivative is some 10 Hz/kg², so that the error of a step of 1e-6 kg is about 1e-5.
                 let error = (sensitivity.by_mass[(mode, index)] - slope).abs();
                 assert!(error < 1e-4, "mass {index}, mode {mode}: {error}");
             }

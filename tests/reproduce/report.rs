@@ -80,7 +80,7 @@ fn a_case_without_data_or_with_infinite_ones_is_still_a_page() {
     assert!(IDS.iter().all(|id| given(&page, id) == 1 || *id == "fig17"));
 }
 
-/// Chromium without a window; none where it is not installed.
+/// Headless Chromium; `None` if it is not installed.
 fn chromium(home: &Path, arguments: &[&str], file: &Path) -> Option<Output> {
     let mut command = Command::new("chromium");
     command.args([
@@ -99,7 +99,7 @@ fn chromium(home: &Path, arguments: &[&str], file: &Path) -> Option<Output> {
     output
 }
 
-/// Opens what is folded away and tells the page above how wide this one is.
+/// Opens collapsed sections and reports the width of this page to its parent.
 const MEASURE: &str = "<script>document.querySelectorAll('details').forEach(d => d.open = true);\
     const empty = [...document.querySelectorAll('svg')].filter(s => { const b = s.getBoundingClientRect();\
     return b.width === 0 || b.height === 0; }).length;\
@@ -110,7 +110,7 @@ const MEASURE: &str = "<script>document.querySelectorAll('details').forEach(d =>
     parent.postMessage(`scroll=${wide} inner=${innerWidth} empty=${empty} small=${small}`, '*');\
     </script>";
 
-/// A page that shows another in a frame of a given width: a window of Chromium is never narrower than 500 px.
+/// A page that shows another in a frame of a given width, because a window of Chromium is never narrower than 500 px.
 fn framed(page: &Path, width: u32) -> String {
     format!(
         "<!doctype html><title>waiting</title><script>onmessage = e => document.title = e.data</script>\
