@@ -141,11 +141,15 @@ impl Changed {
             match target {
                 Target::Springs(indices) => {
                     let factor = factor()?;
-                    indices.iter().for_each(|i| spring_factor[*i] *= factor);
+                    for i in indices {
+                        spring_factor[*i] *= factor;
+                    }
                 }
                 Target::Masses(indices) => {
                     let factor = factor()?;
-                    indices.iter().for_each(|i| mass_factor[*i] *= factor);
+                    for i in indices {
+                        mass_factor[*i] *= factor;
+                    }
                 }
                 Target::AddedSpring(from, to) => {
                     added[number].0 = changed.springs.len();

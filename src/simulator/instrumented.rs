@@ -63,7 +63,7 @@ pub(super) fn check(
         match structure.attachment_points().iter().find(|point| point.name == *name) {
             None => wrong(&key, format!("{} is not the name of a mass or of a node that can deflect", shown(name))),
             Some(_) if !seen.insert(name) => {
-                wrong(&key, format!("{} is listed twice: list each point once", shown(name)))
+                wrong(&key, format!("{} is listed twice: list each point once", shown(name)));
             }
             Some(point) => dofs.push(point.dof),
         }
