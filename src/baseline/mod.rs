@@ -333,7 +333,7 @@ impl Baseline {
     /// draw.
     fn is_set_right(&self) -> bool {
         let certain = self.simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));
-        let quick = self.simulator.structure().is_none_or(|structure| structure.freedoms() <= MOST_FREEDOMS_WEIGHED);
+        let quick = self.simulator.structure().is_none_or(|structure| structure.dofs() <= MOST_FREEDOMS_WEIGHED);
         certain && quick && !self.starts_at_fit()
     }
 
@@ -442,8 +442,11 @@ impl Baseline {
         }
         let shapes = measurement.mode_shapes.iter().flatten().map(|shape| unit_shape(shape.as_ref()?)).collect();
         let sizes = self.simulator.effect_sizes(&measurement.covariates);
-        let possible_sizes =
-            if sizes.missing.is_empty() { Vec::new() } else { self.simulator.possible_sizes(&measurement.covariates) };
+        let possible_sizes = if sizes.missing.is_empty() {
+            Vec::new()
+        } else {
+            self.simulator.marginalised_sizes(&measurement.covariates)
+        };
         let observation =
             Observation { frequencies_hz, noise_multiple, shapes, effect_sizes: sizes.values, possible_sizes };
         Admitted {

@@ -62,7 +62,7 @@ pub struct Effect {
 
 impl Effect {
     /// An effect that the structure has already, with what is known of its numbers as their prior.
-    pub fn known(effect: &crate::simulator::effect::Effect) -> Self {
+    pub fn known(effect: &crate::simulator::effect::SimulationEffect) -> Self {
         let mut names = effect.law.numbers();
         match effect.target {
             Target::Oscillator(_) => names.push("frequency_hz".to_owned()),

@@ -18,7 +18,7 @@ use tokio::sync::mpsc::{channel, Receiver};
 
 use super::{Error, Monitor};
 use crate::baseline::Baseline;
-use crate::measurement::check::{check_measurements, Expectation, Place, RawMeasurement};
+use crate::measurement::check::{check_measurements, Expectation, FieldPath, RawMeasurement};
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
@@ -345,7 +345,7 @@ fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Resu
 /// A batch after the same checks as one that is posted.
 fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBatch, Timestamp), Error> {
     let raw = |(index, m): (usize, &crate::store::archive::Measurement)| RawMeasurement {
-        place: Place::Json { index },
+        path: FieldPath::Json { index },
         measured_at: Some(m.measured_at.clone()),
         frequencies_hz: m.frequencies_hz.clone(),
         std_hz: m.std_hz.clone(),

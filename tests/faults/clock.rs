@@ -65,7 +65,8 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     // A year back: what was measured now is refused with the reason, what was measured then is taken.
     set(&file, "-365d");
     let (status, answer) = post(&service, &batch("logger", 2, 10)).await.unwrap();
-    let year = answer["detail"].as_str().unwrap_or_default().contains("in the future: it is 20");
+    let year =
+        answer["detail"].as_str().unwrap_or_default().contains("in the future: the clock of the service shows 20");
     assert!(status == 422 && year, "{answer}");
     let early =
         json!({ "measurements": [{ "measured_at": "2020-06-01T00:00:00Z", "frequencies_hz": [0.49, 0.92, 1.24] }] });

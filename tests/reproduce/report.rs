@@ -95,7 +95,7 @@ fn chromium(home: &Path, arguments: &[&str], file: &Path) -> Output {
     command.args(arguments).arg(format!("file://{}", file.display())).output().unwrap()
 }
 
-/// Opens what is folded away and tells the page above how wide this one is.
+/// Opens collapsed sections and reports the width of this page to its parent.
 const MEASURE: &str = "<script>document.querySelectorAll('details').forEach(d => d.open = true);\
     const empty = [...document.querySelectorAll('svg')].filter(s => { const b = s.getBoundingClientRect();\
     return b.width === 0 || b.height === 0; }).length;\
@@ -106,7 +106,7 @@ const MEASURE: &str = "<script>document.querySelectorAll('details').forEach(d =>
     parent.postMessage(`scroll=${wide} inner=${innerWidth} empty=${empty} small=${small}`, '*');\
     </script>";
 
-/// A page that shows another in a frame of a given width: a window of Chromium is never narrower than 500 px.
+/// A page that shows another in a frame of a given width, because a window of Chromium is never narrower than 500 px.
 fn framed(page: &Path, width: u32) -> String {
     format!(
         "<!doctype html><title>waiting</title><script>onmessage = e => document.title = e.data</script>\
