@@ -3,7 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 use candle_core::{DType, Device, Tensor};
-use modalwatch::flow::train::{train, Pairs, Stopped, TrainSettings};
+use modalwatch::flow::pairs::Pairs;
+use modalwatch::flow::train::{train, Stopped, TrainSettings};
 use modalwatch::flow::weights::{untrained_flow, Weights};
 use modalwatch::flow::{checkpoint, Architecture, Flow, FlowSettings};
 use modalwatch::stats;
