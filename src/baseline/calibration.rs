@@ -70,8 +70,8 @@ pub struct CellRanks {
 pub fn calibrate(baseline: &Baseline, seed: u64) -> Result<(CalibrationRecord, Vec<CellRanks>), InferenceError> {
     let Some(range) = baseline.manifest().conditions.noise_range else {
         let failure =
-            "the structure has no measurement noise: posteriors of exact data are points, and no interval of \
-                       them means anything; state the noise"
+            "the structure has no measurement noise: posteriors of exact data are points, whose intervals are \
+                       meaningless; state the noise"
                 .to_owned();
         let record = CalibrationRecord { simulations: 0, draws: 0, failures: vec![failure], cells: Vec::new() };
         return Ok((record, Vec::new()));

@@ -36,7 +36,7 @@ pub struct Conditions {
     pub training_box: Vec<[f64; 2]>,
     /// Noise of the frequencies; `None` for a structure without noise, whose measurements must be complete and exact.
     pub noise_range: Option<NoiseRange>,
-    /// Whether the flow starts at the best fit of each measurement, see [`super::start`].
+    /// Whether the flow starts at the best fit of each measurement, see `baseline::start`.
     #[serde(default, skip_serializing_if = "is_false")]
     pub starts_at_fit: bool,
     /// Effects that vary with a covariate. Their sizes are inputs of the flow.

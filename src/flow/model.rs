@@ -20,7 +20,7 @@ pub struct Flow {
 }
 
 impl Flow {
-    /// Builds the flow from the weights of `vb`, which are either drawn (see [`weights`](super::weights)) or read from a
+    /// Builds the flow from the weights of `vb`, which are either drawn (see `flow::weights`) or read from a
     /// checkpoint.
     ///
     /// # Errors

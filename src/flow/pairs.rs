@@ -13,7 +13,7 @@ pub struct Pairs {
     pub y: Tensor,
 }
 
-/// Mean loss of the pairs, a scalar in nats with candle's gradient: the reference for [`fused`](super::fused).
+/// Mean loss of the pairs, a scalar in nats with candle's gradient: the reference for `flow::fused`.
 ///
 /// ```text
 ///  1/n Σ ( ½|z|² − ln|det ∂z/∂x| ),    z = f(x; S(y))

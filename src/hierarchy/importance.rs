@@ -3,7 +3,7 @@
 //!
 //! The points are independent and need one evaluation of the likelihood each, whereas a Markov chain needs several steps
 //! per independent draw. Where the posterior is far from normal, the effective sample size is small and the Markov chain
-//! ([`super::gibbs`]) is used instead.
+//! (`gibbs`) is used instead.
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;

@@ -214,7 +214,7 @@ impl Problem {
         }
     }
 
-    /// The most probable population, by expectation–maximisation; see [`populations`](super::estimate::populations).
+    /// The most probable population, by expectation–maximisation; see `populations`.
     pub(super) fn maximise(&self) -> State {
         let (n, d) = (self.measurements as f64, self.deviations.len());
         let start = |k: usize| {
