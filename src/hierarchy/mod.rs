@@ -38,9 +38,10 @@
 //! let theta = DMatrix::from_fn(measurements * draws, 1, |row, _| centres[row / draws] + normal(0.1));
 //!
 //! let found = populations(&PosteriorSamples::new(theta, draws), None, &space, 1);
-//! let [low, high] = found.parameters[0].mean_interval();
-//! assert!(low < 5.0 && 5.0 < high);
-//! assert!((found.parameters[0].std.unwrap() - 0.2).abs() < 0.1);
+//! let k1 = &found.parameters[0];
+//! // The standard errors are 0.04 N/m for the mean and 0.03 N/m for the standard deviation.
+//! assert!((k1.mean - 5.0).abs() < 0.2);
+//! assert!((k1.std.unwrap() - 0.2).abs() < 0.15);
 //! ```
 
 mod block;
