@@ -215,9 +215,18 @@ impl Notifier {
     }
 }
 
+/// Makes `ring` the TLS implementation of this process. Every call after the first changes nothing.
+///
+/// An HTTP client that is built before the first call panics.
+pub fn install_tls_provider() {
+    // An error means that a provider is installed already.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+}
+
 /// A builder of HTTP clients that trust the system's certificates and Mozilla's: without the latter there would be no client at
 /// all, not even for http, where the system has none, as in small container images.
 pub fn client_builder() -> ClientBuilder {
+    install_tls_provider();
     let certificates = webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter();
     Client::builder().tls_certs_merge(certificates.filter_map(|der| Certificate::from_der(der).ok()))
 }

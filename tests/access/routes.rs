@@ -30,7 +30,7 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 58] = [
+const TABLE: [(&str, &str, Needs, About); 61] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
@@ -88,6 +88,9 @@ const TABLE: [(&str, &str, Needs, About); 58] = [
     ("GET", "/docs", Nothing, Service),
     ("GET", "/docs/", Nothing, Service),
     ("GET", "/docs/{}", Nothing, Service),
+    ("GET", "/docs/api-explorer", Nothing, Service),
+    ("GET", "/docs/api-explorer/", Nothing, Service),
+    ("GET", "/docs/api-explorer/{}", Nothing, Service),
     ("GET", "/", Nothing, Service),
     ("GET", "/assets/{}", Nothing, Service),
 ];

@@ -45,7 +45,12 @@ impl Service {
         // Its log must be read, or the pipe fills and the service waits for it.
         let mut stderr = child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut stderr, &mut std::io::sink()));
-        Self { url: url.to_owned(), child, stdout: Some(stdout), client: Client::new() }
+        Self {
+            url: url.to_owned(),
+            child,
+            stdout: Some(stdout),
+            client: modalwatch::notify::client_builder().build().unwrap(),
+        }
     }
 
     /// Address without scheme.

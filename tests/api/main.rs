@@ -6,6 +6,7 @@ mod bad_input;
 mod batches;
 mod bulk;
 mod diagnosis;
+mod docs;
 mod export;
 mod helpers;
 mod history;

@@ -153,7 +153,10 @@ async fn nested_swollen_and_compressed_bodies_are_refused_in_flat_memory() {
         }
         // A gzip bomb is not unpacked: a megabyte that would be a gigabyte.
         // Its body is not read either, so that its connection ends with the answer: it has one of its own.
-        let bomb = reqwest::Client::new().post(format!("http://{}{BATCHES}", service.address()));
+        let bomb = modalwatch::notify::client_builder()
+            .build()
+            .unwrap()
+            .post(format!("http://{}{BATCHES}", service.address()));
         let bomb = bomb.header("content-encoding", "gzip");
         let bomb = bomb.header("content-type", "application/json").body(gzip_of_zeros(1 << 20));
         problem(bomb.send().await.unwrap(), 415, "unsupported_encoding").await;
