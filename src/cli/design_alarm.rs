@@ -250,7 +250,7 @@ fn print(report: &Report) {
     let ewma = report.ewma_limit_standard_errors.map_or("off".to_owned(), |l| format!("{l:.2}"));
     println!("limits: one batch {:.2} standard errors, moving average {ewma}", report.shift_limit_standard_errors);
     println!(
-        "undamaged: {:.0} ± {:.0} batches to the first false alarm (required {:.0})",
+        "healthy operation: {:.0} ± {:.0} batches to the first false alarm (required {:.0})",
         report.healthy_run_batches, report.healthy_run_error, report.wanted_run_batches
     );
     println!(
