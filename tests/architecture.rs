@@ -38,12 +38,13 @@ const EXCEPTIONS: [(&str, &str); 0] = [];
 const FOUNDATION: [&str; 5] = ["quantity", "stats", "parameter", "measurement", "fault"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
-const TABLE: [(&str, &[&str], bool); 33] = [
+const TABLE: [(&str, &[&str], bool); 34] = [
     // Where tests make things fail: a macro that needs nothing.
     ("fault", &[], false),
     ("quantity", &[], false),
     ("access", &[], true),
     ("stats", &[], false),
+    ("simd", &[], false),
     ("volume", &[], false),
     ("plot", &["stats"], false),
     ("reduction", &[], false),
@@ -52,13 +53,13 @@ const TABLE: [(&str, &[&str], bool); 33] = [
     ("physics", &["quantity", "stats"], false),
     ("emulator", &["stats"], false),
     ("gsa", &["stats"], false),
-    ("flow", &["stats"], false),
+    ("flow", &["simd", "stats"], false),
     ("simulator", &["emulator", "physics"], true),
     ("updating", &["physics", "simulator"], true),
     ("posterior", &[], true),
     // `physics` for the error of a simulation only.
     ("baseline", &["flow", "simulator", "posterior", "physics"], true),
-    ("hierarchy", &["posterior"], true),
+    ("hierarchy", &["posterior", "simd"], true),
     ("trust", &["baseline", "simulator", "physics"], true),
     ("discrepancy", &["physics", "plot", "simulator"], true),
     ("damage", &["hierarchy", "posterior"], true),

@@ -1,4 +1,4 @@
-//! The population behind a batch: bias, coverage, and what remains where noise drowns the spread.
+//! The population behind a batch: bias, coverage, and the intervals where noise dominates the spread.
 
 use std::collections::BTreeMap;
 
@@ -45,7 +45,7 @@ pub fn batch(
 }
 
 pub fn undamaged(baseline: &Baseline, measurements: &[ModalMeasurement]) -> UndamagedState {
-    // A seed of its own, as the service gives each batch: draws of two populations must not move together.
+    // Another seed than that of the batches, as in the service: draws of two populations must be independent.
     assess::undamaged_state(baseline, &[(measurements, Draws { seed: 6, ..DRAWS })], 0.05).unwrap()
 }
 
@@ -109,7 +109,7 @@ fn the_noise_counts_twice_in_the_pool_and_not_at_all_in_the_population() {
 }
 
 #[test]
-fn where_noise_drowns_the_spread_the_intervals_cover_and_are_wide() {
+fn where_noise_dominates_the_spread_the_intervals_cover_and_are_wide() {
     let found = repeat(3.0, 150);
     for f in &found {
         for covered in [f.mean_covered, f.std_covered, f.probability_covered] {
@@ -119,7 +119,7 @@ fn where_noise_drowns_the_spread_the_intervals_cover_and_are_wide() {
             assert!((0.83..=0.985).contains(&covered), "{found:?}");
         }
     }
-    // Noise of 0.24 N/m over a spread of 0.1: the interval of σ is about as wide as σ, or wider.
+    // With noise of 0.24 N/m and a spread of 0.1 N/m, the interval of σ is about as wide as σ or wider.
     assert!(found[1].relative_width > 0.9, "{found:?}");
 }
 
@@ -132,7 +132,7 @@ fn without_noise_pool_and_population_agree() {
         for (k, (_, std)) in TABLE_2.iter().enumerate() {
             let pooled = Hyperparameters::from_pool(&samples.posterior.first(10).column(k), 10);
             let population = &samples.populations.parameters[k];
-            // The sampling error of 50 draws: σ/√50 and σ/√100; a fifth of it.
+            // The bounds are a fifth of the sampling errors of 50 draws, σ/√50 and σ/√100.
             assert!((pooled.mean - population.mean).abs() < 0.2 * std / 50.0_f64.sqrt(), "k{}: {population:?}", k + 1);
             assert!((pooled.std.unwrap() - population.std.unwrap()).abs() < 0.2 * std / 10.0, "k{}", k + 1);
         }
@@ -174,7 +174,7 @@ fn an_undamaged_state_with_damage_in_it_is_doubted_and_one_too_small_refused() {
     assert!(doubts.iter().any(|d| d.starts_with("k2: its batches differ")), "{doubts:?}");
     let small = assess::undamaged_state(&baseline, &[(&healthy[..9], DRAWS)], 0.05).unwrap_err();
     assert!(small.to_string().contains("at least 10"), "{small}");
-    // Its threshold is known better from more measurements.
+    // More measurements determine the threshold more accurately.
     let width = |count: usize| {
         let q = &undamaged(&baseline, &batch(&baseline, &TABLE_2, count, 1.0, 4)).quantities[0];
         q.threshold_interval.unwrap()[1] - q.threshold_interval.unwrap()[0]
