@@ -48,14 +48,14 @@ static SELECT_AFTER: LazyLock<String> = LazyLock::new(|| {
 });
 
 /// Statements that insert points or replace them. Structure, time and batch are the same in all rows.
-static INSERT_POINTS: InsertStatements = InsertStatements::ending_with(
-    "on conflict (structure_id, undamaged_version, series, measured_to_us, batch_id) do update
-     set shift = excluded.shift, shift_limit = excluded.shift_limit, ewma_limit = excluded.ewma_limit,
-         probability_limit = excluded.probability_limit, held = excluded.held, ewma = excluded.ewma,
-         above = excluded.above, state = excluded.state",
+static INSERT_POINTS: InsertStatements = InsertStatements::with_clause(
     "insert into chart_point",
     13,
     &[0, 3, 4],
+    " on conflict (structure_id, undamaged_version, series, measured_to_us, batch_id) do update
+     set shift = excluded.shift, shift_limit = excluded.shift_limit, ewma_limit = excluded.ewma_limit,
+         probability_limit = excluded.probability_limit, held = excluded.held, ewma = excluded.ewma,
+         above = excluded.above, state = excluded.state",
 );
 
 /// The result of storing the points of a batch.

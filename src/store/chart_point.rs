@@ -16,7 +16,7 @@ const SAME: f64 = 1e-9;
 /// A point of a batch on an alarm chart, to be stored.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewChartPoint {
-    /// The parameter of a damage chart, or [`super::FIT_SERIES`].
+    /// The parameter of a damage chart, or `simulation:fit`.
     pub series: String,
     /// Version of the undamaged reference; 0 for the chart of the fit.
     pub undamaged_version: u32,
@@ -35,7 +35,7 @@ pub struct StoredChartPoint {
     pub batch_id: String,
     /// Time of the last measurement of the batch.
     pub measured_to: Timestamp,
-    /// The parameter, or [`super::FIT_SERIES`].
+    /// The parameter, or `simulation:fit`.
     pub series: String,
     /// Shift towards damage, in standard errors.
     pub shift: f64,
