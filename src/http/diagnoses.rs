@@ -187,7 +187,7 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
     let mut items = Vec::new();
-    for record in shared.monitor.store().diagnoses(&id, LISTED).await? {
+    for record in shared.monitor.store().diagnoses().list(&id, LISTED).await? {
         let result: Option<serde_json::Value> = record.result.as_deref().and_then(|r| serde_json::from_str(r).ok());
         let text = |key: &str| result.as_ref().and_then(|r| r[key].as_str()).map(str::to_owned);
         items.push(Listed {
@@ -229,7 +229,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 )]
 pub async fn report(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     shared.monitor.diagnosis(&id).await?;
-    let Some(html) = shared.monitor.store().diagnosis_report(&id).await? else {
+    let Some(html) = shared.monitor.store().diagnoses().diagnosis_report(&id).await? else {
         return Err(ApiError::new(StatusCode::CONFLICT, "no_report", format!("diagnosis {id} has no report yet")));
     };
     let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:";

@@ -132,7 +132,7 @@ pub async fn measurements(
         return export.answer(format).await;
     }
     page.limit = limit.unwrap_or(page.limit);
-    let found = store.measurements(&id, &page).await?;
+    let found = store.batches().measurements(&id, &page).await?;
     let next = (found.len() == page.limit).then(|| found.last().map(|m| cursor(&m.place))).flatten();
     let items = found.into_iter().map(MeasurementItem::from).collect();
     let mut response = Json(MeasurementPage { structure: id.clone(), items, next: next.clone() }).into_response();
@@ -193,7 +193,7 @@ impl Export {
 
     async fn part(mut self) -> Result<Part, ApiError> {
         self.page.limit = self.left.map_or(self.page.limit, |left| left.min(self.page.limit));
-        let found = self.store.measurements(&self.structure, &self.page).await?;
+        let found = self.store.batches().measurements(&self.structure, &self.page).await?;
         self.left = self.left.map(|left| left - found.len());
         let last = found.len() < self.page.limit || self.left == Some(0);
         self.page.after = found.last().map(|m| m.place.clone()).or(self.page.after);

@@ -148,7 +148,7 @@ pub async fn history(
         after: after.map(|(time, batch, _)| (time, batch)),
         after_quantity: None,
     };
-    let entries = shared.monitor.store().history(&id, &page).await?;
+    let entries = shared.monitor.store().history().page(&id, &page).await?;
     let next = (entries.len() == limit).then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id))).flatten();
     let items: Vec<HistoryItem> = entries.into_iter().map(HistoryItem::from).collect();
     let mut response = if format == Format::Json {
@@ -201,7 +201,7 @@ pub async fn exceedances(
     let limit = page_limit(query.limit.as_deref())?;
     let parameter = query.parameter.clone();
     let page = HistoryQuery { from: window.from, to: window.to, parameter, limit, after, after_quantity };
-    let found = shared.monitor.store().exceedances(&id, &page).await?;
+    let found = shared.monitor.store().history().exceedances(&id, &page).await?;
     let next = (found.len() == limit)
         .then(|| found.last().map(|e| format!("{}~{}", cursor(e.measured_from, &e.batch_id), e.quantity)))
         .flatten();

@@ -11,7 +11,7 @@ use utoipa::ToSchema;
 use super::shared::Shared;
 use crate::baseline::library::Refusal;
 use crate::monitor::upkeep::Health;
-use crate::store::Store;
+use crate::store::schema_version;
 
 /// The process is running.
 #[derive(Debug, Serialize, ToSchema)]
@@ -104,8 +104,8 @@ pub async fn version(State(shared): State<Shared>) -> Response {
     let version = Version {
         name: env!("CARGO_PKG_NAME"),
         version: env!("CARGO_PKG_VERSION"),
-        sqlite_version: shared.monitor.store().sqlite_version().to_owned(),
-        schema_version: Store::schema_version(),
+        sqlite_version: shared.monitor.store().file().sqlite_version().to_owned(),
+        schema_version: schema_version(),
         manifest_format: crate::baseline::manifest::FORMAT,
     };
     Json(version).into_response()

@@ -91,7 +91,8 @@ pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, bod
 )]
 pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiError> {
     let store = shared.monitor.store().clone();
-    let listed = tokio::task::spawn_blocking(move || store.backups()).await.map_err(|e| ApiError::internal(&e))?;
+    let listed =
+        tokio::task::spawn_blocking(move || store.file().backups()).await.map_err(|e| ApiError::internal(&e))?;
     let (items, unreadable) = listed?;
     Ok(Json(BackupList { items, unreadable }).into_response())
 }

@@ -175,15 +175,15 @@ pub async fn series(
     // A long interval occupies three connections of the store; the others must stay available.
     let _turn = shared.series.acquire().await.map_err(|e| ApiError::internal(&e))?;
     let store = shared.monitor.store();
-    let extent = store.extent(&id, window).await?;
+    let extent = store.series().extent(&id, window).await?;
     let (from, to) = (window.from.or(extent.measured.map(|m| m.0)), window.to.or(extent.measured.map(|m| m.1)));
 
     let (modes, declared) = (watched.simulator.modes(), watched.simulator.covariates().iter());
     let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
     let (measured, (quantities, trust), charts) = tokio::try_join!(
-        store.frequency_series(&id, window, &extent, modes, &names),
-        store.assessed_series(&id, window, &extent),
-        store.chart_series(&id, window, &extent),
+        store.series().frequency_series(&id, window, &extent, modes, &names),
+        store.series().assessed_series(&id, window, &extent),
+        store.series().chart_series(&id, window, &extent),
     )?;
     let reduced = measured.reduced
         || trust.reduced
@@ -193,12 +193,12 @@ pub async fn series(
 
     // The reference applies only if it was made with the trained model in use.
     let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
-    let undamaged = store.undamaged(&id).await?.filter(|u| in_use == Some(&u.model_digest));
+    let undamaged = store.reference().undamaged(&id).await?.filter(|u| in_use == Some(&u.model_digest));
     let within = |begin: Timestamp, end: Option<Timestamp>| {
         to.is_none_or(|to| begin <= to) && from.is_none_or(|from| end.is_none_or(|end| end >= from))
     };
-    let episodes = store.episodes(&id, None, false, MOST_ALARMS).await?;
-    let maintenance = store.maintenance(&id).await?;
+    let episodes = store.alarms().episodes(&id, None, false, MOST_ALARMS).await?;
+    let maintenance = store.alarms().maintenance(&id).await?;
     let body = SeriesBody {
         from,
         to,

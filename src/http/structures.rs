@@ -92,7 +92,7 @@ struct ListedStructure {
 )]
 pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let mut items = Vec::new();
-    for summary in shared.monitor.store().structures().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
+    for summary in shared.monitor.store().structures().list().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
         let watched = shared.monitor.structure(&summary.id);
         items.push(ListedStructure {
             model_digest: watched.ok().and_then(|it| Some(it.baseline.as_ref().ok()?.digest().to_string())),
@@ -120,7 +120,7 @@ pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response
 pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let watched = shared.monitor.structure(&id)?;
-    let undamaged = shared.monitor.store().undamaged(&id).await?;
+    let undamaged = shared.monitor.store().reference().undamaged(&id).await?;
     Ok(Json(body(&id, &watched, undamaged.map(|u| super::answer::Undamaged::new(&id, &u)))).into_response())
 }
 
@@ -177,7 +177,8 @@ pub async fn put(
     let outcome = shared.monitor.put_structure(definition).await?;
     let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
     let watched = shared.monitor.structure(&id)?;
-    let undamaged = shared.monitor.store().undamaged(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
+    let undamaged =
+        shared.monitor.store().reference().undamaged(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
     let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
     Ok((status, location, Json(self::body(&id, &watched, undamaged))).into_response())
 }

@@ -152,7 +152,8 @@ pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Resp
         let watched = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
         item(found, watched)
     };
-    let items = store.overview().await?.into_iter().filter(|found| grant.may_see(&found.id)).map(item).collect();
+    let items =
+        store.overview().structures().await?.into_iter().filter(|found| grant.may_see(&found.id)).map(item).collect();
     let jobs_running = shared.monitor.jobs_running();
     Ok(Json(Overview { items, jobs_running }).into_response())
 }

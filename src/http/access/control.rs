@@ -82,7 +82,7 @@ impl AccessControl {
         (address, data_dir): (SocketAddr, &Path),
         largest_batch: usize,
     ) -> Result<Self, Error> {
-        let tokens: TokenTable = store.tokens().await?.into_iter().collect();
+        let tokens: TokenTable = store.tokens().list().await?.into_iter().collect();
         let file_token: TokenTable =
             settings.admin_token_file.as_deref().map(read_admin_token).transpose()?.into_iter().collect();
         let proxies = Proxies::parse(&http.trusted_proxies)?;

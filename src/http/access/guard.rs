@@ -65,7 +65,7 @@ async fn structure_of(
     let Some((_, first)) = parameters.iter().next() else { return Ok(None) };
     match about {
         route::Subject::Structure => Ok(Some(first.to_owned())),
-        _ => Ok(access.0.store.structure_of_diagnosis(first).await?),
+        _ => Ok(access.0.store.diagnoses().structure_of_diagnosis(first).await?),
     }
 }
 

@@ -43,7 +43,7 @@ pub(super) fn entry(
 pub(super) async fn run(access: &AccessControl, entry: NewAuditEntry, request: Request, next: Next) -> Response {
     let (store, id) = (access.0.store.clone(), current_id().unwrap_or_default());
     let task = async move {
-        let number = match store.begin_audit(entry).await {
+        let number = match store.audit().begin_audit(entry).await {
             Ok(number) => number,
             // A change that cannot be recorded is not made.
             Err(error) => return Ok(ApiError::from(error).into_response()),
@@ -54,7 +54,7 @@ pub(super) async fn run(access: &AccessControl, entry: NewAuditEntry, request: R
         let status = answered.as_ref().map_or(500, |response| response.status().as_u16());
         let made = answered.as_ref().ok().and_then(|response| response.headers().get(header::LOCATION));
         let made = made.and_then(|value| value.to_str().ok()).map(str::to_owned);
-        if let Err(cause) = store.end_audit(number, status, made).await {
+        if let Err(cause) = store.audit().end_audit(number, status, made).await {
             // The entry exists and the change is made: the client receives its result.
             error!(%cause, number, status, "Could not write the outcome of audit entry {number}: {cause}");
         }
