@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{command, measurements, problem, repository, spawn, time, Service};
+use crate::helpers::{command, eventually, measurements, problem, repository, spawn, time, Service};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -378,13 +378,7 @@ async fn a_batch_that_waited_is_assessed_when_its_baseline_is_there() {
     service.stop("TERM");
     let service = Service::start(folder.path());
     let path = format!("{BATCHES}/{}", batch.as_str().unwrap());
-    for _ in 0..100 {
-        if service.read(&path).await["state"] == "assessed" {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
-    panic!("{}", service.read(&path).await);
+    eventually("the assessment", async || (service.read(&path).await["state"] == "assessed").then_some(())).await;
 }
 
 #[tokio::test]

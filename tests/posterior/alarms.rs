@@ -124,7 +124,11 @@ fn healthy_operation_runs_as_long_as_wanted_to_a_false_alarm() {
             }
             let (mean, error) = (stats::mean(&runs), stats::sample_std(&runs).unwrap() / f64::from(operations).sqrt());
             println!("{id}, batches of {size}: mean run to a false alarm {mean:.0} ± {error:.0} batches (wanted 1000)");
-            assert!((1_000.0 / 1.5..=1_500.0).contains(&mean), "{id}, {size}: {mean} ± {error}");
+            // 300 runs scatter by `error`, 65 to 88 batches. The limits aim at 1,000; what they reach is 1,180 ± 31 (mean of
+            // the six cases here), because an undamaged state of a hundred batches still lengthens the runs. Three standard
+            // errors below the nominal value and above the reached one.
+            let (least, most) = (1_000.0 - 3.0 * error, 1_180.0 + 3.0 * error);
+            assert!((least..=most).contains(&mean), "{id}, {size}: {mean} ± {error}");
         }
     }
 }
@@ -160,6 +164,10 @@ fn a_tenth_less_of_k1_is_alarmed_within_three_batches() {
         stats::quantile(&runs, 0.9),
         100.0 * naive
     );
-    assert!(stats::quantile(&runs, 0.5) <= 3.0);
-    assert!(naive > 0.3, "{naive}");
+    // Nine of ten alarms come with the first batch; the 90 % quantile of 300 runs is then 1 or 2.
+    assert!(stats::quantile(&runs, 0.9) <= 3.0);
+    // 20 measurements of which at least 2 are below the 5 % quantile: 0.26 for one parameter, 0.60 for three that are
+    // independent, and more as the quantile is itself estimated, from 100: 0.65. A share of 300 scatters by 0.028: four times
+    // that about 0.65.
+    assert!((0.54..=0.76).contains(&naive), "{naive}");
 }

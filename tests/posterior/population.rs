@@ -95,13 +95,17 @@ fn the_noise_counts_twice_in_the_pool_and_not_at_all_in_the_population() {
     let found = repeat(1.0, 400);
     for (k, f) in found.iter().enumerate() {
         let std = TABLE_2[k].1;
-        assert!((f.std / std - 1.0).abs() <= 0.10, "k{}: {f:?}", k + 1);
-        // A share of 400: 0.9 ± 0.015.
+        // One estimate of σ from 50 measurements scatters by 10 %, of k2 by 17 % because of the noise: the mean of 400 by
+        // 0.5 % and 0.8 %. Four times the larger; the estimates are low by up to 0.8 % themselves.
+        assert!((f.std / std - 1.0).abs() <= 0.035, "k{}: {f:?}", k + 1);
+        // A share of 400 scatters by 0.015 about 0.9: 3.3 times that.
         for covered in [f.mean_covered, f.std_covered, f.probability_covered] {
             assert!((0.85..=0.95).contains(&covered), "k{}: {f:?}", k + 1);
         }
     }
-    assert!(found[1].pooled_std / 0.1 > 1.4, "the pool of k2 should be some 50 % too wide: {found:?}");
+    // The noise of k2 is about 0.08 N/m, and the pool has it twice: √(0.1² + 2·0.08²) = 0.151. The mean of 400 scatters by
+    // 0.5 % of it: six times that, as the noise is known to two digits.
+    assert!((found[1].pooled_std / 0.151 - 1.0).abs() < 0.03, "the pool of k2 should be 51 % too wide: {found:?}");
 }
 
 #[test]
@@ -109,8 +113,10 @@ fn where_noise_drowns_the_spread_the_intervals_cover_and_are_wide() {
     let found = repeat(3.0, 150);
     for f in &found {
         for covered in [f.mean_covered, f.std_covered, f.probability_covered] {
-            // A share of 150: 0.9 ± 0.024.
-            assert!(covered >= 0.83, "{found:?}");
+            // A share of 150 scatters by 0.0245 about 0.9. The program's own values are between 0.87 and 0.94 here (1,000
+            // repetitions of the sampler alone), where the share scatters by 0.027 and 0.019. So 0.83 is 2.9 standard errors
+            // below the nominal value, and 0.985 is 3.5 above it and 2.4 above 0.94.
+            assert!((0.83..=0.985).contains(&covered), "{found:?}");
         }
     }
     // Noise of 0.24 N/m over a spread of 0.1: the interval of σ is about as wide as σ, or wider.
