@@ -144,7 +144,7 @@ impl Notifier {
     }
 }
 
-/// Makes `ring` the TLS implementation of this process. Every call after the first changes nothing.
+/// Makes `ring` the TLS implementation of this process. Calls after the first change nothing.
 ///
 /// An HTTP client that is built before the first call panics.
 pub fn install_tls_provider() {

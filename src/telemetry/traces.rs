@@ -33,9 +33,10 @@ impl Traces {
         }
         let wrong =
             |e: &dyn std::fmt::Display| format!("traces cannot be sent (log.otlp_endpoint, OTEL_EXPORTER_OTLP_…): {e}");
-        // As `notify::client_builder` does, which this module cannot reach; an error means that it is installed already.
+        // As `notify::client_builder` does, which this module may not use; an error means that it is installed already.
         let _ = rustls::crypto::ring::default_provider().install_default();
-        // Mozilla's certificates too: without any there would be no client, as in small container images.
+        // Mozilla's certificates are added because small container images have none, and the client cannot be built
+        // without any.
         let mozilla = webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter().filter_map(|der| Certificate::from_der(der).ok());
         let client = reqwest::blocking::Client::builder().tls_certs_merge(mozilla);
         // A blocking client cannot be created on an async thread.
