@@ -189,10 +189,8 @@ fn print(d: &Diagnosis) {
     for cause in &d.causes {
         println!("cause ({:?}, probability {:.3}): {}", cause.class, cause.probability, cause.sentence);
         for n in &cause.parameters {
-            println!(
-                "    {:>24} {:>12.5} ({:.5} … {:.5}) {}",
-                n.name, n.value, n.interval90[0], n.interval90[1], n.unit
-            );
+            let name = if n.name == "swing" { "effect range" } else { &n.name };
+            println!("    {name:>24} {:>12.5} ({:.5} … {:.5}) {}", n.value, n.interval90[0], n.interval90[1], n.unit);
         }
     }
     for a in d.alternatives.iter().take(5) {

@@ -294,10 +294,10 @@ impl Wording<'_> {
             LawKind::Constant => self.constant(&what, value, &size()),
             LawKind::Step => {
                 let (unit, at) = (self.time_unit, self.effect.law.reference);
-                format!("{what} {} {} from {unit} {at:.0} of the data on", self.is_or(changes), size())
+                format!("{what} {} {} from {unit} {at:.0} of the data on", self.verb(changes), size())
             }
             LawKind::Category => match &self.name.level {
-                Some(level) => format!("{what} {} {} where {covariate} is {level}", self.is_or(changes), size()),
+                Some(level) => format!("{what} {} {} where {covariate} is {level}", self.verb(changes), size()),
                 None => format!("{what} differs with {covariate} ({})", self.each_category()),
             },
             LawKind::Linear | LawKind::Lagged => self.slope(&what, covariate),
@@ -328,8 +328,8 @@ impl Wording<'_> {
         }
     }
 
-    /// An added spring has no stiffness that could change: its size is its stiffness.
-    fn is_or(&self, changes: &'static str) -> &'static str {
+    /// The verb before a size; the size of an added spring is its stiffness, not a change.
+    fn verb(&self, changes: &'static str) -> &'static str {
         if self.adds_spring() {
             "is"
         } else {
