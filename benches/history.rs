@@ -85,7 +85,7 @@ async fn generate(folder: &Path, batches: usize) -> usize {
         let json = definition.replace("\"three-dof\"", &format!("\"{id}\""));
         let digest = Digest::of_file(json.as_bytes());
         let id = StructureId::parse(&id).expect("an id");
-        store.put_structure(&id, &json, &digest, Timestamp::now()).await.expect("a structure");
+        store.structures().put_structure(&id, &json, &digest, Timestamp::now()).await.expect("a structure");
     }
     store.close().await;
     drop(store);
@@ -219,7 +219,7 @@ async fn queries(folder: &Path, large: usize) {
     BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
     let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
     println!("  the service is there after {:.0} s, its check of the file included", started.elapsed().as_secs_f64());
-    let client = reqwest::Client::new();
+    let client = modalwatch::notify::client_builder().build().unwrap();
     let get = async |path: &str| {
         let started = Instant::now();
         let response = client.get(format!("{url}{path}")).send().await.expect("the service answers");
@@ -284,13 +284,13 @@ async fn replay(threads: usize) -> f64 {
     let started = Instant::now();
     // All others go back to be compared with it.
     monitor.declare_undamaged(&structure, first.into_iter().collect(), 0.05).await.expect("an undamaged state");
-    let waiting = async || !monitor.store().pending(&structure, 1).await.expect("an answer").is_empty();
+    let waiting = async || !monitor.store().batches().pending(&structure, 1).await.expect("an answer").is_empty();
     while waiting().await {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     let seconds = started.elapsed().as_secs_f64();
     let query = HistoryQuery { limit: REPLAYED, ..HistoryQuery::default() };
-    let history = monitor.store().history(&structure, &query).await.expect("a history");
+    let history = monitor.store().history().page(&structure, &query).await.expect("a history");
     let compared = |entry: &modalwatch::store::HistoryEntry| {
         entry.assessment.as_ref().is_some_and(|assessment| assessment.undamaged_version == Some(1))
     };

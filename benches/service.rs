@@ -85,7 +85,7 @@ impl Service {
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
         let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
-        Self { process, url, client: reqwest::Client::new(), folder }
+        Self { process, url, client: modalwatch::notify::client_builder().build().unwrap(), folder }
     }
 
     async fn post(&self, path: &str, body: Vec<u8>) -> Value {
@@ -99,7 +99,7 @@ impl Service {
     async fn declare_undamaged(&self) {
         let batch = self.post(&batches(ASSESSED), body("undamaged", 0, LARGE)).await;
         let declared = json!({ "batches": [batch["batch"]] }).to_string().into_bytes();
-        self.post(&format!("/v1/structures/{ASSESSED}/baseline"), declared).await;
+        self.post(&format!("/v1/structures/{ASSESSED}/reference"), declared).await;
     }
 
     /// Posts until the time is over; what each took, ms.

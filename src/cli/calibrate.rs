@@ -6,8 +6,9 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::write_whole;
-use crate::baseline::calibration::{calibrate as measure, place, CalibrationRecord, CellRanks, DRAWS};
+use crate::baseline::calibration::{calibrate as measure, cell_title, CellRanks, DRAWS};
 use crate::baseline::library::{find_structure, Library};
+use crate::baseline::manifest::CalibrationRecord;
 use crate::baseline::train::renew;
 use crate::baseline::Baseline;
 use crate::plot::{escaped, page, table, Line, Plot};
@@ -81,7 +82,7 @@ fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
     let cell_rows = record.cells.iter().flat_map(|cell| {
         cell.parameters.iter().map(move |p| {
             vec![
-                place(cell.noise_multiple, cell.missing_mode, cell.without_shapes),
+                cell_title(cell.noise_multiple, cell.missing_mode, cell.without_shapes),
                 p.name.clone(),
                 format!("{:.3}", p.coverage_90),
                 format!("{:.3}", p.coverage_50),

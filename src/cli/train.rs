@@ -8,8 +8,9 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::write_whole;
+use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::{find_structure, read_structure_file};
-use crate::baseline::manifest::{Manifest, NoiseRange, ValidationRecord};
+use crate::baseline::manifest::{Manifest, ValidationRecord};
 use crate::baseline::train::{default_epochs, default_samples, diverged, train as train_baseline, Trained};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;

@@ -96,7 +96,7 @@ pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
             between = Some([node(*from), node(*to)]);
             ("added_spring", String::new())
         }
-        Target::Oscillator(host) => ("oscillator", node(Node::Freedom(*host))),
+        Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
     };
     TargetName { kind: kind.to_owned(), name, between, level: candidate.level.clone() }

@@ -1,7 +1,7 @@
 //! Effects whose numbers are fitted to measurements: candidates, and the effects that the structure already has.
 
 use crate::physics::effect::Target;
-use crate::simulator::effect::Effect;
+use crate::simulator::effect::SimulationEffect;
 use crate::simulator::law::{Input, Law, LawKind};
 
 /// One fitted number of an effect. Its prior is normal, truncated at the bounds.
@@ -30,7 +30,7 @@ pub struct FittedEffect {
 
 impl FittedEffect {
     /// An effect that the structure already has; its numbers and their covariance become the prior.
-    pub fn known(effect: &Effect) -> Self {
+    pub fn known(effect: &SimulationEffect) -> Self {
         let mut names = effect.law.numbers();
         match effect.target {
             Target::Oscillator(_) => names.push("frequency_hz".to_owned()),

@@ -203,7 +203,7 @@ fn definition_of(
     Some(EffectDefinition {
         name,
         description,
-        target: target_definition(&effect.target, simulator)?,
+        target: target_definition(&effect.target, simulator.structure(), simulator.space())?,
         law: effect.law.kind,
         covariate: effect.law.covariate.clone(),
         reference: effect.law.reference,

@@ -126,7 +126,7 @@ fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     }
     if let Some(structure) = simulator.structure() {
         targets.extend(missing_springs(structure).into_iter().map(|(from, to)| Target::AddedSpring(from, to)));
-        targets.extend(structure.places().iter().map(|place| Target::Oscillator(place.freedom)));
+        targets.extend(structure.attachment_points().iter().map(|point| Target::Oscillator(point.dof)));
     }
     // A mode that was not identified, or two neighbouring modes that were interchanged.
     if simulator.available_modes() > modes {
@@ -164,7 +164,7 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
 fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
     let sideways = |node: &Node| match node {
         Node::Ground => true,
-        Node::Freedom(freedom) => structure.places().iter().any(|place| place.freedom == *freedom),
+        Node::Dof(dof) => structure.attachment_points().iter().any(|point| point.dof == *dof),
     };
     let between = |s: &&Spring| matches!(&s.form, Form::Spring(a, b) if sideways(a) && sideways(b));
     structure.springs().iter().filter(between).map(|s| s.n_per_m).collect()
@@ -172,14 +172,14 @@ fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
 
 /// Pairs of nodes that no spring joins.
 fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
-    let places: Vec<usize> = structure.places().iter().map(|place| place.freedom).collect();
+    let places: Vec<usize> = structure.attachment_points().iter().map(|point| point.dof).collect();
     let joined = |a: Node, b: Node| {
         let ends = [Form::Spring(a, b), Form::Spring(b, a)];
         structure.springs().iter().any(|s| ends.contains(&s.form))
     };
-    let mut neighbours = vec![std::collections::BTreeSet::new(); structure.freedoms()];
+    let mut neighbours = vec![std::collections::BTreeSet::new(); structure.dofs()];
     for spring in structure.springs() {
-        if let Form::Spring(Node::Freedom(a), Node::Freedom(b)) = spring.form {
+        if let Form::Spring(Node::Dof(a), Node::Dof(b)) = spring.form {
             neighbours[a].insert(b);
             neighbours[b].insert(a);
         }
@@ -187,12 +187,12 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
     let near = |a: usize, b: usize| places.len() <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
     let mut pairs = Vec::new();
     for (index, &a) in places.iter().enumerate() {
-        if !joined(Node::Ground, Node::Freedom(a)) {
-            pairs.push((Node::Ground, Node::Freedom(a)));
+        if !joined(Node::Ground, Node::Dof(a)) {
+            pairs.push((Node::Ground, Node::Dof(a)));
         }
         for &b in &places[index + 1..] {
-            if !joined(Node::Freedom(a), Node::Freedom(b)) && near(a, b) {
-                pairs.push((Node::Freedom(a), Node::Freedom(b)));
+            if !joined(Node::Dof(a), Node::Dof(b)) && near(a, b) {
+                pairs.push((Node::Dof(a), Node::Dof(b)));
             }
         }
     }

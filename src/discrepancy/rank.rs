@@ -200,7 +200,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
     tunings.extend([1.1 * f[f.len() - 1], 1.5 * f[f.len() - 1]]);
     let ordered = fit.effects.iter().any(|e| matches!(e.target, Target::ModeOrder(_)));
     // Trying hundreds of hosts would take hours: every so-manyth host represents its neighbours.
-    let hosts = study.simulator.structure().map_or(0, |s| s.places().len());
+    let hosts = study.simulator.structure().map_or(0, |s| s.attachment_points().len());
     let every = hosts.div_ceil(MOST_HOSTS);
     let mut jobs: Vec<(usize, Option<Vec<f64>>)> = Vec::new();
     let mut oscillators = 0..;

@@ -376,7 +376,7 @@ mod tests {
             vec![Target::Springs(vec![3]), Target::Springs(all), Target::FrequencyOffset(Some(1))],
             vec![Target::Masses(vec![1]), Target::FrequencyScale(None), Target::FrequencyScale(Some(2))],
             vec![
-                Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)),
+                Target::AddedSpring(Node::Dof(0), Node::Dof(2)),
                 Target::Masses(vec![0, 1, 2]),
                 Target::FrequencyOffset(None),
             ],

@@ -10,6 +10,7 @@ use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use data_encoding::HEXLOWER;
 use serde::Serialize;
 use serde_json::json;
 use sha2::{Digest as _, Sha256};
@@ -17,12 +18,12 @@ use tokio::sync::mpsc::{channel, Receiver};
 
 use super::{Error, Monitor};
 use crate::baseline::Baseline;
-use crate::measurement::check::{check_measurements, Expectation, Place, RawMeasurement};
+use crate::measurement::check::{check_measurements, Expectation, FieldPath, RawMeasurement};
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::archive::{Acknowledged, Batch, End, Head, Model, Record, FORMAT, NOT_CARRIED};
+use crate::store::archive::{Acknowledged, ArchivedModel, Batch, End, Head, Record, FORMAT, NOT_CARRIED};
 
 /// Lines on their way between store and reader.
 const BUFFERED: usize = 64;
@@ -96,7 +97,7 @@ impl Monitor {
     /// [`Error::UnknownStructure`], [`Error::Store`].
     pub async fn export(&self, structure: &StructureId) -> Result<Receiver<Result<Vec<u8>, Error>>, Error> {
         let watched = self.structure(structure)?;
-        let mut models = self.store.trained_models(structure).await?;
+        let mut models = self.store.archive().trained_models(structure).await?;
         if let Ok(baseline) = &watched.baseline {
             let digest = baseline.digest().clone();
             if !models.iter().any(|model| model.model_digest == digest.as_str()) {
@@ -106,7 +107,13 @@ impl Monitor {
                 if let Some(files) = files.map_err(|_| Error::Panicked)?.ok().flatten() {
                     let version = baseline.manifest().structure_digest.to_string();
                     let accepted = !baseline.manifest().calibration.failures.is_empty();
-                    models.push(Model::new(&version, digest.as_str(), &files.manifest, &files.weights, accepted));
+                    models.push(ArchivedModel::new(
+                        &version,
+                        digest.as_str(),
+                        &files.manifest,
+                        &files.weights,
+                        accepted,
+                    ));
                 }
             }
         }
@@ -126,7 +133,7 @@ impl Monitor {
             let read = tokio::spawn(async move {
                 // A receiver that is gone is noticed by the other task.
                 let _ = sender.send(head).await;
-                store.export(&id, models, &sender).await
+                store.archive().export(&id, models, &sender).await
             });
             drop(records);
             let (mut hasher, mut count) = (Sha256::new(), 0_u64);
@@ -139,7 +146,9 @@ impl Monitor {
                 }
             }
             let last = match read.await {
-                Ok(Ok(())) => Ok(line_of(&Record::End(End { lines: count, sha256: hex(&hasher.finalize()) }))),
+                Ok(Ok(())) => {
+                    Ok(line_of(&Record::End(End { lines: count, sha256: HEXLOWER.encode(&hasher.finalize()) })))
+                }
                 Ok(Err(error)) => Err(Error::Store(error)),
                 Err(_) => Err(Error::Panicked),
             };
@@ -237,7 +246,7 @@ impl Import<'_> {
             }
             Record::Version(version) => {
                 simulator_of(&structure, &version.digest, &version.definition)?;
-                self.done.versions += u64::from(store.import_version(&structure, version).await?);
+                self.done.versions += u64::from(store.archive().import_version(&structure, version).await?);
             }
             Record::Model(model) => self.take_model(model).await?,
             Record::Batch(batch) => {
@@ -250,10 +259,11 @@ impl Import<'_> {
                 }
             }
             Record::UndamagedState(state) => {
-                self.done.undamaged_states += u64::from(store.import_undamaged(&structure, state).await?);
+                self.done.undamaged_states += u64::from(store.archive().import_undamaged(&structure, state).await?);
             }
             Record::Maintenance(window) => {
-                self.done.maintenance_windows += u64::from(store.import_maintenance(&structure, window).await?);
+                self.done.maintenance_windows +=
+                    u64::from(store.archive().import_maintenance(&structure, window).await?);
             }
             Record::Acknowledgement(note) => self.acknowledgements.push(note),
         }
@@ -263,13 +273,13 @@ impl Import<'_> {
     async fn store_waiting(&mut self) -> Result<(), ImportError> {
         if !self.waiting.is_empty() {
             let waiting = std::mem::take(&mut self.waiting);
-            self.done.batches_new += self.monitor.store.import_batches(waiting).await?;
+            self.done.batches_new += self.monitor.store.archive().import_batches(waiting).await?;
         }
         Ok(())
     }
 
     /// Takes a baseline that is not here already, after its self-test.
-    async fn take_model(&mut self, model: Model) -> Result<(), ImportError> {
+    async fn take_model(&mut self, model: ArchivedModel) -> Result<(), ImportError> {
         let structure = self.done.structure.clone();
         let library = self.monitor.library();
         let here = library.get(&structure).and_then(|entry| entry.baseline.as_ref());
@@ -277,7 +287,7 @@ impl Import<'_> {
             return Ok(());
         }
         let version = Digest::from_stored(model.structure_digest.clone());
-        let stored = self.monitor.store.structure_version(&structure, &version).await?;
+        let stored = self.monitor.store.structures().structure_version(&structure, &version).await?;
         let simulator = match (&self.simulator, stored) {
             (Some(present), _) if *present.digest() == version => present.clone(),
             (_, Some((definition, _))) => simulator_of(&structure, version.as_str(), &definition)?,
@@ -294,7 +304,8 @@ impl Import<'_> {
         if loaded.digest().as_str() != model.model_digest {
             return Err(wrong(&"a trained baseline is not what its digest says").into());
         }
-        self.done.models += u64::from(self.monitor.store.import_model(&structure, model).await?);
+        self.done.models +=
+            u64::from(self.monitor.store.archive().import_model(&structure, model, Timestamp::now()).await?);
         Ok(())
     }
 
@@ -309,7 +320,7 @@ impl Import<'_> {
         }
         let in_use = baseline.as_ref().ok().map(|baseline: &Arc<Baseline>| baseline.digest().clone());
         self.monitor.watch(simulator, baseline);
-        if let Some(state) = self.monitor.store.undamaged(&structure).await? {
+        if let Some(state) = self.monitor.store.reference().undamaged(&structure).await? {
             if in_use.as_ref().is_some_and(|digest| *digest != state.model_digest) {
                 self.done.warnings.push(format!(
                     "the undamaged state {} was taken with baseline {}, which is not in use here: batches are compared with none",
@@ -320,7 +331,8 @@ impl Import<'_> {
         self.monitor.resume_structure(&structure).await?;
         let noted = std::mem::take(&mut self.acknowledgements);
         for note in noted {
-            self.done.acknowledgements += u64::from(self.monitor.store.import_acknowledgement(&structure, note).await?);
+            self.done.acknowledgements +=
+                u64::from(self.monitor.store.archive().import_acknowledgement(&structure, note).await?);
         }
         Ok(self.done)
     }
@@ -342,7 +354,7 @@ fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Resu
 /// A batch after the same checks as one that is posted.
 fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBatch, Timestamp), Error> {
     let raw = |(index, m): (usize, &crate::store::archive::Measurement)| RawMeasurement {
-        place: Place::Json { index },
+        path: FieldPath::Json { index },
         measured_at: Some(m.measured_at.clone()),
         frequencies_hz: m.frequencies_hz.clone(),
         std_hz: m.std_hz.clone(),
@@ -384,10 +396,6 @@ fn line_of(record: &Record) -> Vec<u8> {
     let mut line = serde_json::to_vec(record).expect("a record is plain data");
     line.push(b'\n');
     line
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().concat()
 }
 
 /// Reads an archive to its end and gives back its head: first line, last line, number of lines, SHA-256, each line a record.
@@ -433,7 +441,7 @@ fn each_line(path: &Path, mut take: impl FnMut(u64, Record) -> Result<(), Import
         let record: Record = serde_json::from_slice(&line)
             .map_err(|e| ImportError::Line { line: number, reason: format!("no record of an archive: {e}") })?;
         if let Record::End(end) = &record {
-            let found = hex(&hasher.finalize_reset());
+            let found = HEXLOWER.encode(&hasher.finalize_reset());
             if end.lines != number - 1 || end.sha256 != found {
                 let said = format!(
                     "it has {} lines with SHA-256 {found}, its last line says {} and {}",

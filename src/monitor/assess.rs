@@ -392,7 +392,7 @@ pub fn monitored_quantities(
     per_measurement: usize,
 ) -> Vec<QuantitySamples> {
     let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
-    let edge_mass = samples.posterior.edge_mass(baseline.space());
+    let edge_mass = samples.posterior.prior_bound_mass(baseline.space());
     let population = |column: usize| &samples.populations.parameters[column];
     let groups = baseline.groups();
     let group_of = |column: usize| groups.iter().find(|g| g.columns.contains(&column)).map(|g| g.name.clone());

@@ -95,8 +95,8 @@ impl Monitor {
         let place = self.compute.reserve()?;
         let draws = self.draws(&baseline, &record);
         let (source, from) = (&record.batch.source, record.batch.time_span().0);
-        let previous = self.store.frequencies_before(structure, source, from).await?;
-        let undamaged = self.store.undamaged(structure).await?;
+        let previous = self.store.batches().frequencies_before(structure, source, from).await?;
+        let undamaged = self.store.reference().undamaged(structure).await?;
         let undamaged = undamaged.filter(|u| u.model_digest == *baseline.digest());
         let drawn = Arc::clone(&baseline);
         let work = move || {

@@ -161,7 +161,7 @@ impl Monitor {
         mut request: DiagnosisRequest,
     ) -> Result<DiagnosisRecord, Error> {
         let watched = self.structure(structure)?;
-        let stored = self.store.batch_sizes(structure).await?;
+        let stored = self.store.batches().batch_sizes(structure).await?;
         if request.batches.is_empty() {
             request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
         }
@@ -184,7 +184,7 @@ impl Monitor {
         let id = uuid::Uuid::now_v7().to_string();
         let json = serde_json::to_string(&request).expect("a request is plain data");
         let digest = watched.simulator.digest();
-        self.store.insert_diagnosis(&id, structure, digest, &json, Timestamp::now()).await?;
+        self.store.diagnoses().insert_diagnosis(&id, structure, digest, &json, Timestamp::now()).await?;
         self.jobs.begin(&id, structure, JobKind::Diagnosis);
         let (monitor, job, of) = (self.clone(), id.clone(), structure.clone());
         tokio::spawn(async move {
@@ -197,7 +197,7 @@ impl Monitor {
                 (serde_json::to_string(&outcome.diagnosis).expect("a diagnosis is plain data"), html)
             });
             let state = if stored.is_ok() { JobState::Done } else { JobState::Failed };
-            if let Err(failure) = monitor.store.finish_diagnosis(&job, stored, Timestamp::now()).await {
+            if let Err(failure) = monitor.store.diagnoses().finish_diagnosis(&job, stored, Timestamp::now()).await {
                 error!(diagnosis = %job, "Could not store the end of diagnosis {job}: {failure}");
             }
             monitor.jobs.end(&job, state);
@@ -213,7 +213,8 @@ impl Monitor {
         request: &DiagnosisRequest,
     ) -> Result<(Outcome, Option<String>), String> {
         let _turn = self.jobs.one_at_a_time.acquire().await.expect("the semaphore is never closed");
-        let measurements = self.store.measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
+        let measurements =
+            self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
         let (jobs, id, simulator, request) = (self.jobs.clone(), id.to_owned(), simulator.clone(), request.clone());
         let work = move || {
             let (data, outcome) = study(&jobs, &id, &simulator, &measurements, &request)?;
@@ -228,7 +229,7 @@ impl Monitor {
     /// # Errors
     /// [`Error::UnknownDiagnosis`], [`Error::Store`].
     pub async fn diagnosis(&self, id: &str) -> Result<(DiagnosisRecord, Option<String>), Error> {
-        let record = self.store.diagnosis(id).await?;
+        let record = self.store.diagnoses().diagnosis(id).await?;
         let record = record.ok_or_else(|| Error::UnknownDiagnosis(crate::quantity::shown(id)))?;
         Ok((record, self.jobs.of(id)))
     }
@@ -238,7 +239,7 @@ impl Monitor {
     /// # Errors
     /// [`Error::Store`].
     pub async fn jobs(&self, limit: usize) -> Result<Vec<(JobRecord, Option<String>)>, Error> {
-        let records = self.store.jobs(limit).await?;
+        let records = self.store.diagnoses().jobs(limit).await?;
         let with_progress = |record: JobRecord| {
             let running = record.state == JobState::Running;
             let progress = running.then(|| self.jobs.of(&record.id)).flatten();
@@ -274,7 +275,7 @@ impl Monitor {
         if record.structure_digest != *watched.simulator.digest() {
             return Err(refuse("the structure is another version now: diagnose that one"));
         }
-        if !self.store.begin_extension(id, Timestamp::now()).await? {
+        if !self.store.diagnoses().begin_extension(id, Timestamp::now()).await? {
             return Err(refuse("it is being extended"));
         }
         self.jobs.begin(id, &record.structure, JobKind::Extension);
@@ -286,7 +287,7 @@ impl Monitor {
                 warn!(diagnosis = %job, "Extension by diagnosis {job} failed: {failure}");
             }
             let state = if outcome.is_ok() { JobState::Done } else { JobState::Failed };
-            if let Err(failure) = monitor.store.finish_extension(&job, outcome, Timestamp::now()).await {
+            if let Err(failure) = monitor.store.diagnoses().finish_extension(&job, outcome, Timestamp::now()).await {
                 error!(diagnosis = %job, "Could not store the end of the extension by {job}: {failure}");
             }
             monitor.jobs.end(&job, state);
@@ -313,7 +314,8 @@ impl Monitor {
         }
         let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| said(&e))?;
         let structure = &record.structure;
-        let measurements = self.store.measurements_of(structure, &request.batches).await.map_err(|e| said(&e))?;
+        let measurements =
+            self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| said(&e))?;
         let mut flow = FlowSettings::default();
         flow.units = before.map_or(flow.units, |m| m.architecture.units);
         let (jobs, id, old) = (self.jobs.clone(), record.id.clone(), simulator.clone());
@@ -386,9 +388,10 @@ impl Monitor {
         let watched = self.structure(structure)?;
         let none = || Error::NoStepBack(structure.clone());
         let present = watched.simulator.digest().clone();
-        let (_, parent) = self.store.structure_version(structure, &present).await?.ok_or_else(none)?;
+        let (_, parent) = self.store.structures().structure_version(structure, &present).await?.ok_or_else(none)?;
         let parent = parent.ok_or_else(none)?;
-        let (definition, grandparent) = self.store.structure_version(structure, &parent).await?.ok_or_else(none)?;
+        let (definition, grandparent) =
+            self.store.structures().structure_version(structure, &parent).await?.ok_or_else(none)?;
         let simulator = Simulator::new(StructureDefinition::parse_json(&definition)?)?;
         let missing = |reason| Error::NoModel { structure: structure.clone(), reason };
         let baseline = self.baseline_for(&simulator).await?.map_err(missing)?;
@@ -414,7 +417,7 @@ impl Monitor {
         simulator: Simulator,
         baseline: Arc<Baseline>,
     ) -> Result<Option<u32>, Error> {
-        if !self.store.switch_version(structure, expected, version, Timestamp::now()).await? {
+        if !self.store.structures().switch_version(structure, expected, version, Timestamp::now()).await? {
             return Err(Error::VersionChanged(structure.clone()));
         }
         let watched = Arc::new(Watched { simulator, baseline: Ok(baseline) });

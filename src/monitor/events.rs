@@ -189,7 +189,7 @@ impl Monitor {
     pub(super) async fn look_at_alarms(&self, structure: &StructureId) -> (Vec<News>, Vec<Episode>) {
         let Known { newest, open } = self.known_alarms.of(structure);
         let open: Vec<i64> = open.into_iter().collect();
-        match self.store.episodes_since(structure, newest, &open).await {
+        match self.store.alarms().episodes_since(structure, newest, &open).await {
             Ok(mut episodes) => {
                 let news = self.known_alarms.learn(structure, &episodes);
                 episodes.retain(|episode| episode.state() == "open");

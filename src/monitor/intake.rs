@@ -4,7 +4,7 @@ use tracing::Instrument as _;
 
 use super::{Error, Ingested, MissingCovariate, Monitor, Watched};
 use crate::measurement::body::RawBatch;
-use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, Place, Problem};
+use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, FieldPath, Problem};
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::StructureId;
 
@@ -29,11 +29,10 @@ impl Monitor {
         let source = source.unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
         check_source(&source).map_err(|problem| vec![problem])?;
         idempotency_key.as_deref().map_or(Ok(()), check_idempotency_key).map_err(|problem| vec![problem])?;
-        let places: Vec<Place> = raw.iter().map(|r| r.place).collect();
+        let paths: Vec<FieldPath> = raw.iter().map(|r| r.path).collect();
         let measurements = check_measurements(raw, &self.expectation(watched))?;
         if self.settings().missing_covariate == MissingCovariate::Refuse {
-            let missing =
-                measurements.iter().zip(&places).flat_map(|(m, place)| missing_covariates(watched, m, *place));
+            let missing = measurements.iter().zip(&paths).flat_map(|(m, path)| missing_covariates(watched, m, *path));
             let problems: Vec<Problem> = missing.take(MOST_MISSING).collect();
             if !problems.is_empty() {
                 return Err(problems);
@@ -54,11 +53,11 @@ impl Monitor {
     }
 }
 
-fn missing_covariates(watched: &Watched, measurement: &ModalMeasurement, place: Place) -> Vec<Problem> {
+fn missing_covariates(watched: &Watched, measurement: &ModalMeasurement, path: FieldPath) -> Vec<Problem> {
     let missing = watched.simulator.effect_sizes(&measurement.covariates).missing;
     let problem = |name: String| {
         let message = format!("{name} is missing: the simulation of this structure depends on it");
-        Problem::new(place.of_covariate(&name), message)
+        Problem::new(path.of_covariate(&name), message)
     };
     missing.into_iter().map(problem).collect()
 }

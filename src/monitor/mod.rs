@@ -314,18 +314,19 @@ impl Monitor {
         };
         for (id, entry) in monitor.library().iter() {
             let json = entry.simulator.definition().canonical_json();
-            let outcome = monitor.store.put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            let outcome =
+                monitor.store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
             if outcome == PutStructure::Refused {
                 warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches and the library's differs");
             }
         }
-        let interrupted = monitor.store.end_interrupted_jobs(Timestamp::now()).await?;
+        let interrupted = monitor.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
         if interrupted > 0 {
             warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
         }
         let mut refused = BTreeMap::new();
-        for summary in monitor.store.structures().await? {
-            if let Some(record) = monitor.store.structure(&summary.id).await? {
+        for summary in monitor.store.structures().list().await? {
+            if let Some(record) = monitor.store.structures().structure(&summary.id).await? {
                 let built = StructureDefinition::parse_json(&record.definition_json).and_then(Simulator::new);
                 let simulator = match built {
                     Ok(simulator) => simulator,
@@ -415,7 +416,7 @@ impl Monitor {
         let watched = self.structure(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
         let (foreseen, outcome) = oneshot::channel();
-        let insert = self.store.insert_batch_foreseen(&batch, &batch_id, received_at, foreseen);
+        let insert = self.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, foreseen);
         let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
             batch_id: batch_id.clone(),
             batch,
@@ -492,8 +493,8 @@ impl Monitor {
     /// A batch with what was made of it.
     async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
         let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
-        let assessment = self.store.assessment(structure, batch_id).await?;
-        let charts = self.store.chart_points(structure, batch_id).await?;
+        let assessment = self.store.assessments().assessment(structure, batch_id).await?;
+        let charts = self.store.alarms().chart_points(structure, batch_id).await?;
         self.view_of(record, assessment, charts).await
     }
 
@@ -523,18 +524,18 @@ impl Monitor {
         batch_id: &str,
         model_digest: Option<&Digest>,
     ) -> Result<String, Error> {
-        Ok(match self.store.undamaged(structure).await? {
+        Ok(match self.store.reference().undamaged(structure).await? {
             Some(undamaged) if undamaged.batches.iter().any(|id| id == batch_id) => {
                 format!("part of the undamaged state, version {}: not compared with itself", undamaged.state.version)
             }
             Some(undamaged) if model_digest.is_some_and(|digest| *digest != undamaged.model_digest) => format!(
                 "the undamaged state, version {}, was taken with another trained baseline: name undamaged batches again \
-                 by POST /v1/structures/{structure}/baseline",
+                 by POST /v1/structures/{structure}/reference",
                 undamaged.state.version
             ),
             Some(_) => "not compared with the undamaged state yet".to_owned(),
             None => format!(
-                "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/baseline \
+                "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/reference \
                  {{\"batches\": [\"{batch_id}\"]}}"
             ),
         })
@@ -557,7 +558,7 @@ impl Monitor {
 
     async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
         let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: crate::quantity::shown(batch_id) };
-        self.store.batch(structure, batch_id).await?.ok_or_else(unknown)
+        self.store.batches().batch(structure, batch_id).await?.ok_or_else(unknown)
     }
 }
 

@@ -73,7 +73,7 @@ impl Monitor {
             reason,
             kept: before.as_ref().map(Digest::to_string),
         };
-        if self.store.trained_baseline(structure, watched.simulator.digest()).await?.is_some() {
+        if self.store.structures().trained_baseline(structure, watched.simulator.digest()).await?.is_some() {
             let reason =
                 "its present version was trained by the service itself, which no file replaces: go back by DELETE \
                           …/extension first";
@@ -92,14 +92,14 @@ impl Monitor {
         }
         *self.library.write().expect("no holder of this lock panics") = Arc::new(library);
         let (mut undamaged_version, mut next_step) = (None, None);
-        if changed && self.store.undamaged(structure).await?.is_some() {
+        if changed && self.store.reference().undamaged(structure).await?.is_some() {
             if retake {
                 undamaged_version = self.take_again(structure).await;
             }
             next_step = undamaged_version.is_none().then(|| {
                 format!(
                     "the undamaged state was taken with another baseline, so batches are compared with none: name undamaged \
-                     batches again by POST /v1/structures/{structure}/baseline"
+                     batches again by POST /v1/structures/{structure}/reference"
                 )
             });
         }

@@ -64,7 +64,7 @@ impl Monitor {
                 tokio::time::sleep(BETWEEN_TRIES).await;
                 match monitor.resume_structure(&structure).await {
                     Ok(()) => break,
-                    Err(_) if monitor.store.is_closed() => break,
+                    Err(_) if monitor.store.file().is_closed() => break,
                     Err(error) => {
                         warn!(structure.id = %structure, %error, "Unassessed batches of {structure} still wait: {error}");
                     }
@@ -81,7 +81,7 @@ impl Monitor {
         );
         let _turn = turn.lock().await;
         loop {
-            let pending = self.store.pending(structure, PAGE).await?;
+            let pending = self.store.batches().pending(structure, PAGE).await?;
             if pending.is_empty() || !self.replay(structure, pending).await? {
                 return Ok(());
             }
@@ -133,7 +133,7 @@ impl Monitor {
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
                 error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
                 let version = watched.simulator.digest();
-                self.store.mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
+                self.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
                 return Ok(Taken::Done);
             }
             record => record?,

@@ -41,10 +41,10 @@ impl Monitor {
         let structures: Vec<_> = self.lock_read().keys().cloned().collect();
         for structure in structures {
             let now = Timestamp::now();
-            let Some(last) = self.store.last_received(&structure).await? else { continue };
+            let Some(last) = self.store.batches().last_received(&structure).await? else { continue };
             let overdue = allowed > 0 && now.micros() - last.max(started).micros() > allowed;
-            let silent = overdue && !self.store.is_in_maintenance(&structure, now).await?;
-            if self.store.set_silent(&structure, silent.then_some(last), now).await? {
+            let silent = overdue && !self.store.alarms().is_in_maintenance(&structure, now).await?;
+            if self.store.alarms().set_silent(&structure, silent.then_some(last), now).await? {
                 if silent {
                     warn!(structure.id = %structure, "No batch of {structure} since {last}");
                     self.report_episodes(&structure).await;

@@ -106,14 +106,14 @@ impl Monitor {
     /// The task of a stored batch.
     pub(super) async fn task(&self, watched: Arc<Watched>, record: BatchRecord, place: Place) -> Result<Task, Error> {
         let (batch, (from, _)) = (&record.batch, record.batch.time_span());
-        let previous = self.store.frequencies_before(&batch.structure, &batch.source, from).await?;
+        let previous = self.store.batches().frequencies_before(&batch.structure, &batch.source, from).await?;
         Task::new(watched, record, previous, place)
     }
 
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
         // Where it is not the newest any more, the batch is computed again (`settle`).
-        let undamaged = self.store.undamaged_as_read(&task.record.batch.structure).await?;
+        let undamaged = self.store.reference().undamaged_as_read(&task.record.batch.structure).await?;
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
         let started = Instant::now();
@@ -147,14 +147,14 @@ impl Monitor {
             Ok((assessment, points)) => {
                 metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                 report(structure, id, &assessment, seconds);
-                let insert = self.store.insert_assessment(structure, id, &assessment, points);
+                let insert = self.store.assessments().insert_assessment(structure, id, &assessment, points);
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {
                 metrics::counter!("modalwatch_assessments_failed_total").increment(1);
                 warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
                 let version = task.watched.simulator.digest();
-                Err(self.store.mark_failed(structure, id, version, &reason))
+                Err(self.store.batches().mark_failed(structure, id, version, &reason))
             }
         };
         async move {
@@ -205,7 +205,8 @@ impl Monitor {
         // A state declared while this was computed did not find the batch assessed, and so did not send it back: it is
         // compared now.
         if stored.newest_undamaged != newest_undamaged {
-            let present = self.store.undamaged(structure).await?.filter(|record| task.is_comparable(record));
+            let present =
+                self.store.reference().undamaged(structure).await?.filter(|record| task.is_comparable(record));
             if present.map(|record| record.state.version) != assessment.undamaged_version {
                 return Ok(Settled::GoOn(task));
             }

@@ -34,10 +34,10 @@ impl Monitor {
     /// another: after a switch of versions, also one that a stop of the service cut short. Batches that are unfit now are left
     /// out. Version of the new state.
     pub(super) async fn retake_undamaged(&self, structure: &StructureId) -> Option<u32> {
-        let newest = self.store.undamaged(structure).await.ok()??;
+        let newest = self.store.reference().undamaged(structure).await.ok()??;
         let watched = self.structure(structure).ok()?;
         let baseline = watched.baseline.as_ref().ok()?;
-        let version = self.store.structure_version(structure, watched.simulator.digest()).await.ok()?;
+        let version = self.store.structures().structure_version(structure, watched.simulator.digest()).await.ok()?;
         // A baseline that a person replaced is a person's business: only versions made here are followed.
         if newest.model_digest == *baseline.digest() || version.is_none() {
             return None;
@@ -50,7 +50,7 @@ impl Monitor {
         let failed = |error: &dyn std::fmt::Display| {
             warn!(structure.id = %structure, "The undamaged batches of {structure} make no undamaged state with its present baseline: {error}");
         };
-        let newest = self.store.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
+        let newest = self.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
         let (mut batches, threshold) = (newest.batches.clone(), newest.state.threshold_probability);
         loop {
             let place = self.compute.wait().await;
@@ -103,14 +103,17 @@ impl Monitor {
             }
             UndamagedError::State(error) => Error::Undamaged(error),
         })?;
-        let version =
-            self.store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
+        let version = self
+            .store
+            .reference()
+            .insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now())
+            .await?;
         let batches = batch_ids.len();
         info!(structure.id = %structure, version, "Took {batches} batches as undamaged state {version} of {structure}");
         self.tell_alarms(structure).await;
         self.tell_structure(structure);
         self.resume_later(structure.clone());
-        let stored = self.store.undamaged(structure).await?;
+        let stored = self.store.reference().undamaged(structure).await?;
         Ok(stored.expect("it was stored a moment ago and is never deleted"))
     }
 }

@@ -11,7 +11,7 @@ use tracing::{error, info};
 use super::retention::{RetentionRun, RetentionSettings};
 use super::{Error, Monitor};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::{self, backup, FolderFigures};
+use crate::store::{self, backup, FolderFigures, ALARM_KINDS};
 
 /// Pause before a task that panicked is started again: one that always does would spin.
 const PAUSE_AFTER_PANIC: Duration = Duration::from_secs(1);
@@ -92,9 +92,9 @@ impl Monitor {
     /// What is degraded. A full queue is among them and no reason: who is busy must not be taken for dead and restarted.
     fn findings(&self, has_room: bool) -> Vec<Reason> {
         let mut findings = Vec::new();
-        let files = FolderFigures::of(self.store.folder());
+        let files = FolderFigures::of(self.store.file().folder());
         if let Ok(files) = &files {
-            let (wal, most) = (files.wal_bytes, self.store.max_wal_bytes());
+            let (wal, most) = (files.wal_bytes, self.store.file().max_wal_bytes());
             if wal > most {
                 let message = format!(
                     "the write-ahead log has {wal} bytes, more than {most}: a long reader, such as a backup, keeps it from being \
@@ -102,7 +102,7 @@ impl Monitor {
                 );
                 findings.push(Reason::new("wal_large", message));
             }
-            let (free, floor) = (files.volume.free_bytes, self.store.min_free_bytes());
+            let (free, floor) = (files.volume.free_bytes, self.store.file().min_free_bytes());
             if has_room && free < floor.saturating_mul(2) {
                 let message = format!("{free} bytes are free; below {floor} nothing is stored any more");
                 findings.push(Reason::new("disk_nearly_full", message));
@@ -153,9 +153,10 @@ impl Monitor {
 
     async fn back_up_here(&self, name: Option<String>) -> Result<backup::Manifest, Error> {
         let _turn = self.upkeep.backing_up.try_lock().map_err(|_| Error::BackupRunning)?;
-        let name = name.unwrap_or_else(backup::name_of_now);
+        let now = Timestamp::now();
+        let name = name.unwrap_or_else(|| backup::name_of(now));
         let started = Instant::now();
-        let made = self.store.backup(&name, self.models_in_use().await).await;
+        let made = self.store.file().backup(&name, self.models_in_use().await, now).await;
         let outcome = if made.is_ok() { "done" } else { "failed" };
         metrics::counter!("modalwatch_backups_total", "outcome" => outcome).increment(1);
         match &made {
@@ -170,7 +171,7 @@ impl Monitor {
     }
 
     /// The trained baselines in use that are not in the database.
-    async fn models_in_use(&self) -> Vec<backup::Model> {
+    async fn models_in_use(&self) -> Vec<backup::BackupModel> {
         let in_use: Vec<_> = self
             .lock_read()
             .iter()
@@ -181,7 +182,7 @@ impl Monitor {
         let found = tokio::task::spawn_blocking(move || {
             let model = |(structure, digest): (String, crate::quantity::Digest)| {
                 let files = library.files_of(&digest).ok().flatten()?;
-                Some(backup::Model { structure, digest: digest.to_string(), kept_in: files.kept_in })
+                Some(backup::BackupModel { structure, digest: digest.to_string(), kept_in: files.kept_in })
             };
             in_use.into_iter().filter_map(model).collect()
         });
@@ -196,7 +197,7 @@ impl Monitor {
         metrics::gauge!("modalwatch_uptime_seconds").set(self.upkeep.started.elapsed().as_secs_f64());
         metrics::gauge!("modalwatch_queue_free_places").set(self.free_places() as f64);
         metrics::gauge!("modalwatch_baselines_in_use").set(self.baselines_in_use() as f64);
-        if let Ok(files) = FolderFigures::of(self.store.folder()) {
+        if let Ok(files) = FolderFigures::of(self.store.file().folder()) {
             metrics::gauge!("modalwatch_database_bytes").set(files.database_bytes as f64);
             metrics::gauge!("modalwatch_wal_bytes").set(files.wal_bytes as f64);
             metrics::gauge!("modalwatch_disk_free_bytes").set(files.volume.free_bytes as f64);
@@ -204,7 +205,7 @@ impl Monitor {
         let (resident, open_files) = process_figures();
         metrics::gauge!("modalwatch_resident_memory_bytes").set(resident);
         metrics::gauge!("modalwatch_open_files").set(open_files);
-        let figures = self.store.figures().await?;
+        let figures = self.store.overview().figures().await?;
         metrics::gauge!("modalwatch_structures").set(figures.structures as f64);
         metrics::gauge!("modalwatch_pending_batches").set(figures.pending_batches as f64);
         for kind in ALARM_KINDS {
@@ -216,9 +217,6 @@ impl Monitor {
         Ok(())
     }
 }
-
-/// Kinds of alarms.
-const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
 
 /// What the metrics mean, in the unit that their name ends with.
 const MEANINGS: [(&str, &str); 34] = [

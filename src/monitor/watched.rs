@@ -48,7 +48,7 @@ impl Monitor {
         let built = tokio::task::spawn_blocking(move || Simulator::new(definition)).await;
         let simulator = built.unwrap_or_else(|e| std::panic::resume_unwind(e.into_panic()))?;
         let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
-        let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
+        let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
         match outcome {
             PutStructure::Refused => return Err(Error::StructureInUse(id)),
             PutStructure::Created | PutStructure::Replaced => {
@@ -69,7 +69,7 @@ impl Monitor {
 
     /// The baseline of a version of a structure: one that the service trained for it, or that of the library.
     pub(super) async fn baseline_for(&self, simulator: &Simulator) -> Result<Result<Arc<Baseline>, String>, Error> {
-        let Some(stored) = self.store.trained_baseline(simulator.id(), simulator.digest()).await? else {
+        let Some(stored) = self.store.structures().trained_baseline(simulator.id(), simulator.digest()).await? else {
             return Ok(self.find_baseline(simulator));
         };
         let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);

@@ -1,4 +1,5 @@
-//! No secret is ever written down: not in the log at its most talkative, not in the database, not in the metrics.
+//! No secret is ever stored in plain text: not in the log at its most verbose level, not in the database, not in the
+//! metrics.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -36,7 +37,8 @@ async fn no_secret_is_in_log_database_or_metrics() {
     let mut line = String::new();
     BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     let url = line.trim().split_once("listens on ").unwrap().1.to_owned();
-    let (client, mut secrets) = (Client::new(), vec![first.clone(), from_file.clone()]);
+    let (client, mut secrets) =
+        (modalwatch::notify::client_builder().build().unwrap(), vec![first.clone(), from_file.clone()]);
     let ask =
         |method: Method, path: &str, token: &str| client.request(method, format!("{url}{path}")).bearer_auth(token);
 
@@ -75,7 +77,7 @@ async fn no_secret_is_in_log_database_or_metrics() {
     let database: Vec<_> = while_running.into_iter().chain(files(&data)).collect();
     assert!(database.iter().any(|(_, bytes)| contains(bytes, id_of(&secrets[2]))), "the ids are in the database");
     for secret in &secrets {
-        // The second half alone would do for somebody who has the rest.
+        // The second half alone would be enough for somebody who has the first.
         let secret = &secret.rsplit('_').next().unwrap()[26..];
         assert!(!contains(&log, secret), "a secret is in the log");
         assert!(!contains(metrics.as_bytes(), secret), "a secret is in the metrics");

@@ -2,15 +2,14 @@
 
 use std::path::Path;
 use std::process::{Command, Output};
-use std::time::{Duration, Instant};
 
 use reqwest::{Method, RequestBuilder, Response};
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
-use crate::helpers::{command, created, Service};
+use crate::helpers::{self, command, created, Service};
 
-/// A service that asks for tokens, and its first one.
+/// A service that requires tokens, and its first token.
 pub struct World {
     pub service: Service,
     pub folder: TempDir,
@@ -23,7 +22,7 @@ pub fn program(arguments: &[&str], data_dir: &Path) -> Output {
     command.args(arguments).arg("--data-dir").arg(data_dir).output().unwrap()
 }
 
-/// Makes a token by the command line, as the first one is made.
+/// Creates a token on the command line, as the first token is created.
 pub fn first_token(data_dir: &Path) -> String {
     let made = program(&["token", "create", "--name", "first", "--scope", "admin"], data_dir);
     let text = String::from_utf8(made.stdout).unwrap();
@@ -41,7 +40,7 @@ impl World {
         Self::with(|command| command)
     }
 
-    /// With settings of its own.
+    /// A service with these settings.
     pub fn with(prepare: impl FnOnce(&mut Command) -> &mut Command) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let admin = first_token(folder.path());
@@ -80,17 +79,16 @@ impl World {
     }
 }
 
-/// Asks again until an answer has this status and code.
+/// Repeats a request until its answer has this status and code.
 pub async fn eventually(world: &World, path: &str, token: &str, status: u16, code: &str) {
-    let started = Instant::now();
-    loop {
+    helpers::eventually(&format!("an answer {status} of {path}"), async || {
         let response = world.get(path, token).await;
-        if response.status() == status {
-            let body: Value = response.json().await.unwrap();
-            assert_eq!(body["code"], code, "{body}");
-            return;
+        if response.status() != status {
+            return None;
         }
-        assert!(started.elapsed() < Duration::from_secs(20), "still {}", response.status());
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+        let body: Value = response.json().await.unwrap();
+        assert_eq!(body["code"], code, "{body}");
+        Some(())
+    })
+    .await;
 }

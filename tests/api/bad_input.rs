@@ -1,10 +1,10 @@
-//! Each way a request can be wrong, over HTTP: its own answer, and nothing stored.
+//! Each kind of invalid request over HTTP: it has its own answer, and nothing is stored.
 
 use std::fmt::Write as _;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{command, measurements, problem, repository, spawn, time, Service};
+use crate::helpers::{command, eventually, measurements, problem, repository, spawn, time, Service};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -53,17 +53,17 @@ async fn json_of_another_shape_is_a_422_with_a_pointer() {
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, NaN, 0.93]}}]}}"),
             "/measurements/0/frequencies_hz/1",
-            "NaN is no JSON number",
+            "NaN is not a JSON number",
         ),
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, Infinity, 0.93]}}]}}"),
             "/measurements/0/frequencies_hz/1",
-            "Infinity is no JSON number",
+            "Infinity is not a JSON number",
         ),
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, -Infinity, 0.93]}}]}}"),
             "/measurements/0/frequencies_hz/1",
-            "Infinity is no JSON number",
+            "Infinity is not a JSON number",
         ),
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, 1e999, 0.93]}}]}}"),
@@ -87,8 +87,8 @@ async fn values_that_cannot_be_are_a_422_with_a_pointer() {
         ("frequencies_hz", json!([0.41, 0.0, 0.93]), "/measurements/2/frequencies_hz/1", "above 0"),
         ("frequencies_hz", json!([0.41, -0.0, 0.93]), "/measurements/2/frequencies_hz/1", "above 0"),
         ("frequencies_hz", json!([-0.41, 0.7, 0.93]), "/measurements/2/frequencies_hz/0", "-0.41 Hz"),
-        ("frequencies_hz", json!([0.41, 0.7, 1e6]), "/measurements/2/frequencies_hz/2", "is it in Hz?"),
-        ("frequencies_hz", json!([1e-4, 0.7, 0.93]), "/measurements/2/frequencies_hz/0", "it looks like kHz"),
+        ("frequencies_hz", json!([0.41, 0.7, 1e6]), "/measurements/2/frequencies_hz/2", "it must be in Hz"),
+        ("frequencies_hz", json!([1e-4, 0.7, 0.93]), "/measurements/2/frequencies_hz/0", "it seems to be in kHz"),
         ("frequencies_hz", json!([0.41, 0.93]), "/measurements/2/frequencies_hz", "2 frequencies, expected 3"),
         (
             "frequencies_hz",
@@ -96,7 +96,7 @@ async fn values_that_cannot_be_are_a_422_with_a_pointer() {
             "/measurements/2/frequencies_hz",
             "4 frequencies, expected 3",
         ),
-        ("frequencies_hz", json!([0.00041, 0.00092, 0.0012]), "/measurements/2/frequencies_hz/0", "looks like kHz"),
+        ("frequencies_hz", json!([0.00041, 0.00092, 0.0012]), "/measurements/2/frequencies_hz/0", "seems to be in kHz"),
         ("frequencies_hz", json!([null, null, null]), "/measurements/2/frequencies_hz", "all modes are missing"),
         ("std_hz", json!([0.1, 0.1]), "/measurements/2/std_hz", "expected 3"),
         ("std_hz", json!([0.1, 0.0, 0.1]), "/measurements/2/std_hz/1", "above 0"),
@@ -147,7 +147,7 @@ async fn a_batch_that_is_too_long_or_a_body_that_is_too_large_is_refused() {
 
     let huge = vec![b' '; 5 << 20];
     problem(service.post_text(BATCHES, "application/json", huge.clone()).await, 413, "body_too_large").await;
-    // Without a length, which is found out while reading.
+    // Without a declared length, the size is found while reading.
     let chunks = without_length(&huge);
     problem(service.post_text(BATCHES, "application/json", chunks).await, 413, "body_too_large").await;
     nothing_is_stored(&service).await;
@@ -204,7 +204,7 @@ async fn ids_and_keys_that_are_none_are_refused() {
     problem(service.post("/v1/structures/unheard-of/batches", &body).await, 404, "unknown_structure").await;
     problem(service.get(&format!("{BATCHES}/nothing")).send().await.unwrap(), 404, "unknown_batch").await;
     let unknown = json!({ "batches": ["nothing"] });
-    problem(service.post("/v1/structures/three-dof/baseline", &unknown).await, 404, "unknown_batch").await;
+    problem(service.post("/v1/structures/three-dof/reference", &unknown).await, 404, "unknown_batch").await;
     for key in ["", "a b", "ü", &"k".repeat(129)] {
         let request = service.request(reqwest::Method::POST, BATCHES).json(&body);
         let value = reqwest::header::HeaderValue::from_bytes(key.as_bytes()).unwrap();
@@ -220,7 +220,7 @@ async fn ids_and_keys_that_are_none_are_refused() {
 async fn a_baseline_that_is_none_is_refused() {
     let (service, _folder) = spawn();
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 5, 0)).await["batch"].clone();
-    let path = "/v1/structures/three-dof/baseline";
+    let path = "/v1/structures/three-dof/reference";
     problem(service.post(path, &json!({ "batches": [] })).await, 422, "invalid").await;
     problem(service.post(path, &json!({ "batches": [batch, batch] })).await, 422, "unusable_baseline").await;
     for probability in [0.0, -0.1, 0.6, 2.0] {
@@ -244,8 +244,8 @@ async fn tables_with_mistakes_are_refused_with_line_and_column() {
         (b"measured_at,f1_hz,f2_hz,f3_hz,lab\n".to_vec(), "line 1", "unknown column \"lab\""),
         (b"measured_at,f1_hz,f2_hz,f3_hz,f3_hz\n".to_vec(), "line 1", "twice"),
         (b"measured_at,f1_hz,f2_hz,f3_hz,f4_hz\n".to_vec(), "line 1", "3 modes"),
-        (with("2026-01-01T00:10:00Z,0.41,0.74").into(), "line 3", "3 cells, the header has 4"),
-        (with("2026-01-01T00:10:00Z,0.41,abc,0.93").into(), "line 3, column f2_hz", "\"abc\" is no number"),
+        (with("2026-01-01T00:10:00Z,0.41,0.74").into(), "line 3", "3 cells, but the header has 4"),
+        (with("2026-01-01T00:10:00Z,0.41,abc,0.93").into(), "line 3, column f2_hz", "\"abc\" is not a number"),
         (with("2026-01-01T00:10:00Z,0.41,NaN,0.93").into(), "line 3, column f2_hz", "leave the cell empty"),
         (with("2026-01-01T00:10:00Z,0.41,-0.74,0.93").into(), "line 3, column f2_hz", "above 0"),
         (with("2026-01-01T00:10:00,0.41,0.74,0.93").into(), "line 3, column measured_at", "offset"),
@@ -284,10 +284,10 @@ async fn a_structure_with_mistakes_is_refused_with_its_place() {
     problem(service.get("/v1/structures/x").send().await.unwrap(), 404, "unknown_structure").await;
 }
 
-/// What a test does to the files of a baseline's folder.
+/// Change of the files of a trained model.
 type Change<'a> = Box<dyn Fn(&std::path::Path) + 'a>;
 
-/// A models folder whose one baseline was changed by `change`.
+/// A models folder with one model that was changed by `change`.
 fn models_with(change: impl Fn(&std::path::Path)) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let target = folder.path().join("three-dof");
@@ -307,7 +307,7 @@ async fn a_baseline_file_that_is_damaged_is_named_and_the_others_serve() {
         change(&mut bytes);
         std::fs::write(path, bytes).unwrap();
     };
-    // Changed weights get a manifest that fits, so that each case meets the check it is meant for.
+    // Changed weights get a matching manifest, so that each case reaches the check that it is meant for.
     let sign = |folder: &std::path::Path| {
         let digest = modalwatch::quantity::Digest::of_file(&std::fs::read(weights(folder)).unwrap());
         let path = folder.join("baseline.json");
@@ -378,13 +378,7 @@ async fn a_batch_that_waited_is_assessed_when_its_baseline_is_there() {
     service.stop("TERM");
     let service = Service::start(folder.path());
     let path = format!("{BATCHES}/{}", batch.as_str().unwrap());
-    for _ in 0..100 {
-        if service.read(&path).await["state"] == "assessed" {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
-    panic!("{}", service.read(&path).await);
+    eventually("the assessment", async || (service.read(&path).await["state"] == "assessed").then_some(())).await;
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use reqwest::{Client, Method, RequestBuilder, Response};
@@ -45,7 +45,12 @@ impl Service {
         // Its log must be read, or the pipe fills and the service waits for it.
         let mut stderr = child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut stderr, &mut std::io::sink()));
-        Self { url: url.to_owned(), child, stdout: Some(stdout), client: Client::new() }
+        Self {
+            url: url.to_owned(),
+            child,
+            stdout: Some(stdout),
+            client: modalwatch::notify::client_builder().build().unwrap(),
+        }
     }
 
     /// Address without scheme.
@@ -76,14 +81,14 @@ impl Service {
         self.request(Method::POST, path).header("content-type", content_type).body(body).send().await.unwrap()
     }
 
-    /// Reads JSON that must be there.
+    /// Reads JSON; the answer must be a success.
     pub async fn read(&self, path: &str) -> Value {
         let response = self.get(path).send().await.unwrap();
         assert!(response.status().is_success(), "GET {path}: {}", response.text().await.unwrap());
         response.json().await.unwrap()
     }
 
-    /// Posts a batch that must be taken; returns the answer.
+    /// Posts a batch that must be accepted; returns the answer.
     pub async fn post_batch(&self, structure: &str, measurements: &[Value]) -> Value {
         let body = json!({ "measurements": measurements });
         created(self.post(&format!("/v1/structures/{structure}/batches"), &body).await).await
@@ -96,7 +101,7 @@ impl Service {
     }
 
     /// Sends a signal by name and waits for the end; returns the exit status.
-    pub fn stop(&mut self, signal: &str) -> std::process::ExitStatus {
+    pub fn stop(&mut self, signal: &str) -> ExitStatus {
         self.signal(signal);
         self.wait(Duration::from_secs(40))
     }
@@ -106,15 +111,8 @@ impl Service {
         assert!(status.success());
     }
 
-    pub fn wait(&mut self, limit: Duration) -> std::process::ExitStatus {
-        let started = Instant::now();
-        loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                return status;
-            }
-            assert!(started.elapsed() < limit, "the service did not stop within {limit:?}");
-            std::thread::sleep(Duration::from_millis(20));
-        }
+    pub fn wait(&mut self, limit: Duration) -> ExitStatus {
+        exit_within(&mut self.child, limit).unwrap_or_else(|| panic!("the service did not stop within {limit:?}"))
     }
 }
 
@@ -123,6 +121,48 @@ impl Drop for Service {
         let _ = self.child.kill();
         let _ = self.child.wait();
         drop(self.stdout.take());
+    }
+}
+
+/// The exit status of a process, if it ends within `limit`.
+pub fn exit_within(child: &mut Child, limit: Duration) -> Option<ExitStatus> {
+    let started = Instant::now();
+    loop {
+        let status = child.try_wait().unwrap();
+        if status.is_some() || started.elapsed() > limit {
+            return status;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// What a command that must not start prints; it is ended when it starts all the same.
+pub fn refusal(command: &mut Command) -> String {
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let Some(status) = exit_within(&mut child, Duration::from_secs(20)) else {
+        child.kill().unwrap();
+        panic!("it should have refused to start: {command:?}");
+    };
+    let mut text = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
+    assert!(!status.success(), "{text}");
+    text
+}
+
+/// Asks until `found` gives something, and returns it; panics with `what` after 20 s.
+pub async fn eventually<T>(what: &str, found: impl AsyncFnMut() -> Option<T>) -> T {
+    within(Duration::from_secs(20), what, found).await
+}
+
+/// As [`eventually`], for as long as `limit`.
+pub async fn within<T>(limit: Duration, what: &str, mut found: impl AsyncFnMut() -> Option<T>) -> T {
+    let started = Instant::now();
+    loop {
+        if let Some(value) = found().await {
+            return value;
+        }
+        assert!(started.elapsed() < limit, "{what}: not within {limit:?}");
+        tokio::time::sleep(Duration::from_millis(25)).await;
     }
 }
 
@@ -156,7 +196,8 @@ pub async fn problem(response: Response, status: u16, code: &str) -> Value {
     body
 }
 
-/// Frequencies of `three-dof` by its characteristic polynomial: the tests' own physics, Hz, ascending.
+/// Frequencies of `three-dof` from its characteristic polynomial, Hz, ascending. This is independent of the program's
+/// own physics.
 ///
 /// det(K − λM) = 0 is a cubic in λ with three positive roots, found by bisection between its turning points.
 pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {

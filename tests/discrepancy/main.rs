@@ -4,6 +4,9 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod further;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod spectrum;
 mod world;
 
@@ -385,15 +388,20 @@ fn hidden_effects_are_found_in_a_fixed_set_of_worlds() {
     let judged = judged(&singles.chain(others).collect::<Vec<_>>());
     report(&judged);
 
-    // The rates required of many worlds, with a tolerance for the small number of worlds here.
+    // Of two hundred worlds 95.5 % are right and 94.5 % gain enough: of 29, 27.7 ± 1.1 and 27.4 ± 1.2; the bounds are 0.6 and 1.9
+    // standard errors below.
     let single = Tally::new(&judged, Kind::Single);
     assert!(single.right() + 2 >= single.worlds(), "{} wrong places", single.worlds() - single.right());
+    // 90 % of 27: 24.3 ± 1.6, and the bound is 1.5 standard errors below. All 27 inside happen by chance in 6 % of such sets, so
+    // that there is no bound above; the test of two hundred worlds has one.
     let (compared, inside) = single.sizes();
-    assert!(inside >= 22, "{inside} of {compared} sizes inside");
+    assert!(compared >= 25 && inside >= 22, "{inside} of {compared} sizes inside");
     assert!(single.count(|j| j.gain >= GAIN) >= 25, "gains");
+    // Of sixty worlds each 60, 57 and 59 are right. Of 6, 5 and 4 that makes 6, 4.75 ± 0.5 and 3.93 ± 0.26: three standard errors
+    // below are 4.9 (were one of sixty wrong), 3.3 and 3.2.
     assert!(Tally::new(&judged, Kind::Nothing).right() >= 5, "something in nothing");
     assert!(Tally::new(&judged, Kind::Two).right() >= 4, "two effects");
-    assert!(Tally::new(&judged, Kind::Outside).right() >= 3, "confident wrong names");
+    assert_eq!(Tally::new(&judged, Kind::Outside).right(), 4, "confident wrong names");
 }
 
 #[test]
@@ -410,10 +418,13 @@ fn hidden_effects_are_found_in_two_hundred_worlds() {
     let single = Tally::new(&judged, Kind::Single);
     assert!(single.share(|j| j.right) >= 0.95, "{} single effects in the right place", single.right());
     let (compared, inside) = single.sizes();
+    // A share of 182 scatters by 0.022 about 0.9: 3.5 times that below and 3.2 times above. The program reaches 0.874.
     let coverage = inside as f64 / compared as f64;
-    assert!((0.80..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
+    assert!((0.822..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
     assert!(single.median_gain() >= GAIN, "median gain {}", single.median_gain());
-    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.85), (Kind::Outside, 0.90)] {
+    // Shares of sixty: the program reaches 1, 0.95 ± 0.028 and 0.983 ± 0.017; three standard errors below, for nothing hidden
+    // three worlds.
+    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.866), (Kind::Outside, 0.93)] {
         let tally = Tally::new(&judged, kind);
         assert!(tally.share(|j| j.right) >= least, "{kind:?}: {} of {} right", tally.right(), tally.worlds());
     }
@@ -548,7 +559,7 @@ fn two_laboratories_differ_by_something_common_and_not_by_three_storeys() {
     let repository = Path::new(env!("CARGO_MANIFEST_DIR"));
     let data = repository.join("../shared/data/ruler-frame-4dof/ruler_frame_frequencies.csv");
     if !data.exists() {
-        println!("skipped: ../shared/data/ruler-frame-4dof is not on this machine");
+        needs::missing("the data ../shared/data/ruler-frame-4dof, which are not part of the repository");
         return;
     }
     let output = Command::new(env!("CARGO_BIN_EXE_modalwatch"))

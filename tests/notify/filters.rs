@@ -1,10 +1,10 @@
-//! Webhooks as a resource: who wants what, and what no webhook may be.
+//! Webhooks as a resource: their filters, and the targets that are refused.
 
 use serde_json::{json, Value};
 
 use crate::helpers::{created, problem, spawn};
 use crate::receiver::{Answer, Receiver};
-use crate::webhooks::{damage, declare_undamaged, start};
+use crate::webhooks::{damage, declare_undamaged, settled, start};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_webhook_gets_what_it_asked_for_and_nothing_else() {
@@ -38,7 +38,9 @@ async fn a_webhook_gets_what_it_asked_for_and_nothing_else() {
     declare_undamaged(&service).await;
     damage(&service).await;
     receiver.wait_for(3).await;
-    tokio::time::sleep(std::time::Duration::from_millis(300)).await;
+    for hook in [0, 1, 2, 3, 4, 7] {
+        settled(&service, &hooks[hook], "pending", 0).await;
+    }
     let mut paths: Vec<String> = receiver.all().into_iter().map(|r| r.path).collect();
     paths.sort();
     assert_eq!(paths, ["/all", "/new", "/wanted"]);
@@ -55,7 +57,7 @@ async fn what_no_webhook_may_be_is_a_422_that_says_why() {
         (json!({ "url": "http://0x0a000001/" }), "/url", "private"),
         (json!({ "url": "ftp://example.org/" }), "/url", "only http and https"),
         (json!({ "url": "https://u:p@example.org/" }), "/url", "user name"),
-        (json!({ "url": "hook" }), "/url", "no URL"),
+        (json!({ "url": "hook" }), "/url", "not a valid URL"),
         (json!({ "url": format!("https://93.184.216.34/{}", "a".repeat(3_000)) }), "/url", "at most 2000"),
         (json!({ "url": "https://93.184.216.34/", "events": ["alarm.closed"] }), "/events/0", "alarm.opened"),
         (json!({ "url": "https://93.184.216.34/", "alarm_kinds": ["fire"] }), "/alarm_kinds/0", "damage"),
@@ -78,7 +80,8 @@ async fn what_no_webhook_may_be_is_a_422_that_says_why() {
     problem(service.get("/v1/quarantine/1").send().await.unwrap(), 404, "unknown_message").await;
 }
 
-/// A webhook made while an address was allowed is not sent to when it no longer is: the address is looked at every time.
+/// A webhook that was created while its address was allowed gets no messages once the address is not: the address is
+/// checked for every message.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_address_that_is_no_longer_allowed_is_not_reached() {
     let folder = tempfile::tempdir().unwrap();
