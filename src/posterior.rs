@@ -97,7 +97,7 @@ impl PosteriorSamples {
     }
 
     /// Share of the samples of each parameter that lie within [`EDGE`] of an end of its prior.
-    pub fn edge_mass(&self, space: &ParameterSpace) -> Vec<f64> {
+    pub fn prior_bound_mass(&self, space: &ParameterSpace) -> Vec<f64> {
         let share = |(index, parameter): (usize, &crate::parameter::Parameter)| {
             let at_edge = |value: &&f64| !(EDGE..=1.0 - EDGE).contains(&parameter.to_unit(**value));
             self.theta.column(index).iter().filter(at_edge).count() as f64 / self.theta.nrows() as f64

@@ -35,32 +35,18 @@ const TABLE: [(&str, &[&str], bool); 33] = [
     ("discrepancy", &["physics", "plot", "simulator"], true),
     ("damage", &["hierarchy", "posterior"], true),
     ("alarm", &["damage"], true),
-    ("assessment", &["damage", "trust"], true),
+    (
+        "assessment",
+        &["alarm", "baseline", "damage", "hierarchy", "physics", "plot", "posterior", "simulator", "trust"],
+        true,
+    ),
     ("store", &["access", "alarm", "assessment", "damage", "reduction", "trust", "volume"], true),
     ("notify", &["store"], true),
     ("mqtt", &["monitor"], true),
     ("telemetry", &[], false),
-    // A study of the whole program, the assessment of a batch included.
-    ("reproduce", &["baseline", "damage", "gsa", "monitor", "physics", "plot", "simulator", "updating"], true),
-    (
-        "monitor",
-        &[
-            "alarm",
-            "assessment",
-            "baseline",
-            "damage",
-            "discrepancy",
-            "flow",
-            "hierarchy",
-            "physics",
-            "plot",
-            "posterior",
-            "simulator",
-            "store",
-            "trust",
-        ],
-        true,
-    ),
+    // A study of the methods, the assessment of a batch included.
+    ("reproduce", &["assessment", "baseline", "damage", "gsa", "physics", "plot", "simulator", "updating"], true),
+    ("monitor", &["alarm", "assessment", "baseline", "damage", "discrepancy", "flow", "simulator", "store"], true),
     (
         "http",
         &[
@@ -85,6 +71,7 @@ const TABLE: [(&str, &[&str], bool); 33] = [
         &[
             "access",
             "alarm",
+            "assessment",
             "baseline",
             "config",
             "damage",

@@ -10,7 +10,7 @@ use crate::measurement::ModalMeasurement;
 use crate::monitor::BatchView;
 use crate::quantity::Timestamp;
 use crate::store::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
-use crate::trust::{Finding, Verdict};
+use crate::trust::{Finding, TrustVerdict};
 
 /// One batch.
 #[derive(Debug, Serialize, ToSchema)]
@@ -82,7 +82,7 @@ pub struct AssessmentBody {
     assessed_at: Timestamp,
     exceeds: bool,
     /// `accepted` or `rejected`; rejected withholds the probabilities of damage.
-    trust: Verdict,
+    trust: TrustVerdict,
     extrapolated: bool,
     fit_p_value: Option<f64>,
     /// √(χ²/degrees of freedom): 1 where noise explains all that the simulation does not.
@@ -199,7 +199,7 @@ impl From<QuantityAssessment> for ParameterBody {
             mean_interval: q.mean_interval,
             std: q.std,
             std_interval: q.std_interval,
-            edge_mass: q.edge_mass,
+            edge_mass: q.prior_bound_mass,
             threshold: damage.map(|d| d.threshold),
             probability_of_damage: damage.map(|d| d.probability_of_damage),
             probability_of_damage_interval: damage.and_then(|d| d.probability_interval),
@@ -296,7 +296,7 @@ impl HistoryItem {
             let empty = std::iter::repeat_n(Cell::Empty, HISTORY_COLUMNS.len() - batch.len());
             return vec![batch.into_iter().chain(empty).collect()];
         };
-        let trust = if assessment.trust == Verdict::Accepted { "accepted" } else { "rejected" };
+        let trust = if assessment.trust == TrustVerdict::Accepted { "accepted" } else { "rejected" };
         let low = |interval: Option<[f64; 2]>| Cell::number(interval.map(|i| i[0]));
         let high = |interval: Option<[f64; 2]>| Cell::number(interval.map(|i| i[1]));
         let row = |p: &ParameterBody| {

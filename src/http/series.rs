@@ -20,7 +20,7 @@ use crate::reduction::{Reduced, Row};
 use crate::store::{
     ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
 };
-use crate::trust::{Code, Verdict};
+use crate::trust::{FindingCode, TrustVerdict};
 
 /// Points unless the client asks for another number.
 const DEFAULT_POINTS: usize = 1_000;
@@ -122,8 +122,8 @@ struct Chart {
 struct TrustPoint {
     time: Timestamp,
     batch: String,
-    verdict: Verdict,
-    findings: Vec<Code>,
+    verdict: TrustVerdict,
+    findings: Vec<FindingCode>,
     #[schema(required)]
     p_value: Option<f64>,
 }

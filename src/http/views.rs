@@ -14,10 +14,11 @@ use super::request::{structure_id, ApiPath};
 use super::Shared;
 use crate::access::Grant;
 use crate::alarm::machine::State as AlarmState;
-use crate::monitor::{BatchDetail, ModeDetail, ParameterDetail, Watched};
+use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
+use crate::monitor::Watched;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::store::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
-use crate::trust::Verdict;
+use crate::trust::TrustVerdict;
 
 /// Jobs listed.
 const LISTED_JOBS: usize = 100;
@@ -60,7 +61,7 @@ struct OverviewItem {
 #[schema(as = LatestAssessment)]
 struct Latest {
     batch: String,
-    trust: Verdict,
+    trust: TrustVerdict,
     exceeds: bool,
     #[schema(required)]
     max_probability_of_damage: Option<f64>,

@@ -13,10 +13,11 @@ use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, DeliveryPath, Invalid, Unknown, WebhookPath};
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::Shared;
+use crate::alarm::ALARM_KINDS;
 use crate::measurement::check::Problem;
 use crate::notify::{new_secret, EVENT_KINDS};
 use crate::quantity::{shown, StructureId, Timestamp};
-use crate::store::{Delivery, DeliveryState, EventFilter, WebhookRecord, ALARM_KINDS};
+use crate::store::{Delivery, DeliveryState, EventFilter, WebhookRecord};
 
 /// Most webhooks of a service: each may have a connection of its own.
 const MOST_WEBHOOKS: usize = 100;

@@ -17,7 +17,7 @@ use tokio::sync::mpsc::{channel, Receiver};
 
 use super::{Error, Monitor};
 use crate::baseline::Baseline;
-use crate::measurement::check::{check_measurements, Expectation, Place, RawMeasurement};
+use crate::measurement::check::{check_measurements, Place, RawMeasurement};
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
@@ -350,15 +350,7 @@ fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBat
         covariates: m.covariates.clone(),
         settings: m.settings.clone(),
     };
-    let expectation = Expectation {
-        modes: simulator.modes(),
-        frequency_limits_hz: simulator.frequency_limits_hz(),
-        covariates: simulator.covariates(),
-        instrumented: simulator.instrumented_points(),
-        space: simulator.space(),
-        now: Timestamp::now(),
-        max_measurements: usize::MAX,
-    };
+    let expectation = simulator.expectation(Timestamp::now(), usize::MAX);
     let raw = batch.measurements.iter().enumerate().map(raw).collect();
     let measurements = check_measurements(raw, &expectation).map_err(|problems| {
         let first = problems.first().map_or_else(String::new, |p| format!("{}: {}", p.pointer, p.message));

@@ -6,7 +6,7 @@ use super::{Error, Ingested, MissingCovariate, Monitor, Watched};
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, Place, Problem};
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
-use crate::quantity::StructureId;
+use crate::quantity::{StructureId, Timestamp};
 
 /// Source of a batch that names none.
 const DEFAULT_SOURCE: &str = "default";
@@ -30,7 +30,8 @@ impl Monitor {
         check_source(&source).map_err(|problem| vec![problem])?;
         idempotency_key.as_deref().map_or(Ok(()), check_idempotency_key).map_err(|problem| vec![problem])?;
         let places: Vec<Place> = raw.iter().map(|r| r.place).collect();
-        let measurements = check_measurements(raw, &self.expectation(watched))?;
+        let measurements =
+            check_measurements(raw, &watched.simulator.expectation(Timestamp::now(), self.settings.max_measurements))?;
         if self.settings().missing_covariate == MissingCovariate::Refuse {
             let missing =
                 measurements.iter().zip(&places).flat_map(|(m, place)| missing_covariates(watched, m, *place));

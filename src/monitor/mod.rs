@@ -1,8 +1,6 @@
 //! What happens to a batch: store it, assess it, store the result; declare undamaged states; resume after a restart.
 
 pub mod archive;
-pub mod assess;
-pub mod charts;
 pub mod compute;
 mod detail;
 mod diagnoses;
@@ -29,19 +27,16 @@ use tokio::sync::oneshot;
 use tracing::{error, warn, Instrument as _};
 
 use crate::alarm::AlarmSettings;
-use crate::assessment::{Assessment, BatchState};
+use crate::assessment::{Assessment, BatchState, Draws, KnownLimits};
 use crate::baseline::library::{Library, Refusal};
 use crate::baseline::Baseline;
 use crate::damage;
-use crate::measurement::check::Expectation;
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
 use crate::simulator::Simulator;
 use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store, StoredChartPoint};
-use charts::KnownLimits;
 use compute::{Compute, ComputeSettings, QueueFull};
-pub use detail::{BatchDetail, ModeDetail, ParameterDetail};
 pub use diagnoses::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
 use events::{Events, KnownAlarms};
 pub use models::Reloaded;
@@ -82,8 +77,8 @@ pub enum MissingCovariate {
 impl Default for MonitorSettings {
     fn default() -> Self {
         Self {
-            draws_per_measurement: 10,
-            draws_for_population: 64,
+            draws_per_measurement: Draws::PER_MEASUREMENT,
+            draws_for_population: Draws::FOR_POPULATION,
             max_measurements: 5_000,
             accept_uncalibrated: Vec::new(),
             missing_covariate: MissingCovariate::Marginalise,
@@ -151,7 +146,7 @@ pub enum Error {
         /// The batch.
         batch: String,
         /// The cause.
-        source: assess::Error,
+        source: crate::assessment::Error,
     },
     /// A batch that is not to be trusted cannot be part of an undamaged state.
     #[error("batch {batch} cannot be part of an undamaged state: {reason}")]
@@ -364,19 +359,6 @@ impl Monitor {
     /// Places left in the queue.
     pub fn free_places(&self) -> usize {
         self.compute.free()
-    }
-
-    /// What a batch of this structure must look like.
-    pub fn expectation<'a>(&self, watched: &'a Watched) -> Expectation<'a> {
-        Expectation {
-            modes: watched.simulator.modes(),
-            frequency_limits_hz: watched.simulator.frequency_limits_hz(),
-            covariates: watched.simulator.covariates(),
-            instrumented: watched.simulator.instrumented_points(),
-            space: watched.simulator.space(),
-            now: Timestamp::now(),
-            max_measurements: self.settings.max_measurements,
-        }
     }
 
     /// Stores a batch, assesses it and stores the result.

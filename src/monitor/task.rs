@@ -7,14 +7,13 @@ use std::time::Instant;
 
 use tracing::{info, info_span, warn, Instrument as _};
 
-use super::assess::{self, Context, Draws};
 use super::compute::Place;
-use super::{baseline_of, charts, Error, Monitor, Watched};
-use crate::assessment::{Assessment, BatchState};
+use super::{baseline_of, Error, Monitor, Watched};
+use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, NewChartPoint};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedState;
-use crate::quantity::{Hertz, StructureId};
-use crate::store::{BatchRecord, NewChartPoint, StoredAssessment, StoredChartPoint, UndamagedRecord};
+use crate::quantity::{Hertz, StructureId, Timestamp};
+use crate::store::{BatchRecord, StoredAssessment, StoredChartPoint, UndamagedRecord};
 
 /// A batch on its way, and what it is assessed with.
 pub(super) struct Task {
@@ -124,9 +123,10 @@ impl Monitor {
         let work = move || {
             let undamaged: Option<&UndamagedState> = undamaged.as_deref().map(|record| &record.state);
             let context = Context { undamaged, previous: previous.as_deref() };
-            let assessment = assess::assess(&baseline, &record.batch.measurements, context, draws)?;
-            let points = charts::points(&baseline, &assessment, undamaged, &settings, &known);
-            Ok::<_, assess::Error>((assessment, points))
+            let measurements = &record.batch.measurements;
+            let assessment = assessment::assess(&baseline, measurements, context, draws, Timestamp::now())?;
+            let points = chart_points(&baseline, &assessment, undamaged, &settings, &known);
+            Ok::<_, assessment::Error>((assessment, points))
         };
         let (structure, batch) = (task.record.batch.structure.as_str(), &task.record.batch_id);
         let trace = info_span!(target: "modalwatch::spans", "assess", structure.id = structure, batch.id = batch);

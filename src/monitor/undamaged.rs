@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use tracing::{info, warn, Instrument as _};
 
-use super::assess::{self, Draws, UndamagedError};
 use super::compute::Place;
 use super::{baseline_of, Error, Monitor};
+use crate::assessment::{undamaged_state, Draws, ReferenceError};
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::UndamagedRecord;
 
@@ -91,17 +91,17 @@ impl Monitor {
             .run(move || {
                 let batches: Vec<_> =
                     records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
-                let state = assess::undamaged_state(&baseline, &batches, threshold_probability)?;
+                let state = undamaged_state(&baseline, &batches, threshold_probability)?;
                 known_limits.prepare(&baseline, &state, &settings);
                 Ok(state)
             })
             .await;
         let state = taken.map_err(|_| Error::Panicked)?.map_err(|error| match error {
-            UndamagedError::Assess { batch, source } => Error::Assess { batch: batch_ids[batch].clone(), source },
-            UndamagedError::Untrusted { batch, reason } => {
+            ReferenceError::Assess { batch, source } => Error::Assess { batch: batch_ids[batch].clone(), source },
+            ReferenceError::Untrusted { batch, reason } => {
                 Error::UnfitForUndamaged { batch: batch_ids[batch].clone(), reason }
             }
-            UndamagedError::State(error) => Error::Undamaged(error),
+            ReferenceError::State(error) => Error::Undamaged(error),
         })?;
         let version =
             self.store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;

@@ -10,6 +10,7 @@ use tracing::{error, info};
 
 use super::retention::{RetentionRun, RetentionSettings};
 use super::{Error, Monitor};
+use crate::alarm::ALARM_KINDS;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{self, backup, FolderFigures};
 
@@ -216,9 +217,6 @@ impl Monitor {
         Ok(())
     }
 }
-
-/// Kinds of alarms.
-const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
 
 /// What the metrics mean, in the unit that their name ends with.
 const MEANINGS: [(&str, &str); 34] = [

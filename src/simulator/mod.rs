@@ -7,6 +7,7 @@ mod beam;
 mod check;
 pub mod definition;
 pub mod effect;
+mod expectation;
 pub mod law;
 mod many;
 pub mod population;

@@ -4,15 +4,11 @@ use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
 
 use super::{bad_row, timestamp, Error, Store};
+use crate::alarm::chart::FIT_SERIES;
 use crate::quantity::{StructureId, Timestamp};
 
-/// Series of the chart of the simulation's fit; no parameter can have a colon in its name.
-pub const FIT_SERIES: &str = "simulation:fit";
 /// Series of silence.
 pub const SILENCE_SERIES: &str = "structure:silence";
-
-/// Kinds of alarms.
-pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
 
 /// From an alarm to its end.
 #[derive(Debug, Clone, PartialEq)]

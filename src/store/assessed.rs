@@ -14,19 +14,19 @@ use super::{bad_row, Error, Store};
 use crate::damage::QuantityKind;
 use crate::quantity::StructureId;
 use crate::reduction::{Reduced, Reducer, Row};
-use crate::trust::{Code, Verdict};
+use crate::trust::{FindingCode, TrustVerdict};
 
 /// The part of a stored trust that a series shows.
 #[derive(Deserialize)]
 struct TrustColumn {
-    verdict: Verdict,
+    verdict: TrustVerdict,
     p_value: Option<f64>,
     findings: Vec<FindingColumn>,
 }
 
 #[derive(Deserialize)]
 struct FindingColumn {
-    code: Code,
+    code: FindingCode,
 }
 
 impl TrustColumn {
@@ -34,7 +34,7 @@ impl TrustColumn {
         match text {
             Some(text) => serde_json::from_str(text).map_err(|e| bad_row("assessment")(&e)),
             // From before trust was judged.
-            None => Ok(Self { verdict: Verdict::Accepted, p_value: None, findings: Vec::new() }),
+            None => Ok(Self { verdict: TrustVerdict::Accepted, p_value: None, findings: Vec::new() }),
         }
     }
 }
@@ -238,7 +238,7 @@ impl Store {
         let found: BTreeMap<String, Option<String>> = found.into_iter().collect();
         let row = |Row { time_us, values, tag: batch }| {
             let trust = TrustColumn::of(found.get(&batch).and_then(Option::as_deref))?;
-            let mut findings: Vec<Code> = Vec::new();
+            let mut findings: Vec<FindingCode> = Vec::new();
             for finding in trust.findings {
                 if !findings.contains(&finding.code) {
                     findings.push(finding.code);

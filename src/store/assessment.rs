@@ -5,10 +5,10 @@ use std::future::Future;
 
 use sqlx::{FromRow, SqliteConnection};
 
-use super::chart::{chart, Charted, Charts, NewChartPoint, StoredChartPoint};
+use super::chart::{chart, Charted, Charts, StoredChartPoint};
 use super::rows::{parts, InsertStatements};
 use super::{bad_row, from_blob, plotted, timestamp, to_blob, Error, Store};
-use crate::assessment::Assessment;
+use crate::assessment::{Assessment, NewChartPoint};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::Trust;
@@ -324,7 +324,7 @@ async fn insert(
                 .bind(q.std)
                 .bind(q.pooled.within)
                 .bind(q.pooled.between)
-                .bind(q.edge_mass)
+                .bind(q.prior_bound_mass)
                 .bind(damage.map(|d| d.threshold))
                 .bind(damage.map(|d| d.probability_of_damage))
                 .bind(damage.map(|d| d.exceeds))
@@ -396,7 +396,7 @@ fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
             within: row.variance_within,
             between: row.variance_between,
         },
-        edge_mass: row.edge_mass,
+        prior_bound_mass: row.edge_mass,
         group: row.group_name,
         damage,
     })

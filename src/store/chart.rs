@@ -13,7 +13,7 @@ use super::rows::{parts, InsertStatements};
 use super::{bad_row, timestamp, Error, Store};
 use crate::alarm::chart::{ChartPoint, Series};
 use crate::alarm::machine::State;
-use crate::alarm::AlarmSettings;
+use crate::assessment::NewChartPoint;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Points read at a time.
@@ -25,21 +25,6 @@ const CHARTS_TOGETHER: usize = 32;
 /// Difference of moving averages that is none.
 const SAME: f64 = 1e-9;
 
-/// A batch on a chart, to be stored.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NewChartPoint {
-    /// Parameter of a damage chart, or [`super::FIT_SERIES`].
-    pub series: String,
-    /// Undamaged state it is compared with; 0 for the fit.
-    pub undamaged_version: u32,
-    /// What it says.
-    pub point: ChartPoint,
-    /// Probability of damage that stands at the limit.
-    pub probability_limit: Option<f64>,
-    /// Rules of the chart.
-    pub settings: AlarmSettings,
-}
-
 /// A stored point of a chart.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StoredChartPoint {
@@ -47,7 +32,7 @@ pub struct StoredChartPoint {
     pub batch_id: String,
     /// When it ended.
     pub measured_to: Timestamp,
-    /// Parameter, or [`super::FIT_SERIES`].
+    /// Parameter, or [`crate::alarm::chart::FIT_SERIES`].
     pub series: String,
     /// Shift towards damage, standard errors.
     pub shift: f64,

@@ -56,11 +56,11 @@ use crate::quantity::StructureId;
 use crate::volume;
 use writer::{Work, Writer};
 
-pub use alarm::{Acknowledgement, Episode, MaintenanceWindow, ALARM_KINDS, FIT_SERIES};
+pub use alarm::{Acknowledgement, Episode, MaintenanceWindow};
 pub use assessment::StoredAssessment;
 pub use audit::{AuditEntry, AuditQuery, NewAuditEntry};
 pub use batch::{BatchRecord, InsertBatch};
-pub use chart::{NewChartPoint, StoredChartPoint};
+pub use chart::StoredChartPoint;
 pub use diagnosis::{DiagnosisRecord, JobState, NewVersion, StoredBaseline};
 pub use figures::{Figures, FolderFigures};
 pub use history::{Exceedance, HistoryEntry, HistoryQuery};

@@ -10,7 +10,7 @@ use super::assessment::IS_CURRENT;
 use super::{bad_row, timestamp, Error, Store};
 use crate::alarm::machine::State;
 use crate::quantity::{StructureId, Timestamp};
-use crate::trust::Verdict;
+use crate::trust::TrustVerdict;
 
 /// What is known of a structure at a glance.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,7 +43,7 @@ pub struct LatestAssessment {
     /// The batch.
     pub batch_id: String,
     /// Whether it can be believed.
-    pub verdict: Verdict,
+    pub verdict: TrustVerdict,
     /// Number of findings.
     pub findings: usize,
     /// Whether a probability of damage is above that of the undamaged state.
@@ -77,7 +77,7 @@ struct LatestRow {
 /// The part of a stored trust that the overview shows.
 #[derive(Deserialize)]
 struct TrustColumn {
-    verdict: Verdict,
+    verdict: TrustVerdict,
     findings: Vec<IgnoredAny>,
 }
 
@@ -151,7 +151,7 @@ impl Store {
             let trust = match &row.trust {
                 Some(trust) => serde_json::from_str(trust).map_err(|e| bad_row("assessment")(&e))?,
                 // From before trust was judged.
-                None => TrustColumn { verdict: Verdict::Accepted, findings: Vec::new() },
+                None => TrustColumn { verdict: TrustVerdict::Accepted, findings: Vec::new() },
             };
             let latest = LatestAssessment {
                 batch_id: row.batch_id,

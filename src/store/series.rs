@@ -13,7 +13,7 @@ use super::{bad_row, timestamp, Error, Store};
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
 use crate::reduction::{Reduced, Reducer};
-use crate::trust::{Code, Verdict};
+use crate::trust::{FindingCode, TrustVerdict};
 
 /// Most measurements that are looked at for one answer; of more, every second, third … is.
 const MOST_MEASUREMENTS: u64 = 500_000;
@@ -78,7 +78,7 @@ pub struct QuantityMark {
 /// An alarm chart over a window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartSeries {
-    /// Parameter, or [`super::FIT_SERIES`].
+    /// Parameter, or [`crate::alarm::chart::FIT_SERIES`].
     pub chart: String,
     /// Points by the end of their batch; the values are the shift and the moving average.
     pub points: Reduced<ChartMark>,
@@ -105,9 +105,9 @@ pub struct TrustMark {
     /// The batch.
     pub batch: String,
     /// The verdict.
-    pub verdict: Verdict,
+    pub verdict: TrustVerdict,
     /// What was found, each code once.
-    pub findings: Vec<Code>,
+    pub findings: Vec<FindingCode>,
 }
 
 impl Store {
