@@ -7,8 +7,8 @@ use super::table::{Cell, Kind};
 use crate::assessment::{Assessment, BatchState};
 use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
-use crate::monitor::BatchView;
-use crate::quantity::Timestamp;
+use crate::monitor::{BatchView, Missing};
+use crate::quantity::{StructureId, Timestamp};
 use crate::store::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
 use crate::trust::{Finding, TrustVerdict};
 
@@ -38,7 +38,8 @@ pub struct Batch {
 impl Batch {
     /// The answer for a batch, with its measurements if they are wanted.
     pub fn new(view: BatchView, with_measurements: bool) -> Self {
-        let BatchView { record, assessment, charts, next_step } = view;
+        let BatchView { record, assessment, charts, missing } = view;
+        let next_step = missing.map(|missing| next_step(&record, &missing));
         let (measured_from, measured_to) = record.batch.time_span();
         Self {
             structure: record.batch.structure.to_string(),
@@ -57,6 +58,21 @@ impl Batch {
             measurements: with_measurements.then_some(record.batch.measurements),
         }
     }
+}
+
+/// Why a batch has no assessment or comparison, with the request that helps.
+fn next_step(record: &BatchRecord, missing: &Missing) -> String {
+    let route = declare_reference(&record.batch.structure);
+    match missing {
+        Missing::OutdatedReference(_) => format!("{missing}: {route}"),
+        Missing::Reference => format!("{missing}: {route} {{\"batches\": [\"{}\"]}}", record.batch_id),
+        Missing::Model(_) | Missing::PartOfReference(_) | Missing::NotYet => missing.to_string(),
+    }
+}
+
+/// The request that declares the undamaged reference of a structure.
+pub fn declare_reference(structure: &StructureId) -> String {
+    format!("POST /v1/structures/{structure}/reference")
 }
 
 /// Path of a batch.

@@ -10,13 +10,14 @@ use serde::{Deserialize, Serialize};
 use tracing::error;
 use utoipa::{IntoParams, ToSchema};
 
+use super::answer::declare_reference;
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{parse_json, read_body, structure_id, ApiPath, ApiQuery};
 use super::Shared;
 use crate::monitor::retention::RetentionPlan;
 use crate::monitor::Reloaded;
-use crate::quantity::shown;
+use crate::quantity::{shown, Digest, StructureId};
 use crate::store::backup::Manifest;
 
 /// Lines of an archive on their way to the client.
@@ -62,6 +63,47 @@ struct BackupList {
     unreadable: Vec<String>,
 }
 
+/// The result of a reload.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Reloaded)]
+pub struct ReloadedBody {
+    /// The structure.
+    structure: StructureId,
+    /// The trained baseline in use now.
+    model_digest: Digest,
+    /// The one before.
+    #[schema(required)]
+    previous_model_digest: Option<Digest>,
+    /// False when the files are those in use.
+    changed: bool,
+    /// Version of the undamaged reference that was renewed with it.
+    #[schema(required)]
+    undamaged_version: Option<u32>,
+    /// What is left to do.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next_step: Option<String>,
+}
+
+impl From<Reloaded> for ReloadedBody {
+    fn from(reloaded: Reloaded) -> Self {
+        let next_step = reloaded.reference_outdated.then(|| {
+            format!(
+                "the undamaged reference was made with another trained baseline, so batches are not compared with it: declare \
+                 undamaged batches again by {}",
+                declare_reference(&reloaded.structure)
+            )
+        });
+        Self {
+            structure: reloaded.structure,
+            model_digest: reloaded.model_digest,
+            previous_model_digest: reloaded.previous_model_digest,
+            changed: reloaded.changed,
+            undamaged_version: reloaded.undamaged_version,
+            next_step,
+        }
+    }
+}
+
 /// `POST /v1/backups`: a backup under `backups/` of the data folder, made while everything goes on; 201 when it is checked and
 /// on disk.
 ///
@@ -76,7 +118,7 @@ struct BackupList {
 )]
 pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, ApiError> {
     let body: BackupBody = optional_json(&shared, &headers, body).await?;
-    let manifest = shared.monitor.back_up(body.name).await?;
+    let manifest = shared.monitor.upkeep().backups().make(body.name).await?;
     Ok((StatusCode::CREATED, Json(manifest)).into_response())
 }
 
@@ -90,9 +132,7 @@ pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, bod
     responses((status = 200, description = "The backups", body = BackupList))
 )]
 pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiError> {
-    let store = shared.monitor.store().clone();
-    let listed = tokio::task::spawn_blocking(move || store.backups()).await.map_err(|e| ApiError::internal(&e))?;
-    let (items, unreadable) = listed?;
+    let (items, unreadable) = shared.monitor.upkeep().backups().list().await?;
     Ok(Json(BackupList { items, unreadable }).into_response())
 }
 
@@ -113,7 +153,7 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
 )]
 pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let mut lines = shared.monitor.export(&id).await?;
+    let mut lines = shared.monitor.archive().export(&id).await?;
     let (mut sender, body) = Channel::<Bytes, crate::monitor::Error>::new(BUFFERED);
     tokio::spawn(async move {
         while let Some(line) = lines.recv().await {
@@ -147,7 +187,7 @@ pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) 
     description = "Reads the models folder again; the baseline in use stays when the new one is refused.",
     params(StructurePath),
     request_body(content = Option<ReloadBody>, example = json!({"retake_undamaged": false})),
-    responses((status = 200, description = "What is in use now", body = Reloaded), Unknown, BodyRefused, Conflict)
+    responses((status = 200, description = "What is in use now", body = ReloadedBody), Unknown, BodyRefused, Conflict)
 )]
 pub async fn reload_model(
     State(shared): State<Shared>,
@@ -157,8 +197,8 @@ pub async fn reload_model(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let body: ReloadBody = optional_json(&shared, &headers, body).await?;
-    let reloaded = shared.monitor.reload_model(&id, body.retake_undamaged.unwrap_or(true)).await?;
-    Ok(Json(reloaded).into_response())
+    let reloaded = shared.monitor.models().reload(&id, body.retake_undamaged.unwrap_or(true)).await?;
+    Ok(Json(ReloadedBody::from(reloaded)).into_response())
 }
 
 /// `GET /v1/retention`: what is kept, what would go now, and what the last look did; `days` asks for another number. Nothing is
@@ -183,7 +223,7 @@ pub async fn retention(
             ApiError::invalid_field("query/days", message)
         })
     });
-    Ok(Json(shared.monitor.retention_plan(days.transpose()?).await?).into_response())
+    Ok(Json(shared.monitor.upkeep().retention().plan(days.transpose()?).await?).into_response())
 }
 
 /// A JSON body, or its default where there is none.

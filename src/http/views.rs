@@ -15,7 +15,7 @@ use super::Shared;
 use crate::access::Grant;
 use crate::alarm::machine::State as AlarmState;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
-use crate::monitor::Watched;
+use crate::monitor::ActiveStructure;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::store::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
 use crate::trust::TrustVerdict;
@@ -150,18 +150,25 @@ struct ModeBody {
     responses((status = 200, description = "The structures by id", body = Overview))
 )]
 pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
-    let store = shared.monitor.store();
     let item = |found: StructureOverview| {
-        let watched = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
-        item(found, watched)
+        let active = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
+        item(found, active)
     };
-    let items = store.overview().await?.into_iter().filter(|found| grant.may_see(&found.id)).map(item).collect();
-    let jobs_running = shared.monitor.jobs_running();
+    let items = shared
+        .monitor
+        .records()
+        .overview()
+        .await?
+        .into_iter()
+        .filter(|found| grant.may_see(&found.id))
+        .map(item)
+        .collect();
+    let jobs_running = shared.monitor.jobs().running();
     Ok(Json(Overview { items, jobs_running }).into_response())
 }
 
-fn item(found: StructureOverview, watched: Result<Arc<Watched>, String>) -> OverviewItem {
-    let baseline = watched.and_then(|watched| watched.baseline.clone());
+fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>) -> OverviewItem {
+    let baseline = active.and_then(|active| active.baseline.clone());
     let (baseline, model_missing) = (baseline.as_ref().ok(), baseline.as_ref().err());
     OverviewItem {
         state: state(&found, baseline.is_some()),
@@ -233,7 +240,7 @@ pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response
         verdict: job.verdict,
         summary: job.summary,
     };
-    let jobs = shared.monitor.jobs(LISTED_JOBS).await?;
+    let jobs = shared.monitor.jobs().list(LISTED_JOBS).await?;
     let items: Vec<JobItem> = jobs.into_iter().filter(|(job, _)| grant.may_see(&job.structure)).map(item).collect();
     Ok(Json(JobList { items }).into_response())
 }
@@ -254,7 +261,7 @@ pub async fn detail(
     ApiPath((id, batch)): ApiPath<(String, String)>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let detail = shared.monitor.batch_detail(&id, &batch).await?;
+    let detail = shared.monitor.records().batch_detail(&id, &batch).await?;
     Ok(Json(detail_body(id, batch, detail)).into_response())
 }
 

@@ -9,7 +9,7 @@ use crate::measurement::body::RawBatch;
 use crate::measurement::check::Problem;
 use crate::measurement::json::JsonError;
 use crate::measurement::MeasurementBatch;
-use crate::monitor::{Error, Monitor};
+use crate::monitor::{Error, IngestError, Monitor};
 use crate::quantity::{shown, StructureId, Timestamp};
 
 /// Tries of a message that fails for no fault of its own.
@@ -83,9 +83,9 @@ impl Intake {
     /// Whether the batch was there already.
     async fn store_once(&self, topic: &str, payload: &[u8]) -> Result<bool, Refused> {
         let batch = self.batch(topic, payload).await?;
-        match self.monitor.ingest_when_free(batch).await {
+        match self.monitor.ingest().take_when_free(batch).await {
             Ok(ingested) => Ok(ingested.replayed),
-            Err(error @ (Error::Store(_) | Error::QueueFull(_) | Error::Panicked)) => {
+            Err(IngestError::Monitor(error @ (Error::Store(_) | Error::QueueFull(_) | Error::Panicked))) => {
                 Err(Refused::Trouble(error.to_string()))
             }
             Err(error) => Err(Refused::Poison(error.to_string())),
@@ -97,7 +97,7 @@ impl Intake {
         let id =
             self.topic.structure(topic).ok_or_else(|| poison(format!("the topic {} is not ours", shown(topic))))?;
         let id = StructureId::parse(id).map_err(|e| poison(e.to_string()))?;
-        let watched = self.monitor.structure(&id).map_err(|e| poison(e.to_string()))?;
+        let active = self.monitor.structure(&id).map_err(|e| poison(e.to_string()))?;
         if payload.len() > self.max_payload_bytes {
             let (bytes, most) = (payload.len(), self.max_payload_bytes);
             return Err(poison(format!("{bytes} bytes are more than mqtt.max_payload_bytes, {most}: split the batch")));
@@ -109,7 +109,7 @@ impl Intake {
                 JsonError::Malformed(reason) => reason,
                 JsonError::Shape(problem) => sentence(&[problem]),
             })?;
-            monitor.check(&watched, id, raw).map_err(|problems| sentence(&problems))
+            monitor.ingest().check(&active, raw).map_err(|problems| sentence(&problems))
         };
         tokio::task::spawn_blocking(parse).await.map_err(|e| Refused::Trouble(e.to_string()))?.map_err(Refused::Poison)
     }

@@ -12,7 +12,7 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
     let healthy = measurements([4.0, 5.0, 6.0], 20, 0);
     let first = service.post_batch("three-dof", &healthy).await;
     assert_eq!(first["state"], "assessed", "{first}");
-    assert!(first["next_step"].as_str().unwrap().contains("POST /v1/structures/three-dof/baseline"), "{first}");
+    assert!(first["next_step"].as_str().unwrap().contains("POST /v1/structures/three-dof/reference"), "{first}");
     let k1 = &first["assessment"]["parameters"][0];
     assert!((k1["mean"].as_f64().unwrap() - 4.0).abs() < 0.05, "{k1}");
     assert_eq!(k1["probability_of_damage"], Value::Null);

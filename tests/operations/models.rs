@@ -208,7 +208,7 @@ async fn a_reload_may_leave_the_undamaged_state_to_a_person() {
     put_manifest(models.path(), &other);
     let swapped: Value = service.post(RELOAD, &json!({ "retake_undamaged": false })).await.json().await.unwrap();
     assert_eq!(swapped["undamaged_version"], Value::Null, "{swapped}");
-    assert!(swapped["next_step"].as_str().unwrap().contains("/baseline"), "{swapped}");
+    assert!(swapped["next_step"].as_str().unwrap().contains("/reference"), "{swapped}");
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 86_400 * 30)).await;
     assert_eq!(batch["assessment"]["undamaged_version"], Value::Null, "{batch}");
     problem(service.post("/v1/structures/bridge/model/reload", &json!({})).await, 404, "unknown_structure").await;

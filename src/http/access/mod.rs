@@ -33,7 +33,7 @@ use crate::access::{
     allow, read_admin_token, token_like, About, AccessSettings, Actor, AdminFileError, Denied, Grant, Need, Refused,
     TokenRecord, TokenTable, TokenText,
 };
-use crate::monitor::upkeep::Reason;
+use crate::monitor::Reason;
 use crate::quantity::Timestamp;
 use crate::store::{self, Store};
 use client::{is_local_name, Proxies};
