@@ -85,7 +85,7 @@ async fn generate(folder: &Path, batches: usize) -> usize {
         let json = definition.replace("\"three-dof\"", &format!("\"{id}\""));
         let digest = Digest::of_file(json.as_bytes());
         let id = StructureId::parse(&id).expect("an id");
-        store.put_structure(&id, &json, &digest, Timestamp::now()).await.expect("a structure");
+        store.structures().put_structure(&id, &json, &digest, Timestamp::now()).await.expect("a structure");
     }
     store.close().await;
     drop(store);
@@ -288,13 +288,13 @@ async fn replay(threads: usize) -> f64 {
         .declare_reference(&structure, first.into_iter().collect(), 0.05)
         .await
         .expect("an undamaged state");
-    let waiting = async || !monitor.store().pending(&structure, 1).await.expect("an answer").is_empty();
+    let waiting = async || !monitor.store().batches().pending(&structure, 1).await.expect("an answer").is_empty();
     while waiting().await {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     let seconds = started.elapsed().as_secs_f64();
     let query = HistoryQuery { limit: REPLAYED, ..HistoryQuery::default() };
-    let history = monitor.store().history(&structure, &query).await.expect("a history");
+    let history = monitor.store().history().page(&structure, &query).await.expect("a history");
     let compared = |entry: &modalwatch::store::HistoryEntry| {
         entry.assessment.as_ref().is_some_and(|assessment| assessment.undamaged_version == Some(1))
     };

@@ -10,7 +10,8 @@ use serde_json::json;
 use super::remote::PlaceArgs;
 use crate::baseline::library::Library;
 use crate::config::Config;
-use crate::store::backup::{self, Manifest, Model, Restored};
+use crate::quantity::Timestamp;
+use crate::store::backup::{self, BackupModel, Manifest, Restored};
 use crate::store::Error;
 
 /// Copy the database into a folder.
@@ -52,13 +53,14 @@ pub struct RestoreArgs {
 /// Whatever keeps the backup from being made; there is none then.
 pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
     let config = args.place.read()?;
-    let out = args.out.clone().unwrap_or_else(|| config.data_dir.join(backup::FOLDER).join(backup::name_of_now()));
+    let now = Timestamp::now();
+    let out = args.out.clone().unwrap_or_else(|| config.data_dir.join(backup::FOLDER).join(backup::name_of(now)));
     anyhow::ensure!(!out.exists(), "{} is there already: give another --out", out.display());
     let manifest = if args.place.url.is_some() {
         by_service(args, &config, &out).await?
     } else {
         let models = models_in_use(&config)?;
-        match backup::of_folder(&config.data_dir, &out, models).await {
+        match backup::of_folder(&config.data_dir, &out, models, now).await {
             Err(backup::Error::Store(Error::Locked(_))) => by_service(args, &config, &out).await?,
             made => made?,
         }
@@ -114,14 +116,14 @@ fn copy_folder(from: &Path, to: &Path) -> anyhow::Result<()> {
 }
 
 /// The trained baselines of program and models folder: which belong to the data, though they are not in the database.
-fn models_in_use(config: &Config) -> anyhow::Result<Vec<Model>> {
+fn models_in_use(config: &Config) -> anyhow::Result<Vec<BackupModel>> {
     let library = Library::open(config.models_dir.as_deref())?;
     let mut models = Vec::new();
     for (id, entry) in library.iter() {
         if let Some(baseline) = &entry.baseline {
             let files = library.files_of(baseline.digest())?;
             let kept_in = files.map_or_else(|| "program".to_owned(), |files| files.kept_in);
-            models.push(Model { structure: id.to_string(), digest: baseline.digest().to_string(), kept_in });
+            models.push(BackupModel { structure: id.to_string(), digest: baseline.digest().to_string(), kept_in });
         }
     }
     Ok(models)
@@ -137,7 +139,7 @@ fn print_manifest(folder: &Path, manifest: &Manifest) {
             println!("  {table}: {rows}");
         }
     }
-    for Model { structure, digest, kept_in } in &manifest.models {
+    for BackupModel { structure, digest, kept_in } in &manifest.models {
         let note = match kept_in.as_str() {
             "database" => "in the backup".to_owned(),
             "program" => "shipped inside the program".to_owned(),
@@ -160,7 +162,8 @@ pub async fn restore(args: &RestoreArgs) -> anyhow::Result<()> {
     }
     let flags = crate::config::Flags { data_dir: args.data_dir.clone(), ..crate::config::Flags::default() };
     let config = Config::read(args.config.as_deref(), &flags)?;
-    let Restored { manifest, kept_aside } = backup::restore(&args.from, &config.data_dir, args.replace).await?;
+    let Restored { manifest, kept_aside } =
+        backup::restore(&args.from, &config.data_dir, args.replace, Timestamp::now()).await?;
     print_manifest(&args.from, &manifest);
     if let Some(aside) = kept_aside {
         println!("The database that was there is kept as {}.", aside.display());

@@ -57,7 +57,7 @@ impl Reloading {
             return before;
         }
         monitor.upkeep().retention().set(new.retention);
-        monitor.store().set_limits(&new.store);
+        monitor.store().file().set_limits(&new.store);
         info!(changed = ?now, "SIGHUP: took over {}", if now.is_empty() { "nothing new".to_owned() } else { now.join(", ") });
         if !later.is_empty() {
             warn!(waiting = ?later, "SIGHUP: {} change at the next start", later.join(", "));

@@ -70,7 +70,7 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         broker.into_iter().chain(sender.finding().map(|it| Reason::new("webhooks_failing", it))).collect()
     });
     let router = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
-    declare_metrics(store.sqlite_version());
+    declare_metrics(store.file().sqlite_version());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained baseline(s)");
     let events = monitor.events().clone();

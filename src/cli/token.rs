@@ -104,7 +104,7 @@ async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
         TokenCommand::Revoke { id } => {
             let record = find(store, &id).await?;
             let revoked = TokenRecord { revoked_at: record.revoked_at.or(Some(Timestamp::now())), ..record };
-            store.audited(entry("revoke", &revoked.id), store.update_token(&revoked)).await?;
+            store.audit().audited(entry("revoke", &revoked.id), store.tokens().update_token(&revoked)).await?;
             println!("{} is revoked", revoked.id);
             Ok(())
         }
@@ -114,7 +114,7 @@ async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
 }
 
 fn entry(what: &str, id: &TokenId) -> NewAuditEntry {
-    NewAuditEntry::local(format!("modalwatch token {what}"), Some(format!("/v1/tokens/{id}")))
+    NewAuditEntry::local(Timestamp::now(), format!("modalwatch token {what}"), Some(format!("/v1/tokens/{id}")))
 }
 
 async fn create(store: &Store, new: NewToken) -> anyhow::Result<()> {
@@ -124,7 +124,7 @@ async fn create(store: &Store, new: NewToken) -> anyhow::Result<()> {
     }
     let text = TokenText::generate()?;
     let record = new.record(&text, now);
-    store.audited(entry("create", &record.id), store.insert_token(&record)).await?;
+    store.audit().audited(entry("create", &record.id), store.tokens().insert_token(&record)).await?;
     show_once(&text);
     Ok(())
 }
@@ -135,7 +135,7 @@ async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
     let text = TokenText::with_id(record.id.clone())?;
     let until = Timestamp::from_micros(now.micros() + i64::from(overlap_s) * 1_000_000)?;
     let rotated = record.rotated(&text, until);
-    store.audited(entry("rotate", &rotated.id), store.update_token(&rotated)).await?;
+    store.audit().audited(entry("rotate", &rotated.id), store.tokens().update_token(&rotated)).await?;
     eprintln!("The old secret is good until {until}.");
     show_once(&text);
     Ok(())
@@ -144,7 +144,7 @@ async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
 async fn list(store: &Store) -> anyhow::Result<()> {
     let now = Timestamp::now();
     println!("{:16}  {:7}  {:18}  {:20}  structures  name", "id", "state", "scopes", "expires");
-    for token in store.tokens().await? {
+    for token in store.tokens().list().await? {
         let scopes: Vec<&str> = token.scopes.iter().map(Scope::as_str).collect();
         let expires = token.expires_at.map_or_else(|| "never".to_owned(), |at| at.to_string());
         let structures = token
@@ -164,6 +164,6 @@ fn show_once(text: &TokenText) {
 }
 
 async fn find(store: &Store, id: &str) -> anyhow::Result<TokenRecord> {
-    let found = store.tokens().await?.into_iter().find(|token| token.id.as_str() == id);
+    let found = store.tokens().list().await?.into_iter().find(|token| token.id.as_str() == id);
     found.with_context(|| format!("there is no token {}; modalwatch token list shows all ids", shown(id)))
 }

@@ -105,8 +105,8 @@ pub async fn version(State(shared): State<Shared>) -> Response {
     let version = Version {
         name: env!("CARGO_PKG_NAME"),
         version: env!("CARGO_PKG_VERSION"),
-        sqlite_version: shared.monitor.store().sqlite_version().to_owned(),
-        schema_version: Store::schema_version(),
+        sqlite_version: shared.monitor.store().file().sqlite_version().to_owned(),
+        schema_version: schema_version(),
         manifest_format: crate::baseline::manifest::FORMAT,
     };
     Json(version).into_response()

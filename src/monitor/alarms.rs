@@ -43,7 +43,7 @@ impl Alarms {
         open_only: bool,
         limit: usize,
     ) -> Result<Vec<Episode>, Error> {
-        Ok(self.store.episodes(structure, before, open_only, limit).await?)
+        Ok(self.store.alarms().episodes(structure, before, open_only, limit).await?)
     }
 
     /// Acknowledges an alarm; the first acknowledgement stays. `None` when there is no such alarm.
@@ -56,7 +56,7 @@ impl Alarms {
         number: i64,
         acknowledgement: Acknowledgement,
     ) -> Result<Option<Episode>, Error> {
-        let episode = self.store.acknowledge(structure, number, acknowledgement).await?;
+        let episode = self.store.alarms().acknowledge(structure, number, acknowledgement).await?;
         if let Some(episode) = &episode {
             self.events.publish(event(structure, episode, "acknowledged"));
         }
@@ -68,7 +68,7 @@ impl Alarms {
     /// # Errors
     /// [`Error::Store`].
     pub async fn charts(&self, structure: &StructureId, limit: usize) -> Result<Vec<StoredChartPoint>, Error> {
-        Ok(self.store.charts(structure, limit).await?)
+        Ok(self.store.alarms().charts(structure, limit).await?)
     }
 
     /// Adds a maintenance window: batches measured in it do not enter the charts.
@@ -76,7 +76,7 @@ impl Alarms {
     /// # Errors
     /// [`Error::Store`].
     pub async fn add_maintenance(&self, structure: &StructureId, window: MaintenanceWindow) -> Result<(), Error> {
-        Ok(self.store.insert_maintenance(structure, window, Timestamp::now()).await?)
+        Ok(self.store.alarms().insert_maintenance(structure, window, Timestamp::now()).await?)
     }
 
     /// Maintenance windows of a structure, newest first.
@@ -84,7 +84,7 @@ impl Alarms {
     /// # Errors
     /// [`Error::Store`].
     pub async fn maintenance(&self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
-        Ok(self.store.maintenance(structure).await?)
+        Ok(self.store.alarms().maintenance(structure).await?)
     }
 
     /// Publishes the alarms that changed since the last call, and logs those opened, each once.
@@ -116,7 +116,7 @@ impl Alarms {
         let published = || self.published.lock().expect("no holder of this lock panics");
         let Published { newest, open } = published().get(structure).cloned().unwrap_or_default();
         let open: Vec<i64> = open.into_iter().collect();
-        match self.store.episodes_since(structure, newest, &open).await {
+        match self.store.alarms().episodes_since(structure, newest, &open).await {
             Ok(mut episodes) => {
                 let changes = published().entry(structure.clone()).or_default().learn(structure, &episodes);
                 episodes.retain(|episode| episode.state() == "open");

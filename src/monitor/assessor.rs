@@ -105,7 +105,7 @@ impl Assessor {
     /// A stored batch.
     pub(super) async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
         let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: shown(batch_id) };
-        self.store.batch(structure, batch_id).await?.ok_or_else(unknown)
+        self.store.batches().batch(structure, batch_id).await?.ok_or_else(unknown)
     }
 
     /// The task of a stored batch.
@@ -116,7 +116,7 @@ impl Assessor {
         place: Place,
     ) -> Result<Task, Error> {
         let (batch, (from, _)) = (&record.batch, record.batch.time_span());
-        let previous = self.store.frequencies_before(&batch.structure, &batch.source, from).await?;
+        let previous = self.store.batches().frequencies_before(&batch.structure, &batch.source, from).await?;
         Task::new(active, record, previous, place)
     }
 
@@ -140,7 +140,7 @@ impl Assessor {
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
         // If a newer reference is stored meanwhile, the batch is assessed again (`settle`).
-        let undamaged = self.store.undamaged_as_read(&task.record.batch.structure).await?;
+        let undamaged = self.store.reference().undamaged_as_read(&task.record.batch.structure).await?;
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
         let started = Instant::now();
@@ -175,14 +175,14 @@ impl Assessor {
             Ok((assessment, points)) => {
                 metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                 log_assessment(structure, id, &assessment, seconds);
-                let insert = self.store.insert_assessment(structure, id, &assessment, points);
+                let insert = self.store.assessments().insert_assessment(structure, id, &assessment, points);
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {
                 metrics::counter!("modalwatch_assessments_failed_total").increment(1);
                 warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
                 let version = task.active.simulator.digest();
-                Err(self.store.mark_failed(structure, id, version, &reason))
+                Err(self.store.batches().mark_failed(structure, id, version, &reason))
             }
         };
         async move {
@@ -229,7 +229,7 @@ impl Assessor {
         // A reference declared while this was computed did not find the batch assessed and so did not reset it: it is compared
         // with that reference now.
         if stored.newest_undamaged != newest_undamaged {
-            let present = self.store.undamaged(structure).await?.filter(|record| task.is_comparable(record));
+            let present = self.store.reference().undamaged(structure).await?.filter(|record| task.is_comparable(record));
             if present.map(|record| record.state.version) != assessment.undamaged_version {
                 return Ok(Settled::Again(task));
             }

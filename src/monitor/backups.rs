@@ -38,7 +38,7 @@ impl Backups {
         let _turn = self.running.try_lock().map_err(|_| BackupError::Running)?;
         let name = name.unwrap_or_else(backup::name_of_now);
         let started = Instant::now();
-        let made = self.store.backup(&name, self.models_in_use().await).await;
+        let made = self.store.file().backup(&name, self.models_in_use().await).await;
         let outcome = if made.is_ok() { "done" } else { "failed" };
         metrics::counter!("modalwatch_backups_total", "outcome" => outcome).increment(1);
         match &made {
@@ -59,7 +59,7 @@ impl Backups {
     /// [`BackupError::Failed`] when the folder cannot be listed.
     pub async fn list(&self) -> Result<(Vec<backup::Manifest>, Vec<String>), BackupError> {
         let store = self.store.clone();
-        let listed = tokio::task::spawn_blocking(move || store.backups()).await.map_err(|_| Error::Panicked)?;
+        let listed = tokio::task::spawn_blocking(move || store.file().backups()).await.map_err(|_| Error::Panicked)?;
         Ok(listed?)
     }
 

@@ -121,7 +121,7 @@ impl Ingest {
         let active = self.assessor.structures.get(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
         let (foreseen, outcome) = oneshot::channel();
-        let insert = self.assessor.store.insert_batch_foreseen(&batch, &batch_id, received_at, foreseen);
+        let insert = self.assessor.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, foreseen);
         let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
             batch_id: batch_id.clone(),
             batch,

@@ -101,7 +101,7 @@ impl Models {
             reason,
             kept: before.as_ref().map(Digest::to_string),
         };
-        if self.store.trained_baseline(structure, active.simulator.digest()).await?.is_some() {
+        if self.store.structures().trained_baseline(structure, active.simulator.digest()).await?.is_some() {
             let reason =
                 "the service itself trained the present version, an extension, which no file replaces: undo the \
                           extension first";
@@ -120,7 +120,7 @@ impl Models {
         }
         self.structures.set_library(library);
         let (mut undamaged_version, mut reference_outdated) = (None, false);
-        if changed && self.store.undamaged(structure).await?.is_some() {
+        if changed && self.store.reference().undamaged(structure).await?.is_some() {
             if renew {
                 undamaged_version = self.references.renew(structure).await;
             }

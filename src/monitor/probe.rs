@@ -47,13 +47,13 @@ impl WriterProbe {
         // In a task of its own: otherwise a client that goes away before the result would make the next one test again.
         let task = tokio::spawn(async move {
             let mut last = probe.last.lock().await;
-            let refused_writes = probe.store.refused_writes();
+            let refused_writes = probe.store.file().refused_writes();
             let fresh = |a: &&Answer| a.at.elapsed() < FRESH_FOR && a.refused_writes == refused_writes;
             if let Some(answer) = last.as_ref().filter(fresh) {
                 return answer.finding.clone();
             }
             let finding = question.await;
-            let refused_writes = probe.store.refused_writes();
+            let refused_writes = probe.store.file().refused_writes();
             *last = Some(Answer { at: Instant::now(), finding: finding.clone(), refused_writes });
             finding
         });
@@ -69,7 +69,7 @@ impl WriterProbe {
 const STUCK: &str = "writer_stuck";
 
 async fn ask(store: Store) -> Option<Reason> {
-    match tokio::time::timeout(PATIENCE, store.is_writable()).await {
+    match tokio::time::timeout(PATIENCE, store.file().is_writable()).await {
         Ok(Ok(())) => None,
         Ok(Err(error)) => {
             let code = error.disk_cause().unwrap_or("database_failed");
@@ -118,8 +118,8 @@ mod tests {
         let store = Store::open(folder.path()).await.unwrap();
         let probe = WriterProbe::new(store.clone());
         assert_eq!(probe.finding().await, None);
-        store.set_limits(&StoreSettings { min_free_bytes: u64::MAX, ..StoreSettings::default() });
-        assert!(store.is_writable().await.is_err());
+        store.file().set_limits(&StoreSettings { min_free_bytes: u64::MAX, ..StoreSettings::default() });
+        assert!(store.file().is_writable().await.is_err());
         assert_eq!(probe.finding().await.unwrap().code, "disk_full");
         assert!(probe.responds().await);
     }

@@ -87,7 +87,7 @@ impl Records {
     /// # Errors
     /// [`Error::Store`].
     pub async fn structures(&self) -> Result<Vec<StructureSummary>, Error> {
-        Ok(self.assessor.store.structures().await?)
+        Ok(self.assessor.store.structures().list().await?)
     }
 
     /// All structures with their alarms and newest assessments.
@@ -95,7 +95,7 @@ impl Records {
     /// # Errors
     /// [`Error::Store`].
     pub async fn overview(&self) -> Result<Vec<StructureOverview>, Error> {
-        Ok(self.assessor.store.overview().await?)
+        Ok(self.assessor.store.overview().structures().await?)
     }
 
     /// The newest undamaged reference of a structure.
@@ -103,7 +103,7 @@ impl Records {
     /// # Errors
     /// [`Error::Store`].
     pub async fn reference(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
-        Ok(self.assessor.store.undamaged(structure).await?)
+        Ok(self.assessor.store.reference().undamaged(structure).await?)
     }
 
     /// A page of the batches of a structure with their current assessments.
@@ -111,7 +111,7 @@ impl Records {
     /// # Errors
     /// [`Error::Store`].
     pub async fn history(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
-        Ok(self.assessor.store.history(structure, query).await?)
+        Ok(self.assessor.store.history().page(structure, query).await?)
     }
 
     /// A page of the exceedances of a structure.
@@ -119,7 +119,7 @@ impl Records {
     /// # Errors
     /// [`Error::Store`].
     pub async fn exceedances(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
-        Ok(self.assessor.store.exceedances(structure, query).await?)
+        Ok(self.assessor.store.history().exceedances(structure, query).await?)
     }
 
     /// A page of the measurements of a structure.
@@ -131,7 +131,7 @@ impl Records {
         structure: &StructureId,
         query: &MeasurementQuery,
     ) -> Result<Vec<StoredMeasurement>, Error> {
-        Ok(self.assessor.store.measurements(structure, query).await?)
+        Ok(self.assessor.store.batches().measurements(structure, query).await?)
     }
 
     /// The series of a structure; `modes` is its number of modes, `covariates` are the names of its numeric covariates.
@@ -146,11 +146,11 @@ impl Records {
         covariates: &[String],
     ) -> Result<Series, Error> {
         let store = &self.assessor.store;
-        let extent = store.extent(structure, window).await?;
+        let extent = store.series().extent(structure, window).await?;
         let (measured, (quantities, trust), charts) = tokio::try_join!(
-            store.frequency_series(structure, window, &extent, modes, covariates),
-            store.assessed_series(structure, window, &extent),
-            store.chart_series(structure, window, &extent),
+            store.series().frequency_series(structure, window, &extent, modes, covariates),
+            store.series().assessed_series(structure, window, &extent),
+            store.series().chart_series(structure, window, &extent),
         )?;
         Ok(Series { extent, measured, quantities, trust, charts })
     }
@@ -166,8 +166,8 @@ impl Records {
     /// A stored batch with its current assessment.
     pub(super) async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
         let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
-        let assessment = self.assessor.store.assessment(structure, batch_id).await?;
-        let charts = self.assessor.store.chart_points(structure, batch_id).await?;
+        let assessment = self.assessor.store.assessments().assessment(structure, batch_id).await?;
+        let charts = self.assessor.store.alarms().chart_points(structure, batch_id).await?;
         self.view_of(record, assessment, charts).await
     }
 
@@ -220,8 +220,8 @@ impl Records {
         let place = compute.reserve()?;
         let draws = self.assessor.draws(&baseline, &record);
         let (source, from) = (&record.batch.source, record.batch.time_span().0);
-        let previous = store.frequencies_before(structure, source, from).await?;
-        let reference = store.undamaged(structure).await?.filter(|u| u.model_digest == *baseline.digest());
+        let previous = store.batches().frequencies_before(structure, source, from).await?;
+        let reference = store.reference().undamaged(structure).await?.filter(|u| u.model_digest == *baseline.digest());
         let work = move || {
             let measurements = &record.batch.measurements;
             let samples = draw(&baseline, measurements, previous.as_deref(), draws)?;

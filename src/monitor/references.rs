@@ -25,10 +25,10 @@ impl References {
     /// switch of versions, also one that a stop of the service interrupted. Version of the new reference.
     pub(super) async fn renew_if_outdated(&self, structure: &StructureId) -> Option<u32> {
         let Assessor { store, structures, .. } = &*self.assessor;
-        let newest = store.undamaged(structure).await.ok()??;
+        let newest = store.reference().undamaged(structure).await.ok()??;
         let active = structures.get(structure).ok()?;
         let baseline = active.baseline.as_ref().ok()?;
-        let version = store.structure_version(structure, active.simulator.digest()).await.ok()?;
+        let version = store.structures().structure_version(structure, active.simulator.digest()).await.ok()?;
         // Only versions made by an extension are followed; after replacing a trained baseline, the user decides on the reference.
         if newest.model_digest == *baseline.digest() || version.is_none() {
             return None;
@@ -42,7 +42,7 @@ impl References {
         let failed = |error: &dyn std::fmt::Display| {
             warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present baseline: {error}");
         };
-        let newest = self.assessor.store.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
+        let newest = self.assessor.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
         let (mut batches, threshold) = (newest.batches.clone(), newest.state.threshold_probability);
         loop {
             let place = self.assessor.compute.wait().await;
@@ -98,12 +98,12 @@ impl References {
             }
             ReferenceError::State(error) => DeclareError::Reference(error),
         })?;
-        let version = store.insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
+        let version = store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
         let batches = batch_ids.len();
         info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches");
         alarms.publish_changes(structure).await;
         events.structure_changed(structure);
-        let stored = store.undamaged(structure).await?;
+        let stored = store.reference().undamaged(structure).await?;
         Ok(stored.expect("it was stored a moment ago and is never deleted"))
     }
 }

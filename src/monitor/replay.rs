@@ -104,7 +104,7 @@ impl Replay {
                 tokio::time::sleep(BETWEEN_ATTEMPTS).await;
                 match replay.resume(&structure).await {
                     Ok(()) => break,
-                    Err(_) if replay.assessor.store.is_closed() => break,
+                    Err(_) if replay.assessor.store.file().is_closed() => break,
                     Err(error) => {
                         warn!(structure.id = %structure, %error, "Unassessed batches of {structure} still wait: {error}");
                     }
@@ -121,7 +121,7 @@ impl Replay {
             Arc::clone(self.turns.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default());
         let _turn = turn.lock().await;
         loop {
-            let pending = self.assessor.store.pending(structure, PAGE).await?;
+            let pending = self.assessor.store.batches().pending(structure, PAGE).await?;
             if pending.is_empty() || !self.assess_all(structure, pending).await? {
                 return Ok(());
             }
@@ -182,7 +182,7 @@ impl Replay {
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
                 error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
                 let version = active.simulator.digest();
-                self.assessor.store.mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
+                self.assessor.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
                 return Ok(Waiting::Done);
             }
             record => record?,

@@ -84,7 +84,7 @@ pub async fn plan(
 ) -> Result<RetentionPlan, crate::store::Error> {
     let before = settings.before(now);
     let would_delete = match before {
-        Some(before) => store.expired(before).await?,
+        Some(before) => store.retention().expired(before).await?,
         None => Vec::new(),
     };
     Ok(RetentionPlan { measurements_days: settings.measurements_days, before, would_delete, last_run: None })
@@ -102,7 +102,7 @@ pub async fn delete_expired(
     let mut all = Deleted::default();
     let Some(before) = settings.before(now) else { return Ok(all) };
     loop {
-        let deleted = store.delete_expired(before, AT_A_TIME).await?;
+        let deleted = store.retention().delete_expired(before, AT_A_TIME).await?;
         if deleted.batches == 0 {
             return Ok(all);
         }

@@ -59,10 +59,10 @@ impl Silence {
         let allowed = self.after_s as i64 * 1_000_000;
         for structure in self.structures.ids() {
             let now = clock();
-            let Some(last) = self.store.last_received(&structure).await? else { continue };
+            let Some(last) = self.store.batches().last_received(&structure).await? else { continue };
             let overdue = allowed > 0 && now.micros() - last.max(started).micros() > allowed;
-            let silent = overdue && !self.store.is_in_maintenance(&structure, now).await?;
-            if self.store.set_silent(&structure, silent.then_some(last), now).await? {
+            let silent = overdue && !self.store.alarms().is_in_maintenance(&structure, now).await?;
+            if self.store.alarms().set_silent(&structure, silent.then_some(last), now).await? {
                 if silent {
                     warn!(structure.id = %structure, "No batch of {structure} since {last}");
                     self.alarms.report(&structure).await;

@@ -66,7 +66,7 @@ impl ActiveStructures {
         }
         for (id, entry) in library.iter() {
             let json = entry.simulator.definition().canonical_json();
-            let outcome = store.put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            let outcome = store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
             if outcome == PutStructure::Refused {
                 warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches, and the library's definition differs");
             }
@@ -74,9 +74,9 @@ impl ActiveStructures {
         let library = RwLock::new(Arc::new(library));
         let (active, refused) = (RwLock::default(), BTreeMap::new());
         let mut structures = Self { store, events, accept_uncalibrated, library, active, refused };
-        for summary in structures.store.structures().await? {
+        for summary in structures.store.structures().list().await? {
             let id = summary.id;
-            let Some(record) = structures.store.structure(&id).await? else { continue };
+            let Some(record) = structures.store.structures().structure(&id).await? else { continue };
             match StructureDefinition::parse_json(&record.definition_json).and_then(Simulator::new) {
                 Ok(simulator) => {
                     let baseline = structures.baseline_for(&simulator).await?;
@@ -136,7 +136,7 @@ impl ActiveStructures {
         let built = tokio::task::spawn_blocking(move || Simulator::new(definition)).await;
         let simulator = built.unwrap_or_else(|e| std::panic::resume_unwind(e.into_panic()))?;
         let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
-        let outcome = self.store.put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
+        let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
         match outcome {
             PutStructure::Refused => return Err(Error::StructureInUse(id)),
             PutStructure::Created | PutStructure::Replaced => {
@@ -178,7 +178,7 @@ impl ActiveStructures {
         baseline: Arc<Baseline>,
     ) -> Result<(), Error> {
         let structure = simulator.id().clone();
-        if !self.store.switch_version(&structure, expected, version, Timestamp::now()).await? {
+        if !self.store.structures().switch_version(&structure, expected, version, Timestamp::now()).await? {
             return Err(Error::VersionChanged(structure));
         }
         self.activate(simulator, Ok(baseline));
@@ -188,7 +188,7 @@ impl ActiveStructures {
 
     /// The trained baseline for a version of a structure: one that the service trained for it, or that of the library.
     pub(super) async fn baseline_for(&self, simulator: &Simulator) -> Result<Result<Arc<Baseline>, String>, Error> {
-        let Some(stored) = self.store.trained_baseline(simulator.id(), simulator.digest()).await? else {
+        let Some(stored) = self.store.structures().trained_baseline(simulator.id(), simulator.digest()).await? else {
             return Ok(self.library_baseline(simulator));
         };
         let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);

@@ -71,12 +71,12 @@ async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
 /// Ids of all batches, each of which must be assessed and whole.
 async fn stored(monitor: &Monitor) -> Vec<String> {
     let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
-    let items = monitor.store().history(&structure(), &query).await.unwrap();
+    let items = monitor.store().history().page(&structure(), &query).await.unwrap();
     for item in &items {
         assert_eq!((item.state, item.measurement_count), (BatchState::Assessed, MEASUREMENTS), "{}", item.batch_id);
         assert!(item.assessment.is_some());
         // Compares the measurements with their digest.
-        monitor.store().batch(&structure(), &item.batch_id).await.unwrap().unwrap();
+        monitor.store().batches().batch(&structure(), &item.batch_id).await.unwrap().unwrap();
     }
     items.into_iter().map(|item| item.batch_id).collect()
 }
@@ -156,7 +156,7 @@ async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent
     for _ in 0..100 {
         tokio::time::sleep(std::time::Duration::from_millis(100)).await;
         let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
-        let items = monitor.store().history(&structure(), &query).await.unwrap();
+        let items = monitor.store().history().page(&structure(), &query).await.unwrap();
         if items.len() == 1 && items[0].state == BatchState::Assessed {
             return;
         }

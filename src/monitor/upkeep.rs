@@ -124,8 +124,8 @@ impl Upkeep {
 
     fn disk_findings(&self, writable: bool) -> Vec<Reason> {
         let mut findings = Vec::new();
-        let Ok(files) = FolderFigures::of(self.store.folder()) else { return findings };
-        let (wal, most) = (files.wal_bytes, self.store.max_wal_bytes());
+        let Ok(files) = FolderFigures::of(self.store.file().folder()) else { return findings };
+        let (wal, most) = (files.wal_bytes, self.store.file().max_wal_bytes());
         if wal > most {
             let message = format!(
                 "the write-ahead log has {wal} bytes, more than {most}: a long read, such as a backup, prevents it from being \
@@ -133,7 +133,7 @@ impl Upkeep {
             );
             findings.push(Reason::new("wal_large", message));
         }
-        let (free, floor) = (files.volume.free_bytes, self.store.min_free_bytes());
+        let (free, floor) = (files.volume.free_bytes, self.store.file().min_free_bytes());
         if writable && free < floor.saturating_mul(2) {
             let message = format!("{free} bytes are free; below {floor} nothing more is stored");
             findings.push(Reason::new("disk_nearly_full", message));
@@ -149,7 +149,7 @@ impl Upkeep {
         metrics::gauge!("modalwatch_uptime_seconds").set(self.started.elapsed().as_secs_f64());
         metrics::gauge!("modalwatch_queue_free_places").set(self.free_places() as f64);
         metrics::gauge!("modalwatch_baselines_in_use").set(self.baselines_in_use() as f64);
-        if let Ok(files) = FolderFigures::of(self.store.folder()) {
+        if let Ok(files) = FolderFigures::of(self.store.file().folder()) {
             metrics::gauge!("modalwatch_database_bytes").set(files.database_bytes as f64);
             metrics::gauge!("modalwatch_wal_bytes").set(files.wal_bytes as f64);
             metrics::gauge!("modalwatch_disk_free_bytes").set(files.volume.free_bytes as f64);
@@ -157,7 +157,7 @@ impl Upkeep {
         let (resident, open_files) = process_figures();
         metrics::gauge!("modalwatch_resident_memory_bytes").set(resident);
         metrics::gauge!("modalwatch_open_files").set(open_files);
-        let figures = self.store.figures().await?;
+        let figures = self.store.overview().figures().await?;
         metrics::gauge!("modalwatch_structures").set(figures.structures as f64);
         metrics::gauge!("modalwatch_pending_batches").set(figures.pending_batches as f64);
         for kind in ALARM_KINDS {

@@ -43,7 +43,7 @@ impl Intake {
         let payload = payload.as_ref();
         loop {
             let Some((reason, tries)) = self.store(topic, payload).await else { return };
-            match self.monitor.store().quarantine(topic, payload, &reason, tries, Timestamp::now()).await {
+            match self.monitor.store().quarantine().insert(topic, payload, &reason, tries, Timestamp::now()).await {
                 Ok(()) => {
                     count("quarantined");
                     warn!(topic = %shown(topic), reason, "Put an MQTT message into quarantine: {reason}");

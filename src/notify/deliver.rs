@@ -48,7 +48,7 @@ impl Notifier {
             };
             tokio::select! {
                 () = stopped(&mut stop) => break,
-                () = self.store.written() => tokio::time::sleep(SHORTEST_WAIT).await,
+                () = self.store.outbox().written() => tokio::time::sleep(SHORTEST_WAIT).await,
                 Some(ended) = turns.join_next_with_id() => {
                     let id = ended.map_or_else(|panicked| panicked.id(), |(id, ())| id);
                     busy.remove(&id);
@@ -71,7 +71,7 @@ impl Notifier {
         stop: &watch::Receiver<bool>,
     ) -> Result<Duration, Error> {
         let now = Timestamp::now();
-        let found = self.store.webhook_turns(now, self.latest(now)).await?;
+        let found = self.store.outbox().webhook_turns(now, self.latest(now)).await?;
         metrics::gauge!("modalwatch_webhook_pending").set(found.pending as f64);
         metrics::gauge!("modalwatch_webhook_dead").set(found.dead as f64);
         *self.trouble.lock().expect("no holder of this lock panics") = (found.failing, found.dead);
@@ -109,14 +109,14 @@ impl Notifier {
     /// Sends the message of a webhook whose turn it is; what came of it, or `None` when none is due.
     async fn send_due(&self, webhook: &str) -> Result<Option<DeliveryState>, Error> {
         let now = Timestamp::now();
-        let Some((hook, delivery)) = self.store.due_delivery(webhook, now, self.latest(now)).await? else {
+        let Some((hook, delivery)) = self.store.outbox().due_delivery(webhook, now, self.latest(now)).await? else {
             return Ok(None);
         };
         let attempt = self.send(&hook, &delivery.event).await;
         let settlement = self.settlement(&delivery, &attempt, Timestamp::now());
         report(&hook, &delivery, &attempt, settlement.state);
         let state = settlement.state;
-        self.store.settle_delivery(delivery.id, settlement).await?;
+        self.store.outbox().settle_delivery(delivery.id, settlement).await?;
         Ok(Some(state))
     }
 
@@ -139,7 +139,7 @@ impl Notifier {
     async fn prune(&self) {
         let days = self.settings.keep_delivered_days as i64;
         let Ok(before) = Timestamp::from_micros(Timestamp::now().micros() - days * 86_400_000_000) else { return };
-        match self.store.prune_outbox(before).await {
+        match self.store.outbox().prune_outbox(before).await {
             Ok(0) => {}
             Ok(events) => info!(events, "Forgot {events} old events of the outbox"),
             Err(failure) => error!(error = %failure, "Could not forget old events of the outbox: {failure}"),

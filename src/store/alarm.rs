@@ -1,39 +1,41 @@
-//! Episodes of alarms, and maintenance windows.
+//! Alarm episodes and maintenance windows.
 
-use sqlx::sqlite::SqliteConnection;
 use sqlx::FromRow;
 
-use super::{bad_row, timestamp, Error, Store};
+use super::column::{elements, list, timestamp};
+use super::database::Database;
+use super::error::Error;
+use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
 use crate::quantity::{StructureId, Timestamp};
 
-/// Series of silence.
+/// Series name of alarms about missing data.
 pub const SILENCE_SERIES: &str = "structure:silence";
 
-/// From an alarm to its end.
+/// An alarm from its beginning to its end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// Number within the structure, from 1.
     pub number: i64,
     /// `damage`, `simulation_does_not_fit` or `silence`.
     pub kind: String,
-    /// Parameter of a damage alarm.
+    /// The parameter of a damage alarm, otherwise [`FIT_SERIES`] or [`SILENCE_SERIES`].
     pub series: String,
-    /// The undamaged state compared with; 0 for the other kinds.
+    /// Version of the undamaged reference of a damage alarm; 0 for the other kinds.
     pub undamaged_version: u32,
-    /// Time of the measurement that made it an alarm.
+    /// Time of the measurement that raised the alarm.
     pub opened_at: Timestamp,
-    /// The batch that did.
+    /// The batch of that measurement.
     pub opened_batch: Option<String>,
-    /// When it ended.
+    /// When it ended; `None` while it is open.
     pub ended_at: Option<Timestamp>,
-    /// True when late data showed that there was none.
+    /// True if data that arrived later showed that there was no alarm.
     pub withdrawn: bool,
-    /// Largest shift in it, standard errors.
+    /// Largest shift during the alarm, in standard errors.
     pub peak_shift: f64,
     /// When the service raised it.
     pub noticed_at: Timestamp,
-    /// Who has seen it, when, and what they said.
+    /// Who acknowledged it, when, and with which note.
     pub acknowledgement: Option<Acknowledgement>,
 }
 
@@ -48,25 +50,25 @@ impl Episode {
     }
 }
 
-/// Somebody has seen an alarm.
+/// The acknowledgement of an alarm.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Acknowledgement {
-    /// When.
+    /// When it was acknowledged.
     pub at: Timestamp,
-    /// Who.
+    /// By whom.
     pub by: String,
-    /// What they said.
+    /// Their note.
     pub note: Option<String>,
 }
 
-/// A time in which batches move no chart.
+/// A period in which batches do not change the alarm charts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MaintenanceWindow {
-    /// Its beginning.
+    /// Beginning.
     pub from: Timestamp,
-    /// Its end.
+    /// End.
     pub to: Timestamp,
-    /// Why.
+    /// Reason.
     pub reason: String,
 }
 
@@ -87,7 +89,7 @@ struct EpisodeRow {
     acknowledgement_note: Option<String>,
 }
 
-/// Kind of the alarms of a series.
+/// The kind of the alarms of a series.
 pub(super) fn kind_of(series: &str) -> &'static str {
     match series {
         FIT_SERIES => "simulation_does_not_fit",
@@ -96,8 +98,10 @@ pub(super) fn kind_of(series: &str) -> &'static str {
     }
 }
 
+/// Inserts an episode under the next number: version of the undamaged reference, opening time in µs, opening batch, end in µs,
+/// and largest shift.
 pub(super) async fn insert_episode(
-    connection: &mut SqliteConnection,
+    transaction: &mut Transaction<'_>,
     structure: &str,
     series: &str,
     (version, opened_at, batch, ended_at, peak): (u32, i64, Option<&str>, Option<i64>, f64),
@@ -106,8 +110,8 @@ pub(super) async fn insert_episode(
     sqlx::query(
         "insert into alarm_episode (structure_id, episode, kind, series, undamaged_version, opened_at_us, opened_batch,
              ended_at_us, withdrawn, peak_shift, noticed_at_us)
-         select ?1, coalesce(max(episode), 0) + 1, ?2, ?3, ?4, ?5, ?6, ?7, 0, ?8, ?9
-         from alarm_episode where structure_id = ?1",
+         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, 0, $8, $9
+         from alarm_episode where structure_id = $1",
     )
     .bind(structure)
     .bind(kind_of(series))
@@ -118,92 +122,97 @@ pub(super) async fn insert_episode(
     .bind(ended_at)
     .bind(peak)
     .bind(now.micros())
-    .execute(&mut *connection)
+    .execute(transaction.connection())
     .await?;
     Ok(())
 }
 
-impl Store {
-    /// Alarm episodes, newest first; behind number `before`, if given; only those that last, if asked for.
+/// Alarm episodes, alarm charts and maintenance windows.
+#[derive(Clone, Copy)]
+pub struct Alarms<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Alarms<'_> {
+    /// Alarm episodes, newest first: those with numbers below `before`, if given, and only open ones, if `open_only`.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn episodes(
-        &self,
+        self,
         structure: &StructureId,
         before: Option<i64>,
         open_only: bool,
         limit: usize,
     ) -> Result<Vec<Episode>, Error> {
         let rows: Vec<EpisodeRow> = sqlx::query_as(
-            "select * from alarm_episode where structure_id = ? and episode < ?
-               and (?3 = 0 or (ended_at_us is null and withdrawn = 0))
-             order by episode desc limit ?4",
+            "select * from alarm_episode where structure_id = $1 and episode < $2
+               and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
+             order by episode desc limit $4",
         )
         .bind(structure.as_str())
         .bind(before.unwrap_or(i64::MAX))
         .bind(open_only)
         .bind(limit as i64)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         rows.into_iter().map(episode).collect()
     }
 
-    /// Episodes behind number `newest`, those that last, and those of the given numbers, by number.
+    /// Episodes with numbers above `newest`, open episodes, and those with the given numbers, in the order of their numbers.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn episodes_since(
-        &self,
+        self,
         structure: &StructureId,
         newest: i64,
         numbers: &[i64],
     ) -> Result<Vec<Episode>, Error> {
-        let numbers = serde_json::to_string(numbers).map_err(|e| bad_row("alarm episode")(&e))?;
-        let rows: Vec<EpisodeRow> = sqlx::query_as(
-            "select * from alarm_episode where structure_id = ?1
-               and (episode > ?2 or (ended_at_us is null and withdrawn = 0)
-                    or episode in (select value from json_each(?3)))
-             order by episode",
-        )
+        let rows: Vec<EpisodeRow> = sqlx::query_as(concat!(
+            "select * from alarm_episode where structure_id = $1
+               and (episode > $2 or (ended_at_us is null and withdrawn = 0) or episode in (select value from ",
+            elements!("$3"),
+            ")) order by episode",
+        ))
         .bind(structure.as_str())
         .bind(newest)
-        .bind(numbers)
-        .fetch_all(&self.reader)
+        .bind(list(numbers))
+        .fetch_all(&self.database.reader)
         .await?;
         rows.into_iter().map(episode).collect()
     }
 
-    /// Notes that somebody has seen an alarm; the first to do so stays. `None` when there is no such episode.
+    /// Acknowledges an alarm; only the first acknowledgement is kept. `None` if there is no such episode.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn acknowledge(
-        &self,
+        self,
         structure: &StructureId,
         number: i64,
         acknowledgement: Acknowledgement,
     ) -> Result<Option<Episode>, Error> {
         let id = structure.to_string();
-        let row = self
-            .write(move |connection| {
+        let row = self.database
+            .write(move |transaction| {
                 Box::pin(async move {
                     sqlx::query(
-                        "update alarm_episode set acknowledged_at_us = ?, acknowledged_by = ?, acknowledgement_note = ?
-                         where structure_id = ? and episode = ? and acknowledged_at_us is null",
+                        "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2, acknowledgement_note = $3
+                         where structure_id = $4 and episode = $5 and acknowledged_at_us is null",
                     )
                     .bind(acknowledgement.at.micros())
                     .bind(acknowledgement.by)
                     .bind(acknowledgement.note)
                     .bind(&id)
                     .bind(number)
-                    .execute(&mut *connection)
+                    .execute(transaction.connection())
                     .await?;
                     let row: Option<EpisodeRow> =
-                        sqlx::query_as("select * from alarm_episode where structure_id = ? and episode = ?")
+                        sqlx::query_as("select * from alarm_episode where structure_id = $1 and episode = $2")
                             .bind(&id)
                             .bind(number)
-                            .fetch_optional(&mut *connection)
+                            .fetch_optional(transaction.connection())
                             .await?;
                     Ok(row)
                 })
@@ -212,39 +221,39 @@ impl Store {
         row.map(episode).transpose()
     }
 
-    /// Opens an episode of silence that began at `since`, or ends the one that lasts; nothing changes when it is so already.
-    /// True when something changed.
+    /// Opens an episode of missing data that began at `since`, or ends the open one if `since` is `None`. Returns whether
+    /// something changed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn set_silent(
-        &self,
+        self,
         structure: &StructureId,
         since: Option<Timestamp>,
         now: Timestamp,
     ) -> Result<bool, Error> {
         let id = structure.to_string();
-        self.write(move |connection| {
+        self.database.write(move |transaction| {
             Box::pin(async move {
-                let lasting: Option<(i64,)> = sqlx::query_as(
-                    "select episode from alarm_episode where structure_id = ? and kind = 'silence' and ended_at_us is null
+                let open: Option<(i64,)> = sqlx::query_as(
+                    "select episode from alarm_episode where structure_id = $1 and kind = 'silence' and ended_at_us is null
                      order by episode desc limit 1",
                 )
                 .bind(&id)
-                .fetch_optional(&mut *connection)
+                .fetch_optional(transaction.connection())
                 .await?;
-                match (lasting, since) {
+                match (open, since) {
                     (None, Some(since)) => {
                         let row = (0, since.micros(), None, None, 0.0);
-                        insert_episode(connection, &id, SILENCE_SERIES, row, now).await?;
+                        insert_episode(transaction, &id, SILENCE_SERIES, row, now).await?;
                         Ok(true)
                     }
                     (Some((number,)), None) => {
-                        sqlx::query("update alarm_episode set ended_at_us = ? where structure_id = ? and episode = ?")
+                        sqlx::query("update alarm_episode set ended_at_us = $1 where structure_id = $2 and episode = $3")
                             .bind(now.micros())
                             .bind(&id)
                             .bind(number)
-                            .execute(&mut *connection)
+                            .execute(transaction.connection())
                             .await?;
                         Ok(true)
                     }
@@ -255,44 +264,49 @@ impl Store {
         .await
     }
 
-    /// Declares a maintenance window; batches that were charted before stay as they are.
+    /// Stores a maintenance window. Points of batches that are already on the charts do not change.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn insert_maintenance(
-        &self,
+        self,
         structure: &StructureId,
         window: MaintenanceWindow,
         now: Timestamp,
     ) -> Result<(), Error> {
         let id = structure.to_string();
-        self.write(move |connection| {
-            Box::pin(async move {
-                sqlx::query("insert or replace into maintenance_window values (?, ?, ?, ?, ?)")
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    sqlx::query(
+                        "insert into maintenance_window values ($1, $2, $3, $4, $5)
+                     on conflict (structure_id, from_us, to_us) do update
+                     set reason = excluded.reason, created_at_us = excluded.created_at_us",
+                    )
                     .bind(&id)
                     .bind(window.from.micros())
                     .bind(window.to.micros())
                     .bind(&window.reason)
                     .bind(now.micros())
-                    .execute(&mut *connection)
+                    .execute(transaction.connection())
                     .await?;
-                Ok(())
+                    Ok(())
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// True when a time lies in a maintenance window.
+    /// Whether a time is in a maintenance window.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn is_in_maintenance(&self, structure: &StructureId, at: Timestamp) -> Result<bool, Error> {
+    pub async fn is_in_maintenance(self, structure: &StructureId, at: Timestamp) -> Result<bool, Error> {
         let (found,): (bool,) = sqlx::query_as(
-            "select exists (select 1 from maintenance_window where structure_id = ?1 and from_us <= ?2 and to_us > ?2)",
+            "select exists (select 1 from maintenance_window where structure_id = $1 and from_us <= $2 and to_us > $2)",
         )
         .bind(structure.as_str())
         .bind(at.micros())
-        .fetch_one(&self.reader)
+        .fetch_one(&self.database.reader)
         .await?;
         Ok(found)
     }
@@ -301,35 +315,18 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn maintenance(&self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
+    pub async fn maintenance(self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
         let rows: Vec<(i64, i64, String)> = sqlx::query_as(
-            "select from_us, to_us, reason from maintenance_window where structure_id = ? order by from_us desc limit 1000",
+            "select from_us, to_us, reason from maintenance_window where structure_id = $1 order by from_us desc limit 1000",
         )
         .bind(structure.as_str())
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let window = |(from, to, reason)| {
             let what = "maintenance window";
             Ok(MaintenanceWindow { from: timestamp(what, from)?, to: timestamp(what, to)?, reason })
         };
         rows.into_iter().map(window).collect()
-    }
-
-    /// When the newest batch of a structure arrived.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn last_received(&self, structure: &StructureId) -> Result<Option<Timestamp>, Error> {
-        let row: (Option<i64>,) =
-            // Ids are in the order of arrival.
-            sqlx::query_as(
-                "select max(received_at_us) from (select received_at_us from measurement_batch where structure_id = ?
-                     order by batch_id desc limit 1)",
-            )
-                .bind(structure.as_str())
-                .fetch_one(&self.reader)
-                .await?;
-        row.0.map(|at| timestamp("batch", at)).transpose()
     }
 }
 

@@ -1,4 +1,4 @@
-//! Series of what was found: monitored quantities, and how far the batches can be believed.
+//! Time series of assessments: monitored quantities, and the trust in the batches.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -8,17 +8,18 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::Row as _;
 
 use super::assessment::{kind_of, IS_CURRENT};
+use super::column::{bad_row, elements, list};
+use super::error::Error;
 use super::plotted::{trust_values, Plotted};
-use super::series::{bounds, Extent, QuantityMark, QuantitySeries, SeriesWindow, TrustMark};
-use super::{bad_row, Error, Store};
+use super::series::{bounds, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 use crate::damage::QuantityKind;
 use crate::quantity::StructureId;
 use crate::reduction::{Reduced, Reducer, Row};
 use crate::trust::{FindingCode, TrustVerdict};
 
-/// The part of a stored trust that a series shows.
+/// The part of a stored trust that a series contains.
 #[derive(Deserialize)]
-struct TrustColumn {
+struct SeriesTrust {
     verdict: TrustVerdict,
     p_value: Option<f64>,
     findings: Vec<FindingColumn>,
@@ -29,11 +30,11 @@ struct FindingColumn {
     code: FindingCode,
 }
 
-impl TrustColumn {
+impl SeriesTrust {
     fn of(text: Option<&str>) -> Result<Self, Error> {
         match text {
             Some(text) => serde_json::from_str(text).map_err(|e| bad_row("assessment")(&e)),
-            // From before trust was judged.
+            // Assessments of early versions have no trust.
             None => Ok(Self { verdict: TrustVerdict::Accepted, p_value: None, findings: Vec::new() }),
         }
     }
@@ -48,14 +49,14 @@ struct Track {
     batches: Reducer<QuantityMark>,
 }
 
-/// Series on their way.
+/// The series that are being read.
 struct Tracks {
     extent: Extent,
     points: usize,
     quantities: Vec<Track>,
-    /// Place of a quantity by its name.
+    /// Index of a quantity by its name.
     places: HashMap<String, usize>,
-    /// Batches by their p-value, whether they are rejected, and the number of their findings.
+    /// Batches with p-value, 1 if rejected, and number of findings.
     trust: Reducer<String>,
 }
 
@@ -65,7 +66,7 @@ impl Tracks {
         Self { extent, points, quantities: Vec::new(), places: HashMap::new(), trust }
     }
 
-    /// Place of a quantity, which is new where the name is.
+    /// Index of a quantity, which is added if its name is new.
     fn place(&mut self, (name, unit, kind, position): (String, String, QuantityKind, i64)) -> usize {
         if let Some(place) = self.places.get(&name) {
             return *place;
@@ -78,14 +79,14 @@ impl Tracks {
     }
 }
 
-impl Store {
-    /// Monitored quantities of the assessed batches of a window, in the order of their position; and how far those batches can be
-    /// believed: rejected ones and the most findings of a time are kept.
+impl Series<'_> {
+    /// Monitored quantities of the assessed batches of a window, in the order of their position, and the trust in these batches.
+    /// When the series is reduced, rejected batches and those with the most findings are kept.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn assessed_series(
-        &self,
+        self,
         structure: &StructureId,
         window: SeriesWindow,
         extent: &Extent,
@@ -101,9 +102,9 @@ impl Store {
         Ok((quantities.into_iter().map(series).collect(), trust))
     }
 
-    /// Reads assessments with the column for plots.
+    /// Reads the assessments that have the packed column for plots.
     async fn read_plotted(
-        &self,
+        self,
         structure: &StructureId,
         window: SeriesWindow,
         tracks: &mut Tracks,
@@ -111,13 +112,17 @@ impl Store {
         let (from, to) = bounds(window);
         let select = format!(
             "select b.measured_to_us, b.batch_id, a.model_digest, a.undamaged_version, a.plotted
-             from measurement_batch b cross join assessment a using (structure_id, batch_id)
-             where b.structure_id = ? and b.measured_from_us >= ? and b.measured_from_us < ? and b.state = 'assessed'
-               and a.plotted is not null and {IS_CURRENT}"
+             from measurement_batch b cross join assessment a
+             where a.structure_id = b.structure_id and a.batch_id = b.batch_id
+               and b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
+               and b.state = 'assessed' and a.plotted is not null and {IS_CURRENT}"
         );
-        let mut rows =
-            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
-        // The quantities of an assessment are those of its baseline.
+        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(from)
+            .bind(to)
+            .fetch(&self.database.reader);
+        // The quantities of an assessment depend on its trained baseline only.
         let mut known: HashMap<String, Vec<usize>> = HashMap::new();
         while let Some(row) = rows.try_next().await? {
             let (time, batch): (i64, &str) = (row.try_get_unchecked(0)?, row.try_get_unchecked(1)?);
@@ -146,7 +151,7 @@ impl Store {
 
     /// The quantities of an assessment by their position: name, unit, kind, position.
     async fn quantities_of(
-        &self,
+        self,
         structure: &StructureId,
         batch: &str,
         model: &str,
@@ -154,53 +159,62 @@ impl Store {
     ) -> Result<Vec<(String, String, QuantityKind, i64)>, Error> {
         let rows: Vec<(String, String, String, i64)> = sqlx::query_as(
             "select quantity, unit, kind, position from quantity_assessment
-             where structure_id = ? and batch_id = ? and model_digest = ? and undamaged_version = ? order by position",
+             where structure_id = $1 and batch_id = $2 and model_digest = $3 and undamaged_version = $4 order by position",
         )
         .bind(structure.as_str())
         .bind(batch)
         .bind(model)
         .bind(undamaged_version)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         rows.into_iter().map(|(name, unit, kind, position)| Ok((name, unit, kind_of(&kind)?, position))).collect()
     }
 
-    /// Reads assessments from before there was a column for plots: row by row.
+    /// Reads the assessments of early versions, which have no packed column for plots, from the rows of their quantities.
     async fn read_unplotted(
-        &self,
+        self,
         structure: &StructureId,
         window: SeriesWindow,
         tracks: &mut Tracks,
     ) -> Result<(), Error> {
         let (from, to) = bounds(window);
         let of_window = format!(
-            "where b.structure_id = ? and b.measured_from_us >= ? and b.measured_from_us < ? and b.state = 'assessed'
-               and a.plotted is null and {IS_CURRENT}"
+            "where a.structure_id = b.structure_id and a.batch_id = b.batch_id
+               and b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
+               and b.state = 'assessed' and a.plotted is null and {IS_CURRENT}"
         );
         let select = format!(
             "select b.measured_to_us, b.batch_id, a.trust
-             from measurement_batch b cross join assessment a using (structure_id, batch_id) {of_window}"
+             from measurement_batch b cross join assessment a {of_window}"
         );
-        let mut rows =
-            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
+        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(from)
+            .bind(to)
+            .fetch(&self.database.reader);
         while let Some(row) = rows.try_next().await? {
-            let trust = TrustColumn::of(row.try_get_unchecked(2)?)?;
+            let trust = SeriesTrust::of(row.try_get_unchecked(2)?)?;
             let values = trust_values(trust.p_value, trust.verdict, trust.findings.len());
             let batch = || row.try_get_unchecked(1);
             tracks.trust.try_push(row.try_get_unchecked(0)?, &values, batch).map_err(sqlx_error)?;
         }
         drop(rows);
-        // In this order: whether an assessment is the current one is asked once, not for each of its quantities.
+        // Joined in this order, the current assessment is determined once per batch and not once per quantity.
         let select = format!(
             "select q.quantity, b.measured_to_us, q.mean, q.probability_of_damage, b.batch_id, q.mean_low, q.mean_high,
                     q.probability_low, q.probability_high, q.unit, q.kind, q.position
              from measurement_batch b
-             cross join assessment a using (structure_id, batch_id)
-             cross join quantity_assessment q using (structure_id, batch_id, model_digest, undamaged_version)
-             {of_window}"
+             cross join assessment a
+             cross join quantity_assessment q
+             {of_window}
+               and q.structure_id = a.structure_id and q.batch_id = a.batch_id and q.model_digest = a.model_digest
+               and q.undamaged_version = a.undamaged_version"
         );
-        let mut rows =
-            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
+        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(from)
+            .bind(to)
+            .fetch(&self.database.reader);
         while let Some(row) = rows.try_next().await? {
             let name: &str = row.try_get_unchecked(0)?;
             let place = match tracks.places.get(name) {
@@ -222,22 +236,22 @@ impl Store {
         Ok(())
     }
 
-    /// Looks up what was found in the batches that are kept.
-    async fn with_findings(&self, structure: &StructureId, kept: Reduced<String>) -> Result<Reduced<TrustMark>, Error> {
+    /// Looks up the findings of the batches that are kept.
+    async fn with_findings(self, structure: &StructureId, kept: Reduced<String>) -> Result<Reduced<TrustMark>, Error> {
         let batches: Vec<&String> = kept.rows.iter().map(|row| &row.tag).collect();
-        let batches = serde_json::to_string(&batches).map_err(|e| bad_row("batch")(&e))?;
         let select = format!(
             "select a.batch_id, a.trust from assessment a
-             where a.structure_id = ? and a.batch_id in (select value from json_each(?)) and {IS_CURRENT}"
+             where a.structure_id = $1 and a.batch_id in (select value from {}) and {IS_CURRENT}",
+            elements!("$2")
         );
         let found: Vec<(String, Option<String>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
-            .bind(batches)
-            .fetch_all(&self.reader)
+            .bind(list(&batches))
+            .fetch_all(&self.database.reader)
             .await?;
         let found: BTreeMap<String, Option<String>> = found.into_iter().collect();
         let row = |Row { time_us, values, tag: batch }| {
-            let trust = TrustColumn::of(found.get(&batch).and_then(Option::as_deref))?;
+            let trust = SeriesTrust::of(found.get(&batch).and_then(Option::as_deref))?;
             let mut findings: Vec<FindingCode> = Vec::new();
             for finding in trust.findings {
                 if !findings.contains(&finding.code) {

@@ -1,28 +1,34 @@
-//! Assessments: written beside each other, one for each pair of trained baseline and undamaged state.
+//! Assessments of batches: one for each pair of trained baseline and undamaged reference.
 
 use std::collections::BTreeMap;
 use std::future::Future;
 
-use sqlx::{FromRow, SqliteConnection};
+use sqlx::FromRow;
 
-use super::chart::{chart, Charted, Charts, StoredChartPoint};
+use super::chart::{chart, ChartOutcome};
+use super::chart_episode::Charted;
+use super::chart_point::StoredChartPoint;
+use super::column::{bad_row, elements, from_blob, list, timestamp, to_blob};
+use super::database::Database;
+use super::error::Error;
+use super::plotted;
 use super::rows::{parts, InsertStatements};
-use super::{bad_row, from_blob, plotted, timestamp, to_blob, Error, Store};
+use super::transaction::Transaction;
 use crate::assessment::{Assessment, NewChartPoint};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::Trust;
 
-/// An assessment that was stored.
+/// The result of storing an assessment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StoredAssessment {
-    /// The time it was stored under.
+    /// The time with which it was stored.
     pub assessed_at: Timestamp,
-    /// The points of its batch on the charts.
+    /// The points of its batch on the alarm charts.
     pub charts: Vec<StoredChartPoint>,
     /// Whether an alarm was opened, changed or withdrawn.
     pub alarms_changed: bool,
-    /// Newest undamaged state of the structure when it was stored, 0 where there is none.
+    /// Version of the newest undamaged reference of the structure when it was stored; 0 if there is none.
     pub newest_undamaged: u32,
 }
 
@@ -44,7 +50,7 @@ struct AssessmentRow {
 }
 
 #[derive(FromRow)]
-struct QuantityRow {
+struct QuantityAssessmentRow {
     batch_id: String,
     model_digest: String,
     undamaged_version: u32,
@@ -74,106 +80,114 @@ struct QuantityRow {
     group_name: Option<String>,
 }
 
-/// Statements that insert quantities; the first four columns are common to all rows.
+/// Statements that insert quantities. The first four columns are the same in all rows.
 static INSERT_QUANTITIES: InsertStatements =
     InsertStatements::new("insert into quantity_assessment", 29, &[0, 1, 2, 3]);
 
-/// Orders the assessments of a batch; the current one comes first.
+/// Order of the assessments of a batch in which the current one is first.
 pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
 
-/// Holds for the assessment `a` of a batch that [`CURRENT_FIRST`] puts first.
+/// Condition that an assessment `a` is the current one of its batch: the first in the order [`CURRENT_FIRST`].
 pub(super) const IS_CURRENT: &str = "not exists (
     select 1 from assessment n where n.structure_id = a.structure_id and n.batch_id = a.batch_id
        and (n.assessed_at_us > a.assessed_at_us or n.assessed_at_us = a.assessed_at_us
             and (n.undamaged_version > a.undamaged_version or n.undamaged_version = a.undamaged_version
                  and n.model_digest < a.model_digest)))";
 
-impl Store {
-    /// Stores an assessment with its points on the alarm charts and marks its batch as assessed; storing it again changes
-    /// nothing. An assessment under a version of the structure that is no longer the present one is not stored: the batch
-    /// waits for one under that. `None` where it was not stored.
+/// Assessments of batches.
+#[derive(Clone, Copy)]
+pub struct Assessments<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Assessments<'_> {
+    /// Stores an assessment with its points on the alarm charts and marks its batch as assessed. Storing the same assessment
+    /// again changes nothing. Returns `None` without storing it if it was made for a version of the structure that is no longer
+    /// the present one; the batch then waits for an assessment for the present version.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub fn insert_assessment(
-        &self,
+        self,
         structure: &StructureId,
         batch_id: &str,
         assessment: &Assessment,
         charted: Vec<NewChartPoint>,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
-        self.write(move |connection| {
+        self.database.write(move |transaction| {
             Box::pin(async move {
-                let Some(place) = place_of(connection, &structure, &id, &a).await? else {
+                let Some(slot) = slot_of(transaction, &structure, &id, &a).await? else {
                     return Ok(None);
                 };
-                let assessed_at = timestamp("assessment", place.assessed_at_us)?;
-                if place.taken {
-                    remove(connection, &structure, &id, &a).await?;
+                let assessed_at = timestamp("assessment", slot.assessed_at_us)?;
+                if slot.taken {
+                    remove(transaction, &structure, &id, &a).await?;
                 }
-                insert(connection, &structure, &id, &a, place.assessed_at_us).await?;
+                insert(transaction, &structure, &id, &a, slot.assessed_at_us).await?;
                 let batch = Charted {
                     structure: &structure,
-                    place: (place.measured_to_us, id.clone()),
+                    position: (slot.measured_to_us, id.clone()),
                     now: assessed_at,
-                    maintained: place.maintained,
-                    newest_undamaged: place.newest_undamaged,
+                    maintained: slot.maintained,
+                    newest_undamaged: slot.newest_undamaged,
                 };
-                let Charts { points: charts, alarms_changed } = chart(connection, &batch, charted).await?;
-                let newest_undamaged = place.newest_undamaged;
+                let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
+                let newest_undamaged = slot.newest_undamaged;
                 Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged }))
             })
         })
     }
 
-    /// The current assessment of a batch: the newest.
+    /// The current assessment of a batch, which is the newest.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn assessment(&self, structure: &StructureId, batch_id: &str) -> Result<Option<Assessment>, Error> {
+    pub async fn assessment(self, structure: &StructureId, batch_id: &str) -> Result<Option<Assessment>, Error> {
         let mut found = self.current_assessments(structure, &[batch_id.to_owned()], None).await?;
         Ok(found.remove(batch_id))
     }
 
-    /// The current assessments of some batches, by batch; with one quantity each, if one is asked for.
+    /// The current assessments of batches by batch id, with all quantities or only the given one.
     pub(super) async fn current_assessments(
-        &self,
+        self,
         structure: &StructureId,
         batch_ids: &[String],
         quantity: Option<&str>,
     ) -> Result<BTreeMap<String, Assessment>, Error> {
-        let ids = serde_json::to_string(batch_ids).map_err(|e| bad_row("batch")(&e))?;
+        let ids = list(batch_ids);
         let select = format!(
             "select batch_id, model_digest, undamaged_version, structure_digest, seed, draws_per_measurement,
                     measurements_used, measurements_left_out, measurements_outside, misfit_percent, assessed_at_us,
                     effective_sample_size, trust
-             from assessment where structure_id = ? and batch_id in (select value from json_each(?))
-             order by batch_id, {CURRENT_FIRST}"
+             from assessment where structure_id = $1 and batch_id in (select value from {})
+             order by batch_id, {CURRENT_FIRST}",
+            elements!("$2")
         );
         let rows: Vec<AssessmentRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(&ids)
-            .fetch_all(&self.reader)
+            .fetch_all(&self.database.reader)
             .await?;
-        let quantities: Vec<QuantityRow> = sqlx::query_as(
+        let quantities: Vec<QuantityAssessmentRow> = sqlx::query_as(concat!(
             "select batch_id, model_digest, undamaged_version, quantity, unit, kind, mean, std, variance_within,
                     variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change, mean_low,
                     mean_high, std_low, std_high, pooled_mean, pooled_std, probability_low, probability_high,
                     pooled_probability, change_low, change_high, group_name
              from quantity_assessment
-             where structure_id = ? and batch_id in (select value from json_each(?))
-               and (?3 is null or quantity = ?3)
+             where structure_id = $1 and batch_id in (select value from ",
+            elements!("$2"),
+            ") and ($3 is null or quantity = $3)
              order by batch_id, position",
-        )
+        ))
         .bind(structure.as_str())
         .bind(&ids)
         .bind(quantity)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let mut current = BTreeMap::new();
         for row in rows {
-            // The first of a batch is the current one.
+            // The first assessment of each batch is the current one.
             if !current.contains_key(&row.batch_id) {
                 let key = (row.model_digest.clone(), row.undamaged_version);
                 current.insert(row.batch_id.clone(), (key, assessment(row)?));
@@ -190,69 +204,70 @@ impl Store {
     }
 }
 
-/// Where an assessment is stored.
-struct Place {
-    /// The time it is stored under, µs: after all others of its batch, also where the clock was set back since, for the newest
-    /// is the current one. An assessment that is stored again keeps its time.
+/// What must be known of a batch to store its assessment.
+struct Slot {
+    /// The time to store, µs: after the times of all other assessments of the batch, even if the clock was set back, because
+    /// the newest assessment is the current one. An assessment that is stored again keeps its time.
     assessed_at_us: i64,
-    /// Whether one of the same trained baseline and undamaged state is there.
+    /// Whether an assessment for the same trained baseline and undamaged reference is stored.
     taken: bool,
-    /// When its batch ended, µs,
+    /// Time of the last measurement of the batch, µs.
     measured_to_us: i64,
-    /// and whether it touches a maintenance window.
+    /// Whether the batch overlaps a maintenance window.
     maintained: bool,
-    /// Newest undamaged state, 0 where there is none.
+    /// Version of the newest undamaged reference; 0 if there is none.
     newest_undamaged: u32,
 }
 
 #[derive(FromRow)]
-struct PlaceRow {
-    /// Time of the assessment of the same trained baseline and undamaged state, µs,
+struct SlotRow {
+    /// Time of the stored assessment for the same trained baseline and undamaged reference, µs.
     own_us: Option<i64>,
-    /// and of the newest of the others.
+    /// Time of the newest other assessment, µs.
     others_us: Option<i64>,
     measured_to_us: i64,
     maintained: bool,
     newest_undamaged: u32,
 }
 
-/// The place of an assessment; `None` when it is of a version of the structure that is not the present one, or of no batch.
-async fn place_of(
-    connection: &mut SqliteConnection,
+/// What must be known to store an assessment. `None` if it was made for a version of the structure that is not the present one,
+/// or if there is no such batch.
+async fn slot_of(
+    transaction: &mut Transaction<'_>,
     structure: &str,
     batch_id: &str,
     a: &Assessment,
-) -> Result<Option<Place>, Error> {
+) -> Result<Option<Slot>, Error> {
     let given = a.assessed_at.micros();
-    let found: Option<PlaceRow> = sqlx::query_as(
+    let found: Option<SlotRow> = sqlx::query_as(
         "select own_us, others_us, measured_to_us,
-                exists (select 1 from maintenance_window where structure_id = ?1 and from_us <= measured_to_us
+                exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
                     and to_us > measured_from_us) as maintained,
-                (select coalesce(max(version), 0) from undamaged_state where structure_id = ?1) as newest_undamaged
-         from (select max(assessed_at_us) filter (where model_digest = ?3 and undamaged_version = ?4) as own_us,
-                      max(assessed_at_us) filter (where not (model_digest = ?3 and undamaged_version = ?4)) as others_us
-               from assessment where structure_id = ?1 and batch_id = ?2)
-         cross join measurement_batch where structure_id = ?1 and batch_id = ?2
-             and exists (select 1 from structure where structure_id = ?1 and digest = ?5)",
+                (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged
+         from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
+                      max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
+               from assessment where structure_id = $1 and batch_id = $2) a
+         cross join measurement_batch b where structure_id = $1 and batch_id = $2
+             and exists (select 1 from structure where structure_id = $1 and digest = $5)",
     )
     .bind(structure)
     .bind(batch_id)
     .bind(a.model_digest.as_str())
     .bind(a.undamaged_version.unwrap_or(0))
     .bind(a.structure_digest.as_str())
-    .fetch_optional(&mut *connection)
+    .fetch_optional(transaction.connection())
     .await?;
-    let Some(PlaceRow { own_us, others_us, measured_to_us, maintained, newest_undamaged }) = found else {
+    let Some(SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged }) = found else {
         return Ok(None);
     };
-    let behind = others_us.map_or(given, |latest| given.max(latest + 1));
-    let assessed_at_us = if own_us == Some(given) { given } else { behind };
-    Ok(Some(Place { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
+    let after = others_us.map_or(given, |latest| given.max(latest + 1));
+    let assessed_at_us = if own_us == Some(given) { given } else { after };
+    Ok(Some(Slot { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
 }
 
-/// Removes the assessment that another takes the place of.
+/// Removes the stored assessment for the same trained baseline and undamaged reference.
 async fn remove(
-    connection: &mut SqliteConnection,
+    transaction: &mut Transaction<'_>,
     structure: &str,
     batch_id: &str,
     a: &Assessment,
@@ -260,14 +275,14 @@ async fn remove(
     for table in ["quantity_assessment", "assessment"] {
         let delete = format!(
             "delete from {table}
-             where structure_id = ? and batch_id = ? and model_digest = ? and undamaged_version = ?"
+             where structure_id = $1 and batch_id = $2 and model_digest = $3 and undamaged_version = $4"
         );
         sqlx::query(sqlx::AssertSqlSafe(delete))
             .bind(structure)
             .bind(batch_id)
             .bind(a.model_digest.as_str())
             .bind(a.undamaged_version.unwrap_or(0))
-            .execute(&mut *connection)
+            .execute(transaction.connection())
             .await?;
     }
     Ok(())
@@ -275,7 +290,7 @@ async fn remove(
 
 /// Inserts an assessment and marks its batch as assessed.
 async fn insert(
-    connection: &mut SqliteConnection,
+    transaction: &mut Transaction<'_>,
     structure: &str,
     batch_id: &str,
     a: &Assessment,
@@ -283,9 +298,9 @@ async fn insert(
 ) -> Result<(), Error> {
     let version = a.undamaged_version.unwrap_or(0);
     let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
-    // Two statements, handed over together; each takes the parameters behind those of the one before.
-    let insert = "insert into assessment values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?);
-         update measurement_batch set state = 'assessed', failure = null where structure_id = ? and batch_id = ?";
+    // Two statements in one call, which saves a round trip to the thread of SQLite for every batch. PostgreSQL takes them singly.
+    let insert = "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15);
+         update measurement_batch set state = 'assessed', failure = null where structure_id = $1 and batch_id = $2";
     sqlx::query(insert)
         .bind(structure)
         .bind(batch_id)
@@ -302,9 +317,7 @@ async fn insert(
         .bind(a.effective_sample_size)
         .bind(trust)
         .bind(plotted::pack(a))
-        .bind(structure)
-        .bind(batch_id)
-        .execute(&mut *connection)
+        .execute(transaction.connection())
         .await?;
     for rows in parts(a.quantities.len()) {
         let mut insert = sqlx::query(INSERT_QUANTITIES.of(rows.len()))
@@ -342,7 +355,7 @@ async fn insert(
                 .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[1]))
                 .bind(&q.group);
         }
-        insert.execute(&mut *connection).await?;
+        insert.execute(transaction.connection()).await?;
     }
     Ok(())
 }
@@ -368,7 +381,7 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
     })
 }
 
-fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
+fn quantity_assessment(row: QuantityAssessmentRow) -> Result<QuantityAssessment, Error> {
     let damage = match (row.threshold, row.probability_of_damage, row.exceeds, row.relative_change) {
         (Some(threshold), Some(probability_of_damage), Some(exceeds), Some(relative_change)) => Some(Damage {
             threshold,
@@ -389,7 +402,7 @@ fn quantity_assessment(row: QuantityRow) -> Result<QuantityAssessment, Error> {
         mean_interval: both(row.mean_low, row.mean_high),
         std: row.std,
         std_interval: both(row.std_low, row.std_high),
-        // Rows from before populations hold the pool's moments in `mean` and `std`.
+        // Rows of versions without the population model contain the pooled moments in `mean` and `std`.
         pooled: Hyperparameters {
             mean: row.pooled_mean.unwrap_or(row.mean),
             std: row.pooled_mean.map_or(row.std, |_| row.pooled_std),

@@ -1,21 +1,23 @@
-//! The audit: who changed what, and when. Entries are added, given their status once, and never changed again.
+//! The audit log: who changed what, and when. An entry is added before the change and receives its status once.
 
 use std::future::Future;
 
 use sqlx::FromRow;
 
-use super::{timestamp, Error, Store};
+use super::column::timestamp;
+use super::database::Database;
+use super::error::Error;
 use crate::quantity::Timestamp;
 
-/// Status of a command that did what it was asked.
+/// Status of a command that succeeded.
 const COMMAND_DONE: u16 = 200;
 /// Status of a command that failed.
 const COMMAND_FAILED: u16 = 500;
 
-/// A change that somebody is about to try.
+/// An attempted change.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewAuditEntry {
-    /// When.
+    /// When it was attempted.
     pub at: Timestamp,
     /// Id of the token, or `local`.
     pub actor: String,
@@ -27,17 +29,17 @@ pub struct NewAuditEntry {
     pub request_id: Option<String>,
     /// Method and route, or the command.
     pub action: String,
-    /// The structure it is about.
+    /// The structure concerned.
     pub structure: Option<String>,
-    /// Path of what is changed.
+    /// Path of the changed resource.
     pub subject: Option<String>,
 }
 
 impl NewAuditEntry {
-    /// A change by a command or by the service itself: a clean-up, a backup.
-    pub fn local(action: impl Into<String>, subject: Option<String>) -> Self {
+    /// A change by a command of the command line or by the service itself, such as a backup.
+    pub fn local(at: Timestamp, action: impl Into<String>, subject: Option<String>) -> Self {
         Self {
-            at: Timestamp::now(),
+            at,
             actor: "local".to_owned(),
             actor_name: None,
             peer: None,
@@ -52,24 +54,24 @@ impl NewAuditEntry {
 /// A stored entry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AuditEntry {
-    /// Its number: later entries have higher ones.
+    /// Its number; later entries have higher numbers.
     pub number: i64,
-    /// What was tried.
+    /// The attempted change.
     pub entry: NewAuditEntry,
-    /// What came of it, as HTTP status; `None` while it runs, and when the program ended in between.
+    /// Its outcome as an HTTP status; `None` while it runs, or if the program ended before it was known.
     pub status: Option<u16>,
 }
 
-/// Which entries of the audit.
+/// Selects entries of the audit log.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct AuditQuery {
-    /// Not before.
+    /// Entries at or after this time.
     pub from: Option<Timestamp>,
-    /// Before.
+    /// Entries before this time.
     pub to: Option<Timestamp>,
-    /// Only entries older than this number.
+    /// Entries with a lower number than this.
     pub before: Option<i64>,
-    /// Most entries.
+    /// Largest number of entries.
     pub limit: usize,
 }
 
@@ -87,17 +89,24 @@ struct AuditRow {
     status: Option<i64>,
 }
 
-impl Store {
-    /// Writes down that a change is about to be tried; returns the entry's number.
+/// The audit log.
+#[derive(Clone, Copy)]
+pub struct Audit<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Audit<'_> {
+    /// Adds an entry before a change is attempted and returns its number.
     ///
     /// # Errors
-    /// [`Error::Sqlite`]: then the change must not be tried.
-    pub async fn begin_audit(&self, entry: NewAuditEntry) -> Result<i64, Error> {
-        self.write(move |connection| {
-            Box::pin(async move {
-                let inserted = sqlx::query(
+    /// [`Error::Sqlite`]; the change must then not be attempted.
+    pub async fn begin_audit(self, entry: NewAuditEntry) -> Result<i64, Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let (number,): (i64,) = sqlx::query_as(
                     "insert into audit_entry (at_us, actor, actor_name, peer, request_id, action, structure_id, subject)
-                     values (?, ?, ?, ?, ?, ?, ?, ?)",
+                     values ($1, $2, $3, $4, $5, $6, $7, $8) returning entry_id",
                 )
                 .bind(entry.at.micros())
                 .bind(&entry.actor)
@@ -107,42 +116,43 @@ impl Store {
                 .bind(&entry.action)
                 .bind(&entry.structure)
                 .bind(&entry.subject)
-                .execute(&mut *connection)
+                .fetch_one(transaction.connection())
                 .await?;
-                Ok(inserted.last_insert_rowid())
+                    Ok(number)
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Adds what came of a change, and the path of what it made.
+    /// Stores the outcome of a change, and the path of the created resource.
     ///
     /// # Errors
-    /// [`Error::Sqlite`]: the entry then stays without a status.
-    pub async fn end_audit(&self, number: i64, status: u16, made: Option<String>) -> Result<(), Error> {
-        self.write(move |connection| {
-            Box::pin(async move {
-                sqlx::query(
-                    "update audit_entry set status = ?, subject = coalesce(?, subject)
-                     where entry_id = ? and status is null",
-                )
-                .bind(status)
-                .bind(made)
-                .bind(number)
-                .execute(&mut *connection)
-                .await?;
-                Ok(())
+    /// [`Error::Sqlite`]; the entry then keeps no status.
+    pub async fn end_audit(self, number: i64, status: u16, made: Option<String>) -> Result<(), Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    sqlx::query(
+                        "update audit_entry set status = $1, subject = coalesce($2, subject)
+                     where entry_id = $3 and status is null",
+                    )
+                    .bind(status)
+                    .bind(made)
+                    .bind(number)
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(())
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Runs a change that comes by no request, with its entry before and its status after.
+    /// Runs a change that was not requested over HTTP, and stores its entry before and its status after it.
     ///
     /// # Errors
-    /// Those of the change; [`Error::Sqlite`] when the entry cannot be written, before the change is tried.
+    /// Those of the change; [`Error::Sqlite`] if the entry cannot be stored, in which case the change is not attempted.
     pub async fn audited<T, E: From<Error>>(
-        &self,
+        self,
         entry: NewAuditEntry,
         change: impl Future<Output = Result<T, E>>,
     ) -> Result<T, E> {
@@ -157,18 +167,18 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn audit(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, Error> {
+    pub async fn list(self, query: &AuditQuery) -> Result<Vec<AuditEntry>, Error> {
         let rows: Vec<AuditRow> = sqlx::query_as(
             "select entry_id, at_us, actor, actor_name, peer, request_id, action, structure_id, subject, status
              from audit_entry
-             where (?1 is null or at_us >= ?1) and (?2 is null or at_us < ?2) and (?3 is null or entry_id < ?3)
-             order by entry_id desc limit ?4",
+             where ($1 is null or at_us >= $1) and ($2 is null or at_us < $2) and ($3 is null or entry_id < $3)
+             order by entry_id desc limit $4",
         )
         .bind(query.from.map(Timestamp::micros))
         .bind(query.to.map(Timestamp::micros))
         .bind(query.before)
         .bind(query.limit as i64)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let entry = |row: AuditRow| {
             Ok(AuditEntry {

@@ -1,26 +1,28 @@
-//! Sizes and counts of the store, for `/readyz`, `/metrics` and `doctor`.
+//! Sizes and counts of the stored data, for `/readyz`, `/metrics` and `doctor`.
 
 use std::path::Path;
 
-use super::{newest, Error, Store, DATABASE_FILE};
+use super::error::Error;
+use super::file::DATABASE_FILE;
+use super::overview::Overview;
 use crate::volume;
 
-/// Sizes of the files of a data folder, and the room beside them.
+/// Sizes of the files of a data folder, and the state of its volume.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FolderFigures {
     /// Bytes of the database file.
     pub database_bytes: u64,
     /// Bytes of its write-ahead log.
     pub wal_bytes: u64,
-    /// The volume it lies on.
+    /// The volume of the folder.
     pub volume: volume::Volume,
 }
 
 impl FolderFigures {
-    /// The figures of a data folder that exists.
+    /// The sizes of an existing data folder. A missing file counts as 0 bytes.
     ///
     /// # Errors
-    /// What the operating system says of the volume; files that are missing have no bytes.
+    /// The error of the operating system if the volume cannot be read.
     pub fn of(data_dir: &Path) -> std::io::Result<Self> {
         let bytes = |name: String| std::fs::metadata(data_dir.join(name)).map_or(0, |file| file.len());
         Ok(Self {
@@ -31,38 +33,33 @@ impl FolderFigures {
     }
 }
 
-/// Counts of what is stored.
+/// Counts of the stored data.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Figures {
     /// Structures.
     pub structures: u64,
     /// Batches that wait for their assessment.
     pub pending_batches: u64,
-    /// Alarms that last: kind, how many, and how many of them nobody has acknowledged.
+    /// Open alarms: kind, number, and number of those that are not acknowledged.
     pub open_alarms: Vec<(String, u64, u64)>,
 }
 
-impl Store {
-    /// The newest schema this program knows: that of every store it has open.
-    pub fn schema_version() -> i64 {
-        newest()
-    }
-
-    /// Counts of what is stored; each is read from an index, so that a scrape costs the same for a year of data.
+impl Overview<'_> {
+    /// Counts of the stored data. Each is read from an index, so that the cost does not grow with the history.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn figures(&self) -> Result<Figures, Error> {
+    pub async fn figures(self) -> Result<Figures, Error> {
         let (structures, pending): (i64, i64) = sqlx::query_as(
             "select (select count(*) from structure), (select count(*) from measurement_batch where state = 'received')",
         )
-        .fetch_one(&self.reader)
+        .fetch_one(&self.database.reader)
         .await?;
         let alarms: Vec<(String, i64, i64)> = sqlx::query_as(
-            "select kind, count(*), coalesce(sum(acknowledged_at_us is null), 0) from alarm_episode
+            "select kind, count(*), count(*) filter (where acknowledged_at_us is null) from alarm_episode
              where ended_at_us is null and withdrawn = 0 group by kind order by kind",
         )
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let count = i64::unsigned_abs;
         Ok(Figures {

@@ -1,13 +1,16 @@
-//! Pages of history and of exceedances, by keyset: a page costs the same at the end as at the beginning.
+//! Pages of batches and of exceedances. They are found by key and not by offset, so that late pages cost as much as early ones.
 
 use sqlx::FromRow;
 
+use super::assessment::{Assessments, CURRENT_FIRST};
 use super::batch::batch_state;
-use super::{timestamp, Error, Store};
+use super::column::timestamp;
+use super::database::Database;
+use super::error::Error;
 use crate::assessment::{Assessment, BatchState};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
-/// Which part of the history.
+/// Selects part of the history.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct HistoryQuery {
     /// Batches that begin at or after this time.
@@ -16,11 +19,11 @@ pub struct HistoryQuery {
     pub to: Option<Timestamp>,
     /// Only this quantity.
     pub parameter: Option<String>,
-    /// Most items.
+    /// Largest number of items.
     pub limit: usize,
-    /// Behind this place: time of the first measurement and id of the last item of the page before.
+    /// Items after this position: time of the first measurement and id of the last batch of the previous page.
     pub after: Option<(Timestamp, String)>,
-    /// For exceedances, of which a batch can have several: the quantity of the last item of the page before.
+    /// The quantity of the last item of the previous page, for exceedances, of which a batch can have several.
     pub after_quantity: Option<String>,
 }
 
@@ -29,7 +32,7 @@ pub struct HistoryQuery {
 pub struct HistoryEntry {
     /// Its id.
     pub batch_id: String,
-    /// Where it came from.
+    /// Its source.
     pub source: String,
     /// Time of its first measurement.
     pub measured_from: Timestamp,
@@ -37,9 +40,9 @@ pub struct HistoryEntry {
     pub measured_to: Timestamp,
     /// When it arrived.
     pub received_at: Timestamp,
-    /// Its measurements.
+    /// Number of its measurements.
     pub measurement_count: usize,
-    /// How far it has come.
+    /// Its state.
     pub state: BatchState,
     /// Why its assessment failed.
     pub failure: Option<String>,
@@ -47,7 +50,7 @@ pub struct HistoryEntry {
     pub assessment: Option<Assessment>,
 }
 
-/// A probability of damage above the undamaged threshold, in the current assessment of a batch.
+/// A probability of damage above that of the undamaged reference, in the current assessment of a batch.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Exceedance {
     /// The batch.
@@ -62,15 +65,15 @@ pub struct Exceedance {
     pub unit: String,
     /// Its probability of damage.
     pub probability_of_damage: f64,
-    /// The probability that was exceeded.
+    /// The probability that is exceeded.
     pub threshold_probability: f64,
-    /// δ, in the unit.
+    /// Threshold δ, in the unit of the quantity.
     pub threshold: f64,
-    /// (μ − μ_ud)/μ_ud.
+    /// (μ − μ_ud)/μ_ud, with the mean μ_ud of the undamaged reference.
     pub relative_change: f64,
-    /// The undamaged state compared with.
+    /// Version of the undamaged reference.
     pub undamaged_version: u32,
-    /// The trained baseline.
+    /// Digest of the trained baseline.
     pub model_digest: Digest,
 }
 
@@ -101,21 +104,27 @@ struct ExceedanceRow {
     model_digest: String,
 }
 
-impl Store {
+/// Pages of batches and of exceedances.
+#[derive(Clone, Copy)]
+pub struct History<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl History<'_> {
     /// A page of batches with their current assessments, by (first measurement, id), oldest first.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn history(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
+    pub async fn page(self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
         let (after_time, after_id) = query.after.clone().unzip();
-        // SQLite takes one lower bound for its search in the index: without this it reads all earlier pages again.
+        // SQLite uses only one lower bound to search the index. Without this one it would read all earlier pages again.
         let from = query.from.max(after_time);
         let rows: Vec<EntryRow> = sqlx::query_as(
             "select batch_id, source, measured_from_us, measured_to_us, received_at_us, measurement_count, state, failure
              from measurement_batch
-             where structure_id = ?1 and measured_from_us >= ?2 and measured_from_us < ?3
-               and (measured_from_us, batch_id) > (?4, ?5)
-             order by measured_from_us, batch_id limit ?6",
+             where structure_id = $1 and measured_from_us >= $2 and measured_from_us < $3
+               and (measured_from_us, batch_id) > ($4, $5)
+             order by measured_from_us, batch_id limit $6",
         )
         .bind(structure.as_str())
         .bind(from.map_or(i64::MIN, Timestamp::micros))
@@ -123,10 +132,12 @@ impl Store {
         .bind(after_time.map_or(i64::MIN, Timestamp::micros))
         .bind(after_id.unwrap_or_default())
         .bind(query.limit as i64)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let ids: Vec<String> = rows.iter().map(|row| row.batch_id.clone()).collect();
-        let mut assessments = self.current_assessments(structure, &ids, query.parameter.as_deref()).await?;
+        let mut assessments = Assessments { database: self.database }
+            .current_assessments(structure, &ids, query.parameter.as_deref())
+            .await?;
         let entry = |row: EntryRow| {
             Ok(HistoryEntry {
                 assessment: assessments.remove(&row.batch_id),
@@ -147,9 +158,9 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn exceedances(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
+    pub async fn exceedances(self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
         let (before_time, before_id) = query.after.clone().unzip();
-        // As in `history`; one microsecond more, because a batch of the same time can still follow.
+        // As in `page`, plus one microsecond, because a batch with the same time can follow.
         let behind = before_time.map_or(i64::MAX, |time| time.micros() + 1);
         let to = query.to.map_or(i64::MAX, Timestamp::micros).min(behind);
         let select = format!(
@@ -158,15 +169,15 @@ impl Store {
              from measurement_batch b
              join quantity_assessment q using (structure_id, batch_id)
              join undamaged_state u on u.structure_id = q.structure_id and u.version = q.undamaged_version
-             where b.structure_id = ?1 and b.measured_from_us >= ?2 and b.measured_from_us < ?3 and q.exceeds = 1
-               and (?4 is null or (b.measured_from_us, b.batch_id, q.quantity) < (?4, ?5, ?6))
-               and (?7 is null or q.quantity = ?7)
+             where b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3 and q.exceeds = 1
+               and ($4 is null or (b.measured_from_us, b.batch_id, q.quantity) < ($4, $5, $6))
+               and ($7 is null or q.quantity = $7)
                and (q.model_digest, q.undamaged_version) = (
                    select model_digest, undamaged_version from assessment a
                    where a.structure_id = b.structure_id and a.batch_id = b.batch_id
                    order by {} limit 1)
-             order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit ?8",
-            super::assessment::CURRENT_FIRST
+             order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit $8",
+            CURRENT_FIRST
         );
         let rows: Vec<ExceedanceRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
@@ -177,7 +188,7 @@ impl Store {
             .bind(query.after_quantity.clone().unwrap_or_default())
             .bind(query.parameter.clone())
             .bind(query.limit as i64)
-            .fetch_all(&self.reader)
+            .fetch_all(&self.database.reader)
             .await?;
         let exceedance = |row: ExceedanceRow| {
             Ok(Exceedance {

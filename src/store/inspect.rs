@@ -1,39 +1,41 @@
-//! A look at a database that no service has open, changing nothing: for `doctor`.
+//! Inspecting a database that no service has open, without changing it, for `doctor`.
 
 use std::path::Path;
 
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
-use super::diagnosis::StoredBaseline;
-use super::{newest, refuse_foreign, take_lock, timestamp, Error, DATABASE_FILE, OLDEST_SQLITE};
+use super::column::timestamp;
+use super::error::Error;
+use super::file::{library_version, refuse_foreign, schema_version, take_lock, DATABASE_FILE};
+use super::version::StoredBaseline;
 use crate::quantity::Timestamp;
 
-/// What was found.
+/// The state of a database.
 #[derive(Debug)]
 pub struct Inspection {
     /// Version of the SQLite library.
     pub sqlite_version: String,
-    /// True when it is free of the defect that can damage a log.
+    /// True if the library is free of the WAL-reset defect.
     pub sqlite_is_safe: bool,
-    /// Schema of the file.
+    /// Schema version of the file.
     pub schema_version: i64,
-    /// Newest schema of this program.
+    /// Newest schema version known to this program.
     pub known_schema: i64,
-    /// What is wrong with its pages and indices; empty when nothing is.
+    /// Defects of its pages and indexes.
     pub damage: Vec<String>,
-    /// Rows that refer to rows that are not there.
+    /// Number of rows that refer to missing rows.
     pub dangling_rows: u64,
     /// When the newest batch arrived.
     pub newest_received: Option<Timestamp>,
-    /// Structures as stored: id, definition, and the baseline that the service trained for the present version.
+    /// Structures: id, definition, and the baseline that the service trained for the present version.
     pub structures: Vec<(String, String, Option<StoredBaseline>)>,
 }
 
-/// Looks at the database of a data folder; `None` when there is none yet.
+/// Inspects the database of a data folder. `None` if there is none yet.
 ///
 /// # Errors
-/// [`Error::Locked`] when a service has it open; [`Error::NotADatabase`], [`Error::Foreign`].
+/// [`Error::Locked`] if a service has it open; [`Error::NotADatabase`], [`Error::Foreign`].
 pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
     let path = data_dir.join(DATABASE_FILE);
     if !path.exists() {
@@ -43,18 +45,17 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
     refuse_foreign(&path).await?;
     let mut connection = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(&path)).await?;
     let connection = &mut connection;
-    let (sqlite_version,): (String,) = sqlx::query_as("select sqlite_version()").fetch_one(&mut *connection).await?;
-    let numbers: Vec<u32> = sqlite_version.split('.').filter_map(|n| n.parse().ok()).collect();
+    let (sqlite_version, sqlite_is_safe) = library_version(connection).await?;
     let findings: Vec<(String,)> = sqlx::query_as("pragma integrity_check(10)").fetch_all(&mut *connection).await?;
     let (dangling,): (i64,) =
         sqlx::query_as("select count(*) from pragma_foreign_key_check").fetch_one(&mut *connection).await?;
-    let mut schema_version = 0;
+    let mut found_schema = 0;
     if has_table(connection, "_sqlx_migrations").await? {
         let (version,): (i64,) =
             sqlx::query_as("select coalesce(max(version), 0) from _sqlx_migrations where success = 1")
                 .fetch_one(&mut *connection)
                 .await?;
-        schema_version = version;
+        found_schema = version;
     }
     let (mut newest_received, mut structures) = (None, Vec::new());
     if has_table(connection, "measurement_batch").await? {
@@ -72,7 +73,7 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
             let stored = if trained {
                 sqlx::query_as(
                     "select model_digest, manifest, weights, accepted from trained_baseline
-                     where structure_id = ? and structure_digest = ?",
+                     where structure_id = $1 and structure_digest = $2",
                 )
                 .bind(&id)
                 .bind(digest)
@@ -85,10 +86,10 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
         }
     }
     Ok(Some(Inspection {
-        sqlite_is_safe: numbers.as_slice() >= OLDEST_SQLITE.as_slice(),
         sqlite_version,
-        schema_version,
-        known_schema: newest(),
+        sqlite_is_safe,
+        schema_version: found_schema,
+        known_schema: schema_version(),
         damage: findings.into_iter().map(|(finding,)| finding).filter(|finding| finding != "ok").collect(),
         dangling_rows: dangling.unsigned_abs(),
         newest_received,
@@ -98,7 +99,7 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
 
 async fn has_table(connection: &mut SqliteConnection, table: &str) -> Result<bool, Error> {
     let (found,): (bool,) =
-        sqlx::query_as("select exists (select 1 from sqlite_schema where type = 'table' and name = ?)")
+        sqlx::query_as("select exists (select 1 from sqlite_schema where type = 'table' and name = $1)")
             .bind(table)
             .fetch_one(connection)
             .await?;

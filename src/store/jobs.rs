@@ -2,17 +2,18 @@
 
 use sqlx::FromRow;
 
-use super::diagnosis::{job_state, JobState};
-use super::{bad_row, timestamp, Error, Store};
+use super::column::{bad_row, timestamp};
+use super::diagnosis::{job_state, Diagnoses, JobState};
+use super::error::Error;
 use crate::quantity::{StructureId, Timestamp};
 
-/// What a job does.
+/// Kind of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JobKind {
-    /// It looks for what the simulation gets wrong.
+    /// Searches for discrepancies between simulation and measurements.
     Diagnosis,
-    /// It extends the structure by what a diagnosis found.
+    /// Extends the structure by the findings of a diagnosis.
     Extension,
 }
 
@@ -23,24 +24,24 @@ pub struct JobRecord {
     pub id: String,
     /// The structure.
     pub structure: StructureId,
-    /// What it does.
+    /// Its kind.
     pub kind: JobKind,
-    /// Where it is.
+    /// Its state.
     pub state: JobState,
     /// Why it failed.
     pub failure: Option<String>,
-    /// When it was asked for; of extensions stored by earlier versions, when their diagnosis ended.
+    /// When it was requested. For extensions stored by early versions, the end of their diagnosis.
     pub created_at: Timestamp,
     /// When it ended.
     pub finished_at: Option<Timestamp>,
     /// Verdict of a diagnosis.
     pub verdict: Option<String>,
-    /// A sentence: what a diagnosis found, what an extension added.
+    /// A sentence about what a diagnosis found, or a list of what an extension added.
     pub summary: Option<String>,
 }
 
 #[derive(FromRow)]
-struct Row {
+struct JobRow {
     diagnosis_id: String,
     structure_id: String,
     extension: bool,
@@ -50,42 +51,49 @@ struct Row {
     finished_at_us: Option<i64>,
     verdict: Option<String>,
     summary: Option<String>,
+    /// What an extension added, a JSON list of texts.
+    added: Option<String>,
 }
 
-impl Store {
+impl Diagnoses<'_> {
     /// Diagnoses and extensions of all structures, newest first.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn jobs(&self, limit: usize) -> Result<Vec<JobRecord>, Error> {
-        // The newest are chosen before any result, which can be long, is read.
-        let rows: Vec<Row> = sqlx::query_as(
+    pub async fn jobs(self, limit: usize) -> Result<Vec<JobRecord>, Error> {
+        // The inner select chooses the newest jobs before their results, which can be long, are read.
+        let rows: Vec<JobRow> = sqlx::query_as(
             "select d.diagnosis_id, d.structure_id, j.extension,
-                    iif(j.extension, d.extension_state, d.state) as state,
-                    iif(j.extension, d.extension_failure, d.failure) as failure,
+                    case when j.extension then d.extension_state else d.state end as state,
+                    case when j.extension then d.extension_failure else d.failure end as failure,
                     j.created_at_us,
-                    iif(j.extension, d.extended_at_us, d.finished_at_us) as finished_at_us,
-                    iif(j.extension, null, d.result ->> '$.verdict') as verdict,
-                    iif(j.extension, (select group_concat(value, '; ') from json_each(d.extension, '$.added')),
-                        d.result ->> '$.summary') as summary
+                    case when j.extension then d.extended_at_us else d.finished_at_us end as finished_at_us,
+                    case when j.extension then null else d.result ->> 'verdict' end as verdict,
+                    case when j.extension then null else d.result ->> 'summary' end as summary,
+                    case when j.extension then d.extension ->> 'added' end as added
              from (select * from (
                        select diagnosis_id, false as extension, created_at_us from diagnosis
                        union all
                        select diagnosis_id, true, coalesce(extension_begun_at_us, finished_at_us, created_at_us)
-                       from diagnosis where extension_state is not null)
-                   order by created_at_us desc, diagnosis_id desc, extension desc limit ?) j
+                       from diagnosis where extension_state is not null) a
+                   order by created_at_us desc, diagnosis_id desc, extension desc limit $1) j
              join diagnosis d using (diagnosis_id)
              order by j.created_at_us desc, d.diagnosis_id desc, j.extension desc",
         )
         .bind(limit as i64)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         rows.into_iter().map(record).collect()
     }
 }
 
-fn record(row: Row) -> Result<JobRecord, Error> {
+fn record(row: JobRow) -> Result<JobRecord, Error> {
     let what = "job";
+    let added: Option<Vec<String>> = match &row.added {
+        Some(added) => serde_json::from_str(added).map_err(|e| bad_row(what)(&e))?,
+        None => None,
+    };
+    let added = added.filter(|added| !added.is_empty()).map(|added| added.join("; "));
     Ok(JobRecord {
         id: row.diagnosis_id,
         structure: StructureId::parse(&row.structure_id).map_err(|e| bad_row(what)(&e))?,
@@ -95,6 +103,6 @@ fn record(row: Row) -> Result<JobRecord, Error> {
         created_at: timestamp(what, row.created_at_us)?,
         finished_at: row.finished_at_us.map(|at| timestamp(what, at)).transpose()?,
         verdict: row.verdict,
-        summary: row.summary,
+        summary: row.summary.or(added),
     })
 }

@@ -1,49 +1,51 @@
-//! Raw measurements in the order of the history, by keyset: batches by their first measurement, in a batch as they came.
+//! Pages of measurements in the order of the first measurement of their batch, and within a batch in the order of arrival.
 
 use sqlx::FromRow;
 
-use super::batch::{measurement, MeasurementRow};
-use super::{timestamp, Error, Store};
+use super::batch::Batches;
+use super::column::timestamp;
+use super::error::Error;
+use super::measurement_row::{measurement, MeasurementRow};
 use crate::measurement::ModalMeasurement;
 use crate::quantity::{StructureId, Timestamp};
 
-/// Which measurements.
+/// Selects measurements.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeasurementQuery {
     /// Taken at or after this time.
     pub from: Option<Timestamp>,
     /// Taken before this time.
     pub to: Option<Timestamp>,
-    /// Most measurements.
+    /// Largest number of measurements.
     pub limit: usize,
-    /// Behind this place.
+    /// Measurements after this position.
     pub after: Option<MeasurementPlace>,
 }
 
-/// Place of a measurement in the order of the history.
+/// Position of a measurement in the order of the pages.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MeasurementPlace {
     /// Time of the first measurement of its batch.
     pub batch_from: Timestamp,
     /// Its batch.
     pub batch_id: String,
-    /// Its place in the batch, from 0.
+    /// Its index in the batch, from 0.
     pub ordinal: u32,
 }
 
-/// A measurement with where it came from.
+/// A stored measurement with its source.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StoredMeasurement {
-    /// Where it stands.
+    /// Its position.
     pub place: MeasurementPlace,
     /// Source of its batch.
     pub source: String,
-    /// What was measured.
+    /// The measurement.
     pub measurement: ModalMeasurement,
 }
 
 #[derive(FromRow)]
-struct Row {
+struct StoredMeasurementRow {
     batch_id: String,
     measured_from_us: i64,
     ordinal: u32,
@@ -52,27 +54,27 @@ struct Row {
     measurement: MeasurementRow,
 }
 
-impl Store {
-    /// A page of measurements. A reader that walks all pages holds no transaction between them: batches that arrive on the way
-    /// are seen if they stand behind the place it has come to.
+impl Batches<'_> {
+    /// A page of measurements. There is no transaction across pages: batches that arrive while a reader goes through the pages
+    /// are returned if they are after the position it has reached.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn measurements(
-        &self,
+        self,
         structure: &StructureId,
         query: &MeasurementQuery,
     ) -> Result<Vec<StoredMeasurement>, Error> {
         let after = query.after.as_ref();
-        let rows: Vec<Row> = sqlx::query_as(
+        let rows: Vec<StoredMeasurementRow> = sqlx::query_as(
             "select b.batch_id, b.measured_from_us, m.ordinal, m.source, m.measured_at_us, m.frequency_hz, m.std_hz,
                     m.mode_shapes, m.covariates, m.settings
              from measurement_batch b
              join measurement m using (structure_id, batch_id)
-             where b.structure_id = ?1 and b.measured_from_us >= ?2 and b.measured_from_us < ?3
-               and b.measured_to_us >= ?4 and m.measured_at_us >= ?4 and m.measured_at_us < ?3
-               and (b.measured_from_us, b.batch_id, m.ordinal) > (?2, ?5, ?6)
-             order by b.measured_from_us, b.batch_id, m.ordinal limit ?7",
+             where b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
+               and b.measured_to_us >= $4 and m.measured_at_us >= $4 and m.measured_at_us < $3
+               and (b.measured_from_us, b.batch_id, m.ordinal) > ($2, $5, $6)
+             order by b.measured_from_us, b.batch_id, m.ordinal limit $7",
         )
         .bind(structure.as_str())
         .bind(after.map_or(i64::MIN, |place| place.batch_from.micros()))
@@ -81,9 +83,9 @@ impl Store {
         .bind(after.map_or("", |place| &place.batch_id))
         .bind(after.map_or(-1, |place| i64::from(place.ordinal)))
         .bind(query.limit as i64)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
-        let stored = |row: Row| {
+        let stored = |row: StoredMeasurementRow| {
             let batch_from = timestamp("batch", row.measured_from_us)?;
             let place = MeasurementPlace { batch_from, batch_id: row.batch_id, ordinal: row.ordinal };
             Ok(StoredMeasurement { place, source: row.source, measurement: measurement(row.measurement)? })

@@ -1,22 +1,25 @@
-//! The outbox: messages to webhooks, one row for each webhook that wants one. SQL triggers fill it (migration 0005).
+//! The outbox: messages to webhooks, with one delivery for each webhook that subscribes to the event. SQL triggers fill it
+//! (migration 0005).
 //!
-//! A message may be sent when no older one of the same alarm waits for the same webhook: the messages of an alarm keep
-//! their order, and one that is refused holds back none of another alarm.
+//! A message may be sent if no older message about the same alarm waits for the same webhook. The messages of an alarm are thus
+//! sent in order, and a refused message does not delay those of other alarms.
 
 use sqlx::FromRow;
 
+use super::column::{bad_row, timestamp};
+use super::database::Database;
+use super::error::Error;
 use super::webhook::{WebhookRecord, WebhookRow};
-use super::{bad_row, timestamp, Error, Store};
 use crate::quantity::{StructureId, Timestamp};
 
-/// How far a delivery has come.
+/// State of a delivery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DeliveryState {
     /// It waits for its next attempt.
     Pending,
-    /// The receiver has taken it.
+    /// The receiver has accepted it.
     Delivered,
-    /// It was tried until nobody would wait any longer.
+    /// All attempts failed and it was given up.
     Dead,
 }
 
@@ -34,10 +37,10 @@ impl DeliveryState {
     }
 }
 
-/// Something that happened to an alarm.
+/// A change of an alarm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutboxEvent {
-    /// The same at every attempt.
+    /// Id of the message, the same at every attempt.
     pub message_id: String,
     /// Such as `alarm.opened`.
     pub kind: String,
@@ -45,7 +48,7 @@ pub struct OutboxEvent {
     pub structure: StructureId,
     /// Number of the alarm within the structure.
     pub alarm: i64,
-    /// The alarm as it was then, JSON.
+    /// The alarm at that time, JSON.
     pub facts: String,
     /// When it happened.
     pub created_at: Timestamp,
@@ -56,13 +59,13 @@ pub struct OutboxEvent {
 pub struct Delivery {
     /// Its number.
     pub id: i64,
-    /// What it tells.
+    /// The event.
     pub event: OutboxEvent,
-    /// How far it has come.
+    /// Its state.
     pub state: DeliveryState,
     /// Attempts so far.
     pub attempts: u32,
-    /// Retries count from here.
+    /// Beginning of the retry schedule.
     pub started_at: Timestamp,
     /// Next attempt, while pending.
     pub next_at: Timestamp,
@@ -74,14 +77,14 @@ pub struct Delivery {
     pub last_error: Option<String>,
 }
 
-/// What an attempt has come to.
+/// The outcome of an attempt.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settlement {
     /// The state after it.
     pub state: DeliveryState,
-    /// When it was.
+    /// Time of the attempt.
     pub at: Timestamp,
-    /// When the next one is; does not matter unless pending.
+    /// Time of the next attempt; ignored unless the state is pending.
     pub next_at: Timestamp,
     /// HTTP status, if there was an answer.
     pub status: Option<u16>,
@@ -89,18 +92,18 @@ pub struct Settlement {
     pub error: Option<String>,
 }
 
-/// Whose turn it is.
+/// The webhooks with messages to send.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Turns {
     /// Webhooks with a message that is due.
     pub due: Vec<String>,
-    /// When a message of the others is.
+    /// When the next message of the other webhooks is due.
     pub next_at: Option<Timestamp>,
-    /// Webhooks with a waiting message that has failed before.
+    /// Number of webhooks with a waiting message that has failed before.
     pub failing: u64,
-    /// Messages that wait.
+    /// Number of waiting messages.
     pub pending: u64,
-    /// Messages that were given up.
+    /// Number of messages that were given up.
     pub dead: u64,
 }
 
@@ -126,10 +129,10 @@ const DELIVERY_COLUMNS: &str =
     "d.delivery_id, d.state, d.attempts, d.started_at_us, d.next_at_us, d.last_at_us, d.last_status, d.last_error,
      e.message_id, e.kind, e.structure_id, e.episode, e.facts, e.created_at_us";
 
-/// Of a delivery `d`: it is due at ?1, or was planned before the clock was set back, since it waits until after ?2.
-const DUE: &str = "d.state = 'pending' and (d.next_at_us <= ?1 or d.next_at_us > ?2)";
+/// Condition that a delivery `d` is due at $1, or was scheduled after $2, which happens only if the clock was set back since.
+const DUE: &str = "d.state = 'pending' and (d.next_at_us <= $1 or d.next_at_us > $2)";
 
-/// Of a delivery `d` of an event `e`: no older message of its alarm waits for the same webhook.
+/// Condition that no older message about the alarm of a delivery `d` of an event `e` waits for the same webhook.
 const FIRST_OF_ITS_ALARM: &str =
     "not exists (select 1 from outbox_event older join webhook_delivery waiting using (event_id)
          where older.structure_id = e.structure_id and older.episode = e.episode and older.event_id < e.event_id
@@ -158,18 +161,24 @@ fn delivery(row: DeliveryRow) -> Result<Delivery, Error> {
     })
 }
 
-impl Store {
-    /// Done when something was written since the last call; for one listener.
-    pub async fn written(&self) {
-        self.writer.written.notified().await;
+/// Messages to webhooks.
+#[derive(Clone, Copy)]
+pub struct Outbox<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Outbox<'_> {
+    /// Completes when something was written since the last call. For a single listener.
+    pub async fn written(self) {
+        self.database.writer.written.notified().await;
     }
 
-    /// Webhooks with a message that may be sent and is due, that is neither later than `now` nor, after the clock was set
-    /// back, later than `latest`.
+    /// The webhooks with a message that may be sent and is due: its next attempt is not after `now`, or is after `latest`, which
+    /// happens only if the clock was set back.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn webhook_turns(&self, now: Timestamp, latest: Timestamp) -> Result<Turns, Error> {
+    pub async fn webhook_turns(self, now: Timestamp, latest: Timestamp) -> Result<Turns, Error> {
         let select = format!(
             "select w.webhook_id,
                     exists (select 1 from webhook_delivery d join outbox_event e using (event_id)
@@ -177,19 +186,19 @@ impl Store {
                     exists (select 1 from webhook_delivery d
                         where d.webhook_id = w.webhook_id and d.state = 'pending' and d.attempts > 0),
                     (select min(d.next_at_us) from webhook_delivery d
-                        where d.webhook_id = w.webhook_id and d.state = 'pending' and d.next_at_us > ?1)
+                        where d.webhook_id = w.webhook_id and d.state = 'pending' and d.next_at_us > $1)
              from webhook w where w.enabled = 1"
         );
         let webhooks: Vec<(String, bool, bool, Option<i64>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(now.micros())
             .bind(latest.micros())
-            .fetch_all(&self.reader)
+            .fetch_all(&self.database.reader)
             .await?;
         let (pending, dead): (i64, i64) = sqlx::query_as(
             "select (select count(*) from webhook_delivery where state = 'pending'),
                     (select count(*) from webhook_delivery where state = 'dead')",
         )
-        .fetch_one(&self.reader)
+        .fetch_one(&self.database.reader)
         .await?;
         let mut turns = Turns { pending: pending.unsigned_abs(), dead: dead.unsigned_abs(), ..Turns::default() };
         for (webhook, due, failing, next_at_us) in webhooks {
@@ -203,28 +212,28 @@ impl Store {
         Ok(turns)
     }
 
-    /// The message of a webhook whose turn it is: one that was never tried before those that failed, then the one that has
-    /// been due for longest; due as in [`Store::webhook_turns`]. `None` when none is due or the webhook is switched off.
+    /// The next message of a webhook: messages without an attempt come before those that failed, then the one that has been due
+    /// longest; due as in [`Self::webhook_turns`]. `None` if no message is due or the webhook is disabled.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn due_delivery(
-        &self,
+        self,
         webhook: &str,
         now: Timestamp,
         latest: Timestamp,
     ) -> Result<Option<(WebhookRecord, Delivery)>, Error> {
-        let mut reader = self.reader.acquire().await?;
-        let hook: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = ? and enabled = 1")
+        let mut reader = self.database.reader.acquire().await?;
+        let hook: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = $1 and enabled = 1")
             .bind(webhook)
             .fetch_optional(&mut *reader)
             .await?;
         let Some(hook) = hook else { return Ok(None) };
-        // Two queries, each in the order of an index: with thousands waiting, none of them sorts.
+        // Two queries that each follow the order of an index, so that SQLite does not sort thousands of waiting messages.
         for rest in ["and d.attempts = 0 order by d.delivery_id", "order by d.next_at_us, d.delivery_id"] {
             let select = format!(
                 "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
-                 where {DUE} and {FIRST_OF_ITS_ALARM} and d.webhook_id = ?3 {rest} limit 1"
+                 where {DUE} and {FIRST_OF_ITS_ALARM} and d.webhook_id = $3 {rest} limit 1"
             );
             let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
                 .bind(now.micros())
@@ -239,16 +248,17 @@ impl Store {
         Ok(None)
     }
 
-    /// Notes what an attempt has come to.
+    /// Stores the outcome of an attempt.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn settle_delivery(&self, id: i64, settlement: Settlement) -> Result<(), Error> {
-        self.write(move |connection| {
-            Box::pin(async move {
-                sqlx::query(
-                    "update webhook_delivery set state = ?, attempts = attempts + 1, next_at_us = ?, last_at_us = ?,
-                         last_status = ?, last_error = ? where delivery_id = ?",
+    pub async fn settle_delivery(self, id: i64, settlement: Settlement) -> Result<(), Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    sqlx::query(
+                    "update webhook_delivery set state = $1, attempts = attempts + 1, next_at_us = $2, last_at_us = $3,
+                         last_status = $4, last_error = $5 where delivery_id = $6",
                 )
                 .bind(settlement.state.as_str())
                 .bind(settlement.next_at.micros())
@@ -256,20 +266,20 @@ impl Store {
                 .bind(settlement.status)
                 .bind(settlement.error)
                 .bind(id)
-                .execute(&mut *connection)
+                .execute(transaction.connection())
                 .await?;
-                Ok(())
+                    Ok(())
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Messages of a webhook, newest first; behind number `before`, if given; only those in `state`, if given.
+    /// Messages of a webhook, newest first: those with numbers below `before`, if given, and only those in `state`, if given.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn deliveries(
-        &self,
+        self,
         webhook: &str,
         state: Option<DeliveryState>,
         before: Option<i64>,
@@ -277,75 +287,78 @@ impl Store {
     ) -> Result<Vec<Delivery>, Error> {
         let select = format!(
             "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
-             where d.webhook_id = ?1 and d.delivery_id < ?2 and (?3 is null or d.state = ?3)
-             order by d.delivery_id desc limit ?4"
+             where d.webhook_id = $1 and d.delivery_id < $2 and ($3 is null or d.state = $3)
+             order by d.delivery_id desc limit $4"
         );
         let rows: Vec<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(webhook)
             .bind(before.unwrap_or(i64::MAX))
             .bind(state.map(DeliveryState::as_str))
             .bind(limit as i64)
-            .fetch_all(&self.reader)
+            .fetch_all(&self.database.reader)
             .await?;
         rows.into_iter().map(delivery).collect()
     }
 
-    /// Makes a message due now, its retries beginning anew; one that was delivered stays so. The message as it is then.
+    /// Makes a message due now and restarts its retries, unless it was delivered. Returns the message after the change.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn retry_delivery(&self, webhook: &str, id: i64, now: Timestamp) -> Result<Option<Delivery>, Error> {
+    pub async fn retry_delivery(self, webhook: &str, id: i64, now: Timestamp) -> Result<Option<Delivery>, Error> {
         let webhook = webhook.to_owned();
-        self.write(move |connection| {
-            Box::pin(async move {
-                sqlx::query(
-                    "update webhook_delivery set state = 'pending', started_at_us = ?1, next_at_us = ?1
-                     where webhook_id = ?2 and delivery_id = ?3 and state <> 'delivered'",
-                )
-                .bind(now.micros())
-                .bind(&webhook)
-                .bind(id)
-                .execute(&mut *connection)
-                .await?;
-                let select = format!(
-                    "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
-                     where d.webhook_id = ? and d.delivery_id = ?"
-                );
-                let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    sqlx::query(
+                        "update webhook_delivery set state = 'pending', started_at_us = $1, next_at_us = $1
+                     where webhook_id = $2 and delivery_id = $3 and state <> 'delivered'",
+                    )
+                    .bind(now.micros())
                     .bind(&webhook)
                     .bind(id)
-                    .fetch_optional(&mut *connection)
+                    .execute(transaction.connection())
                     .await?;
-                row.map(delivery).transpose()
+                    let select = format!(
+                        "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
+                     where d.webhook_id = $1 and d.delivery_id = $2"
+                    );
+                    let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+                        .bind(&webhook)
+                        .bind(id)
+                        .fetch_optional(transaction.connection())
+                        .await?;
+                    row.map(delivery).transpose()
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Forgets what was delivered, and events that nobody waits for, from before a time. Waiting and dead messages stay.
+    /// Deletes delivered messages and events without messages from before a time. Waiting and dead messages are kept. Returns the
+    /// number of deleted events.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn prune_outbox(&self, before: Timestamp) -> Result<u64, Error> {
-        self.write(move |connection| {
-            Box::pin(async move {
-                sqlx::query(
-                    "delete from webhook_delivery where state = 'delivered'
-                       and event_id in (select event_id from outbox_event where created_at_us < ?)",
-                )
-                .bind(before.micros())
-                .execute(&mut *connection)
-                .await?;
-                let forgotten = sqlx::query(
-                    "delete from outbox_event where created_at_us < ?
+    pub async fn prune_outbox(self, before: Timestamp) -> Result<u64, Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    sqlx::query(
+                        "delete from webhook_delivery where state = 'delivered'
+                       and event_id in (select event_id from outbox_event where created_at_us < $1)",
+                    )
+                    .bind(before.micros())
+                    .execute(transaction.connection())
+                    .await?;
+                    let deleted = sqlx::query(
+                        "delete from outbox_event where created_at_us < $1
                        and not exists (select 1 from webhook_delivery d where d.event_id = outbox_event.event_id)",
-                )
-                .bind(before.micros())
-                .execute(&mut *connection)
-                .await?;
-                Ok(forgotten.rows_affected())
+                    )
+                    .bind(before.micros())
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(deleted.rows_affected())
+                })
             })
-        })
-        .await
+            .await
     }
 }

@@ -1,4 +1,4 @@
-//! All structures at a glance.
+//! Summary of all structures.
 
 use std::collections::BTreeMap;
 
@@ -7,17 +7,20 @@ use serde::Deserialize;
 use sqlx::FromRow;
 
 use super::assessment::IS_CURRENT;
-use super::{bad_row, timestamp, Error, Store};
+use super::chart_point::{state_of, CHARTS};
+use super::column::{bad_row, timestamp};
+use super::database::Database;
+use super::error::Error;
 use crate::alarm::machine::State;
 use crate::quantity::{StructureId, Timestamp};
 use crate::trust::TrustVerdict;
 
-/// What is known of a structure at a glance.
+/// Summary of a structure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StructureOverview {
     /// Its id.
     pub id: StructureId,
-    /// Batches stored.
+    /// Number of stored batches.
     pub batches: u64,
     /// Time of its latest measurement.
     pub last_measured_at: Option<Timestamp>,
@@ -25,35 +28,35 @@ pub struct StructureOverview {
     pub last_received_at: Option<Timestamp>,
     /// The assessed batch that was measured last.
     pub latest: Option<LatestAssessment>,
-    /// Alarms that last.
+    /// Number of open alarms.
     pub open_alarms: u64,
-    /// Those of them that nobody has seen.
+    /// Number of open alarms that are not acknowledged.
     pub unacknowledged_alarms: u64,
-    /// True while an alarm of silence lasts.
+    /// True while an alarm about missing data is open.
     pub silent: bool,
-    /// Version of its newest undamaged state.
+    /// Version of its newest undamaged reference.
     pub undamaged_version: Option<u32>,
-    /// Where its charts are now, under the newest undamaged state.
+    /// Present states of its alarm charts for the newest undamaged reference.
     pub chart_states: Vec<State>,
 }
 
-/// What the overview shows of the assessed batch that was measured last.
+/// Summary of the assessed batch that was measured last.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LatestAssessment {
     /// The batch.
     pub batch_id: String,
-    /// Whether it can be believed.
+    /// Verdict of the trust.
     pub verdict: TrustVerdict,
     /// Number of findings.
     pub findings: usize,
-    /// Whether a probability of damage is above that of the undamaged state.
+    /// Whether a probability of damage exceeds that of the undamaged reference.
     pub exceeds: bool,
-    /// The largest probability of damage, and the quantity that has it.
+    /// The largest probability of damage and its quantity.
     pub worst: Option<(f64, String)>,
 }
 
 #[derive(FromRow)]
-struct Row {
+struct OverviewRow {
     structure_id: String,
     batches: i64,
     last_measured_us: Option<i64>,
@@ -74,9 +77,9 @@ struct LatestRow {
     quantity: Option<String>,
 }
 
-/// The part of a stored trust that the overview shows.
+/// The part of a stored trust that the overview contains.
 #[derive(Deserialize)]
-struct TrustColumn {
+struct OverviewTrust {
     verdict: TrustVerdict,
     findings: Vec<IgnoredAny>,
 }
@@ -91,15 +94,21 @@ const COMPARED: &str = "from quantity_assessment q
        and q.undamaged_version = a.undamaged_version and q.threshold is not null and q.exceeds is not null
        and q.relative_change is not null and q.probability_of_damage is not null";
 
-impl Store {
-    /// All structures, by id: three statements, however many there are.
+/// Summary of all structures.
+#[derive(Clone, Copy)]
+pub struct Overview<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Overview<'_> {
+    /// All structures by id, with three statements independent of their number.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn overview(&self) -> Result<Vec<StructureOverview>, Error> {
+    pub async fn structures(self) -> Result<Vec<StructureOverview>, Error> {
         let select = format!(
             "select s.structure_id, coalesce(c.batches, 0) as batches, c.last_measured_us,
-                    -- Ids are in the order of arrival.
+                    -- The ids of batches are in the order of their arrival.
                     (select received_at_us from measurement_batch b where b.structure_id = s.structure_id
                      order by batch_id desc limit 1) as last_received_us,
                     (select count(*) {OPEN}) as open_alarms,
@@ -109,11 +118,12 @@ impl Store {
                         as undamaged_version
              from structure s left join structure_summary c using (structure_id) order by s.structure_id"
         );
-        let rows: Vec<Row> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
+        let rows: Vec<OverviewRow> =
+            sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut latest = self.latest_assessments().await?;
         let mut chart_states = self.chart_states().await?;
         let what = "structure";
-        let overview = |row: Row| {
+        let overview = |row: OverviewRow| {
             Ok(StructureOverview {
                 id: StructureId::parse(&row.structure_id).map_err(|e| bad_row(what)(&e))?,
                 batches: row.batches.unsigned_abs(),
@@ -131,7 +141,7 @@ impl Store {
     }
 
     /// The current assessment of the assessed batch that was measured last, by structure.
-    async fn latest_assessments(&self) -> Result<BTreeMap<String, LatestAssessment>, Error> {
+    async fn latest_assessments(self) -> Result<BTreeMap<String, LatestAssessment>, Error> {
         let select = format!(
             "with latest as materialized (
                  select s.structure_id,
@@ -144,14 +154,15 @@ impl Store {
                      order by q.probability_of_damage desc, q.position desc limit 1) as probability_of_damage,
                     (select q.quantity {COMPARED}
                      order by q.probability_of_damage desc, q.position desc limit 1) as quantity
-             from latest cross join assessment a using (structure_id, batch_id) where {IS_CURRENT}"
+             from latest l cross join assessment a
+             where a.structure_id = l.structure_id and a.batch_id = l.batch_id and {IS_CURRENT}"
         );
-        let rows: Vec<LatestRow> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
+        let rows: Vec<LatestRow> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let latest = |row: LatestRow| {
             let trust = match &row.trust {
                 Some(trust) => serde_json::from_str(trust).map_err(|e| bad_row("assessment")(&e))?,
-                // From before trust was judged.
-                None => TrustColumn { verdict: TrustVerdict::Accepted, findings: Vec::new() },
+                // Assessments of early versions have no trust.
+                None => OverviewTrust { verdict: TrustVerdict::Accepted, findings: Vec::new() },
             };
             let latest = LatestAssessment {
                 batch_id: row.batch_id,
@@ -165,8 +176,8 @@ impl Store {
         rows.into_iter().map(latest).collect()
     }
 
-    /// The states after the last points of the charts under the newest undamaged state, by structure.
-    async fn chart_states(&self) -> Result<BTreeMap<String, Vec<State>>, Error> {
+    /// The states after the last points of the charts for the newest undamaged reference, by structure.
+    async fn chart_states(self) -> Result<BTreeMap<String, Vec<State>>, Error> {
         let select = format!(
             "with recursive whose (structure_id, version) as (
                  select structure_id, max(version) from undamaged_state group by structure_id
@@ -178,43 +189,15 @@ impl Store {
                      order by measured_to_us desc, batch_id desc limit 1)
              from chart where series is not null"
         );
-        let rows: Vec<(String, String)> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.reader).await?;
+        let rows: Vec<(String, String)> =
+            sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut states: BTreeMap<String, Vec<State>> = BTreeMap::new();
         for (structure, state) in rows {
-            states.entry(structure).or_default().push(super::chart::state_of(&state)?);
+            states.entry(structure).or_default().push(state_of(&state)?);
         }
         Ok(states)
     }
-
-    /// The charts of a structure under an undamaged state, with the state they belong to: 0 for the fit.
-    pub(super) async fn chart_names(
-        &self,
-        structure: &str,
-        undamaged_version: u32,
-    ) -> Result<Vec<(u32, String)>, Error> {
-        let select = format!(
-            "with recursive whose (structure_id, version) as (select ?1, ?2 union select ?1, 0),
-             {CHARTS}
-             select version, series from chart where series is not null order by version desc, series"
-        );
-        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select))
-            .bind(structure)
-            .bind(undamaged_version)
-            .fetch_all(&self.reader)
-            .await?)
-    }
 }
-
-/// The charts of the structures and versions of a table `whose`, name by name, because `select distinct` reads all points.
-const CHARTS: &str = "chart (structure_id, version, series) as (
-         select w.structure_id, w.version, (select min(series) from chart_point p
-             where p.structure_id = w.structure_id and p.undamaged_version = w.version)
-         from whose w
-         union all
-         select structure_id, version, (select min(series) from chart_point p
-             where p.structure_id = chart.structure_id and p.undamaged_version = chart.version
-               and p.series > chart.series)
-         from chart where series is not null)";
 
 #[cfg(test)]
 mod tests {
@@ -223,31 +206,32 @@ mod tests {
     use super::super::tests::{assessment, at, batch, bridge, open};
     use super::super::Store;
 
-    /// What the summaries say, and what a recount says.
+    /// The stored summaries, and the same counted from the batches.
     async fn both(store: &Store) -> [Vec<(String, i64, Option<i64>)>; 2] {
         let kept = "select structure_id, batches, last_measured_us from structure_summary
                     where batches > 0 or last_measured_us is not null";
         let counted = "select structure_id, count(*), max(measured_to_us) from measurement_batch group by structure_id";
-        let ask = async |select: &'static str| sqlx::query_as(select).fetch_all(&store.reader).await.unwrap();
+        let ask = async |select: &'static str| sqlx::query_as(select).fetch_all(&store.database.reader).await.unwrap();
         [ask(kept).await, ask(counted).await]
     }
 
-    /// Batches come in any order, some of them twice, and the old ones go.
+    /// Batches arrive in any order, some of them twice, and old ones are deleted.
     async fn check(steps: Vec<(i64, bool)>) {
         let (store, _folder) = open().await;
         for (number, (start, expire)) in steps.into_iter().enumerate() {
             let id = format!("b{number:03}");
-            // Half of them are there already: another source makes them new.
+            // Every second batch is a repetition; another source would make it a new one.
             let source = if start % 2 == 0 { "s".to_owned() } else { format!("s{number}") };
-            let _ = store.insert_batch(&batch(&source, start, None), &id, at(0)).await.unwrap();
-            let _ = store.insert_assessment(&bridge(), &id, &assessment("m", None, at(1)), Vec::new()).await;
+            let _ = store.batches().insert_batch(&batch(&source, start, None), &id, at(0)).await.unwrap();
+            let _ =
+                store.assessments().insert_assessment(&bridge(), &id, &assessment("m", None, at(1)), Vec::new()).await;
             if expire {
-                store.delete_expired(at(start), 3).await.unwrap();
+                store.retention().delete_expired(at(start), 3).await.unwrap();
             }
             let [kept, counted] = both(&store).await;
             assert_eq!(kept, counted);
         }
-        store.delete_expired(at(1_000_000), 1_000).await.unwrap();
+        store.retention().delete_expired(at(1_000_000), 1_000).await.unwrap();
         let [kept, counted] = both(&store).await;
         assert!(kept.is_empty() && counted.is_empty(), "{kept:?} {counted:?}");
     }
@@ -266,18 +250,18 @@ mod tests {
         let (store, _folder) = open().await;
         for (number, start) in [3, 9, 5].into_iter().enumerate() {
             let id = format!("b{number}");
-            store.insert_batch(&batch(&id, start, None), &id, at(0)).await.unwrap();
+            store.batches().insert_batch(&batch(&id, start, None), &id, at(0)).await.unwrap();
         }
-        let overview = async || store.overview().await.unwrap().remove(0);
+        let overview = async || store.overview().structures().await.unwrap().remove(0);
         assert_eq!(overview().await.latest, None);
         let mut other = assessment("later", Some(1), at(3));
         other.quantities[1].damage.as_mut().unwrap().probability_of_damage = 0.7;
         for (id, given) in
             [("b0", assessment("m", Some(1), at(1))), ("b1", assessment("m", None, at(2))), ("b1", other)]
         {
-            store.insert_assessment(&bridge(), id, &given, Vec::new()).await.unwrap();
+            store.assessments().insert_assessment(&bridge(), id, &given, Vec::new()).await.unwrap();
             let found = overview().await.latest.unwrap();
-            let expected = store.assessment(&bridge(), &found.batch_id).await.unwrap().unwrap();
+            let expected = store.assessments().assessment(&bridge(), &found.batch_id).await.unwrap().unwrap();
             let damages = || expected.quantities.iter().filter_map(|q| Some((q.damage.as_ref()?, q.name.clone())));
             assert_eq!(found.batch_id, id);
             assert_eq!((found.verdict, found.findings), (expected.trust.verdict, expected.trust.findings.len()));

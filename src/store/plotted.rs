@@ -1,23 +1,24 @@
-//! What a plot over time needs of an assessment, in one column: a window of a hundred thousand batches is drawn without a look at
-//! the rows of their quantities.
+//! The values of an assessment that a plot over time needs, packed into one column, so that a window of a hundred thousand
+//! batches is plotted without reading the rows of their quantities.
 
 use crate::assessment::Assessment;
 use crate::trust::TrustVerdict;
 
-use super::{bad_row, to_blob, Error};
+use super::column::{bad_row, to_blob};
+use super::error::Error;
 
-/// Values of the trust, which come first: p-value, 1 for rejected, number of findings.
+/// Number of values of the trust, which come first: p-value, 1 if rejected, number of findings.
 const OF_TRUST: usize = 3;
-/// Values of a quantity: mean, the ends of its interval, probability of damage, the ends of its interval.
+/// Number of values of a quantity: mean and its interval, probability of damage and its interval.
 const OF_A_QUANTITY: usize = 6;
 
-/// P-value, 1 for rejected, number of findings; NaN stands for a p-value that is not there.
+/// P-value, 1 if rejected, number of findings. A missing p-value is NaN.
 pub(super) fn trust_values(p_value: Option<f64>, verdict: TrustVerdict, findings: usize) -> [f64; OF_TRUST] {
     let rejected = if verdict == TrustVerdict::Rejected { 1.0 } else { 0.0 };
     [p_value.unwrap_or(f64::NAN), rejected, findings as f64]
 }
 
-/// The column of an assessment; NaN stands for a value that is not there.
+/// The column of an assessment. Missing values are NaN.
 pub(super) fn pack(a: &Assessment) -> Vec<u8> {
     let trust = trust_values(a.trust.p_value, a.trust.verdict, a.trust.findings.len());
     let ends = |interval: Option<[f64; 2]>| interval.unwrap_or([f64::NAN; 2]);
@@ -30,7 +31,7 @@ pub(super) fn pack(a: &Assessment) -> Vec<u8> {
     to_blob(trust.into_iter().chain(quantities))
 }
 
-/// The column, read where it lies.
+/// A view of the column.
 pub(super) struct Plotted<'a> {
     values: &'a [[u8; 8]],
 }
@@ -44,7 +45,7 @@ pub(super) struct PlottedQuantity {
 }
 
 impl<'a> Plotted<'a> {
-    /// The column of an assessment with so many quantities.
+    /// Views the column of an assessment with a number of quantities.
     pub(super) fn read(blob: &'a [u8], quantities: usize) -> Result<Self, Error> {
         let (values, rest) = blob.as_chunks::<8>();
         if rest.is_empty() && values.len() == OF_TRUST + OF_A_QUANTITY * quantities {

@@ -1,18 +1,19 @@
-//! Messages from the broker that can never become a batch, and why.
+//! Messages from the MQTT broker that cannot become a batch, with the reason.
 
 use sqlx::FromRow;
 
-use super::{timestamp, Error, Store};
+use super::column::timestamp;
+use super::database::Database;
+use super::error::Error;
 use crate::quantity::{Digest, Timestamp};
 
-/// Most bytes of a payload that are kept.
+/// Largest number of bytes of a payload that is kept.
 const KEPT_BYTES: usize = 64 * 1024;
 
-/// Most messages that are kept: a gateway that sends nothing but nonsense must not fill the disk.
+/// Largest number of messages that is kept, so that a faulty gateway cannot fill the disk.
 const KEPT_MESSAGES: i64 = 1_000;
 
-/// A message that was put aside.
-#[derive(Debug, Clone, PartialEq, Eq, FromRow)]
+#[derive(FromRow)]
 struct QuarantineRow {
     message: i64,
     topic: String,
@@ -25,26 +26,26 @@ struct QuarantineRow {
     last_at_us: i64,
 }
 
-/// A message that was put aside.
+/// A quarantined message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct QuarantinedMessage {
     /// Its number.
     pub number: i64,
-    /// Where it was published.
+    /// Its topic.
     pub topic: String,
     /// SHA-256 of the whole payload.
     pub digest: Digest,
-    /// The payload's beginning, at most 64 KiB.
+    /// The beginning of the payload, at most 64 KiB.
     pub payload: Vec<u8>,
-    /// Bytes of the whole payload.
+    /// Size of the whole payload, bytes.
     pub payload_bytes: u64,
-    /// Why it is no batch.
+    /// Why it is not a batch.
     pub reason: String,
-    /// How often it was tried, over all its arrivals.
+    /// Number of attempts to store it, over all its arrivals.
     pub tries: u64,
-    /// When it came first.
+    /// When it arrived first.
     pub first_at: Timestamp,
-    /// When it came last.
+    /// When it arrived last.
     pub last_at: Timestamp,
 }
 
@@ -63,13 +64,19 @@ fn quarantined(row: QuarantineRow) -> Result<QuarantinedMessage, Error> {
     })
 }
 
-impl Store {
-    /// Puts a message aside; one that is there already is counted. Beyond a thousand the oldest go.
+/// Messages that could not become a batch.
+#[derive(Clone, Copy)]
+pub struct Quarantine<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Quarantine<'_> {
+    /// Stores a message, or counts another arrival of a stored one. Only the newest thousand messages are kept.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn quarantine(
-        &self,
+    pub async fn insert(
+        self,
         topic: &str,
         payload: &[u8],
         reason: &str,
@@ -78,13 +85,13 @@ impl Store {
     ) -> Result<(), Error> {
         let (topic, reason, digest) = (topic.to_owned(), reason.to_owned(), Digest::of_file(payload).to_string());
         let (kept, bytes) = (payload[..payload.len().min(KEPT_BYTES)].to_vec(), payload.len() as i64);
-        self.write(move |connection| {
+        self.database.write(move |transaction| {
             Box::pin(async move {
                 sqlx::query(
                     "insert into quarantine (topic, digest, payload, payload_bytes, reason, tries, first_at_us, last_at_us)
-                     values (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?7)
+                     values ($1, $2, $3, $4, $5, $6, $7, $7)
                      on conflict (topic, digest) do update set
-                         reason = excluded.reason, tries = tries + excluded.tries, last_at_us = excluded.last_at_us",
+                         reason = excluded.reason, tries = quarantine.tries + excluded.tries, last_at_us = excluded.last_at_us",
                 )
                 .bind(topic)
                 .bind(digest)
@@ -93,14 +100,14 @@ impl Store {
                 .bind(reason)
                 .bind(tries)
                 .bind(now.micros())
-                .execute(&mut *connection)
+                .execute(transaction.connection())
                 .await?;
                 sqlx::query(
                     "delete from quarantine where message <=
-                         (select message from quarantine order by message desc limit 1 offset ?)",
+                         (select message from quarantine order by message desc limit 1 offset $1)",
                 )
                 .bind(KEPT_MESSAGES)
-                .execute(&mut *connection)
+                .execute(transaction.connection())
                 .await?;
                 Ok(())
             })
@@ -108,31 +115,32 @@ impl Store {
         .await
     }
 
-    /// Messages that were put aside, newest first; behind number `before`, if given.
+    /// Quarantined messages, newest first: those with numbers below `before`, if given.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn quarantined(&self, before: Option<i64>, limit: usize) -> Result<Vec<QuarantinedMessage>, Error> {
+    pub async fn quarantined(self, before: Option<i64>, limit: usize) -> Result<Vec<QuarantinedMessage>, Error> {
         let rows: Vec<QuarantineRow> =
-            sqlx::query_as("select * from quarantine where message < ? order by message desc limit ?")
+            sqlx::query_as("select * from quarantine where message < $1 order by message desc limit $2")
                 .bind(before.unwrap_or(i64::MAX))
                 .bind(limit as i64)
-                .fetch_all(&self.reader)
+                .fetch_all(&self.database.reader)
                 .await?;
         rows.into_iter().map(quarantined).collect()
     }
 
-    /// Removes a message that was put aside. Whether there was one.
+    /// Deletes a quarantined message. Returns whether it existed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn delete_quarantined(&self, number: i64) -> Result<bool, Error> {
-        self.write(move |connection| {
-            Box::pin(async move {
-                let deleted = sqlx::query("delete from quarantine where message = ?");
-                Ok(deleted.bind(number).execute(&mut *connection).await?.rows_affected() > 0)
+    pub async fn delete_quarantined(self, number: i64) -> Result<bool, Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let deleted = sqlx::query("delete from quarantine where message = $1");
+                    Ok(deleted.bind(number).execute(transaction.connection()).await?.rows_affected() > 0)
+                })
             })
-        })
-        .await
+            .await
     }
 }

@@ -1,4 +1,4 @@
-//! Many rows by few statements: what a statement costs lies mostly in handing it over.
+//! Inserting many rows by few statements, because most of the cost of a statement is passing it to SQLite.
 
 use std::ops::Range;
 use std::sync::OnceLock;
@@ -6,35 +6,46 @@ use std::sync::OnceLock;
 /// Rows of the largest statement.
 const MOST_ROWS: usize = 64;
 
-/// Up to so many rows go into one statement, whatever their number; beyond, full statements and half ones leave few of them to
-/// be kept prepared.
+/// Up to this number, all rows go into one statement. Larger numbers are split into statements of [`MOST_ROWS`] and of half as
+/// many rows, so that few different statements have to be prepared.
 const ANY_NUMBER: usize = MOST_ROWS / 2;
 
-/// Statements that insert rows, one for each number of them, made when they are first asked for.
+/// Statements that insert rows, one for each number of rows, built when first used.
 ///
-/// The parameters are first the `common` columns, given by their places, which are the same in all rows; then the others, row
-/// by row.
+/// The first parameters are the values that are the same in all rows, for the columns with the indices `common`. The values of
+/// the other columns follow, row by row.
 pub(super) struct InsertStatements {
     into: &'static str,
     columns: usize,
     common: &'static [usize],
+    clause: &'static str,
     of_rows: [OnceLock<String>; MOST_ROWS],
 }
 
 impl InsertStatements {
-    /// Statements that begin with `into`.
+    /// Statements that begin with `into`, for rows of so many columns.
     pub const fn new(into: &'static str, columns: usize, common: &'static [usize]) -> Self {
-        Self { into, columns, common, of_rows: [const { OnceLock::new() }; MOST_ROWS] }
+        Self::ending_with("", into, columns, common)
     }
 
-    /// The statement of so many rows.
+    /// As [`Self::new`], with a clause after the values, such as `on conflict …`.
+    pub const fn ending_with(
+        clause: &'static str,
+        into: &'static str,
+        columns: usize,
+        common: &'static [usize],
+    ) -> Self {
+        Self { into, columns, common, clause, of_rows: [const { OnceLock::new() }; MOST_ROWS] }
+    }
+
+    /// The statement for a number of rows.
     ///
     /// # Panics
-    /// For none, or more than one statement takes: a bug.
+    /// For 0 or more than [`MOST_ROWS`] rows, which is a programming error.
     pub fn of(&self, rows: usize) -> &str {
         self.of_rows[rows - 1].get_or_init(|| {
             let rows: Vec<String> = (0..rows).map(|row| self.row(row)).collect();
-            format!("{} values {}", self.into, rows.join(", "))
+            format!("{} values {} {}", self.into, rows.join(", "), self.clause).trim_end().to_owned()
         })
     }
 
@@ -46,14 +57,14 @@ impl InsertStatements {
                 next += 1;
                 next - 1
             });
-            format!("?{}", number + 1)
+            format!("${}", number + 1)
         };
         let parameters: Vec<String> = (0..self.columns).map(parameter).collect();
         format!("({})", parameters.join(", "))
     }
 }
 
-/// Which rows go into one statement each.
+/// The ranges of rows that each go into one statement.
 pub(super) fn parts(rows: usize) -> impl Iterator<Item = Range<usize>> {
     let mut first = 0;
     std::iter::from_fn(move || {
@@ -89,7 +100,7 @@ mod tests {
     #[test]
     fn common_columns_keep_their_parameter_and_the_others_count_on() {
         let statements = InsertStatements::new("insert into t", 3, &[0, 2]);
-        assert_eq!(statements.of(1), "insert into t values (?1, ?3, ?2)");
-        assert_eq!(statements.of(2), "insert into t values (?1, ?3, ?2), (?1, ?4, ?2)");
+        assert_eq!(statements.of(1), "insert into t values ($1, $3, $2)");
+        assert_eq!(statements.of(2), "insert into t values ($1, $3, $2), ($1, $4, $2)");
     }
 }

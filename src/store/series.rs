@@ -1,7 +1,7 @@
-//! Series for plots: read row by row, reduced on the way, so that a window of any length needs the memory of a short one.
+//! Time series for plots. They are read row by row and reduced at the same time, so that the memory does not grow with the window.
 //!
-//! A window is a set of batches: those that begin in it. Assessments are the current ones, as in the history, of batches that
-//! are assessed and do not wait for another assessment.
+//! A window consists of the batches that begin in it. As in the history, assessments are the current ones; batches that wait for
+//! another assessment are left out.
 
 use std::collections::BTreeMap;
 
@@ -9,39 +9,42 @@ use futures_util::TryStreamExt as _;
 use serde::Deserialize;
 use sqlx::Row as _;
 
-use super::{bad_row, timestamp, Error, Store};
+use super::alarm::Alarms;
+use super::column::{bad_row, timestamp};
+use super::database::Database;
+use super::error::Error;
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
 use crate::reduction::{Reduced, Reducer};
 use crate::trust::{FindingCode, TrustVerdict};
 
-/// Most measurements that are looked at for one answer; of more, every second, third … is.
+/// Largest number of measurements that is read for one series. Of longer series, every second, third … measurement is read.
 const MOST_MEASUREMENTS: u64 = 500_000;
 
-/// Part of the history that is wanted, and how much of it is to be left.
+/// Selects part of the history, and how far its series are reduced.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeriesWindow {
     /// Batches that begin at or after this time.
     pub from: Option<Timestamp>,
     /// Batches that begin before this time.
     pub to: Option<Timestamp>,
-    /// Rows of a series that are kept without a reduction; half of those that one channel of a longer one keeps at most.
+    /// Largest number of rows of a series that is not reduced. A reduced series keeps at most twice as many rows for each channel.
     pub points: usize,
 }
 
-/// What lies in a window.
+/// The extent of a window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Extent {
-    /// Batches.
+    /// Number of batches.
     pub batches: u64,
-    /// Their measurements.
+    /// Number of their measurements.
     pub measurements: u64,
-    /// The first and the last time of a measurement; `None` without batches.
+    /// Times of the first and the last measurement; `None` without batches.
     pub measured: Option<(Timestamp, Timestamp)>,
 }
 
 impl Extent {
-    /// Every how many measurements one is looked at: 1 unless there are too many of them.
+    /// The step at which measurements are read: 1 unless there are too many.
     pub fn stride(&self) -> u64 {
         self.measurements.div_ceil(MOST_MEASUREMENTS).max(1)
     }
@@ -58,13 +61,13 @@ pub struct QuantitySeries {
     pub name: String,
     /// Its unit.
     pub unit: String,
-    /// What it is.
+    /// Its kind.
     pub kind: QuantityKind,
-    /// Batches by the end of their measurements; the values are the mean of the population and the probability of damage.
+    /// Batches by the time of their last measurement. The values are the population mean and the probability of damage.
     pub batches: Reduced<QuantityMark>,
 }
 
-/// What a batch of a quantity carries besides mean and probability of damage.
+/// What a batch of a quantity has besides mean and probability of damage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct QuantityMark {
     /// The batch.
@@ -78,53 +81,59 @@ pub struct QuantityMark {
 /// An alarm chart over a window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartSeries {
-    /// Parameter, or [`crate::alarm::chart::FIT_SERIES`].
+    /// The parameter, or [`crate::alarm::chart::FIT_SERIES`].
     pub chart: String,
-    /// Points by the end of their batch; the values are the shift and the moving average.
+    /// Points by the time of the last measurement of their batch. The values are the shift and the moving average.
     pub points: Reduced<ChartMark>,
 }
 
-/// What a point of a chart carries besides its values.
+/// What a point of a chart has besides its values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartMark {
     /// The batch.
     pub batch: String,
-    /// Limit of one shift.
+    /// Limit of a single shift.
     pub shift_limit: f64,
     /// Limit of the moving average.
     pub ewma_limit: Option<f64>,
-    /// True when it moved nothing.
+    /// True if the point does not count, as during maintenance.
     pub held: bool,
-    /// State after it.
+    /// State of the chart after this point.
     pub state: String,
 }
 
-/// How far a batch can be believed; its p-value is the first value of its row.
+/// The trust in a batch. Its p-value is the first value of its row.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrustMark {
     /// The batch.
     pub batch: String,
     /// The verdict.
     pub verdict: TrustVerdict,
-    /// What was found, each code once.
+    /// Codes of the findings, each once.
     pub findings: Vec<FindingCode>,
 }
 
-impl Store {
-    /// What lies in a window.
+/// Time series for plots.
+#[derive(Clone, Copy)]
+pub struct Series<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Series<'_> {
+    /// The extent of a window.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn extent(&self, structure: &StructureId, window: SeriesWindow) -> Result<Extent, Error> {
+    pub async fn extent(self, structure: &StructureId, window: SeriesWindow) -> Result<Extent, Error> {
         let (from, to) = bounds(window);
         let (batches, measurements, first, last): (i64, i64, Option<i64>, Option<i64>) = sqlx::query_as(
-            "select count(*), coalesce(sum(measurement_count), 0), min(measured_from_us), max(measured_to_us)
-             from measurement_batch where structure_id = ? and measured_from_us >= ? and measured_from_us < ?",
+            "select count(*), coalesce(cast(sum(measurement_count) as bigint), 0), min(measured_from_us), max(measured_to_us)
+             from measurement_batch where structure_id = $1 and measured_from_us >= $2 and measured_from_us < $3",
         )
         .bind(structure.as_str())
         .bind(from)
         .bind(to)
-        .fetch_one(&self.reader)
+        .fetch_one(&self.database.reader)
         .await?;
         let measured = match (first, last) {
             (Some(first), Some(last)) => Some((timestamp("batch", first)?, timestamp("batch", last)?)),
@@ -133,12 +142,13 @@ impl Store {
         Ok(Extent { batches: batches.unsigned_abs(), measurements: measurements.unsigned_abs(), measured })
     }
 
-    /// Measured frequencies by time: one value a mode, then one a covariate of the given names; text is no value.
+    /// Measurements by time: the frequency of each mode in Hz, then the value of each named covariate. A missing value and a
+    /// covariate that is not a number are NaN.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn frequency_series(
-        &self,
+        self,
         structure: &StructureId,
         window: SeriesWindow,
         extent: &Extent,
@@ -149,26 +159,29 @@ impl Store {
         let (from, to) = bounds(window);
         let stride = extent.stride();
         let joined = "from measurement_batch b join measurement m using (structure_id, batch_id)
-             where b.structure_id = ?1 and b.measured_from_us >= ?2 and b.measured_from_us < ?3";
+             where b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3";
         let columns = "measured_at_us, frequency_hz, covariates";
         let select = if stride == 1 {
             format!("select {columns} {joined} order by b.measured_from_us, b.batch_id")
         } else {
-            // Thrown away before they leave SQLite: handing a row over costs more than finding it.
+            // Skipped inside SQLite, because returning a row costs more than finding it.
             format!(
-                "select {columns} from (select {columns}, row_number() over () as number {joined})
+                "select {columns} from (select {columns}, row_number() over () as number {joined}) numbered
                  where number % {stride} = 1"
             )
         };
-        let mut rows =
-            sqlx::query(sqlx::AssertSqlSafe(select)).bind(structure.as_str()).bind(from).bind(to).fetch(&self.reader);
+        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(from)
+            .bind(to)
+            .fetch(&self.database.reader);
         let mut reducer = Reducer::new(extent.span(), window.points, modes + covariates.len());
         let mut values = Vec::with_capacity(modes + covariates.len());
         while let Some(row) = rows.try_next().await? {
             values.clear();
             let (blocks, rest) = row.try_get_unchecked::<&[u8], _>(1)?.as_chunks::<8>();
             if !rest.is_empty() {
-                return Err(bad_row(what)(&"a vector that is no whole number of values"));
+                return Err(bad_row(what)(&"the length of a vector is not a multiple of 8 bytes"));
             }
             values.extend(blocks.iter().take(modes).map(|block| f64::from_le_bytes(*block)));
             values.resize(modes, f64::NAN);
@@ -183,35 +196,36 @@ impl Store {
         Ok(reducer.finish())
     }
 
-    /// The charts under the newest undamaged state: points of batches that end in the window.
+    /// The alarm charts for the newest undamaged reference: points of batches that end in the window.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn chart_series(
-        &self,
+        self,
         structure: &StructureId,
         window: SeriesWindow,
         extent: &Extent,
     ) -> Result<Vec<ChartSeries>, Error> {
         let (from, to) = bounds(window);
         let (version,): (u32,) =
-            sqlx::query_as("select coalesce(max(version), 0) from undamaged_state where structure_id = ?")
+            sqlx::query_as("select coalesce(max(version), 0) from undamaged_state where structure_id = $1")
                 .bind(structure.as_str())
-                .fetch_one(&self.reader)
+                .fetch_one(&self.database.reader)
                 .await?;
         let mut all = Vec::new();
-        for (version, chart) in self.chart_names(structure.as_str(), version).await? {
+        let alarms = Alarms { database: self.database };
+        for (version, chart) in alarms.chart_names(structure.as_str(), version).await? {
             let mut rows = sqlx::query(
                 "select measured_to_us, shift, ewma, batch_id, shift_limit, ewma_limit, held, state from chart_point
-                 where structure_id = ? and undamaged_version = ? and series = ?
-                   and measured_to_us >= ? and measured_to_us < ?",
+                 where structure_id = $1 and undamaged_version = $2 and series = $3
+                   and measured_to_us >= $4 and measured_to_us < $5",
             )
             .bind(structure.as_str())
             .bind(version)
             .bind(&chart)
             .bind(from)
             .bind(to)
-            .fetch(&self.reader);
+            .fetch(&self.database.reader);
             let mut reducer = Reducer::new(extent.span(), window.points, 2);
             while let Some(row) = rows.try_next().await? {
                 let values = [row.try_get_unchecked(1)?, row.try_get_unchecked(2)?];
@@ -234,14 +248,14 @@ impl Store {
     }
 }
 
-/// A covariate as it is stored; only numbers can be drawn.
+/// A stored covariate. Only numbers can be plotted.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Covariate<'a> {
     Number(f64),
-    #[allow(dead_code, reason = "a category is told apart from a number, and not looked at")]
+    #[allow(dead_code, reason = "distinguishes a category from a number, and is not read")]
     Category(&'a str),
-    #[allow(dead_code, reason = "one with escapes in it")]
+    #[allow(dead_code, reason = "a category with escaped characters, which cannot be borrowed")]
     Escaped(String),
 }
 

@@ -7,7 +7,8 @@ use std::path::Path;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
-use super::{Error, HistoryQuery, InsertBatch, PutStructure, Store, APPLICATION_ID, DATABASE_FILE};
+use super::file::APPLICATION_ID;
+use super::{schema_version, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
 use crate::assessment::Assessment;
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedState};
 use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
@@ -96,7 +97,7 @@ fn undamaged() -> UndamagedState {
 pub(super) async fn open() -> (Store, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(folder.path()).await.unwrap();
-    let put = store.put_structure(&bridge(), "{}", &Digest::of(&[b"v1"]), at(0)).await.unwrap();
+    let put = store.structures().put_structure(&bridge(), "{}", &Digest::of(&[b"v1"]), at(0)).await.unwrap();
     assert_eq!(put, PutStructure::Created);
     (store, folder)
 }
@@ -135,8 +136,8 @@ async fn a_first_start_that_was_killed_before_it_marked_its_file_can_be_repeated
     by_hand(folder.path(), &["pragma journal_mode = wal"]).await;
     assert!(std::fs::metadata(folder.path().join(DATABASE_FILE)).unwrap().len() > 0);
     let store = Store::open(folder.path()).await.unwrap();
-    store.is_writable().await.unwrap();
-    let (id,): (i64,) = sqlx::query_as("pragma application_id").fetch_one(&store.reader).await.unwrap();
+    store.file().is_writable().await.unwrap();
+    let (id,): (i64,) = sqlx::query_as("pragma application_id").fetch_one(&store.database.reader).await.unwrap();
     assert_eq!(id, APPLICATION_ID);
 }
 
@@ -146,7 +147,7 @@ async fn one_folder_has_one_store() {
     assert!(matches!(refusal(folder.path()).await, Error::Locked(_)));
     store.close().await;
     drop(store);
-    assert_eq!(Store::open(folder.path()).await.unwrap().structures().await.unwrap().len(), 1);
+    assert_eq!(Store::open(folder.path()).await.unwrap().structures().list().await.unwrap().len(), 1);
 }
 
 #[tokio::test]
@@ -171,7 +172,7 @@ async fn a_newer_schema_is_refused_with_both_versions() {
     let newer =
         "insert into _sqlx_migrations select 9999, 'x', installed_on, true, checksum, 0 from _sqlx_migrations limit 1";
     by_hand(folder.path(), &[newer]).await;
-    let newest = super::newest();
+    let newest = schema_version();
     assert!(matches!(refusal(folder.path()).await, Error::SchemaTooNew { found: 9999, known, .. } if known == newest));
 }
 
@@ -179,7 +180,7 @@ async fn a_newer_schema_is_refused_with_both_versions() {
 async fn a_damaged_or_truncated_file_is_refused_as_corrupt() {
     let (store, folder) = open().await;
     for i in 0..40 {
-        store.insert_batch(&batch(&format!("s{i}"), 0, None), &format!("b{i}"), at(0)).await.unwrap();
+        store.batches().insert_batch(&batch(&format!("s{i}"), 0, None), &format!("b{i}"), at(0)).await.unwrap();
     }
     store.close().await;
     drop(store);
@@ -202,14 +203,14 @@ async fn a_damaged_or_truncated_file_is_refused_as_corrupt() {
 async fn a_known_key_decides_and_then_the_measurements() {
     let (store, _folder) = open().await;
     let (given, other) = (batch("s", 0, Some("key")), batch("s", 50, Some("key")));
-    let insert = async |batch: &MeasurementBatch| store.insert_batch(batch, "b", at(0)).await.unwrap();
+    let insert = async |batch: &MeasurementBatch| store.batches().insert_batch(batch, "b", at(0)).await.unwrap();
     assert!(matches!(insert(&given).await, InsertBatch::Inserted { .. }));
-    assert_eq!(store.batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
+    assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
     assert_eq!(insert(&given).await, InsertBatch::Replayed("b".to_owned()));
     assert_eq!(insert(&batch("s", 0, None)).await, InsertBatch::Replayed("b".to_owned()));
     assert_eq!(insert(&other).await, InsertBatch::KeyConflict { batch_id: "b".to_owned() });
     let nowhere = MeasurementBatch { structure: StructureId::parse("nowhere").unwrap(), ..given };
-    assert!(matches!(store.insert_batch(&nowhere, "c", at(0)).await, Err(Error::UnknownStructure(_))));
+    assert!(matches!(store.batches().insert_batch(&nowhere, "c", at(0)).await, Err(Error::UnknownStructure(_))));
 }
 
 #[tokio::test]
@@ -219,26 +220,26 @@ async fn what_is_foreseen_of_a_batch_holds_only_when_it_is_on_the_disk() {
     let faults = crate::fault::Faults::arm();
     faults.set("store::commit", "1*return");
     let (foreseen, outcome) = tokio::sync::oneshot::channel();
-    let inserted = store.insert_batch_foreseen(&given, "b", at(0), foreseen).await;
+    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), foreseen).await;
     assert!(matches!(outcome.await, Ok(InsertBatch::Inserted { .. })), "it was told before the commit");
     assert!(inserted.is_err());
-    assert_eq!(store.batch(&bridge(), "b").await.unwrap(), None);
+    assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap(), None);
     faults.clear("store::commit");
     let (foreseen, outcome) = tokio::sync::oneshot::channel();
-    let inserted = store.insert_batch_foreseen(&given, "b", at(0), foreseen).await.unwrap();
+    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), foreseen).await.unwrap();
     assert_eq!(outcome.await.unwrap(), inserted);
-    assert_eq!(store.batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
+    assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
 }
 
 #[tokio::test]
 async fn a_comparison_under_an_earlier_baseline_does_not_keep_a_batch_from_the_next() {
     let (store, _folder) = open().await;
     for id in ["b0", "b1"] {
-        store.insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
+        store.batches().insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
     }
     let declare = async |model: &str| {
         let digest = Digest::of(&[model.as_bytes()]);
-        store.insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap()
+        store.reference().insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap()
     };
     assert_eq!(declare("old").await, 1);
     for (id, assessment) in [
@@ -246,10 +247,10 @@ async fn a_comparison_under_an_earlier_baseline_does_not_keep_a_batch_from_the_n
         ("b1", assessment("new", None, at(3))),
         ("b0", assessment("new", None, at(3))),
     ] {
-        store.insert_assessment(&bridge(), id, &assessment, Vec::new()).await.unwrap();
+        store.assessments().insert_assessment(&bridge(), id, &assessment, Vec::new()).await.unwrap();
     }
     assert_eq!(declare("new").await, 2);
-    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b1"]);
+    assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b1"]);
 }
 
 #[tokio::test]
@@ -258,19 +259,31 @@ async fn pages_of_exceedances_walk_the_current_ones_once_and_newest_first() {
     for i in 0..12 {
         let id = format!("b{i:02}");
         // Three batches at each time, so that pages end between equals.
-        store.insert_batch(&batch(&format!("s{i}"), i / 3, None), &id, at(0)).await.unwrap();
+        store.batches().insert_batch(&batch(&format!("s{i}"), i / 3, None), &id, at(0)).await.unwrap();
         if i == 0 {
-            store.insert_undamaged(&bridge(), &undamaged(), &Digest::of(&[b"m"]), &[id], at(1)).await.unwrap();
+            store
+                .reference()
+                .insert_undamaged(&bridge(), &undamaged(), &Digest::of(&[b"m"]), &[id], at(1))
+                .await
+                .unwrap();
         } else {
-            store.insert_assessment(&bridge(), &id, &assessment("m", Some(1), at(1)), Vec::new()).await.unwrap();
+            store
+                .assessments()
+                .insert_assessment(&bridge(), &id, &assessment("m", Some(1), at(1)), Vec::new())
+                .await
+                .unwrap();
         }
     }
-    store.insert_assessment(&bridge(), "b07", &assessment("later", None, at(9)), Vec::new()).await.unwrap();
+    store
+        .assessments()
+        .insert_assessment(&bridge(), "b07", &assessment("later", None, at(9)), Vec::new())
+        .await
+        .unwrap();
     for limit in 1..6 {
         let mut query = HistoryQuery { limit, from: Some(at(0)), to: Some(at(3)), ..HistoryQuery::default() };
         let mut walked = Vec::new();
         loop {
-            let page = store.exceedances(&bridge(), &query).await.unwrap();
+            let page = store.history().exceedances(&bridge(), &query).await.unwrap();
             let Some(last) = page.last() else { break };
             query.after = Some((last.measured_from, last.batch_id.clone()));
             query.after_quantity = Some(last.quantity.clone());

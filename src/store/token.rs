@@ -1,18 +1,20 @@
-//! Tokens, by what is kept of them.
+//! Access tokens. Of their secrets only digests are stored.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use sqlx::FromRow;
 
-use super::{bad_row, timestamp, Error, Store};
+use super::column::{bad_row, timestamp};
+use super::database::Database;
+use super::error::Error;
 use crate::access::{Scope, SecretDigest, TokenId, TokenRecord};
 use crate::quantity::{StructureId, Timestamp};
 
 const TOKEN: &str = "token";
 
 #[derive(FromRow)]
-#[expect(clippy::struct_excessive_bools, reason = "a row as it is stored")]
+#[expect(clippy::struct_excessive_bools, reason = "a row has the columns of its table")]
 struct TokenRow {
     token_id: String,
     name: String,
@@ -28,21 +30,29 @@ struct TokenRow {
     revoked_at_us: Option<i64>,
 }
 
-impl Store {
-    /// All tokens, revoked ones included.
+/// Access tokens.
+#[derive(Clone, Copy)]
+pub struct Tokens<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Tokens<'_> {
+    /// All tokens, including revoked ones.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn tokens(&self) -> Result<Vec<TokenRecord>, Error> {
+    pub async fn list(self) -> Result<Vec<TokenRecord>, Error> {
         let rows: Vec<TokenRow> = sqlx::query_as(
             "select token_id, name, ingest, read, admin, limited, digest, previous_digest, previous_until_us,
                     created_at_us, expires_at_us, revoked_at_us
              from api_token order by created_at_us, token_id",
         )
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let structures: Vec<(String, String)> =
-            sqlx::query_as("select token_id, structure_id from api_token_structure").fetch_all(&self.reader).await?;
+            sqlx::query_as("select token_id, structure_id from api_token_structure")
+                .fetch_all(&self.database.reader)
+                .await?;
         rows.into_iter().map(|row| record(row, &structures)).collect()
     }
 
@@ -50,59 +60,61 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn insert_token(&self, token: &TokenRecord) -> Result<(), Error> {
+    pub async fn insert_token(self, token: &TokenRecord) -> Result<(), Error> {
         let token = token.clone();
-        self.write(move |connection| {
-            Box::pin(async move {
-                sqlx::query("insert into api_token values (?, ?, ?, ?, ?, ?, ?, null, null, ?, ?, null)")
-                    .bind(token.id.as_str())
-                    .bind(&token.name)
-                    .bind(has(&token, Scope::Ingest))
-                    .bind(has(&token, Scope::Read))
-                    .bind(has(&token, Scope::Admin))
-                    .bind(token.structures.is_some())
-                    .bind(token.digest.as_bytes().as_slice())
-                    .bind(token.created_at.micros())
-                    .bind(token.expires_at.map(Timestamp::micros))
-                    .execute(&mut *connection)
-                    .await?;
-                for structure in token.structures.iter().flat_map(|ids| ids.iter()) {
-                    sqlx::query("insert into api_token_structure values (?, ?)")
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    sqlx::query("insert into api_token values ($1, $2, $3, $4, $5, $6, $7, null, null, $8, $9, null)")
                         .bind(token.id.as_str())
-                        .bind(structure.as_str())
-                        .execute(&mut *connection)
+                        .bind(&token.name)
+                        .bind(has(&token, Scope::Ingest))
+                        .bind(has(&token, Scope::Read))
+                        .bind(has(&token, Scope::Admin))
+                        .bind(token.structures.is_some())
+                        .bind(token.digest.as_bytes().as_slice())
+                        .bind(token.created_at.micros())
+                        .bind(token.expires_at.map(Timestamp::micros))
+                        .execute(transaction.connection())
                         .await?;
-                }
-                Ok(())
+                    for structure in token.structures.iter().flat_map(|ids| ids.iter()) {
+                        sqlx::query("insert into api_token_structure values ($1, $2)")
+                            .bind(token.id.as_str())
+                            .bind(structure.as_str())
+                            .execute(transaction.connection())
+                            .await?;
+                    }
+                    Ok(())
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Stores what rotation and revocation change of a token.
+    /// Stores the digests and the revocation of a token.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn update_token(&self, token: &TokenRecord) -> Result<(), Error> {
+    pub async fn update_token(self, token: &TokenRecord) -> Result<(), Error> {
         let token = token.clone();
-        self.write(move |connection| {
-            Box::pin(async move {
-                let previous = token.previous.as_ref();
-                sqlx::query(
-                    "update api_token set digest = ?, previous_digest = ?, previous_until_us = ?, revoked_at_us = ?
-                     where token_id = ?",
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let previous = token.previous.as_ref();
+                    sqlx::query(
+                    "update api_token set digest = $1, previous_digest = $2, previous_until_us = $3, revoked_at_us = $4
+                     where token_id = $5",
                 )
                 .bind(token.digest.as_bytes().as_slice())
                 .bind(previous.map(|(digest, _)| digest.as_bytes().to_vec()))
                 .bind(previous.map(|(_, until)| until.micros()))
                 .bind(token.revoked_at.map(Timestamp::micros))
                 .bind(token.id.as_str())
-                .execute(&mut *connection)
+                .execute(transaction.connection())
                 .await?;
-                Ok(())
+                    Ok(())
+                })
             })
-        })
-        .await
+            .await
     }
 }
 
@@ -112,7 +124,7 @@ fn has(token: &TokenRecord, scope: Scope) -> bool {
 
 fn record(row: TokenRow, structures: &[(String, String)]) -> Result<TokenRecord, Error> {
     let digest = |bytes: Vec<u8>| {
-        let bytes: [u8; 32] = bytes.try_into().map_err(|_| bad_row(TOKEN)(&"a digest of another length"))?;
+        let bytes: [u8; 32] = bytes.try_into().map_err(|_| bad_row(TOKEN)(&"a digest does not have 32 bytes"))?;
         Ok::<_, Error>(SecretDigest::from_stored(bytes))
     };
     let time = |micros: Option<i64>| micros.map(|micros| timestamp(TOKEN, micros)).transpose();

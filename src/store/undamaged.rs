@@ -1,192 +1,153 @@
-//! Undamaged states: versions that never change.
+//! Undamaged references. A stored version never changes.
 
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
 
+use serde::Serialize;
 use sqlx::FromRow;
 
 use super::assessment::CURRENT_FIRST;
-use super::{bad_row, from_blob, timestamp, to_blob, Error, Store};
+use super::column::{bad_row, from_blob, timestamp, to_blob};
+use super::database::Database;
+use super::error::Error;
+use super::transaction::Transaction;
 use crate::damage::{ChartReference, UndamagedQuantity, UndamagedState};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
-/// A stored undamaged state.
+/// A stored undamaged reference.
 #[derive(Debug, Clone, PartialEq)]
 pub struct UndamagedRecord {
-    /// The state.
+    /// The reference.
     pub state: UndamagedState,
-    /// Digest of the trained baseline whose samples it was taken from.
+    /// Digest of the trained baseline with which it was computed.
     pub model_digest: Digest,
-    /// When it was declared.
+    /// When it was stored.
     pub created_at: Timestamp,
-    /// Its batches.
+    /// Ids of its batches.
     pub batches: Vec<String>,
 }
 
-impl Store {
-    /// Stores an undamaged state under the next version, which is returned.
+/// The newest undamaged references that were read, by structure.
+pub(super) type Newest = Mutex<BTreeMap<StructureId, Arc<UndamagedRecord>>>;
+
+/// Undamaged references.
+#[derive(Clone, Copy)]
+pub struct References<'s> {
+    pub(super) database: &'s Database,
+    pub(super) newest: &'s Newest,
+}
+
+impl References<'_> {
+    /// Stores an undamaged reference under the next version, which is returned.
     ///
-    /// In the same transaction, batches outside it that were compared with none, or came after it, go back to be assessed.
+    /// In the same transaction, batches outside it that were compared with no reference, or came after it, are marked to be
+    /// assessed again.
     ///
     /// # Errors
     /// [`Error::UnknownBatch`], [`Error::Sqlite`].
     pub async fn insert_undamaged(
-        &self,
+        self,
         structure: &StructureId,
         state: &UndamagedState,
         model_digest: &Digest,
         batch_ids: &[String],
         now: Timestamp,
     ) -> Result<u32, Error> {
-        let (id, state) = (structure, state.clone());
-        let structure = structure.to_string();
-        let (digest, batches) = (model_digest.to_string(), batch_ids.to_vec());
-        let written = self.write(move |connection| {
+        let (id, state) = (structure.to_string(), state.clone());
+        let (digest, batches) = (model_digest.clone(), batch_ids.to_vec());
+        let written = self.database.write(move |transaction| {
             Box::pin(async move {
                 let (version,): (u32,) =
-                    sqlx::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = ?")
-                        .bind(&structure)
-                        .fetch_one(&mut *connection)
+                    sqlx::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = $1")
+                        .bind(&id)
+                        .fetch_one(transaction.connection())
                         .await?;
-                let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("undamaged state")(&e));
-                sqlx::query("insert into undamaged_state values (?, ?, ?, ?, ?, ?, ?, ?)")
-                    .bind(&structure)
-                    .bind(version)
-                    .bind(&digest)
-                    .bind(now.micros())
-                    .bind(state.threshold_probability)
-                    .bind(state.measurements as i64)
-                    .bind(json(serde_json::to_string(&state.conditions))?)
-                    .bind(json(serde_json::to_string(&state.doubts))?)
-                    .execute(&mut *connection)
-                    .await?;
-                for batch in &batches {
-                    let inserted = sqlx::query(
-                        "insert into undamaged_batch
-                         select structure_id, ?, batch_id from measurement_batch where structure_id = ? and batch_id = ?",
-                    )
-                    .bind(version)
-                    .bind(&structure)
-                    .bind(batch)
-                    .execute(&mut *connection)
-                    .await?;
-                    if inserted.rows_affected() == 0 {
-                        return Err(Error::UnknownBatch { structure, batch: batch.clone() });
-                    }
-                }
-                for (position, q) in state.quantities.iter().enumerate() {
-                    sqlx::query("insert into undamaged_quantity values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)")
-                        .bind(&structure)
-                        .bind(version)
-                        .bind(&q.name)
-                        .bind(position as i64)
-                        .bind(q.mean)
-                        .bind(q.std)
-                        .bind(q.threshold)
-                        .bind(json(serde_json::to_string(q))?)
-                        .bind(to_blob(q.mean_draws.iter().copied()))
-                        .bind(to_blob(q.std_draws.iter().copied()))
-                        .execute(&mut *connection)
-                        .await?;
-                }
-                // Alarms were set against the state before: what they say is asked anew.
+                insert_state(transaction, (&id, version), &state, &digest, now).await?;
+                insert_batches(transaction, (&id, version), &batches).await?;
+                insert_quantities(transaction, (&id, version), &state.quantities).await?;
+                // The open alarms refer to the earlier reference: the new charts raise them again where they persist.
                 sqlx::query(
-                    "update alarm_episode set ended_at_us = ? where structure_id = ? and kind = 'damage' and ended_at_us is null",
+                    "update alarm_episode set ended_at_us = $1
+                     where structure_id = $2 and kind = 'damage' and ended_at_us is null",
                 )
                 .bind(now.micros())
-                .bind(&structure)
-                .execute(&mut *connection)
+                .bind(&id)
+                .execute(transaction.connection())
                 .await?;
-                // Those that were never compared (the current assessment decides: one compared under an earlier baseline
-                // says nothing under this one), and all that came after the undamaged batches: the charts begin anew.
-                let requeue = format!(
-                    "update measurement_batch set state = 'received'
-                     where structure_id = ?1 and state = 'assessed'
-                       and batch_id not in (select batch_id from undamaged_batch where structure_id = ?1 and version = ?2)
-                       and (0 = (select undamaged_version from assessment a
-                               where a.structure_id = ?1 and a.batch_id = measurement_batch.batch_id
-                               order by {CURRENT_FIRST} limit 1)
-                           or measured_from_us > (select max(b.measured_to_us) from measurement_batch b
-                               join undamaged_batch u using (structure_id, batch_id)
-                               where u.structure_id = ?1 and u.version = ?2))"
-                );
-                sqlx::query(sqlx::AssertSqlSafe(requeue))
-                    .bind(&structure)
-                    .bind(version)
-                    .execute(&mut *connection)
-                    .await?;
+                requeue(transaction, (&id, version)).await?;
                 Ok(version)
             })
         });
         let version = written.await?;
-        // The next who asks is told of this one.
-        self.undamaged.lock().expect("no holder of this lock panics").remove(id);
+        // The next call of `undamaged_as_read` reads the new reference.
+        self.newest.lock().expect("no holder of this lock panics").remove(structure);
         Ok(version)
     }
 
-    /// The newest undamaged state of a structure. Read once: a version never changes.
+    /// The newest undamaged reference of a structure. Each version is read only once, because it never changes.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn undamaged(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+    pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
         fault_point!("store::read", |_| Err(bad_row("undamaged state")(&"a fault")));
         let (newest,): (Option<u32>,) =
-            sqlx::query_as("select max(version) from undamaged_state where structure_id = ?")
+            sqlx::query_as("select max(version) from undamaged_state where structure_id = $1")
                 .bind(structure.as_str())
-                .fetch_one(&self.reader)
+                .fetch_one(&self.database.reader)
                 .await?;
         let Some(newest) = newest else { return Ok(None) };
         if let Some(record) = self.known_undamaged(structure).filter(|record| record.state.version == newest) {
             return Ok(Some(record));
         }
         let Some(record) = self.read_undamaged(structure).await?.map(Arc::new) else { return Ok(None) };
-        let mut all = self.undamaged.lock().expect("no holder of this lock panics");
+        let mut all = self.newest.lock().expect("no holder of this lock panics");
         all.insert(structure.clone(), Arc::clone(&record));
         Ok(Some(record))
     }
 
-    /// As [`Self::undamaged`], but a state that was read already is not asked for again. It can be that another was declared since
-    /// by a transaction that has not returned: whoever stores what was made of this one is told
-    /// ([`super::StoredAssessment::newest_undamaged`]).
+    /// As [`Self::undamaged`], but without checking that a reference that was read earlier is still the newest. A transaction that
+    /// has not returned yet may have stored a newer one; storing an assessment reports this in
+    /// [`super::StoredAssessment::newest_undamaged`].
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn undamaged_as_read(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+    pub async fn undamaged_as_read(self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
         match self.known_undamaged(structure) {
             Some(record) => Ok(Some(record)),
             None => self.undamaged(structure).await,
         }
     }
 
-    fn known_undamaged(&self, structure: &StructureId) -> Option<Arc<UndamagedRecord>> {
-        self.undamaged.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
+    fn known_undamaged(self, structure: &StructureId) -> Option<Arc<UndamagedRecord>> {
+        self.newest.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
     }
 
-    async fn read_undamaged(&self, structure: &StructureId) -> Result<Option<UndamagedRecord>, Error> {
+    async fn read_undamaged(self, structure: &StructureId) -> Result<Option<UndamagedRecord>, Error> {
         let row: Option<(u32, String, i64, f64, i64, String, String)> = sqlx::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts
-             from undamaged_state where structure_id = ? order by version desc limit 1",
+             from undamaged_state where structure_id = $1 order by version desc limit 1",
         )
         .bind(structure.as_str())
-        .fetch_optional(&self.reader)
+        .fetch_optional(&self.database.reader)
         .await?;
         let Some((version, model_digest, created, threshold_probability, measurements, conditions, doubts)) = row
         else {
             return Ok(None);
         };
         let batches: Vec<(String,)> = sqlx::query_as(
-            "select batch_id from undamaged_batch where structure_id = ? and version = ? order by batch_id",
+            "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
         )
         .bind(structure.as_str())
         .bind(version)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
-        let quantities: Vec<QuantityRow> = sqlx::query_as(
+        let quantities: Vec<UndamagedQuantityRow> = sqlx::query_as(
             "select quantity, mean, std, threshold, detail, mean_draws, std_draws from undamaged_quantity
-             where structure_id = ? and version = ? order by position",
+             where structure_id = $1 and version = $2 order by position",
         )
         .bind(structure.as_str())
         .bind(version)
-        .fetch_all(&self.reader)
+        .fetch_all(&self.database.reader)
         .await?;
         let bad = bad_row("undamaged state");
         let quantity = |row| quantity(row, measurements as usize);
@@ -206,8 +167,101 @@ impl Store {
     }
 }
 
+/// Structure and version of a reference.
+type Key<'k> = (&'k str, u32);
+
+fn to_json<T: Serialize>(value: &T) -> Result<String, Error> {
+    serde_json::to_string(value).map_err(|e| bad_row("undamaged state")(&e))
+}
+
+async fn insert_state(
+    transaction: &mut Transaction<'_>,
+    (structure, version): Key<'_>,
+    state: &UndamagedState,
+    model_digest: &Digest,
+    now: Timestamp,
+) -> Result<(), Error> {
+    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8)")
+        .bind(structure)
+        .bind(version)
+        .bind(model_digest.as_str())
+        .bind(now.micros())
+        .bind(state.threshold_probability)
+        .bind(state.measurements as i64)
+        .bind(to_json(&state.conditions)?)
+        .bind(to_json(&state.doubts)?)
+        .execute(transaction.connection())
+        .await?;
+    Ok(())
+}
+
+async fn insert_batches(
+    transaction: &mut Transaction<'_>,
+    (structure, version): Key<'_>,
+    batches: &[String],
+) -> Result<(), Error> {
+    for batch in batches {
+        let inserted = sqlx::query(
+            "insert into undamaged_batch
+             select structure_id, $1, batch_id from measurement_batch where structure_id = $2 and batch_id = $3",
+        )
+        .bind(version)
+        .bind(structure)
+        .bind(batch)
+        .execute(transaction.connection())
+        .await?;
+        if inserted.rows_affected() == 0 {
+            return Err(Error::UnknownBatch { structure: structure.to_owned(), batch: batch.clone() });
+        }
+    }
+    Ok(())
+}
+
+async fn insert_quantities(
+    transaction: &mut Transaction<'_>,
+    (structure, version): Key<'_>,
+    quantities: &[UndamagedQuantity],
+) -> Result<(), Error> {
+    for (position, q) in quantities.iter().enumerate() {
+        sqlx::query("insert into undamaged_quantity values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
+            .bind(structure)
+            .bind(version)
+            .bind(&q.name)
+            .bind(position as i64)
+            .bind(q.mean)
+            .bind(q.std)
+            .bind(q.threshold)
+            .bind(to_json(q)?)
+            .bind(to_blob(q.mean_draws.iter().copied()))
+            .bind(to_blob(q.std_draws.iter().copied()))
+            .execute(transaction.connection())
+            .await?;
+    }
+    Ok(())
+}
+
+/// Marks batches to be assessed again: those that were never compared with a reference, and all that came after the batches of
+/// the new reference, because its charts begin there. The current assessment decides whether a batch was compared, since one
+/// with an earlier trained baseline is not comparable.
+async fn requeue(transaction: &mut Transaction<'_>, (structure, version): Key<'_>) -> Result<(), Error> {
+    let update = format!(
+        "update measurement_batch set state = 'received'
+         where structure_id = $1 and state = 'assessed'
+           and batch_id not in (select batch_id from undamaged_batch where structure_id = $1 and version = $2)
+           and (0 = (select undamaged_version from assessment a
+                   where a.structure_id = $1 and a.batch_id = measurement_batch.batch_id
+                   order by {CURRENT_FIRST} limit 1)
+               or measured_from_us > (select max(b.measured_to_us) from measurement_batch b
+                   join undamaged_batch u using (structure_id, batch_id)
+                   where u.structure_id = $1 and u.version = $2))"
+    );
+    let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version);
+    update.execute(transaction.connection()).await?;
+    Ok(())
+}
+
 #[derive(FromRow)]
-struct QuantityRow {
+struct UndamagedQuantityRow {
     quantity: String,
     mean: f64,
     std: f64,
@@ -217,10 +271,10 @@ struct QuantityRow {
     std_draws: Option<Vec<u8>>,
 }
 
-fn quantity(row: QuantityRow, measurements: usize) -> Result<UndamagedQuantity, Error> {
+fn quantity(row: UndamagedQuantityRow, measurements: usize) -> Result<UndamagedQuantity, Error> {
     let what = "undamaged quantity";
     let Some(detail) = row.detail else {
-        // From before populations: nothing is known of the uncertainty.
+        // References of versions without the population model have no uncertainty.
         let reference = ChartReference {
             mean: row.mean,
             std: row.std,

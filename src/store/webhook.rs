@@ -1,23 +1,25 @@
-//! Webhooks: who is told of alarms.
+//! Webhooks: receivers of messages about alarms.
 
 use std::fmt;
 
 use sqlx::FromRow;
 
-use super::{bad_row, timestamp, Error, Store};
+use super::column::{bad_row, timestamp};
+use super::database::Database;
+use super::error::Error;
 use crate::quantity::Timestamp;
 
-/// A signing secret; it shows itself only to those who ask for its text.
+/// A signing secret, which does not appear in debug output.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 
 impl Secret {
-    /// A secret of its text, `whsec_…`.
+    /// Makes a secret from its text, `whsec_…`.
     pub fn new(text: String) -> Self {
         Self(text)
     }
 
-    /// The text: for signing, and for the one answer that gives it out.
+    /// The text, for signing and for the response that returns it once.
     pub fn reveal(&self) -> &str {
         &self.0
     }
@@ -29,7 +31,7 @@ impl fmt::Debug for Secret {
     }
 }
 
-/// Which events a webhook wants; an empty list stands for all.
+/// Selects the events of a webhook. An empty list selects all.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct EventFilter {
     /// Kinds of events, such as `alarm.opened`.
@@ -45,17 +47,17 @@ pub struct EventFilter {
 pub struct WebhookRecord {
     /// Its id, a UUIDv7.
     pub id: String,
-    /// Where messages go.
+    /// Address of the receiver.
     pub url: String,
-    /// Signs messages.
+    /// Secret that signs messages.
     pub secret: Secret,
-    /// Signs them too, until a time.
+    /// Earlier secret that also signs messages, until a time.
     pub previous_secret: Option<(Secret, Timestamp)>,
-    /// What it wants.
+    /// Selected events.
     pub filter: EventFilter,
-    /// False: nothing is put into its outbox, nothing is sent.
+    /// If false, no messages are stored for it or sent.
     pub enabled: bool,
-    /// When it was made.
+    /// When it was created.
     pub created_at: Timestamp,
     /// When it was last changed.
     pub updated_at: Timestamp,
@@ -101,48 +103,55 @@ impl WebhookRow {
     }
 }
 
-/// A list as the triggers read it.
+/// A list in the JSON text that the triggers of the outbox read.
 fn json(list: &[String]) -> String {
     serde_json::to_string(list).expect("a list of texts is plain data")
 }
 
-impl Store {
-    /// Stores a new webhook, unless there are `most` already. Whether it was stored.
+/// Webhooks.
+#[derive(Clone, Copy)]
+pub struct Webhooks<'s> {
+    pub(super) database: &'s Database,
+}
+
+impl Webhooks<'_> {
+    /// Stores a new webhook unless there are `most` already. Returns whether it was stored.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn insert_webhook(&self, webhook: WebhookRecord, most: usize) -> Result<bool, Error> {
-        self.write(move |connection| {
-            Box::pin(async move {
-                let (found,): (i64,) =
-                    sqlx::query_as("select count(*) from webhook").fetch_one(&mut *connection).await?;
-                if found >= most as i64 {
-                    return Ok(false);
-                }
-                sqlx::query("insert into webhook values (?, ?, ?, null, null, ?, ?, ?, ?, ?, ?)")
-                    .bind(webhook.id)
-                    .bind(webhook.url)
-                    .bind(webhook.secret.0)
-                    .bind(json(&webhook.filter.events))
-                    .bind(json(&webhook.filter.alarm_kinds))
-                    .bind(json(&webhook.filter.structures))
-                    .bind(webhook.enabled)
-                    .bind(webhook.created_at.micros())
-                    .bind(webhook.updated_at.micros())
-                    .execute(&mut *connection)
-                    .await?;
-                Ok(true)
+    pub async fn insert_webhook(self, webhook: WebhookRecord, most: usize) -> Result<bool, Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let (found,): (i64,) =
+                        sqlx::query_as("select count(*) from webhook").fetch_one(transaction.connection()).await?;
+                    if found >= most as i64 {
+                        return Ok(false);
+                    }
+                    sqlx::query("insert into webhook values ($1, $2, $3, null, null, $4, $5, $6, $7, $8, $9)")
+                        .bind(webhook.id)
+                        .bind(webhook.url)
+                        .bind(webhook.secret.0)
+                        .bind(json(&webhook.filter.events))
+                        .bind(json(&webhook.filter.alarm_kinds))
+                        .bind(json(&webhook.filter.structures))
+                        .bind(webhook.enabled)
+                        .bind(webhook.created_at.micros())
+                        .bind(webhook.updated_at.micros())
+                        .execute(transaction.connection())
+                        .await?;
+                    Ok(true)
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Gives a webhook another address, filter or switch; its secrets stay. Whether there is such a webhook.
+    /// Changes address, filter and state of a webhook; its secrets do not change. Returns whether the webhook exists.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn update_webhook(
-        &self,
+        self,
         id: &str,
         url: &str,
         filter: EventFilter,
@@ -150,50 +159,51 @@ impl Store {
         now: Timestamp,
     ) -> Result<bool, Error> {
         let (id, url) = (id.to_owned(), url.to_owned());
-        self.write(move |connection| {
-            Box::pin(async move {
-                let updated = sqlx::query(
-                    "update webhook set url = ?, events = ?, alarm_kinds = ?, structures = ?, enabled = ?,
-                         updated_at_us = ? where webhook_id = ?",
-                )
-                .bind(url)
-                .bind(json(&filter.events))
-                .bind(json(&filter.alarm_kinds))
-                .bind(json(&filter.structures))
-                .bind(enabled)
-                .bind(now.micros())
-                .bind(id)
-                .execute(&mut *connection)
-                .await?;
-                Ok(updated.rows_affected() > 0)
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let updated = sqlx::query(
+                        "update webhook set url = $1, events = $2, alarm_kinds = $3, structures = $4, enabled = $5,
+                         updated_at_us = $6 where webhook_id = $7",
+                    )
+                    .bind(url)
+                    .bind(json(&filter.events))
+                    .bind(json(&filter.alarm_kinds))
+                    .bind(json(&filter.structures))
+                    .bind(enabled)
+                    .bind(now.micros())
+                    .bind(id)
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(updated.rows_affected() > 0)
+                })
             })
-        })
-        .await
+            .await
     }
 
-    /// Makes `secret` the one that signs; the one before signs too until `previous_until`. Whether there is such a webhook.
+    /// Makes `secret` the signing secret; the earlier one also signs until `previous_until`. Returns whether the webhook exists.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn rotate_secret(
-        &self,
+        self,
         id: &str,
         secret: Secret,
         previous_until: Timestamp,
         now: Timestamp,
     ) -> Result<bool, Error> {
         let id = id.to_owned();
-        self.write(move |connection| {
+        self.database.write(move |transaction| {
             Box::pin(async move {
                 let updated = sqlx::query(
-                    "update webhook set previous_secret = secret, previous_until_us = ?, secret = ?, updated_at_us = ?
-                     where webhook_id = ?",
+                    "update webhook set previous_secret = secret, previous_until_us = $1, secret = $2, updated_at_us = $3
+                     where webhook_id = $4",
                 )
                 .bind(previous_until.micros())
                 .bind(secret.0)
                 .bind(now.micros())
                 .bind(id)
-                .execute(&mut *connection)
+                .execute(transaction.connection())
                 .await?;
                 Ok(updated.rows_affected() > 0)
             })
@@ -201,28 +211,31 @@ impl Store {
         .await
     }
 
-    /// Removes a webhook with its outbox. Whether there was such a webhook.
+    /// Deletes a webhook with its messages. Returns whether it existed.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn delete_webhook(&self, id: &str) -> Result<bool, Error> {
+    pub async fn delete_webhook(self, id: &str) -> Result<bool, Error> {
         let id = id.to_owned();
-        self.write(move |connection| {
-            Box::pin(async move {
-                let deleted = sqlx::query("delete from webhook where webhook_id = ?");
-                Ok(deleted.bind(id).execute(&mut *connection).await?.rows_affected() > 0)
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let deleted = sqlx::query("delete from webhook where webhook_id = $1");
+                    Ok(deleted.bind(id).execute(transaction.connection()).await?.rows_affected() > 0)
+                })
             })
-        })
-        .await
+            .await
     }
 
     /// One webhook.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn webhook(&self, id: &str) -> Result<Option<WebhookRecord>, Error> {
-        let row: Option<WebhookRow> =
-            sqlx::query_as("select * from webhook where webhook_id = ?").bind(id).fetch_optional(&self.reader).await?;
+    pub async fn webhook(self, id: &str) -> Result<Option<WebhookRecord>, Error> {
+        let row: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = $1")
+            .bind(id)
+            .fetch_optional(&self.database.reader)
+            .await?;
         row.map(WebhookRow::into_record).transpose()
     }
 
@@ -230,9 +243,9 @@ impl Store {
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn webhooks(&self) -> Result<Vec<WebhookRecord>, Error> {
+    pub async fn list(self) -> Result<Vec<WebhookRecord>, Error> {
         let rows: Vec<WebhookRow> =
-            sqlx::query_as("select * from webhook order by webhook_id").fetch_all(&self.reader).await?;
+            sqlx::query_as("select * from webhook order by webhook_id").fetch_all(&self.database.reader).await?;
         rows.into_iter().map(WebhookRow::into_record).collect()
     }
 }

@@ -1,63 +1,66 @@
-//! The queue of writers: all that waits is written in one transaction, with one sync of the disk.
+//! The write queue: group commit of write tasks on the one connection that writes.
 //!
-//! While one transaction is synced, others queue; the next takes them all. Each piece of work has a savepoint, so that one that
-//! fails takes no other with it, and none is answered before the commit: what was acknowledged is on the disk.
+//! While one transaction is synced to disk, further tasks queue; the next transaction runs all of them. Each task has its own
+//! savepoint, so that a failed task does not roll back the others. No task is answered before the commit: what was acknowledged
+//! is on disk.
 
 use std::collections::VecDeque;
 use std::future::Future;
 use std::panic::AssertUnwindSafe;
 use std::pin::Pin;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use futures_util::FutureExt as _;
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{SqliteConnection, SqlitePool};
-use sqlx::{Connection as _, Sqlite, Transaction};
+use sqlx::{Connection as _, Sqlite};
 use tokio::sync::{oneshot, Notify};
 
-use super::{Error, OpenedFile};
+use super::error::Error;
+use super::file::OpenedFile;
+use super::transaction::Transaction;
 
-/// Most pieces of work of one transaction: the first of them waits for the last.
-const MOST_TOGETHER: usize = 64;
+/// Most tasks of one group commit: the first of them waits for the last.
+const GROUP_LIMIT: usize = 64;
 
-/// What runs inside a write transaction.
-pub(super) type Work<'c, T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send + 'c>>;
+/// The future of a write task.
+pub(super) type Work<'t, T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send + 't>>;
 
-/// A piece of work; what it returns is left where its caller finds it.
-type Piece = Box<dyn for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, ()> + Send>;
+/// A write task whose result is stored where its caller finds it.
+type Task = Box<dyn for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, ()> + Send>;
 
-/// A piece of work that waits for its turn.
-struct Waiting {
-    piece: Piece,
+/// A queued write task.
+struct Queued {
+    task: Task,
     caller: Caller,
 }
 
-/// Who waits for the end of a piece of work; dropped without an answer, it stands for a panic.
+/// Receives the outcome of a write task. If it is dropped without an outcome, the task panicked.
 type Caller = oneshot::Sender<Result<(), Error>>;
 
-/// What became of a piece of work inside a transaction that is still open.
-struct Done {
+/// A task that has run in a transaction that is not committed yet.
+struct Finished {
     caller: Caller,
     outcome: Result<(), Error>,
 }
 
 #[derive(Default)]
 struct Queue {
-    waiting: VecDeque<Waiting>,
-    /// Whether a task works the queue off: one for all, since one for each would queue for the connection itself.
-    worked_off: bool,
+    waiting: VecDeque<Queued>,
+    /// Whether a Tokio task is draining the queue. There is at most one, because several would compete for the connection.
+    draining: bool,
 }
 
-/// The one connection that writes, and what waits for it.
+/// The connection that writes, and its queue.
 pub(super) struct Writer {
-    /// Of one connection, which lives as long as the store.
+    /// A pool of one connection, which lives as long as the store.
     pub(super) pool: SqlitePool,
-    pub(super) file: OpenedFile,
-    /// Told after every transaction.
+    /// Notified after every transaction that wrote something.
     pub(super) written: Notify,
-    /// Writes that the disk refused since the store was opened.
+    /// Number of writes that failed because of the disk since the store was opened.
     pub(super) refused: AtomicU64,
+    file: OpenedFile,
     queue: Mutex<Queue>,
 }
 
@@ -66,44 +69,52 @@ impl Writer {
         Self { pool, file, written: Notify::new(), refused: AtomicU64::new(0), queue: Mutex::default() }
     }
 
-    /// Queues a piece of work, at once; the answer comes when it is on the disk. It is done whether or not the answer is
-    /// waited for, in the order in which it was queued.
+    /// Queues a write task immediately. The returned future resolves when the task is committed. The task runs in the order of
+    /// the calls, whether or not the future is awaited.
     pub(super) fn queue<T, F>(self: &Arc<Self>, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
     where
         T: Send + 'static,
-        F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, T> + Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
     {
-        let found = Arc::new(Mutex::new(None));
-        let place = Arc::clone(&found);
-        let piece = piece(move |connection| {
+        let result = Arc::new(Mutex::new(None));
+        let slot = Arc::clone(&result);
+        let task = boxed(move |transaction| {
             Box::pin(async move {
-                let value = work(connection).await?;
-                *place.lock().expect("no holder of this lock panics") = Some(value);
+                let value = work(transaction).await?;
+                *slot.lock().expect("no holder of this lock panics") = Some(value);
                 Ok(())
             })
         });
         let (caller, answer) = oneshot::channel();
         let idle = {
             let mut queue = self.lock();
-            queue.waiting.push_back(Waiting { piece, caller });
-            !std::mem::replace(&mut queue.worked_off, true)
+            queue.waiting.push_back(Queued { task, caller });
+            !std::mem::replace(&mut queue.draining, true)
         };
         if idle {
             let writer = Arc::clone(self);
-            // A task of its own, because axum drops handlers whose client is gone.
-            tokio::spawn(async move { writer.work_off().await });
+            // A separate Tokio task, because axum drops the futures of handlers whose client has disconnected.
+            tokio::spawn(async move { writer.drain().await });
         }
         let writer = Arc::clone(self);
         async move {
-            let result = match answer.await {
-                Ok(Ok(())) => found.lock().expect("no holder of this lock panics").take().ok_or(Error::Panicked),
+            let outcome = match answer.await {
+                Ok(Ok(())) => result.lock().expect("no holder of this lock panics").take().ok_or(Error::Panicked),
                 Ok(Err(error)) => Err(error),
                 Err(_) => Err(Error::Panicked),
             };
-            if let Err(error) = &result {
+            if let Err(error) = &outcome {
                 writer.count_failure(error);
             }
-            result
+            outcome
+        }
+    }
+
+    /// Counts a write that failed because of the disk.
+    pub(super) fn count_failure(&self, error: &Error) {
+        if let Some(cause) = error.disk_cause() {
+            metrics::counter!("modalwatch_write_failures_total", "cause" => cause).increment(1);
+            self.refused.fetch_add(1, Ordering::Relaxed);
         }
     }
 
@@ -111,103 +122,103 @@ impl Writer {
         self.queue.lock().expect("no holder of this lock panics")
     }
 
-    /// Does all that waits, and what comes meanwhile, until nothing waits any more.
-    async fn work_off(&self) {
+    /// Runs queued tasks, group by group, until the queue is empty.
+    async fn drain(&self) {
         loop {
             let connection = self.pool.acquire().await.map_err(Error::from);
-            // Now, not before: what came while the connection was waited for goes into the same transaction.
-            let together: Vec<Waiting> = {
+            // Taken after the connection, so that tasks that arrived in the meantime share the transaction.
+            let group: Vec<Queued> = {
                 let mut queue = self.lock();
                 if queue.waiting.is_empty() {
-                    queue.worked_off = false;
+                    queue.draining = false;
                     return;
                 }
-                let count = queue.waiting.len().min(MOST_TOGETHER);
+                let count = queue.waiting.len().min(GROUP_LIMIT);
                 queue.waiting.drain(..count).collect()
             };
             match connection {
-                // A panic drops the callers, who take it for one; those behind them still have their turn.
-                Ok(connection) => drop(AssertUnwindSafe(self.write(connection, together)).catch_unwind().await),
+                // A panic here drops the callers of the group, who report it; later groups still run.
+                Ok(connection) => drop(AssertUnwindSafe(self.write(connection, group)).catch_unwind().await),
                 Err(error) => {
-                    for waiting in together {
-                        answer(waiting.caller, Err(error.again()));
+                    for queued in group {
+                        answer(queued.caller, Err(error.copy()));
                     }
                 }
             }
         }
     }
 
-    /// Writes in one transaction and answers all callers.
-    async fn write(&self, mut connection: PoolConnection<Sqlite>, together: Vec<Waiting>) {
-        let mut done = Vec::with_capacity(together.len());
-        let ended = in_transaction(&mut connection, together, &mut done).await;
-        if ended.is_ok() && done.iter().any(|done| done.outcome.is_ok()) {
+    /// Runs a group of tasks in one transaction and answers their callers.
+    async fn write(&self, mut connection: PoolConnection<Sqlite>, group: Vec<Queued>) {
+        let mut finished = Vec::with_capacity(group.len());
+        let ended = run_group(&mut connection, group, &mut finished).await;
+        if ended.is_ok() && finished.iter().any(|task| task.outcome.is_ok()) {
             self.written.notify_one();
         }
         let spoilt = |error: &Error| error.spoils_the_connection();
-        if ended.as_ref().is_err_and(spoilt) || done.iter().any(|done| done.outcome.as_ref().is_err_and(spoilt)) {
-            // SQLite ends a transaction by itself when the disk fails. sqlx still counts it as open and would refuse the
-            // next one for ever; and a handle that failed once is best not trusted. The pool makes a new one.
+        if ended.as_ref().is_err_and(spoilt) || finished.iter().any(|task| task.outcome.as_ref().is_err_and(spoilt)) {
+            // SQLite rolls a transaction back by itself when the disk fails. sqlx would still count it as open and refuse every
+            // later one, so the connection is closed and the pool opens a new one.
             let _ = connection.detach().close_hard().await;
         }
         let ended = ended.and_then(|()| self.file.check());
-        for Done { caller, outcome } in done {
-            // What failed by itself has its own reason; all others share that of the transaction.
-            let outcome = outcome.and_then(|()| ended.as_ref().copied().map_err(Error::again));
+        for Finished { caller, outcome } in finished {
+            // A failed task reports its own error; all others report the outcome of the transaction.
+            let outcome = outcome.and_then(|()| ended.as_ref().copied().map_err(Error::copy));
             answer(caller, outcome);
         }
     }
 }
 
 fn answer(caller: Caller, outcome: Result<(), Error>) {
-    // An error means that nobody waits any more.
+    // Sending fails if the caller no longer waits.
     let _ = caller.send(outcome);
 }
 
-/// Lets the compiler see that a closure takes a connection of any lifetime.
-fn piece<F>(work: F) -> Piece
+/// Lets the compiler infer that a closure takes a transaction of any lifetime.
+fn boxed<F>(task: F) -> Task
 where
-    F: for<'c> FnOnce(&'c mut SqliteConnection) -> Work<'c, ()> + Send + 'static,
+    F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, ()> + Send + 'static,
 {
-    Box::new(work)
+    Box::new(task)
 }
 
-/// Does pieces of work one after another in one immediate transaction and commits what did not fail.
+/// Runs tasks one after another in one immediate transaction and commits those that did not fail.
 ///
-/// Immediate, because a transaction that begins with a read and then writes is refused at once when another writes, whatever
-/// the busy timeout.
-async fn in_transaction(
+/// Immediate, because SQLite refuses at once, without waiting for the busy timeout, to upgrade a transaction that began with a
+/// read while another connection writes.
+async fn run_group(
     connection: &mut SqliteConnection,
-    together: Vec<Waiting>,
-    done: &mut Vec<Done>,
+    group: Vec<Queued>,
+    finished: &mut Vec<Finished>,
 ) -> Result<(), Error> {
     let mut transaction = match begin(connection).await {
         Ok(transaction) => transaction,
         Err(error) => {
-            done.extend(together.into_iter().map(|waiting| Done { caller: waiting.caller, outcome: Ok(()) }));
+            finished.extend(group.into_iter().map(|queued| Finished { caller: queued.caller, outcome: Ok(()) }));
             return Err(error);
         }
     };
-    let alone = together.len() == 1;
+    let alone = group.len() == 1;
     let (mut savepoint, mut lost) = (FIRST_SAVEPOINT, None);
-    for Waiting { piece, caller, .. } in together {
+    for Queued { task, caller } in group {
         let outcome = match lost {
             Some(_) => Ok(()),
-            None if alone => caught(piece, &mut transaction).await,
-            None => one(&mut transaction, piece, savepoint).await.unwrap_or_else(|error| {
+            None if alone => run(task, &mut transaction).await,
+            None => run_in_savepoint(task, &mut transaction, savepoint).await.unwrap_or_else(|error| {
                 lost = Some(error);
                 Ok(())
             }),
         };
         savepoint = NEXT_SAVEPOINT;
-        done.push(Done { caller, outcome });
+        finished.push(Finished { caller, outcome });
     }
     if let Some(error) = lost {
         // SQLite may have rolled it back already.
         let _ = transaction.rollback().await;
         return Err(error);
     }
-    if done.iter().all(|done| done.outcome.is_err()) {
+    if finished.iter().all(|task| task.outcome.is_err()) {
         return Ok(transaction.rollback().await?);
     }
     fault_point!("store::commit", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
@@ -216,34 +227,36 @@ async fn in_transaction(
     Ok(())
 }
 
-async fn begin(connection: &mut SqliteConnection) -> Result<Transaction<'_, Sqlite>, Error> {
+async fn begin(connection: &mut SqliteConnection) -> Result<sqlx::Transaction<'_, Sqlite>, Error> {
     fault_point!("store::begin", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     Ok(connection.begin_with("begin immediate").await?)
 }
 
-/// Statements that set the savepoint of a piece: of the first, and of one behind another. A commit ends the last.
-const FIRST_SAVEPOINT: &str = "savepoint piece";
-const NEXT_SAVEPOINT: &str = "release piece; savepoint piece";
+/// Statements that set the savepoint of the first task, and of each later one. The commit releases the last savepoint.
+const FIRST_SAVEPOINT: &str = "savepoint task";
+const NEXT_SAVEPOINT: &str = "release task; savepoint task";
 
-/// Does one piece of work behind a savepoint. The inner result is that of the work; the outer one is an error when the whole
-/// transaction is lost.
-async fn one(
-    transaction: &mut Transaction<'_, Sqlite>,
-    piece: Piece,
+/// Runs a task behind a savepoint. The inner result is that of the task; the outer one is an error when the whole transaction
+/// is lost.
+async fn run_in_savepoint(
+    task: Task,
+    connection: &mut SqliteConnection,
     savepoint: &'static str,
 ) -> Result<Result<(), Error>, Error> {
-    sqlx::query(savepoint).execute(&mut **transaction).await?;
-    let Err(error) = caught(piece, transaction).await else { return Ok(Ok(())) };
-    match sqlx::query("rollback to piece").execute(&mut **transaction).await {
+    sqlx::query(savepoint).execute(&mut *connection).await?;
+    let Err(error) = run(task, connection).await else { return Ok(Ok(())) };
+    match sqlx::query("rollback to task").execute(&mut *connection).await {
         Ok(_) => Ok(Err(error)),
-        // SQLite has rolled back everything, or nobody knows what it did.
+        // SQLite has rolled back everything, or its state is unknown.
         Err(failed) if error.disk_cause().is_none() => Err(failed.into()),
         Err(_) => Err(error),
     }
 }
 
-async fn caught(piece: Piece, connection: &mut SqliteConnection) -> Result<(), Error> {
-    AssertUnwindSafe(piece(connection)).catch_unwind().await.unwrap_or(Err(Error::Panicked))
+/// Runs a task and turns a panic into an error.
+async fn run(task: Task, connection: &mut SqliteConnection) -> Result<(), Error> {
+    let mut transaction = Transaction::of(connection);
+    AssertUnwindSafe(task(&mut transaction)).catch_unwind().await.unwrap_or(Err(Error::Panicked))
 }
 
 #[cfg(test)]
@@ -251,7 +264,7 @@ mod tests {
     use futures_util::future::join_all;
 
     use super::super::{Error, Store};
-    use super::MOST_TOGETHER;
+    use super::GROUP_LIMIT;
     use crate::fault::Faults;
     use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -260,16 +273,16 @@ mod tests {
         (Store::open(folder.path()).await.unwrap(), folder)
     }
 
-    /// Writes a structure, and then does what `number` says: every fourth fails, every fifth panics.
+    /// Writes a structure; every fourth task then fails and every fifth panics.
     async fn put(store: &Store, number: usize) -> Result<usize, Error> {
-        let work = store.write(move |connection| {
+        let work = store.database.write(move |transaction| {
             Box::pin(async move {
-                let insert = sqlx::query("insert into structure values (?, '{}', 'digest', 0, 0)");
-                insert.bind(format!("s{number:03}")).execute(&mut *connection).await?;
+                let insert = sqlx::query("insert into structure values ($1, '{}', 'digest', 0, 0)");
+                insert.bind(format!("s{number:03}")).execute(transaction.connection()).await?;
                 if number.is_multiple_of(4) {
                     return Err(Error::UnknownStructure(format!("s{number:03}")));
                 }
-                assert!(!number.is_multiple_of(5), "a piece of work panics");
+                assert!(!number.is_multiple_of(5), "a write task panics");
                 Ok(number)
             })
         });
@@ -277,17 +290,17 @@ mod tests {
     }
 
     async fn stored(store: &Store) -> Vec<String> {
-        store.structures().await.unwrap().into_iter().map(|summary| summary.id.to_string()).collect()
+        store.structures().list().await.unwrap().into_iter().map(|summary| summary.id.to_string()).collect()
     }
 
     #[tokio::test]
-    async fn a_piece_that_fails_or_panics_takes_no_other_with_it() {
+    async fn a_task_that_fails_or_panics_rolls_back_no_other() {
         let (store, _folder) = open().await;
-        // All are queued before the first gets its turn.
+        // All are queued before the first one runs.
         let outcomes = join_all((0..100).map(|number| put(&store, number))).await;
         for (number, outcome) in outcomes.into_iter().enumerate() {
             match outcome {
-                Ok(said) => assert!(said == number && !number.is_multiple_of(4) && !number.is_multiple_of(5)),
+                Ok(value) => assert!(value == number && !number.is_multiple_of(4) && !number.is_multiple_of(5)),
                 Err(Error::UnknownStructure(_)) => assert!(number.is_multiple_of(4)),
                 Err(Error::Panicked) => assert!(number.is_multiple_of(5)),
                 Err(other) => panic!("{number}: {other}"),
@@ -298,35 +311,35 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_waits_shares_a_commit_and_is_answered_by_it() {
+    async fn waiting_tasks_share_a_commit_and_are_answered_by_it() {
         let (store, _folder) = open().await;
         let faults = Faults::arm();
         let odd = |count: usize| (0..count).map(|i| 20 * i + 1);
-        // One commit fails: all who shared it are told, and none of it is there.
+        // One commit fails: all tasks of the group fail, and nothing of them is stored.
         faults.set("store::commit", "1*return");
-        let outcomes = join_all(odd(MOST_TOGETHER + 3).map(|number| put(&store, number))).await;
+        let outcomes = join_all(odd(GROUP_LIMIT + 3).map(|number| put(&store, number))).await;
         faults.clear("store::commit");
         let failed = outcomes.iter().filter(|outcome| outcome.is_err()).count();
-        assert_eq!(failed, MOST_TOGETHER, "those behind them have another transaction");
+        assert_eq!(failed, GROUP_LIMIT, "later tasks have another transaction");
         assert_eq!(stored(&store).await.len(), 3);
-        // Lost behind the commit, the answer is an error, and all of it is there.
+        // A failure after the commit: the tasks report an error, although they are stored.
         faults.set("store::committed", "1*return");
-        let outcomes = join_all(odd(MOST_TOGETHER).map(|number| put(&store, number))).await;
+        let outcomes = join_all(odd(GROUP_LIMIT).map(|number| put(&store, number))).await;
         assert!(outcomes.iter().all(Result::is_err));
-        assert_eq!(stored(&store).await.len(), MOST_TOGETHER + 3);
+        assert_eq!(stored(&store).await.len(), GROUP_LIMIT + 3);
     }
 
     #[tokio::test]
-    async fn works_are_done_in_the_order_of_the_calls_whoever_waits_first() {
+    async fn tasks_run_in_the_order_of_the_calls_whichever_is_awaited_first() {
         let (store, _folder) = open().await;
         let id = |number: usize| StructureId::parse(&format!("s{number}")).unwrap();
         let put = |definition: &'static str| {
             let store = store.clone();
-            store.write(move |connection| {
+            store.database.write(move |transaction| {
                 Box::pin(async move {
-                    let insert = "insert into structure values ('s', ?1, 'digest', 0, 0)
-                                  on conflict do update set definition = definition || ?1";
-                    sqlx::query(insert).bind(definition).execute(&mut *connection).await?;
+                    let insert = "insert into structure values ('s', $1, 'digest', 0, 0)
+                                  on conflict do update set definition = definition || $1";
+                    sqlx::query(insert).bind(definition).execute(transaction.connection()).await?;
                     Ok(())
                 })
             })
@@ -335,14 +348,14 @@ mod tests {
         third.await.unwrap();
         first.await.unwrap();
         second.await.unwrap();
-        let record = store.structure(&StructureId::parse("s").unwrap()).await.unwrap().unwrap();
+        let record = store.structures().structure(&StructureId::parse("s").unwrap()).await.unwrap().unwrap();
         assert_eq!(record.definition_json, "abc");
-        // A caller who goes away leaves the work to be done.
+        // A task runs also when its caller no longer waits.
         let digest = Digest::of(&[b"v1"]);
         let (gone, stays) = (id(1), id(2));
-        let dropped = store.put_structure(&gone, "{}", &digest, Timestamp::now());
+        let dropped = store.structures().put_structure(&gone, "{}", &digest, Timestamp::now());
         let _ = tokio::time::timeout(std::time::Duration::ZERO, dropped).await;
-        store.put_structure(&stays, "{}", &digest, Timestamp::now()).await.unwrap();
+        store.structures().put_structure(&stays, "{}", &digest, Timestamp::now()).await.unwrap();
         assert_eq!(stored(&store).await, ["s", "s1", "s2"]);
     }
 }

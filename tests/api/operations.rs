@@ -194,8 +194,8 @@ async fn a_database_that_is_not_ours_or_cannot_be_written_is_refused_and_left_as
         assert_eq!(std::fs::read(folder.path().join("modalwatch.sqlite")).unwrap(), bytes);
         text
     };
-    assert!(with_file(b"just some text, longer than a header").contains("is no SQLite database"));
-    assert!(with_file(b"short").contains("is no SQLite database"));
+    assert!(with_file(b"just some text, longer than a header").contains("is not a SQLite database"));
+    assert!(with_file(b"short").contains("is not a SQLite database"));
 
     let foreign = tempfile::tempdir().unwrap();
     let path = foreign.path().join("other.sqlite");

@@ -62,7 +62,7 @@ async fn read_all(folder: &Path, acknowledged: &Acknowledged) -> Outcome {
     };
     let mut outcome = Outcome::Intact;
     let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
-    match store.history(&structure, &query).await {
+    match store.history().page(&structure, &query).await {
         Err(_) => outcome = Outcome::RowRefused,
         Ok(items) => {
             let found: Vec<&String> = items.iter().map(|item| &item.batch_id).collect();
@@ -72,21 +72,21 @@ async fn read_all(folder: &Path, acknowledged: &Acknowledged) -> Outcome {
         }
     }
     for (id, digest) in &acknowledged.0 {
-        match store.batch(&structure, id).await {
+        match store.batches().batch(&structure, id).await {
             Err(_) => outcome = outcome.max_of(Outcome::RowRefused),
             Ok(Some(record)) if record.content_digest.as_str() == digest => {}
             Ok(_) => outcome = Outcome::Wrong(format!("batch {id} is missing or another")),
         }
         // Results may be refused; what they are is recomputed from the measurements.
-        let _ = store.assessment(&structure, id).await;
-        let _ = store.chart_points(&structure, id).await;
+        let _ = store.assessments().assessment(&structure, id).await;
+        let _ = store.alarms().chart_points(&structure, id).await;
     }
-    let _ = store.episodes(&structure, None, false, 100).await;
-    let _ = store.charts(&structure, 100).await;
-    let _ = store.undamaged(&structure).await;
-    let _ = store.structures().await;
-    let _ = store.pending(&structure, 100).await;
-    let _ = store.exceedances(&structure, &query).await;
+    let _ = store.alarms().episodes(&structure, None, false, 100).await;
+    let _ = store.alarms().charts(&structure, 100).await;
+    let _ = store.reference().undamaged(&structure).await;
+    let _ = store.structures().list().await;
+    let _ = store.batches().pending(&structure, 100).await;
+    let _ = store.history().exceedances(&structure, &query).await;
     store.close().await;
     outcome
 }

@@ -145,7 +145,7 @@ pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
     let store = Store::open(data_dir).await.unwrap();
     for (structure, id, ..) in &rows {
         let structure = StructureId::parse(structure).unwrap();
-        store.batch(&structure, id).await.unwrap().expect("a listed batch is there");
+        store.batches().batch(&structure, id).await.unwrap().expect("a listed batch is there");
     }
     store.close().await;
     let of_monitored = || rows.iter().filter(|(structure, ..)| structure == STRUCTURE);

@@ -161,7 +161,7 @@ covariate = [{ name = "temperature_c" }]
 "#;
 
 /// What a job says that a kill ended.
-const STOPPED: &str = "stopped while it ran";
+const STOPPED: &str = "stopped while it was running";
 
 const SOFT_BATCHES: usize = 30;
 

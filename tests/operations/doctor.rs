@@ -82,7 +82,7 @@ async fn each_defect_is_found_and_ends_with_status_1() {
 
     let other = tempfile::tempdir().unwrap();
     std::fs::write(other.path().join("modalwatch.sqlite"), "just some text, longer than a header").unwrap();
-    finds(&["--data-dir", text(other.path())], &[], "database", "is no SQLite database").await;
+    finds(&["--data-dir", text(other.path())], &[], "database", "is not a SQLite database").await;
     let file = folder.path().join("modalwatch.sqlite");
     let mut bytes = std::fs::read(&file).unwrap();
     // A page in the middle.

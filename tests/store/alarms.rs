@@ -3,7 +3,9 @@
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
 use modalwatch::assessment::NewChartPoint;
-use modalwatch::store::{Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord};
+use modalwatch::store::{
+    Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord,
+};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
 
@@ -11,7 +13,7 @@ use super::{assessment, at, batch, bridge, open, undamaged};
 async fn chart(store: &Store, id: &str, time: i64, shift: f64) {
     let given = batch(id, time, 1);
     let measured = given.time_span();
-    store.insert_batch(&given, id, at(time)).await.unwrap();
+    store.batches().insert_batch(&given, id, at(time)).await.unwrap();
     assess(store, id, measured, shift).await;
 }
 
@@ -25,23 +27,27 @@ async fn assess(
     let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, held: false };
     let series = "k1".to_owned();
     let point = NewChartPoint { series, undamaged_version: 1, point, probability_limit: Some(0.3), settings };
-    store.insert_assessment(&bridge(), id, &assessment("m", Some(1), measured.1), vec![point]).await.unwrap();
+    store
+        .assessments()
+        .insert_assessment(&bridge(), id, &assessment("m", Some(1), measured.1), vec![point])
+        .await
+        .unwrap();
 }
 
 async fn opened() -> (Store, tempfile::TempDir) {
     let (store, folder) = open().await;
-    store.insert_batch(&batch("first", -5_000, 1), "b0", at(0)).await.unwrap();
+    store.batches().insert_batch(&batch("first", -5_000, 1), "b0", at(0)).await.unwrap();
     let model = modalwatch::quantity::Digest::of(&[b"m"]);
-    store.insert_undamaged(&bridge(), &undamaged(), &model, &["b0".to_owned()], at(0)).await.unwrap();
+    store.reference().insert_undamaged(&bridge(), &undamaged(), &model, &["b0".to_owned()], at(0)).await.unwrap();
     (store, folder)
 }
 
 async fn episodes(store: &Store) -> Vec<Episode> {
-    store.episodes(&bridge(), None, false, 100).await.unwrap()
+    store.alarms().episodes(&bridge(), None, false, 100).await.unwrap()
 }
 
 async fn states(store: &Store) -> Vec<String> {
-    store.charts(&bridge(), 100).await.unwrap().into_iter().map(|p| p.state).collect()
+    store.alarms().charts(&bridge(), 100).await.unwrap().into_iter().map(|p| p.state).collect()
 }
 
 #[tokio::test]
@@ -77,14 +83,18 @@ async fn a_batch_that_comes_late_moves_the_alarm_and_keeps_who_has_seen_it() {
     chart(&store, "b3", 3_000, 0.0).await;
     chart(&store, "b5", 5_000, 4.0).await;
     let seen = Acknowledgement { at: at(6_000), by: "night shift".to_owned(), note: None };
-    store.acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
+    store.alarms().acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
     let second = Acknowledgement { by: "somebody else".to_owned(), ..seen.clone() };
-    assert_eq!(store.acknowledge(&bridge(), 1, second).await.unwrap().unwrap().acknowledgement, Some(seen.clone()));
+    assert_eq!(
+        store.alarms().acknowledge(&bridge(), 1, second).await.unwrap().unwrap().acknowledgement,
+        Some(seen.clone())
+    );
     chart(&store, "b4", 4_000, 4.5).await;
     let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
     assert_eq!((episode.opened_batch.as_deref(), episode.acknowledgement.clone()), (Some("b4"), Some(seen)));
     assert_eq!(states(&store).await, ["normal", "alarming", "alarming"]);
     assert!(store
+        .alarms()
         .acknowledge(&bridge(), 9, Acknowledgement { at: at(1), by: "x".into(), note: None })
         .await
         .unwrap()
@@ -99,7 +109,7 @@ async fn an_alarm_that_a_corrected_batch_takes_back_is_withdrawn() {
     assess(&store, "b1", batch("b1", 1_000, 1).time_span(), 1.0).await;
     assert!(episodes(&store).await[0].withdrawn);
     assert_eq!(states(&store).await, ["normal", "normal"]);
-    assert!(store.episodes(&bridge(), None, true, 10).await.unwrap().is_empty());
+    assert!(store.alarms().episodes(&bridge(), None, true, 10).await.unwrap().is_empty());
 }
 
 #[tokio::test]
@@ -134,39 +144,39 @@ async fn order_of_arrival_does_not_matter() {
 async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_state_begins_anew() {
     let (store, _folder) = opened().await;
     let window = MaintenanceWindow { from: at(1_500), to: at(2_500), reason: "bolts".to_owned() };
-    store.insert_maintenance(&bridge(), window.clone(), at(0)).await.unwrap();
-    assert_eq!(store.maintenance(&bridge()).await.unwrap(), [window]);
+    store.alarms().insert_maintenance(&bridge(), window.clone(), at(0)).await.unwrap();
+    assert_eq!(store.alarms().maintenance(&bridge()).await.unwrap(), [window]);
     chart(&store, "b1", 1_000, 0.0).await;
     chart(&store, "b2", 2_000, 9.0).await;
     assert!(episodes(&store).await.is_empty());
     chart(&store, "b3", 3_000, 9.0).await;
     assert_eq!(episodes(&store).await.len(), 1);
     let model = modalwatch::quantity::Digest::of(&[b"m"]);
-    store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".to_owned()], at(4_000)).await.unwrap();
+    store.reference().insert_undamaged(&bridge(), &undamaged(), &model, &["b1".to_owned()], at(4_000)).await.unwrap();
     assert_eq!(episodes(&store).await[0].ended_at, Some(at(4_000)));
     assert_eq!(
-        store.pending(&bridge(), 9).await.unwrap(),
+        store.batches().pending(&bridge(), 9).await.unwrap(),
         ["b0", "b2", "b3"],
         "b0 was never compared, and all after the undamaged batch come again"
     );
     // Computed before the new state, stored after it: it must not raise what has ended.
     assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 8.0).await;
-    assert_eq!(store.episodes(&bridge(), None, true, 10).await.unwrap(), []);
+    assert_eq!(store.alarms().episodes(&bridge(), None, true, 10).await.unwrap(), []);
 }
 
 #[tokio::test]
 async fn silence_is_one_alarm_until_something_comes() {
     let (store, _folder) = opened().await;
-    assert!(store.set_silent(&bridge(), Some(at(10)), at(99)).await.unwrap());
-    assert!(!store.set_silent(&bridge(), Some(at(10)), at(100)).await.unwrap());
-    assert!(store.set_silent(&bridge(), None, at(120)).await.unwrap());
+    assert!(store.alarms().set_silent(&bridge(), Some(at(10)), at(99)).await.unwrap());
+    assert!(!store.alarms().set_silent(&bridge(), Some(at(10)), at(100)).await.unwrap());
+    assert!(store.alarms().set_silent(&bridge(), None, at(120)).await.unwrap());
     let [episode] = &episodes(&store).await[..] else { panic!("one episode") };
     assert_eq!((episode.kind.as_str(), episode.opened_at, episode.ended_at), ("silence", at(10), Some(at(120))));
 }
 
 /// What the outbox has for a webhook that wants everything, oldest first.
 async fn told(store: &Store) -> Vec<String> {
-    let mut found = store.deliveries("hook", None, None, 100).await.unwrap();
+    let mut found = store.outbox().deliveries("hook", None, None, 100).await.unwrap();
     found.reverse();
     found.into_iter().map(|d| format!("{} {}", d.event.kind, d.event.alarm)).collect()
 }
@@ -183,8 +193,8 @@ async fn opened_with_a_webhook() -> (Store, tempfile::TempDir) {
         created_at: at(0),
         updated_at: at(0),
     };
-    assert!(store.insert_webhook(webhook.clone(), 1).await.unwrap());
-    assert!(!store.insert_webhook(WebhookRecord { id: "second".to_owned(), ..webhook }, 1).await.unwrap());
+    assert!(store.webhooks().insert_webhook(webhook.clone(), 1).await.unwrap());
+    assert!(!store.webhooks().insert_webhook(WebhookRecord { id: "second".to_owned(), ..webhook }, 1).await.unwrap());
     (store, folder)
 }
 
@@ -203,7 +213,7 @@ async fn each_change_of_an_alarm_is_told_once_and_writing_it_again_is_no_change(
     assert_eq!(told(&store).await, ["alarm.opened 1"]);
     let seen = Acknowledgement { at: at(6_000), by: "night shift".to_owned(), note: None };
     for _ in 0..2 {
-        store.acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
+        store.alarms().acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
     }
     chart(&store, "b5", 5_000, 0.0).await;
     chart(&store, "b6", 6_000, 0.0).await;
@@ -215,7 +225,7 @@ async fn each_change_of_an_alarm_is_told_once_and_writing_it_again_is_no_change(
     // A corrected batch shows that it lasts, another that it has ended all the same.
     assess(&store, "b6", batch("b6", 6_000, 1).time_span(), 7.0).await;
     assert_eq!(told(&store).await[3..], ["alarm.reopened 1"]);
-    let facts = store.deliveries("hook", None, None, 1).await.unwrap().remove(0).event.facts;
+    let facts = store.outbox().deliveries("hook", None, None, 1).await.unwrap().remove(0).event.facts;
     assert!(facts.contains("\"ended_at_us\":null") && facts.contains("\"peak_shift\":7.0"), "{facts}");
 }
 
@@ -231,14 +241,14 @@ async fn an_alarm_that_was_none_is_withdrawn_and_one_found_in_the_past_is_told_w
     }
     chart(&store, "late", 9_500, 8.0).await;
     assert_eq!(told(&store).await[2..], ["alarm.opened 2", "alarm.ended 2"]);
-    assert_eq!(store.prune_outbox(at(1_000_000_000)).await.unwrap(), 0, "what waits is not forgotten");
+    assert_eq!(store.outbox().prune_outbox(at(1_000_000_000)).await.unwrap(), 0, "what waits is not forgotten");
 }
 
 #[tokio::test]
 async fn silence_is_told_when_it_begins_and_when_it_ends() {
     let (store, _folder) = opened_with_a_webhook().await;
     for since in [Some(at(5)), Some(at(5)), None, None] {
-        store.set_silent(&bridge(), since, at(100)).await.unwrap();
+        store.alarms().set_silent(&bridge(), since, at(100)).await.unwrap();
     }
     assert_eq!(told(&store).await, ["alarm.opened 1", "alarm.ended 1"]);
 }

@@ -10,13 +10,13 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
     let (store, _folder) = open().await;
     let digest = Digest::of(&[b"v1"]);
     for (id, time) in [("d1", 10), ("d2", 20), ("d3", 30)] {
-        store.insert_diagnosis(id, &bridge(), &digest, "{}", at(time)).await.unwrap();
+        store.diagnoses().insert_diagnosis(id, &bridge(), &digest, "{}", at(time)).await.unwrap();
     }
     let found = r#"{"verdict": "temperature", "summary": "k2 softens with temperature_c"}"#.to_owned();
-    store.finish_diagnosis("d1", Ok((found, None)), at(15)).await.unwrap();
-    store.finish_diagnosis("d2", Err("no data".to_owned()), at(25)).await.unwrap();
-    assert!(store.begin_extension("d1", at(40)).await.unwrap());
-    let jobs = store.jobs(100).await.unwrap();
+    store.diagnoses().finish_diagnosis("d1", Ok((found, None)), at(15)).await.unwrap();
+    store.diagnoses().finish_diagnosis("d2", Err("no data".to_owned()), at(25)).await.unwrap();
+    assert!(store.diagnoses().begin_extension("d1", at(40)).await.unwrap());
+    let jobs = store.diagnoses().jobs(100).await.unwrap();
     let of = |kind: JobKind, id: &str| jobs.iter().find(|job| job.kind == kind && job.id == id).unwrap().clone();
     let order: Vec<(&str, JobKind)> = jobs.iter().map(|job| (job.id.as_str(), job.kind)).collect();
     let (diagnosis, extension) = (JobKind::Diagnosis, JobKind::Extension);
@@ -30,15 +30,15 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
     assert_eq!((failed.state, failed.failure.as_deref(), failed.summary), (JobState::Failed, Some("no data"), None));
 
     let added = r#"{"added": ["k2 by temperature_c", "k1 by wind"], "left_out": []}"#.to_owned();
-    store.finish_extension("d1", Ok(added), at(50)).await.unwrap();
-    let newest = store.jobs(1).await.unwrap().remove(0);
+    store.diagnoses().finish_extension("d1", Ok(added), at(50)).await.unwrap();
+    let newest = store.diagnoses().jobs(1).await.unwrap().remove(0);
     assert_eq!((newest.kind, newest.state, newest.finished_at), (extension, JobState::Done, Some(at(50))));
     assert_eq!(newest.summary.as_deref(), Some("k2 by temperature_c; k1 by wind"));
 
     // What a stop leaves behind has failed, and when.
-    assert!(store.begin_extension("d1", at(60)).await.unwrap());
-    assert_eq!(store.end_interrupted_jobs(at(70)).await.unwrap(), 2);
-    let jobs = store.jobs(100).await.unwrap();
+    assert!(store.diagnoses().begin_extension("d1", at(60)).await.unwrap());
+    assert_eq!(store.diagnoses().end_interrupted_jobs(at(70)).await.unwrap(), 2);
+    let jobs = store.diagnoses().jobs(100).await.unwrap();
     for job in jobs.iter().filter(|job| job.id == "d3" || job.kind == extension) {
         assert_eq!((job.state, job.finished_at), (JobState::Failed, Some(at(70))), "{job:?}");
     }

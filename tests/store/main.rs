@@ -14,7 +14,7 @@ use modalwatch::damage::{ChartReference, Damage, Hyperparameters, QuantityAssess
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
 use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
-use modalwatch::trust::{Finding, FindingCode, FindingEffect, Trust};
+use modalwatch::trust::{FindingCode, FindingEffect, Finding, Trust};
 
 fn bridge() -> StructureId {
     StructureId::parse("bridge").unwrap()
@@ -45,7 +45,7 @@ async fn open() -> (Store, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(folder.path()).await.unwrap();
     let digest = Digest::of(&[b"v1"]);
-    assert_eq!(store.put_structure(&bridge(), "{}", &digest, at(0)).await.unwrap(), PutStructure::Created);
+    assert_eq!(store.structures().put_structure(&bridge(), "{}", &digest, at(0)).await.unwrap(), PutStructure::Created);
     (store, folder)
 }
 
@@ -94,35 +94,35 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
 async fn a_batch_comes_back_as_it_was_given() {
     let (store, _folder) = open().await;
     let given = batch("logger", 0, 4);
-    assert!(matches!(store.insert_batch(&given, "b1", at(99)).await.unwrap(), InsertBatch::Inserted { .. }));
-    let stored = store.batch(&bridge(), "b1").await.unwrap().unwrap();
+    assert!(matches!(store.batches().insert_batch(&given, "b1", at(99)).await.unwrap(), InsertBatch::Inserted { .. }));
+    let stored = store.batches().batch(&bridge(), "b1").await.unwrap().unwrap();
     assert_eq!((stored.batch, stored.received_at, stored.state), (given.clone(), at(99), BatchState::Received));
     assert_eq!(stored.content_digest, given.content_digest());
-    assert!(store.batch(&bridge(), "b2").await.unwrap().is_none());
+    assert!(store.batches().batch(&bridge(), "b2").await.unwrap().is_none());
 }
 
 #[tokio::test]
 async fn an_assessment_comes_back_as_it_was_given_and_the_newest_is_current() {
     let (store, _folder) = open().await;
-    store.insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
+    store.batches().insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
     let (old, new) = (assessment("m1", None, at(1)), assessment("m2", None, at(2)));
     for given in [&old, &new, &old, &old] {
-        store.insert_assessment(&bridge(), "b1", given, Vec::new()).await.unwrap();
+        store.assessments().insert_assessment(&bridge(), "b1", given, Vec::new()).await.unwrap();
     }
-    assert_eq!(store.assessment(&bridge(), "b1").await.unwrap().unwrap(), new);
-    assert_eq!(store.batch(&bridge(), "b1").await.unwrap().unwrap().state, BatchState::Assessed);
+    assert_eq!(store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap(), new);
+    assert_eq!(store.batches().batch(&bridge(), "b1").await.unwrap().unwrap().state, BatchState::Assessed);
 }
 
 #[tokio::test]
 async fn pages_walk_batches_of_equal_time_once() {
     let (store, _folder) = open().await;
     for i in 0..23 {
-        store.insert_batch(&batch(&format!("s{i}"), i / 5, 1), &format!("b{i:02}"), at(i)).await.unwrap();
+        store.batches().insert_batch(&batch(&format!("s{i}"), i / 5, 1), &format!("b{i:02}"), at(i)).await.unwrap();
     }
     let (mut walked, mut after) = (Vec::new(), None);
     loop {
         let query = HistoryQuery { limit: 4, after: after.clone(), ..HistoryQuery::default() };
-        let page = store.history(&bridge(), &query).await.unwrap();
+        let page = store.history().page(&bridge(), &query).await.unwrap();
         let Some(last) = page.last() else { break };
         after = Some((last.measured_from, last.batch_id.clone()));
         walked.extend(page.iter().map(|e| (e.measured_from, e.batch_id.clone())));
@@ -138,18 +138,19 @@ async fn a_writer_who_goes_away_leaves_whole_batches_and_a_usable_store() {
         let given = batch(&format!("s{i}"), 0, 40);
         let id = format!("b{i}");
         // Dropped at once, or after some microseconds in the middle of the transaction.
-        let _ = tokio::time::timeout(Duration::from_micros(i * 20), store.insert_batch(&given, &id, at(0))).await;
+        let _ =
+            tokio::time::timeout(Duration::from_micros(i * 20), store.batches().insert_batch(&given, &id, at(0))).await;
     }
     // One more write waits for those still under way and shows that the connection is not left in a transaction.
     assert!(matches!(
-        store.insert_batch(&batch("last", 0, 40), "last", at(0)).await.unwrap(),
+        store.batches().insert_batch(&batch("last", 0, 40), "last", at(0)).await.unwrap(),
         InsertBatch::Inserted { .. }
     ));
     let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
-    let stored = store.history(&bridge(), &query).await.unwrap();
+    let stored = store.history().page(&bridge(), &query).await.unwrap();
     assert!(stored.len() > 1);
     for entry in stored {
-        let record = store.batch(&bridge(), &entry.batch_id).await.unwrap().unwrap();
+        let record = store.batches().batch(&bridge(), &entry.batch_id).await.unwrap().unwrap();
         assert_eq!(record.batch.measurements.len(), 40, "{} is not whole", entry.batch_id);
     }
 }
@@ -157,14 +158,14 @@ async fn a_writer_who_goes_away_leaves_whole_batches_and_a_usable_store() {
 #[tokio::test]
 async fn a_refused_batch_leaves_nothing_behind() {
     let (store, _folder) = open().await;
-    store.insert_batch(&batch("logger", 10, 5), "b1", at(0)).await.unwrap();
-    let overlapping = store.insert_batch(&batch("logger", 7, 5), "b2", at(1)).await.unwrap();
+    store.batches().insert_batch(&batch("logger", 10, 5), "b1", at(0)).await.unwrap();
+    let overlapping = store.batches().insert_batch(&batch("logger", 7, 5), "b2", at(1)).await.unwrap();
     let expected = InsertBatch::MeasurementConflict { ordinal: 3, measured_at: at(10), batch_id: "b1".to_owned() };
     assert_eq!(overlapping, expected);
-    assert!(store.batch(&bridge(), "b2").await.unwrap().is_none());
+    assert!(store.batches().batch(&bridge(), "b2").await.unwrap().is_none());
     // The three that did not collide are free.
     assert!(matches!(
-        store.insert_batch(&batch("logger", 7, 3), "b3", at(2)).await.unwrap(),
+        store.batches().insert_batch(&batch("logger", 7, 3), "b3", at(2)).await.unwrap(),
         InsertBatch::Inserted { .. }
     ));
 }
@@ -175,22 +176,32 @@ async fn a_new_undamaged_state_sends_back_only_what_was_never_compared() {
     let model = Digest::of(&[b"m"]);
     for (i, version) in [(0, None), (1, None), (2, Some(1))] {
         let id = format!("b{i}");
-        store.insert_batch(&batch(&format!("s{i}"), i, 2), &id, at(i)).await.unwrap();
+        store.batches().insert_batch(&batch(&format!("s{i}"), i, 2), &id, at(i)).await.unwrap();
         if version.is_some() {
             let state = undamaged();
-            assert_eq!(store.insert_undamaged(&bridge(), &state, &model, &["b0".into()], at(5)).await.unwrap(), 1);
+            assert_eq!(
+                store.reference().insert_undamaged(&bridge(), &state, &model, &["b0".into()], at(5)).await.unwrap(),
+                1
+            );
         }
-        store.insert_assessment(&bridge(), &id, &assessment("m", version, at(i)), Vec::new()).await.unwrap();
+        store
+            .assessments()
+            .insert_assessment(&bridge(), &id, &assessment("m", version, at(i)), Vec::new())
+            .await
+            .unwrap();
     }
-    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b1"]);
-    store.insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8)), Vec::new()).await.unwrap();
-    assert_eq!(store.insert_undamaged(&bridge(), &undamaged(), &model, &["b1".into()], at(9)).await.unwrap(), 2);
-    assert_eq!(store.pending(&bridge(), 9).await.unwrap(), ["b0"], "b0 was never compared; b2 was");
-    let newest = store.undamaged(&bridge()).await.unwrap().unwrap();
+    assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b1"]);
+    store.assessments().insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8)), Vec::new()).await.unwrap();
+    assert_eq!(
+        store.reference().insert_undamaged(&bridge(), &undamaged(), &model, &["b1".into()], at(9)).await.unwrap(),
+        2
+    );
+    assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b0"], "b0 was never compared; b2 was");
+    let newest = store.reference().undamaged(&bridge()).await.unwrap().unwrap();
     assert_eq!((newest.state.version, newest.batches.as_slice()), (2, &["b1".to_owned()][..]));
-    let unknown = store.insert_undamaged(&bridge(), &undamaged(), &model, &["nothing".into()], at(9)).await;
+    let unknown = store.reference().insert_undamaged(&bridge(), &undamaged(), &model, &["nothing".into()], at(9)).await;
     assert!(unknown.unwrap_err().to_string().contains("no batch nothing"));
-    assert_eq!(store.undamaged(&bridge()).await.unwrap().unwrap().state.version, 2);
+    assert_eq!(store.reference().undamaged(&bridge()).await.unwrap().unwrap().state.version, 2);
 }
 
 fn undamaged() -> modalwatch::damage::UndamagedState {
@@ -226,7 +237,7 @@ fn undamaged() -> modalwatch::damage::UndamagedState {
 async fn each_connection_keeps_what_it_acknowledges() {
     use sqlx::Connection as _;
     let (store, folder) = open().await;
-    store.insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
+    store.batches().insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
     store.close().await;
     let ids: BTreeSet<String> = {
         let options = sqlx::sqlite::SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite"));

@@ -85,6 +85,7 @@ async fn fill(folder: &tempfile::TempDir) {
 async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let (store, folder) = open().await;
     store
+        .reference()
         .insert_undamaged(&bridge(), &undamaged(), &modalwatch::quantity::Digest::of(&[b"m"]), &[], at(0))
         .await
         .unwrap();
@@ -92,13 +93,13 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let covariates = ["temperature_c".to_owned(), "operator".to_owned()];
 
     let started = Instant::now();
-    let extent = store.extent(&bridge(), ALL).await.unwrap();
+    let extent = store.series().extent(&bridge(), ALL).await.unwrap();
     println!("extent of {MANY} batches: {:?}", started.elapsed());
     assert_eq!((extent.batches, extent.measurements, extent.stride()), (MANY as u64, MANY as u64, 1));
     let time_of = |i: i64| at(i * EVERY_S + i64::from(i >= AFTER_THE_GAP) * 86_400).micros();
 
     let started = Instant::now();
-    let measured = store.frequency_series(&bridge(), ALL, &extent, 5, &covariates).await.unwrap();
+    let measured = store.series().frequency_series(&bridge(), ALL, &extent, 5, &covariates).await.unwrap();
     println!("frequencies of {MANY} measurements: {:?}, {} rows left", started.elapsed(), measured.rows.len());
     assert!(measured.reduced && measured.rows.len() <= 2 * ALL.points * 7, "{} rows", measured.rows.len());
     let spike = measured.rows.iter().find(|row| row.time_us == time_of(SPIKE)).unwrap();
@@ -112,7 +113,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     assert_eq!(measured.rows[behind - 1].time_us, time_of(AFTER_THE_GAP - 1));
 
     let started = Instant::now();
-    let (quantities, trust) = store.assessed_series(&bridge(), ALL, &extent).await.unwrap();
+    let (quantities, trust) = store.series().assessed_series(&bridge(), ALL, &extent).await.unwrap();
     println!("4 quantities and trust of {MANY} batches: {:?}", started.elapsed());
     assert_eq!(quantities.iter().map(|q| q.name.as_str()).collect::<Vec<_>>(), ["k1", "k2", "k3", "k4"]);
     for quantity in &quantities {
@@ -127,7 +128,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     }
 
     let started = Instant::now();
-    let charts = store.chart_series(&bridge(), ALL, &extent).await.unwrap();
+    let charts = store.series().chart_series(&bridge(), ALL, &extent).await.unwrap();
     println!("5 charts of {MANY} points: {:?}", started.elapsed());
     assert_eq!(charts.len(), 5);
     for chart in &charts {
@@ -144,7 +145,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     );
 
     let started = Instant::now();
-    let overview = store.overview().await.unwrap();
+    let overview = store.overview().structures().await.unwrap();
     println!("overview of a structure with {MANY} batches: {:?}", started.elapsed());
     let latest = overview[0].latest.as_ref().unwrap();
     assert_eq!((overview[0].batches, latest.batch_id.as_str()), (MANY as u64, "b099999"));
@@ -155,7 +156,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let too_many = Extent { measurements: 1_200_000, ..extent };
     assert_eq!(too_many.stride(), 3);
     let started = Instant::now();
-    let thinned = store.frequency_series(&bridge(), ALL, &too_many, 5, &covariates).await.unwrap();
+    let thinned = store.series().frequency_series(&bridge(), ALL, &too_many, 5, &covariates).await.unwrap();
     println!("every third of {MANY} measurements: {:?}", started.elapsed());
     let looked_at: Vec<i64> = (0..MANY).step_by(3).map(time_of).collect();
     assert!(thinned.rows.len() > 400 && thinned.rows.iter().all(|row| looked_at.binary_search(&row.time_us).is_ok()));
@@ -163,9 +164,9 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     // A window out of the middle costs what lies in it, and its bounds hold.
     let window = SeriesWindow { from: Some(at(600_000)), to: Some(at(606_000)), points: 1_000 };
     let started = Instant::now();
-    let extent = store.extent(&bridge(), window).await.unwrap();
-    let measured = store.frequency_series(&bridge(), window, &extent, 5, &covariates).await.unwrap();
-    let (quantities, _) = store.assessed_series(&bridge(), window, &extent).await.unwrap();
+    let extent = store.series().extent(&bridge(), window).await.unwrap();
+    let measured = store.series().frequency_series(&bridge(), window, &extent, 5, &covariates).await.unwrap();
+    let (quantities, _) = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
     println!("a window of ten batches: {:?}", started.elapsed());
     assert_eq!((extent.batches, measured.rows.len(), quantities[0].batches.rows.len()), (10, 10, 10));
     assert!(!measured.reduced && !quantities[0].batches.reduced);
@@ -175,18 +176,22 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
 async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
     let (store, _folder) = open().await;
     for (i, id) in ["b1", "b2", "b3"].into_iter().enumerate() {
-        store.insert_batch(&batch(id, 1_000 * i as i64, 2), id, at(0)).await.unwrap();
+        store.batches().insert_batch(&batch(id, 1_000 * i as i64, 2), id, at(0)).await.unwrap();
     }
     let mut old = assessment("m1", Some(1), at(1));
     old.quantities.iter_mut().for_each(|q| q.mean = 9.9);
-    store.insert_assessment(&bridge(), "b1", &old, Vec::new()).await.unwrap();
-    store.insert_assessment(&bridge(), "b1", &assessment("m2", None, at(2)), Vec::new()).await.unwrap();
-    store.insert_assessment(&bridge(), "b2", &assessment("m1", Some(1), at(1)), Vec::new()).await.unwrap();
+    store.assessments().insert_assessment(&bridge(), "b1", &old, Vec::new()).await.unwrap();
+    store.assessments().insert_assessment(&bridge(), "b1", &assessment("m2", None, at(2)), Vec::new()).await.unwrap();
+    store
+        .assessments()
+        .insert_assessment(&bridge(), "b2", &assessment("m1", Some(1), at(1)), Vec::new())
+        .await
+        .unwrap();
     let version = modalwatch::quantity::Digest::of(&[b"v1"]);
-    store.mark_failed(&bridge(), "b2", &version, "it failed under the new model").await.unwrap();
-    let extent = store.extent(&bridge(), ALL).await.unwrap();
+    store.batches().mark_failed(&bridge(), "b2", &version, "it failed under the new model").await.unwrap();
+    let extent = store.series().extent(&bridge(), ALL).await.unwrap();
     assert_eq!((extent.batches, extent.measurements), (3, 6));
-    let (quantities, trust) = store.assessed_series(&bridge(), ALL, &extent).await.unwrap();
+    let (quantities, trust) = store.series().assessed_series(&bridge(), ALL, &extent).await.unwrap();
     assert_eq!(quantities.len(), 2);
     for quantity in quantities {
         let [row] = &quantity.batches.rows[..] else { panic!("one batch: {quantity:?}") };
@@ -202,7 +207,7 @@ async fn the_column_for_plots_says_what_the_rows_say() {
     let (store, folder) = open().await;
     for i in 0..60 {
         let id = format!("b{i:02}");
-        store.insert_batch(&batch(&id, 1_000 * i, 2), &id, at(0)).await.unwrap();
+        store.batches().insert_batch(&batch(&id, 1_000 * i, 2), &id, at(0)).await.unwrap();
         let mut given = assessment(["m1", "m2"][i as usize % 2], (i % 3 > 0).then_some(1), at(i));
         if i % 7 == 0 {
             given.trust.verdict = TrustVerdict::Rejected;
@@ -219,15 +224,15 @@ async fn the_column_for_plots_says_what_the_rows_say() {
             given.quantities.reverse();
             given.quantities[0].name = "k9".to_owned();
         }
-        store.insert_assessment(&bridge(), &id, &given, Vec::new()).await.unwrap();
+        store.assessments().insert_assessment(&bridge(), &id, &given, Vec::new()).await.unwrap();
     }
     // Longer than the points of the plot, so that the reduction takes part.
     let window = SeriesWindow { points: 20, ..ALL };
-    let extent = store.extent(&bridge(), window).await.unwrap();
-    let by_column = store.assessed_series(&bridge(), window, &extent).await.unwrap();
+    let extent = store.series().extent(&bridge(), window).await.unwrap();
+    let by_column = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
     assert!(by_column.1.reduced && by_column.0.iter().any(|quantity| quantity.batches.reduced));
     sqlx::query("update assessment set plotted = null").execute(&mut connection(&folder).await).await.unwrap();
-    let by_rows = store.assessed_series(&bridge(), window, &extent).await.unwrap();
+    let by_rows = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
     // NaN is not equal to itself: the texts are compared.
     assert_eq!(format!("{by_column:?}"), format!("{by_rows:?}"));
 }

@@ -48,7 +48,7 @@ pub(super) fn entry(
 pub(super) async fn run(access: &AccessControl, entry: NewAuditEntry, request: Request, next: Next) -> Response {
     let (store, id) = (access.0.store.clone(), current_id().unwrap_or_default());
     let task = async move {
-        let number = match store.begin_audit(entry).await {
+        let number = match store.audit().begin_audit(entry).await {
             Ok(number) => number,
             // What cannot be written down is not done.
             Err(error) => return Ok(ApiError::from(error).into_response()),
@@ -59,7 +59,7 @@ pub(super) async fn run(access: &AccessControl, entry: NewAuditEntry, request: R
         let status = answered.as_ref().map_or(500, |response| response.status().as_u16());
         let made = answered.as_ref().ok().and_then(|response| response.headers().get(header::LOCATION));
         let made = made.and_then(|value| value.to_str().ok()).map(str::to_owned);
-        if let Err(cause) = store.end_audit(number, status, made).await {
+        if let Err(cause) = store.audit().end_audit(number, status, made).await {
             // The entry itself is there, and the change is done: the client is told what came of it.
             error!(%cause, number, status, "The outcome of audit entry {number} could not be written: {cause}");
         }
@@ -166,7 +166,7 @@ pub async fn list(
     let Window { from, to } = Window::of(query.from.as_deref(), query.to.as_deref())?;
     let before = page_cursor(query.cursor.as_deref())?;
     let asked = AuditQuery { from, to, before, limit: page_limit(query.limit.as_deref())? };
-    let found = shared.monitor.store().audit(&asked).await?;
+    let found = shared.monitor.store().audit().list(&asked).await?;
     let next = (found.len() == asked.limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
     Ok(Json(AuditPage { items: found.into_iter().map(AuditItem::from).collect(), next }).into_response())
 }

@@ -105,7 +105,7 @@ impl AccessControl {
         (address, data_dir): (SocketAddr, &Path),
         largest_batch: usize,
     ) -> Result<Self, Error> {
-        let tokens: TokenTable = store.tokens().await?.into_iter().collect();
+        let tokens: TokenTable = store.tokens().list().await?.into_iter().collect();
         let file_token: TokenTable =
             settings.admin_token_file.as_deref().map(read_admin_token).transpose()?.into_iter().collect();
         let proxies = Proxies::parse(&http.trusted_proxies)?;
@@ -263,7 +263,7 @@ async fn structure_of(
     let Some((_, first)) = parameters.iter().next() else { return Ok(None) };
     match about {
         route::AboutWhat::Structure => Ok(Some(first.to_owned())),
-        _ => Ok(access.0.store.structure_of_diagnosis(first).await?),
+        _ => Ok(access.0.store.diagnoses().structure_of_diagnosis(first).await?),
     }
 }
 

@@ -225,7 +225,7 @@ impl AccessControl {
                           structures and no expires_at, so that others can be made";
             return Err(ApiError::invalid("first_token_must_be_admin", detail, Vec::new()));
         }
-        self.0.store.insert_token(&record).await?;
+        self.0.store.tokens().insert_token(&record).await?;
         self.remember(record.clone());
         Ok((record, text))
     }
@@ -240,7 +240,7 @@ impl AccessControl {
         let text = TokenText::with_id(record.id.clone()).map_err(|e| ApiError::internal(&e))?;
         let until = Timestamp::from_micros(now.micros() + overlap_s * 1_000_000);
         let rotated = record.rotated(&text, until.map_err(|e| ApiError::internal(&e))?);
-        self.0.store.update_token(&rotated).await?;
+        self.0.store.tokens().update_token(&rotated).await?;
         self.remember(rotated.clone());
         Ok((rotated, text))
     }
@@ -260,7 +260,7 @@ impl AccessControl {
             return Err(ApiError::new(StatusCode::CONFLICT, "last_admin_token", detail));
         }
         let revoked = TokenRecord { revoked_at: Some(now), ..record };
-        self.0.store.update_token(&revoked).await?;
+        self.0.store.tokens().update_token(&revoked).await?;
         self.remember(revoked.clone());
         Ok(revoked)
     }

@@ -19,7 +19,7 @@ pub(super) async fn export(
     structure: &StructureId,
 ) -> Result<Receiver<Result<Vec<u8>, Error>>, Error> {
     let active = assessor.structures.get(structure)?;
-    let mut models = assessor.store.trained_models(structure).await?;
+    let mut models = assessor.store.archive().trained_models(structure).await?;
     if let Ok(baseline) = &active.baseline {
         let digest = baseline.digest().clone();
         if !models.iter().any(|model| model.model_digest == digest.as_str()) {
@@ -49,7 +49,7 @@ pub(super) async fn export(
         let read = tokio::spawn(async move {
             // The other task notices when the receiver is gone.
             let _ = sender.send(head).await;
-            store.export(&id, models, &sender).await
+            store.archive().export(&id, models, &sender).await
         });
         drop(records);
         let (mut hasher, mut count) = (Sha256::new(), 0_u64);

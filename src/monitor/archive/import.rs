@@ -126,7 +126,7 @@ impl Import<'_> {
             }
             Record::Version(version) => {
                 simulator_of(&structure, &version.digest, &version.definition)?;
-                self.done.versions += u64::from(store.import_version(&structure, version).await?);
+                self.done.versions += u64::from(store.archive().import_version(&structure, version).await?);
             }
             Record::Model(model) => self.take_model(model).await?,
             Record::Batch(batch) => {
@@ -140,10 +140,10 @@ impl Import<'_> {
                 }
             }
             Record::UndamagedState(state) => {
-                self.done.undamaged_states += u64::from(store.import_undamaged(&structure, state).await?);
+                self.done.undamaged_states += u64::from(store.archive().import_undamaged(&structure, state).await?);
             }
             Record::Maintenance(window) => {
-                self.done.maintenance_windows += u64::from(store.import_maintenance(&structure, window).await?);
+                self.done.maintenance_windows += u64::from(store.archive().import_maintenance(&structure, window).await?);
             }
             Record::Acknowledgement(note) => self.acknowledgements.push(note),
         }
@@ -153,7 +153,7 @@ impl Import<'_> {
     async fn store_waiting(&mut self) -> Result<(), ImportError> {
         if !self.waiting.is_empty() {
             let waiting = std::mem::take(&mut self.waiting);
-            self.done.batches_new += self.assessor.store.import_batches(waiting).await?;
+            self.done.batches_new += self.assessor.store.archive().import_batches(waiting).await?;
         }
         Ok(())
     }
@@ -167,7 +167,7 @@ impl Import<'_> {
             return Ok(());
         }
         let version = Digest::from_stored(model.structure_digest.clone());
-        let stored = self.assessor.store.structure_version(&structure, &version).await?;
+        let stored = self.assessor.store.structures().structure_version(&structure, &version).await?;
         let simulator = match (&self.simulator, stored) {
             (Some(present), _) if *present.digest() == version => present.clone(),
             (_, Some((definition, _))) => simulator_of(&structure, version.as_str(), &definition)?,
@@ -184,7 +184,7 @@ impl Import<'_> {
         if loaded.digest().as_str() != model.model_digest {
             return Err(invalid(&"a trained baseline does not match its digest").into());
         }
-        self.done.models += u64::from(self.assessor.store.import_model(&structure, model).await?);
+        self.done.models += u64::from(self.assessor.store.archive().import_model(&structure, model, Timestamp::now()).await?);
         Ok(())
     }
 
@@ -199,7 +199,7 @@ impl Import<'_> {
         }
         let in_use = baseline.as_ref().ok().map(|baseline: &Arc<Baseline>| baseline.digest().clone());
         self.assessor.structures.activate(simulator, baseline);
-        if let Some(state) = self.assessor.store.undamaged(&structure).await? {
+        if let Some(state) = self.assessor.store.reference().undamaged(&structure).await? {
             if in_use.as_ref().is_some_and(|digest| *digest != state.model_digest) {
                 self.done.warnings.push(format!(
                     "the undamaged reference {} was made with baseline {}, which is not in use here: batches are not compared with it",
@@ -211,7 +211,7 @@ impl Import<'_> {
         let noted = std::mem::take(&mut self.acknowledgements);
         for note in noted {
             self.done.acknowledgements +=
-                u64::from(self.assessor.store.import_acknowledgement(&structure, note).await?);
+                u64::from(self.assessor.store.archive().import_acknowledgement(&structure, note).await?);
         }
         Ok(self.done)
     }

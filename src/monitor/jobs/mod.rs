@@ -69,7 +69,7 @@ impl Jobs {
 
     /// Marks the jobs that the end of an earlier run interrupted as failed.
     pub(super) async fn end_interrupted(&self) -> Result<(), Error> {
-        let interrupted = self.store.end_interrupted_jobs(Timestamp::now()).await?;
+        let interrupted = self.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
         if interrupted > 0 {
             warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
         }
@@ -95,7 +95,7 @@ impl Jobs {
         mut request: DiagnosisRequest,
     ) -> Result<DiagnosisRecord, JobError> {
         let active = self.structures.get(&structure)?;
-        let stored = self.store.batch_sizes(&structure).await?;
+        let stored = self.store.batches().batch_sizes(&structure).await?;
         if request.batches.is_empty() {
             request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
         }
@@ -106,7 +106,7 @@ impl Jobs {
         let id = uuid::Uuid::now_v7().to_string();
         let json = serde_json::to_string(&request).expect("a request is plain data");
         let simulator = active.simulator.clone();
-        self.store.insert_diagnosis(&id, &structure, simulator.digest(), &json, Timestamp::now()).await?;
+        self.store.diagnoses().insert_diagnosis(&id, &structure, simulator.digest(), &json, Timestamp::now()).await?;
         let (jobs, job) = (self.clone(), id.clone());
         let diagnose = async move {
             let _turn = jobs.turn().await;
@@ -139,7 +139,7 @@ impl Jobs {
         if record.structure_digest != *active.simulator.digest() {
             return Err(refuse("the structure has another version now: diagnose that one"));
         }
-        if !self.store.begin_extension(id, Timestamp::now()).await? {
+        if !self.store.diagnoses().begin_extension(id, Timestamp::now()).await? {
             return Err(refuse("an extension by it is running"));
         }
         let begun = self.diagnosis(id).await?.0;
@@ -166,9 +166,9 @@ impl Jobs {
             }
             let state = if output.is_ok() { JobState::Done } else { JobState::Failed };
             let stored = match kind {
-                JobKind::Diagnosis => jobs.store.finish_diagnosis(&id, output, Timestamp::now()).await,
+                JobKind::Diagnosis => jobs.store.diagnoses().finish_diagnosis(&id, output, Timestamp::now()).await,
                 JobKind::Extension => {
-                    jobs.store.finish_extension(&id, output.map(|(result, _)| result), Timestamp::now()).await
+                    jobs.store.diagnoses().finish_extension(&id, output.map(|(result, _)| result), Timestamp::now()).await
                 }
             };
             if let Err(failure) = stored {
@@ -191,7 +191,7 @@ impl Jobs {
         simulator: Simulator,
         request: DiagnosisRequest,
     ) -> Result<Study, String> {
-        let measurements = self.store.measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
+        let measurements = self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
         Ok(Study { id, simulator, measurements, request, progress: self.progress.clone() })
     }
 
@@ -261,7 +261,7 @@ impl Jobs {
     /// # Errors
     /// [`JobError::UnknownDiagnosis`], [`Error::Store`].
     pub async fn diagnosis(&self, id: &str) -> Result<(DiagnosisRecord, Option<String>), JobError> {
-        let record = self.store.diagnosis(id).await?;
+        let record = self.store.diagnoses().diagnosis(id).await?;
         let record = record.ok_or_else(|| JobError::UnknownDiagnosis(shown(id)))?;
         Ok((record, self.progress.of(id)))
     }
@@ -271,7 +271,7 @@ impl Jobs {
     /// # Errors
     /// [`Error::Store`].
     pub async fn diagnoses(&self, structure: &StructureId, limit: usize) -> Result<Vec<DiagnosisRecord>, Error> {
-        Ok(self.store.diagnoses(structure, limit).await?)
+        Ok(self.store.diagnoses().list(structure, limit).await?)
     }
 
     /// The report of a diagnosis as HTML; `None` where there is none yet.
@@ -280,7 +280,7 @@ impl Jobs {
     /// [`JobError::UnknownDiagnosis`], [`Error::Store`].
     pub async fn report(&self, id: &str) -> Result<Option<String>, JobError> {
         self.diagnosis(id).await?;
-        Ok(self.store.diagnosis_report(id).await?)
+        Ok(self.store.diagnoses().diagnosis_report(id).await?)
     }
 
     /// Diagnoses and extensions, newest first, at most `limit`, each with what it is doing now if it runs.
@@ -288,7 +288,7 @@ impl Jobs {
     /// # Errors
     /// [`Error::Store`].
     pub async fn list(&self, limit: usize) -> Result<Vec<(JobRecord, Option<String>)>, Error> {
-        let records = self.store.jobs(limit).await?;
+        let records = self.store.diagnoses().jobs(limit).await?;
         let with_progress = |record: JobRecord| {
             let running = record.state == JobState::Running;
             let progress = running.then(|| self.progress.of(&record.id)).flatten();

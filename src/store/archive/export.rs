@@ -1,0 +1,230 @@
+//! Writing the archive of a structure.
+
+use std::collections::BTreeMap;
+
+use sqlx::FromRow;
+use tokio::sync::mpsc::Sender;
+
+use super::super::column::{bad_row, elements, from_blob, list, timestamp};
+use super::super::database::Database;
+use super::super::error::Error;
+use super::super::measurement_row::mode_shapes;
+use super::super::structure::Structures;
+use super::record::{
+    Acknowledged, ArchivedModel, Batch, Maintenance, Measurement, Record, Structure, Undamaged, UndamagedQuantity,
+    Version,
+};
+use crate::quantity::StructureId;
+
+/// Batches read at a time.
+const PAGE: i64 = 200;
+
+/// Export and import of one structure.
+#[derive(Clone, Copy)]
+pub struct Archive<'s> {
+    pub(in super::super) database: &'s Database,
+}
+
+#[derive(FromRow)]
+struct ExportedMeasurement {
+    batch_id: String,
+    measured_at_us: i64,
+    frequency_hz: Vec<u8>,
+    std_hz: Option<Vec<u8>>,
+    mode_shapes: Option<String>,
+    covariates: String,
+    settings: String,
+}
+
+/// Columns of a batch: id, source, idempotency key, content digest, time of arrival in µs.
+type BatchRow = (String, String, Option<String>, String, i64);
+
+/// Columns of an undamaged reference: version, model digest, creation in µs, threshold probability, number of measurements,
+/// conditions, doubts.
+type StateRow = (u32, String, i64, f64, i64, String, String);
+
+/// The error of an export whose receiver was dropped.
+fn gone<T>(_: T) -> Error {
+    Error::Row { what: "archive", detail: "its reader is gone".to_owned() }
+}
+
+/// Digests of version and baseline, manifest, weights, and whether it is used although it failed its calibration check.
+type ModelRow = (String, String, Vec<u8>, Vec<u8>, bool);
+
+impl Archive<'_> {
+    /// Sends the records of an archive between its first and its last line, in order, with the given trained baselines.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::Sqlite`], [`Error::Row`] if the receiver was dropped.
+    pub async fn export(
+        self,
+        structure: &StructureId,
+        models: Vec<ArchivedModel>,
+        records: &Sender<Record>,
+    ) -> Result<(), Error> {
+        let present = Structures { database: self.database }.structure(structure).await?;
+        let present = present.ok_or_else(|| Error::UnknownStructure(structure.to_string()))?;
+        let versions: Vec<(String, String, Option<String>, i64)> = sqlx::query_as(
+            "select digest, definition, parent_digest, created_at_us from structure_version where structure_id = $1
+             order by created_at_us, digest",
+        )
+        .bind(structure.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        let present = Structure {
+            digest: present.digest.to_string(),
+            definition: present.definition_json,
+            created_at: present.created_at.to_string(),
+        };
+        records.send(Record::Structure(present)).await.map_err(gone)?;
+        for (digest, definition, parent_digest, created) in versions {
+            let created_at = timestamp("version", created)?.to_string();
+            let version = Version { digest, definition, parent_digest, created_at };
+            records.send(Record::Version(version)).await.map_err(gone)?;
+        }
+        for model in models {
+            records.send(Record::Model(model)).await.map_err(gone)?;
+        }
+        self.export_batches(structure, records).await?;
+        self.export_states(structure, records).await?;
+        self.export_notes(structure, records).await
+    }
+
+    async fn export_batches(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
+        let (mut received, mut last) = (i64::MIN, String::new());
+        loop {
+            let rows: Vec<BatchRow> = sqlx::query_as(
+                "select batch_id, source, idempotency_key, content_digest, received_at_us from measurement_batch
+                 where structure_id = $1 and (received_at_us, batch_id) > ($2, $3) order by received_at_us, batch_id limit $4",
+            )
+            .bind(structure.as_str())
+            .bind(received)
+            .bind(&last)
+            .bind(PAGE)
+            .fetch_all(&self.database.reader)
+            .await?;
+            let Some(end) = rows.last() else { return Ok(()) };
+            (received, last) = (end.4, end.0.clone());
+            let ids: Vec<&String> = rows.iter().map(|row| &row.0).collect();
+            let measured: Vec<ExportedMeasurement> = sqlx::query_as(concat!(
+                "select batch_id, measured_at_us, frequency_hz, std_hz, mode_shapes, covariates, settings
+                 from measurement where structure_id = $1 and batch_id in (select value from ",
+                elements!("$2"),
+                ") order by batch_id, ordinal",
+            ))
+            .bind(structure.as_str())
+            .bind(list(&ids))
+            .fetch_all(&self.database.reader)
+            .await?;
+            let mut by_batch = BTreeMap::<String, Vec<Measurement>>::new();
+            for row in measured {
+                by_batch.entry(row.batch_id.clone()).or_default().push(measurement(row)?);
+            }
+            for (batch, source, idempotency_key, content_digest, received) in rows {
+                let measurements = by_batch.remove(&batch).unwrap_or_default();
+                let received_at = timestamp("batch", received)?.to_string();
+                let record = Batch { batch, source, idempotency_key, content_digest, received_at, measurements };
+                records.send(Record::Batch(record)).await.map_err(gone)?;
+            }
+        }
+    }
+
+    async fn export_states(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
+        let rows: Vec<StateRow> = sqlx::query_as(
+            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts
+             from undamaged_state where structure_id = $1 order by version",
+        )
+        .bind(structure.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        for (version, model_digest, created, threshold_probability, measurements, conditions, doubts) in rows {
+            let batches: Vec<(String,)> = sqlx::query_as(
+                "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
+            )
+            .bind(structure.as_str())
+            .bind(version)
+            .fetch_all(&self.database.reader)
+            .await?;
+            let quantities: Vec<UndamagedQuantity> = sqlx::query_as(
+                "select quantity, position, mean, std, threshold, detail, mean_draws, std_draws
+                 from undamaged_quantity where structure_id = $1 and version = $2 order by position",
+            )
+            .bind(structure.as_str())
+            .bind(version)
+            .fetch_all(&self.database.reader)
+            .await?;
+            let state = Undamaged {
+                version,
+                model_digest,
+                created_at: timestamp("undamaged state", created)?.to_string(),
+                threshold_probability,
+                measurements,
+                conditions,
+                doubts,
+                batches: batches.into_iter().map(|(id,)| id).collect(),
+                quantities,
+            };
+            records.send(Record::UndamagedState(state)).await.map_err(gone)?;
+        }
+        Ok(())
+    }
+
+    async fn export_notes(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
+        let windows: Vec<(i64, i64, String, i64)> = sqlx::query_as(
+            "select from_us, to_us, reason, created_at_us from maintenance_window where structure_id = $1 order by from_us, to_us",
+        )
+        .bind(structure.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        let time = |micros| timestamp("maintenance window", micros).map(|t| t.to_string());
+        for (from, to, reason, created) in windows {
+            let window = Maintenance { from: time(from)?, to: time(to)?, reason, created_at: time(created)? };
+            records.send(Record::Maintenance(window)).await.map_err(gone)?;
+        }
+        let seen: Vec<(String, String, String, i64, String, Option<String>)> = sqlx::query_as(
+            "select kind, series, opened_batch, acknowledged_at_us, acknowledged_by, acknowledgement_note
+             from alarm_episode where structure_id = $1 and acknowledged_at_us is not null and acknowledged_by is not null
+               and opened_batch is not null and withdrawn = 0 order by episode",
+        )
+        .bind(structure.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        for (kind, series, opened_batch, at, by, note) in seen {
+            let at = timestamp("acknowledgement", at)?.to_string();
+            let record = Acknowledged { kind, series, opened_batch, at, by, note };
+            records.send(Record::Acknowledgement(record)).await.map_err(gone)?;
+        }
+        Ok(())
+    }
+
+    /// The baselines that the service trained for the versions of a structure.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn trained_models(self, structure: &StructureId) -> Result<Vec<ArchivedModel>, Error> {
+        let rows: Vec<ModelRow> = sqlx::query_as(
+            "select structure_digest, model_digest, manifest, weights, accepted from trained_baseline
+             where structure_id = $1 order by created_at_us, structure_digest",
+        )
+        .bind(structure.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        let model = |(version, digest, manifest, weights, accepted): ModelRow| {
+            ArchivedModel::new(&version, &digest, &manifest, &weights, accepted)
+        };
+        Ok(rows.into_iter().map(model).collect())
+    }
+}
+
+fn measurement(row: ExportedMeasurement) -> Result<Measurement, Error> {
+    let what = "measurement";
+    let present = |values: Vec<f64>| values.into_iter().map(|v| Some(v).filter(|v| !v.is_nan())).collect();
+    Ok(Measurement {
+        measured_at: timestamp(what, row.measured_at_us)?.to_string(),
+        frequencies_hz: present(from_blob(what, &row.frequency_hz)?),
+        std_hz: row.std_hz.map(|blob| from_blob(what, &blob)).transpose()?.map(present),
+        mode_shapes: mode_shapes(row.mode_shapes.as_deref())?,
+        covariates: serde_json::from_str(&row.covariates).map_err(|e| bad_row(what)(&e))?,
+        settings: serde_json::from_str(&row.settings).map_err(|e| bad_row(what)(&e))?,
+    })
+}

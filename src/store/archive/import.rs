@@ -1,0 +1,237 @@
+//! Storing the lines of an archive.
+
+use super::super::batch::import_batch;
+use super::super::column::{bad_row, from_blob};
+use super::super::error::Error;
+use super::super::transaction::Transaction;
+use super::export::Archive;
+use super::record::{Acknowledged, ArchivedModel, Maintenance, Undamaged, Version};
+use crate::measurement::MeasurementBatch;
+use crate::quantity::{StructureId, Timestamp};
+
+impl Archive<'_> {
+    /// Stores batches of an archive under their own ids in one transaction. Batches that are stored already are skipped. Returns
+    /// the number of new batches.
+    ///
+    /// # Errors
+    /// [`Error::Row`] with the batch if its id or one of its measurements belongs to different content here.
+    pub async fn import_batches(self, batches: Vec<(String, MeasurementBatch, Timestamp)>) -> Result<u64, Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let mut stored = 0;
+                    for (id, batch, received_at) in batches {
+                        stored += u64::from(import_batch(transaction, &id, &batch, received_at).await?);
+                    }
+                    Ok(stored)
+                })
+            })
+            .await
+    }
+
+    /// Stores a version of a structure unless it is stored already. Returns whether it was new.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`] if a time cannot be parsed.
+    pub async fn import_version(self, structure: &StructureId, version: Version) -> Result<bool, Error> {
+        let structure = structure.to_string();
+        let created = Timestamp::parse(&version.created_at).map_err(|e| bad_row("version of the archive")(&e))?;
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let inserted = sqlx::query(
+                        "insert into structure_version values ($1, $2, $3, $4, null, $5) on conflict do nothing",
+                    )
+                    .bind(&structure)
+                    .bind(&version.digest)
+                    .bind(&version.definition)
+                    .bind(&version.parent_digest)
+                    .bind(created.micros())
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(inserted.rows_affected() > 0)
+                })
+            })
+            .await
+    }
+
+    /// Stores a trained baseline unless one is stored for its version. Returns whether it was new.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`] if the weights are not base64.
+    pub async fn import_model(
+        self,
+        structure: &StructureId,
+        model: ArchivedModel,
+        now: Timestamp,
+    ) -> Result<bool, Error> {
+        let structure = structure.to_string();
+        let weights = model.weights().map_err(|e| bad_row("model of the archive")(&e))?;
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let inserted = sqlx::query(
+                        "insert into trained_baseline values ($1, $2, $3, $4, $5, $6, $7) on conflict do nothing",
+                    )
+                    .bind(&structure)
+                    .bind(&model.structure_digest)
+                    .bind(&model.model_digest)
+                    .bind(model.manifest.into_bytes())
+                    .bind(weights)
+                    .bind(model.accepted)
+                    .bind(now.micros())
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(inserted.rows_affected() > 0)
+                })
+            })
+            .await
+    }
+
+    /// Stores an undamaged reference under its own version unless it is stored already. All batches outside a new reference are
+    /// assessed again. Returns whether it was new.
+    ///
+    /// # Errors
+    /// [`Error::Row`] if that version is a different reference here.
+    pub async fn import_undamaged(self, structure: &StructureId, state: Undamaged) -> Result<bool, Error> {
+        let structure = structure.to_string();
+        let wrong = |detail: &dyn std::fmt::Display| bad_row("undamaged state of the archive")(detail);
+        let created = Timestamp::parse(&state.created_at).map_err(|e| wrong(&e))?;
+        for quantity in &state.quantities {
+            for draws in [&quantity.mean_draws, &quantity.std_draws].into_iter().flatten() {
+                from_blob("undamaged quantity of the archive", draws)?;
+            }
+        }
+        self.database.write(move |transaction| {
+            Box::pin(async move {
+                let known: Option<(String, i64)> = sqlx::query_as(
+                    "select model_digest, created_at_us from undamaged_state where structure_id = $1 and version = $2",
+                )
+                .bind(&structure)
+                .bind(state.version)
+                .fetch_optional(transaction.connection())
+                .await?;
+                if let Some((model_digest, created_here)) = known {
+                    if model_digest == state.model_digest && created_here == created.micros() {
+                        return Ok(false);
+                    }
+                    let detail = format!("{structure} has another undamaged state {} here", state.version);
+                    return Err(bad_row("undamaged state of the archive")(&detail));
+                }
+                insert_undamaged(transaction, &structure, &state, created).await?;
+                sqlx::query(
+                    "update measurement_batch set state = 'received' where structure_id = $1 and state = 'assessed'
+                       and batch_id not in (select batch_id from undamaged_batch where structure_id = $1 and version = $2)",
+                )
+                .bind(&structure)
+                .bind(state.version)
+                .execute(transaction.connection())
+                .await?;
+                Ok(true)
+            })
+        })
+        .await
+    }
+
+    /// Stores a maintenance window unless it is stored already. Returns whether it was new.
+    ///
+    /// # Errors
+    /// [`Error::Row`] if a time cannot be parsed.
+    pub async fn import_maintenance(self, structure: &StructureId, window: Maintenance) -> Result<bool, Error> {
+        let time = |text: &str| Timestamp::parse(text).map_err(|e| bad_row("maintenance window of the archive")(&e));
+        let (from, to, created) = (time(&window.from)?, time(&window.to)?, time(&window.created_at)?);
+        let structure = structure.to_string();
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let inserted = sqlx::query(
+                        "insert into maintenance_window values ($1, $2, $3, $4, $5) on conflict do nothing",
+                    )
+                    .bind(&structure)
+                    .bind(from.micros())
+                    .bind(to.micros())
+                    .bind(&window.reason)
+                    .bind(created.micros())
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(inserted.rows_affected() > 0)
+                })
+            })
+            .await
+    }
+
+    /// Stores an acknowledgement with its alarm. Returns whether something changed, which it does not if the alarm does not exist
+    /// here or is acknowledged already.
+    ///
+    /// # Errors
+    /// [`Error::Row`] if a time cannot be parsed.
+    pub async fn import_acknowledgement(self, structure: &StructureId, note: Acknowledged) -> Result<bool, Error> {
+        let at = Timestamp::parse(&note.at).map_err(|e| bad_row("acknowledgement of the archive")(&e))?;
+        let structure = structure.to_string();
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let updated = sqlx::query(
+                    "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2, acknowledgement_note = $3
+                     where structure_id = $4 and kind = $5 and series = $6 and opened_batch = $7 and withdrawn = 0
+                       and acknowledged_at_us is null",
+                )
+                .bind(at.micros())
+                .bind(&note.by)
+                .bind(&note.note)
+                .bind(&structure)
+                .bind(&note.kind)
+                .bind(&note.series)
+                .bind(&note.opened_batch)
+                .execute(transaction.connection())
+                .await?;
+                    Ok(updated.rows_affected() > 0)
+                })
+            })
+            .await
+    }
+}
+
+/// Stores an undamaged reference with its batches and quantities.
+async fn insert_undamaged(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    state: &Undamaged,
+    created: Timestamp,
+) -> Result<(), Error> {
+    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8)")
+        .bind(structure)
+        .bind(state.version)
+        .bind(&state.model_digest)
+        .bind(created.micros())
+        .bind(state.threshold_probability)
+        .bind(state.measurements)
+        .bind(&state.conditions)
+        .bind(&state.doubts)
+        .execute(transaction.connection())
+        .await?;
+    for batch in &state.batches {
+        sqlx::query("insert into undamaged_batch values ($1, $2, $3)")
+            .bind(structure)
+            .bind(state.version)
+            .bind(batch)
+            .execute(transaction.connection())
+            .await?;
+    }
+    for q in &state.quantities {
+        sqlx::query("insert into undamaged_quantity values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
+            .bind(structure)
+            .bind(state.version)
+            .bind(&q.quantity)
+            .bind(q.position)
+            .bind(q.mean)
+            .bind(q.std)
+            .bind(q.threshold)
+            .bind(&q.detail)
+            .bind(&q.mean_draws)
+            .bind(&q.std_draws)
+            .execute(transaction.connection())
+            .await?;
+    }
+    Ok(())
+}

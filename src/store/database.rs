@@ -1,0 +1,84 @@
+//! The open database: the readers and the write queue that all areas of the store share.
+
+use std::fs::File;
+use std::future::Future;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use sqlx::sqlite::SqlitePool;
+use tracing::{info_span, Instrument as _};
+
+use super::error::Error;
+use super::file::Limits;
+use super::transaction::Transaction;
+use super::writer::{Work, Writer};
+use crate::volume;
+
+/// The open database of a data folder.
+pub(super) struct Database {
+    /// Connections that only read.
+    pub reader: SqlitePool,
+    /// The connection that writes.
+    pub writer: Arc<Writer>,
+    /// The database file.
+    pub path: PathBuf,
+    /// Version of the SQLite library.
+    pub sqlite_version: String,
+    /// Limits that can be changed while the database is open.
+    pub limits: Limits,
+    /// Held as long as the database is open, so that a second process on the same folder is refused.
+    pub _lock: File,
+}
+
+impl Database {
+    /// The data folder.
+    pub fn folder(&self) -> &Path {
+        self.path.parent().unwrap_or(Path::new("."))
+    }
+
+    /// Fails while less space is free than the configured minimum, which SQLite needs to write the log back into the database.
+    pub fn check_free_space(&self) -> Result<(), Error> {
+        let minimum = self.limits.min_free_bytes();
+        if minimum == 0 {
+            return Ok(());
+        }
+        let folder = self.folder();
+        let free = volume::free_bytes(folder).map_err(|source| Error::Folder { path: folder.to_owned(), source })?;
+        if free >= minimum {
+            return Ok(());
+        }
+        Err(Error::DiskFull(format!("{free} bytes are free, store.min_free_bytes asks for {minimum}")))
+    }
+
+    /// Queues a write task and returns its result once it is committed.
+    ///
+    /// Write tasks run in the order of the calls, also where the result is awaited later. Tasks that wait at the same time share
+    /// one immediate transaction.
+    pub fn write<T, F>(&self, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
+        let queued = self.check_free_space().map(|()| self.write_without_floor(work));
+        let writer = Arc::clone(&self.writer);
+        async move {
+            match queued {
+                Ok(answer) => answer.await,
+                Err(error) => {
+                    writer.count_failure(&error);
+                    Err(error)
+                }
+            }
+        }
+    }
+
+    /// As [`Self::write`], but also below the minimum of free space: for tasks that free space.
+    pub fn write_without_floor<T, F>(&self, work: F) -> impl Future<Output = Result<T, Error>> + Send + 'static
+    where
+        T: Send + 'static,
+        F: for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, T> + Send + 'static,
+    {
+        let trace = info_span!(target: "modalwatch::spans", "store transaction");
+        self.writer.queue(work).instrument(trace)
+    }
+}

@@ -1,0 +1,226 @@
+//! The errors of the store, and how failures of the disk are distinguished from programming errors.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use sqlx::migrate::MigrateError;
+
+/// Why an operation of the store failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The data folder or a file in it cannot be created or read.
+    #[error("{path} cannot be used: {source}")]
+    Folder {
+        /// The path.
+        path: PathBuf,
+        /// The cause.
+        source: std::io::Error,
+    },
+    /// The database file or its folder is read-only.
+    #[error("{0} is read-only: give write permission, or another --data-dir")]
+    ReadOnly(PathBuf),
+    /// The database file was deleted or replaced while it was open, so that new data would be lost with the process.
+    #[error("{0} was deleted or replaced while it was open: nothing more is stored; put it back and start the service again")]
+    Gone(PathBuf),
+    /// Another process has the data folder open.
+    #[error("{0} is in use by another modalwatch: stop it, or give another --data-dir")]
+    Locked(PathBuf),
+    /// The file is not a SQLite database.
+    #[error("{0} is not a SQLite database: move it away, or give another --data-dir")]
+    NotADatabase(PathBuf),
+    /// The file is a SQLite database of another program.
+    #[error("{path} belongs to another program (application id {application_id:#x}): give another --data-dir")]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// Its application id.
+        application_id: i64,
+    },
+    /// The database file is damaged.
+    #[error("{path} is damaged ({detail}): restore it from a backup; nothing was changed")]
+    Corrupt {
+        /// The file.
+        path: PathBuf,
+        /// The first defect that SQLite reported.
+        detail: String,
+    },
+    /// The database was written by a newer program.
+    #[error("{path} has schema version {found}, newer than this program's {known}: use the newer modalwatch")]
+    SchemaTooNew {
+        /// The file.
+        path: PathBuf,
+        /// Schema version of the file.
+        found: i64,
+        /// Newest schema version known to this program.
+        known: i64,
+    },
+    /// The linked SQLite library has a defect that can corrupt a database.
+    #[error("SQLite {0} can corrupt a database (WAL reset): version 3.51.3 or later is needed")]
+    LibraryTooOld(String),
+    /// The structure is not stored.
+    #[error("there is no structure {0}")]
+    UnknownStructure(String),
+    /// The batch is not stored.
+    #[error("structure {structure} has no batch {batch}")]
+    UnknownBatch {
+        /// The structure.
+        structure: String,
+        /// The batch.
+        batch: String,
+    },
+    /// A row cannot be decoded: the file was changed by another program, or there is a programming error.
+    #[error("a stored {what} cannot be read: {detail}")]
+    Row {
+        /// Kind of row.
+        what: &'static str,
+        /// The cause.
+        detail: String,
+    },
+    /// A migration of the schema failed.
+    #[error("the database could not be migrated to this version: {0}")]
+    Migration(#[from] MigrateError),
+    /// The data folder is on a network file system.
+    #[error(
+        "{path} is on a network file system ({file_system}), whose locks cannot keep a database whole: give a --data-dir on a \
+         local disk, or set store.allow_network_filesystem = true"
+    )]
+    NetworkFileSystem {
+        /// The folder.
+        path: PathBuf,
+        /// Its file system.
+        file_system: String,
+    },
+    /// The disk is full, or has less free space than the configured minimum. Nothing was written; writes succeed again as soon
+    /// as there is space.
+    #[error("the disk of the data folder is full: {0}")]
+    DiskFull(String),
+    /// The disk reported an input or output error. Nothing was written.
+    #[error("the disk of the data folder failed: {0}")]
+    Disk(String),
+    /// The database became read-only while it was open.
+    #[error("the database can no longer be written: {0}")]
+    BecameReadOnly(String),
+    /// Another connection held the write lock longer than the busy timeout.
+    #[error("the database is busy: {0}")]
+    Busy(String),
+    /// Any other error of SQLite.
+    #[error("database: {0}")]
+    Sqlite(Arc<sqlx::Error>),
+    /// A write task panicked, which is a programming error.
+    #[error("a database task panicked")]
+    Panicked,
+}
+
+impl From<sqlx::Error> for Error {
+    /// Maps failures of the disk to variants of their own, because they are temporary and not programming errors.
+    fn from(error: sqlx::Error) -> Self {
+        match primary_code(&error) {
+            Some(13) => Self::DiskFull(error.to_string()),
+            // SQLITE_IOERR, and SQLITE_CANTOPEN, which opening the write-ahead log can return at any time.
+            Some(10 | 14) => Self::Disk(error.to_string()),
+            Some(8) => Self::BecameReadOnly(error.to_string()),
+            Some(5 | 6) => Self::Busy(error.to_string()),
+            _ if matches!(error, sqlx::Error::PoolTimedOut) => Self::Busy(error.to_string()),
+            _ => Self::Sqlite(Arc::new(error)),
+        }
+    }
+}
+
+/// The primary result code of SQLite, without its extension.
+fn primary_code(error: &sqlx::Error) -> Option<i32> {
+    let code = error.as_database_error()?.code()?;
+    code.parse::<i32>().ok().map(|code| code & 0xff)
+}
+
+impl Error {
+    /// Short name of the cause if it is the disk and not the request, for metrics and for `/readyz`.
+    pub fn disk_cause(&self) -> Option<&'static str> {
+        match self {
+            Self::DiskFull(_) => Some("disk_full"),
+            Self::Disk(_) => Some("disk_failed"),
+            Self::BecameReadOnly(_) | Self::ReadOnly(_) => Some("read_only"),
+            Self::Busy(_) => Some("database_busy"),
+            Self::Gone(_) => Some("database_gone"),
+            _ => None,
+        }
+    }
+
+    /// A copy of the error, for each further caller that waited for the same transaction.
+    pub(super) fn copy(&self) -> Self {
+        match self {
+            Self::DiskFull(reason) => Self::DiskFull(reason.clone()),
+            Self::Disk(reason) => Self::Disk(reason.clone()),
+            Self::BecameReadOnly(reason) => Self::BecameReadOnly(reason.clone()),
+            Self::Busy(reason) => Self::Busy(reason.clone()),
+            Self::Gone(path) => Self::Gone(path.clone()),
+            Self::Sqlite(error) => Self::Sqlite(Arc::clone(error)),
+            other => Self::Sqlite(Arc::new(sqlx::Error::Protocol(other.to_string()))),
+        }
+    }
+
+    /// True when the connection that returned this error must not be used again.
+    pub(super) fn spoils_the_connection(&self) -> bool {
+        matches!(self, Self::DiskFull(_) | Self::Disk(_) | Self::BecameReadOnly(_) | Self::Busy(_) | Self::Sqlite(_))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Store, StoreSettings};
+    use super::Error;
+    use crate::quantity::{Digest, StructureId, Timestamp};
+
+    async fn put(store: &Store, id: &str, bytes: usize) -> Result<(), Error> {
+        let json = format!("\"{}\"", "x".repeat(bytes));
+        let (id, digest) = (StructureId::parse(id).unwrap(), Digest::of_file(json.as_bytes()));
+        store.structures().put_structure(&id, &json, &digest, Timestamp::now()).await.map(|_| ())
+    }
+
+    #[tokio::test]
+    async fn a_full_disk_is_reported_and_writes_succeed_again_when_there_is_space() {
+        let folder = tempfile::tempdir().unwrap();
+        let settings = StoreSettings { min_free_bytes: 0, ..StoreSettings::default() };
+        let store = Store::open_with(folder.path(), &settings).await.unwrap();
+        let pool = &store.database.writer.pool;
+        let pages: (i64,) = sqlx::query_as("pragma page_count").fetch_one(pool).await.unwrap();
+        let limit = format!("pragma max_page_count = {}", pages.0 + 2);
+        sqlx::query(sqlx::AssertSqlSafe(limit)).execute(pool).await.unwrap();
+        // The limit belongs to the connection. The failed connection is closed, so its successor has no limit, as if space had
+        // been freed.
+        let error = put(&store, "large", 100_000).await.unwrap_err();
+        assert_eq!(error.disk_cause(), Some("disk_full"), "{error}");
+        assert!(store.structures().list().await.unwrap().is_empty(), "half of it was stored");
+        put(&store, "large", 100_000).await.unwrap();
+        assert_eq!(store.structures().list().await.unwrap().len(), 1);
+    }
+
+    #[tokio::test]
+    async fn below_the_minimum_of_free_space_nothing_is_written_and_everything_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).await.unwrap();
+        put(&store, "before", 10).await.unwrap();
+        store.file().set_limits(&StoreSettings { min_free_bytes: u64::MAX, ..StoreSettings::default() });
+        let error = put(&store, "during", 10).await.unwrap_err();
+        assert_eq!(error.disk_cause(), Some("disk_full"), "{error}");
+        assert!(store.file().is_writable().await.is_err());
+        assert_eq!(store.structures().list().await.unwrap().len(), 1);
+        store.file().set_limits(&StoreSettings::default());
+        put(&store, "after", 10).await.unwrap();
+        assert_eq!(store.structures().list().await.unwrap().len(), 2);
+    }
+
+    #[tokio::test]
+    async fn a_write_that_breaks_a_constraint_leaves_the_writer_usable() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).await.unwrap();
+        let broken = store.database.write(|transaction| {
+            Box::pin(async move {
+                let insert = sqlx::query("insert into structure values (null, null, null, null, null)");
+                insert.execute(transaction.connection()).await?;
+                Ok(())
+            })
+        });
+        assert!(matches!(broken.await, Err(Error::Sqlite(_))));
+        put(&store, "after", 10).await.unwrap();
+    }
+}

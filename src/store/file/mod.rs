@@ -1,0 +1,16 @@
+//! The SQLite file: its folder and lock, its identity, how it is opened, and its limits.
+
+mod folder;
+mod identity;
+mod opening;
+mod settings;
+
+pub use folder::DATABASE_FILE;
+pub(super) use folder::{prepare_folder, take_lock};
+#[cfg(test)]
+pub(super) use identity::APPLICATION_ID;
+pub(super) use identity::{refuse_foreign, OpenedFile};
+pub use opening::schema_version;
+pub(super) use opening::{library_version, open, Opened};
+pub(super) use settings::Limits;
+pub use settings::StoreSettings;

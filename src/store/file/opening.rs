@@ -1,0 +1,99 @@
+//! Opening the database: pragmas, integrity check, and migrations.
+
+use std::path::Path;
+use std::time::Duration;
+
+use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::sqlite::{
+    SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous,
+};
+
+use super::super::error::Error;
+use super::identity::{not_a_database, APPLICATION_ID};
+
+/// The first SQLite release without the WAL-reset defect, through which two connections could corrupt a database.
+const OLDEST_SQLITE: [u32; 3] = [3, 51, 3];
+
+/// Largest database whose indexes are compared with their tables at every start, which takes about five seconds. A single
+/// flipped bit in a key hides a batch, and the quick check does not detect it.
+const FULL_CHECK_BYTES: u64 = 1 << 30;
+
+/// The log file is truncated to this size when it restarts. Without the limit, one long read would leave a large file for good.
+const LOG_LIMIT_BYTES: &str = "67108864";
+
+const READERS: u32 = 8;
+/// Rows that a reader buffers: for long series, passing rows singly between threads would cost more than reading them.
+const ROWS_AT_A_TIME: usize = 1_000;
+const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+
+static MIGRATIONS: Migrator = sqlx::migrate!();
+
+/// The newest schema version that this program knows, which is that of every open store.
+pub fn schema_version() -> i64 {
+    MIGRATIONS.iter().map(|m| m.version).max().unwrap_or_default()
+}
+
+/// The connections of a database that was opened.
+pub(in super::super) struct Opened {
+    pub writer: SqlitePool,
+    pub reader: SqlitePool,
+    pub sqlite_version: String,
+}
+
+/// Opens a database: checks its integrity, marks it as ours, and migrates it to the newest schema.
+pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
+    let options = SqliteConnectOptions::new()
+        .filename(path)
+        .journal_mode(SqliteJournalMode::Wal)
+        .synchronous(SqliteSynchronous::Full)
+        .foreign_keys(true)
+        .pragma("journal_size_limit", LOG_LIMIT_BYTES)
+        .busy_timeout(BUSY_TIMEOUT);
+    // The only connection that writes; it lives as long as the store.
+    let writer = SqlitePoolOptions::new().max_connections(1).idle_timeout(None).max_lifetime(None);
+    let writer = writer.connect_with(options.clone().create_if_missing(true)).await;
+    let writer = writer.map_err(|e| not_a_database(e, path))?;
+    let check: Result<(String,), _> = sqlx::query_as(check_of(path)).fetch_one(&writer).await;
+    let (check,) = check.map_err(|e| not_a_database(e, path))?;
+    if check != "ok" {
+        return Err(Error::Corrupt { path: path.to_owned(), detail: check });
+    }
+    let (sqlite_version, safe) = library_version(&mut *writer.acquire().await?).await?;
+    if !safe {
+        return Err(Error::LibraryTooOld(sqlite_version));
+    }
+    // After the checks, because setting the application id is a write and a damaged file must stay as it is.
+    let mark = format!("pragma application_id = {APPLICATION_ID}");
+    sqlx::query(sqlx::AssertSqlSafe(mark)).execute(&writer).await?;
+    MIGRATIONS.run(&writer).await.map_err(|error| match error {
+        MigrateError::VersionMissing(found) => {
+            Error::SchemaTooNew { path: path.to_owned(), found, known: schema_version() }
+        }
+        other => Error::Migration(other),
+    })?;
+    // For larger savepoints SQLite copies pages to a temporary file, which would be created, written and removed in nearly every
+    // transaction. Set after the migrations, which may have to sort a whole table.
+    sqlx::query("pragma temp_store = memory").execute(&writer).await?;
+    writer.set_connect_options(options.clone().pragma("temp_store", "memory"));
+    let reader = SqlitePoolOptions::new()
+        .max_connections(READERS)
+        .connect_with(options.read_only(true).row_buffer_size(ROWS_AT_A_TIME))
+        .await?;
+    Ok(Opened { writer, reader, sqlite_version })
+}
+
+/// The version of the SQLite library, and whether it is free of the WAL-reset defect.
+pub(in super::super) async fn library_version(connection: &mut SqliteConnection) -> Result<(String, bool), Error> {
+    let (version,): (String,) = sqlx::query_as("select sqlite_version()").fetch_one(connection).await?;
+    let numbers: Vec<u32> = version.split('.').filter_map(|n| n.parse().ok()).collect();
+    let safe = numbers.as_slice() >= OLDEST_SQLITE.as_slice();
+    Ok((version, safe))
+}
+
+/// The integrity check that is fast enough for every start.
+fn check_of(path: &Path) -> &'static str {
+    match std::fs::metadata(path) {
+        Ok(file) if file.len() > FULL_CHECK_BYTES => "pragma quick_check(1)",
+        _ => "pragma integrity_check(1)",
+    }
+}

@@ -1,0 +1,55 @@
+//! Settings of the database file.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use serde::{Deserialize, Serialize};
+
+/// Where a database may be located, and how much disk space it needs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StoreSettings {
+    /// Open a database on NFS, SMB or another network file system nevertheless.
+    pub allow_network_filesystem: bool,
+    /// Free bytes below which nothing is written; 0 = write until the disk is full.
+    pub min_free_bytes: u64,
+    /// Bytes of the write-ahead log above which `/readyz` warns.
+    pub max_wal_bytes: u64,
+}
+
+impl Default for StoreSettings {
+    fn default() -> Self {
+        Self { allow_network_filesystem: false, min_free_bytes: 64 << 20, max_wal_bytes: 256 << 20 }
+    }
+}
+
+/// Limits that can be changed while the store is open.
+pub(in super::super) struct Limits {
+    min_free_bytes: AtomicU64,
+    max_wal_bytes: AtomicU64,
+}
+
+impl Limits {
+    /// The limits of settings.
+    pub const fn of(settings: &StoreSettings) -> Self {
+        Self {
+            min_free_bytes: AtomicU64::new(settings.min_free_bytes),
+            max_wal_bytes: AtomicU64::new(settings.max_wal_bytes),
+        }
+    }
+
+    /// Adopts the limits of changed settings.
+    pub fn set(&self, settings: &StoreSettings) {
+        self.min_free_bytes.store(settings.min_free_bytes, Ordering::Relaxed);
+        self.max_wal_bytes.store(settings.max_wal_bytes, Ordering::Relaxed);
+    }
+
+    /// Free bytes below which nothing is written.
+    pub fn min_free_bytes(&self) -> u64 {
+        self.min_free_bytes.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of the write-ahead log above which `/readyz` warns.
+    pub fn max_wal_bytes(&self) -> u64 {
+        self.max_wal_bytes.load(Ordering::Relaxed)
+    }
+}

@@ -1,0 +1,164 @@
+//! Versions of structures, and the baselines trained for them.
+
+use sqlx::FromRow;
+
+use super::error::Error;
+use super::structure::{is_present, Structures};
+use super::transaction::Transaction;
+use crate::quantity::{Digest, StructureId, Timestamp};
+
+/// A new version of a structure, with the baseline trained for it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewVersion {
+    /// Digest of the definition.
+    pub digest: Digest,
+    /// Canonical JSON.
+    pub definition_json: String,
+    /// Digest of the version that it extends.
+    pub parent: Option<Digest>,
+    /// Id of the diagnosis from which it was made.
+    pub diagnosis: Option<String>,
+    /// A trained baseline that is not in the library.
+    pub baseline: Option<StoredBaseline>,
+}
+
+/// A baseline that the service trained.
+#[derive(Debug, Clone, PartialEq, FromRow)]
+pub struct StoredBaseline {
+    /// Digest of the manifest.
+    pub model_digest: String,
+    /// The manifest file.
+    pub manifest: Vec<u8>,
+    /// The weight file.
+    pub weights: Vec<u8>,
+    /// True if it is used although it failed its calibration check.
+    pub accepted: bool,
+}
+
+impl Structures<'_> {
+    /// Makes another version the present version of a structure and stores the baseline trained for it. The earlier version and
+    /// the assessments for it are kept, and all batches are assessed again for the new one. Changes nothing and returns false if
+    /// `expected` is not the present version.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn switch_version(
+        self,
+        structure: &StructureId,
+        expected: &Digest,
+        version: NewVersion,
+        now: Timestamp,
+    ) -> Result<bool, Error> {
+        let (structure, expected, now) = (structure.to_string(), expected.clone(), now.micros());
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    if !is_present(transaction, &structure, &expected).await? {
+                        return Ok(false);
+                    }
+                    sqlx::query(
+                        "insert into structure_version
+                     select structure_id, digest, definition, null, null, created_at_us from structure
+                     where structure_id = $1
+                     on conflict do nothing",
+                    )
+                    .bind(&structure)
+                    .execute(transaction.connection())
+                    .await?;
+                    sqlx::query("insert into structure_version values ($1, $2, $3, $4, $5, $6) on conflict do nothing")
+                        .bind(&structure)
+                        .bind(version.digest.as_str())
+                        .bind(&version.definition_json)
+                        .bind(version.parent.as_ref().map(Digest::as_str))
+                        .bind(&version.diagnosis)
+                        .bind(now)
+                        .execute(transaction.connection())
+                        .await?;
+                    if let Some(baseline) = &version.baseline {
+                        insert_baseline(transaction, &structure, &version.digest, baseline, now).await?;
+                    }
+                    sqlx::query(
+                        "update structure set definition = $1, digest = $2, updated_at_us = $3 where structure_id = $4",
+                    )
+                    .bind(&version.definition_json)
+                    .bind(version.digest.as_str())
+                    .bind(now)
+                    .bind(&structure)
+                    .execute(transaction.connection())
+                    .await?;
+                    sqlx::query(
+                        "update measurement_batch set state = 'received', failure = null where structure_id = $1",
+                    )
+                    .bind(&structure)
+                    .execute(transaction.connection())
+                    .await?;
+                    Ok(true)
+                })
+            })
+            .await
+    }
+
+    /// A version of a structure: its definition, and the digest of the version that it extends.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn structure_version(
+        self,
+        structure: &StructureId,
+        digest: &Digest,
+    ) -> Result<Option<(String, Option<Digest>)>, Error> {
+        let row: Option<(String, Option<String>)> = sqlx::query_as(
+            "select definition, parent_digest from structure_version where structure_id = $1 and digest = $2",
+        )
+        .bind(structure.as_str())
+        .bind(digest.as_str())
+        .fetch_optional(&self.database.reader)
+        .await?;
+        Ok(row.map(|(definition, parent)| (definition, parent.map(Digest::from_stored))))
+    }
+
+    /// The baseline that the service trained for a version.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn trained_baseline(
+        self,
+        structure: &StructureId,
+        structure_digest: &Digest,
+    ) -> Result<Option<StoredBaseline>, Error> {
+        Ok(sqlx::query_as(
+            "select model_digest, manifest, weights, accepted from trained_baseline
+             where structure_id = $1 and structure_digest = $2",
+        )
+        .bind(structure.as_str())
+        .bind(structure_digest.as_str())
+        .fetch_optional(&self.database.reader)
+        .await?)
+    }
+}
+
+/// Stores the baseline trained for a version in place of an earlier one.
+async fn insert_baseline(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    version: &Digest,
+    baseline: &StoredBaseline,
+    now_us: i64,
+) -> Result<(), Error> {
+    sqlx::query(
+        "insert into trained_baseline values ($1, $2, $3, $4, $5, $6, $7)
+         on conflict (structure_id, structure_digest) do update
+         set model_digest = excluded.model_digest, manifest = excluded.manifest, weights = excluded.weights,
+             accepted = excluded.accepted, created_at_us = excluded.created_at_us",
+    )
+    .bind(structure)
+    .bind(version.as_str())
+    .bind(&baseline.model_digest)
+    .bind(&baseline.manifest)
+    .bind(&baseline.weights)
+    .bind(baseline.accepted)
+    .bind(now_us)
+    .execute(transaction.connection())
+    .await?;
+    Ok(())
+}
