@@ -99,7 +99,7 @@ impl Service {
     async fn declare_undamaged(&self) {
         let batch = self.post(&batches(ASSESSED), body("undamaged", 0, LARGE)).await;
         let declared = json!({ "batches": [batch["batch"]] }).to_string().into_bytes();
-        self.post(&format!("/v1/structures/{ASSESSED}/baseline"), declared).await;
+        self.post(&format!("/v1/structures/{ASSESSED}/reference"), declared).await;
     }
 
     /// Posts until the time is over; what each took, ms.

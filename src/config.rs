@@ -1,4 +1,5 @@
-//! The settings of all modules, and where they are read from: defaults < file < environment < flags.
+//! The configuration: the settings of all modules, read from defaults, file, environment and flags; later ones take
+//! precedence.
 
 use std::path::{Path, PathBuf};
 
@@ -15,13 +16,13 @@ use crate::notify::NotifySettings;
 use crate::store::StoreSettings;
 use crate::telemetry::LogSettings;
 
-/// Prefix of the environment variables; `__` stands between section and key.
+/// Prefix of the environment variables; `__` separates section and key.
 const ENVIRONMENT: &str = "MODALWATCH__";
 
-/// Names the admin token file.
+/// Variable with the path of the admin token file.
 const ADMIN_TOKEN_FILE: &str = "MODALWATCH_ADMIN_TOKEN_FILE";
 
-/// The commented defaults, as a file.
+/// Configuration file with the commented defaults.
 pub const DEFAULT_FILE: &str = include_str!("config.default.toml");
 
 /// All settings of the service.
@@ -30,24 +31,24 @@ pub const DEFAULT_FILE: &str = include_str!("config.default.toml");
 pub struct Config {
     /// Folder of the database.
     pub data_dir: PathBuf,
-    /// Folder of the user's own structures and trained baselines.
+    /// Folder of the user's own structures and trained models.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub models_dir: Option<PathBuf>,
-    /// Towards clients.
+    /// HTTP server.
     pub http: HttpSettings,
-    /// Who gets in.
+    /// Access to the service.
     pub access: AccessSettings,
-    /// How batches are taken and assessed.
+    /// Storing and assessing batches.
     pub monitor: MonitorSettings,
-    /// Messages to other programs.
+    /// Webhooks.
     pub notify: NotifySettings,
-    /// Batches from a broker.
+    /// MQTT broker.
     pub mqtt: MqttSettings,
-    /// Where the database may lie, and the room it needs.
+    /// Requirements on the file system of the database.
     pub store: StoreSettings,
-    /// How long batches are kept.
+    /// Retention of batches.
     pub retention: RetentionSettings,
-    /// Logs.
+    /// Logs and traces.
     pub log: LogSettings,
 }
 
@@ -68,7 +69,7 @@ impl Default for Config {
     }
 }
 
-/// Flags that go over everything else.
+/// Command-line flags, which take precedence over all other sources.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Flags {
     /// `--data-dir`
@@ -96,7 +97,7 @@ impl HttpFlags {
     }
 }
 
-/// Why there is no configuration.
+/// Why the configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file given by `--config` cannot be read.
@@ -110,7 +111,7 @@ pub enum Error {
     /// An unknown key or a value of the wrong type; the message names key and origin.
     #[error("configuration: {0}")]
     Value(Box<figment::Error>),
-    /// A setting of the broker that cannot be used.
+    /// An invalid setting of the MQTT broker.
     #[error("configuration: {0}")]
     Mqtt(#[from] crate::mqtt::SettingError),
     /// A value out of range.
@@ -120,23 +121,23 @@ pub enum Error {
         key: &'static str,
         /// Its value.
         value: String,
-        /// What would be right.
+        /// Values that are allowed.
         must: &'static str,
     },
 }
 
 impl Config {
-    /// Reads the configuration from all its places.
+    /// Reads the configuration from all sources.
     ///
     /// # Errors
-    /// [`Error`] naming file, key or value.
+    /// [`Error`], which names file, key or value.
     pub fn read(file: Option<&Path>, flags: &Flags) -> Result<Self, Error> {
         let mut figment = Figment::from(Serialized::defaults(Self::default()));
         if let Some(path) = file {
             let text = std::fs::read_to_string(path).map_err(|source| Error::File { path: path.to_owned(), source })?;
             figment = figment.merge(Toml::string(&text));
         }
-        // A file's name under a name of its own: what holds a secret is set apart from the settings.
+        // A separate, shorter variable for the path of a secret.
         let admin_file = Env::raw().only(&[ADMIN_TOKEN_FILE]).map(|_| "access.admin_token_file".into());
         figment =
             figment.merge(admin_file).merge(Env::prefixed(ENVIRONMENT).split("__")).merge(Serialized::defaults(flags));
@@ -197,7 +198,7 @@ impl Config {
     }
 }
 
-/// The leaves of a tree of settings, by their keys.
+/// Collects the leaves of a tree of settings by their keys.
 fn flatten(path: String, value: &serde_json::Value, keys: &mut std::collections::BTreeMap<String, serde_json::Value>) {
     let serde_json::Value::Object(members) = value else {
         keys.insert(path, value.clone());

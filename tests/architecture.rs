@@ -46,7 +46,11 @@ const TABLE: [(&str, &[&str], bool); 33] = [
     ("telemetry", &[], false),
     // A study of the methods, the assessment of a batch included.
     ("reproduce", &["assessment", "baseline", "damage", "gsa", "physics", "plot", "simulator", "updating"], true),
-    ("monitor", &["alarm", "assessment", "baseline", "damage", "discrepancy", "flow", "simulator", "store"], true),
+    (
+        "monitor",
+        &["alarm", "assessment", "baseline", "damage", "discrepancy", "flow", "reduction", "simulator", "store"],
+        true,
+    ),
     (
         "http",
         &[

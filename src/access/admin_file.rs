@@ -1,4 +1,5 @@
-//! The token that is in a file instead of the database: for the first start, and for when all others are lost.
+//! The admin token file: a token outside the database, for the first start and for the case that all other tokens are
+//! lost.
 
 use std::io::Write as _;
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
@@ -11,7 +12,7 @@ use crate::quantity::Timestamp;
 /// Name of the token in lists and in the audit.
 pub const ADMIN_FILE_TOKEN_NAME: &str = "admin token file";
 
-/// Any right of others than owner and group.
+/// Permission bits of users other than owner and group.
 const RIGHTS_OF_OTHERS: u32 = 0o007;
 
 /// Why the file cannot be used.
@@ -25,23 +26,23 @@ pub enum Error {
         /// The cause.
         source: std::io::Error,
     },
-    /// Everybody on this machine could use the token.
-    #[error("the admin token file {path} has the mode {mode:03o}: everybody here could use it; run chmod 600 {path}")]
+    /// Other users of this machine could read the token.
+    #[error("the admin token file {path} has the mode {mode:03o}: every user of this machine could use it; run chmod 600 {path}")]
     OpenToOthers {
         /// The file.
         path: PathBuf,
         /// Its mode.
         mode: u32,
     },
-    /// It holds no token.
-    #[error("the admin token file {path} holds no token ({source}): make one with modalwatch token file {path}")]
+    /// It contains no token.
+    #[error("the admin token file {path} contains no token ({source}): create one with modalwatch token file {path}")]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// What a token looks like.
+        /// The format of a token.
         source: Malformed,
     },
-    /// The operating system gave no random numbers.
+    /// The operating system provided no random numbers.
     #[error(transparent)]
     Random(#[from] NoRandomness),
 }
@@ -49,7 +50,7 @@ pub enum Error {
 /// Reads the token; only its digest is kept.
 ///
 /// # Errors
-/// [`Error`] for a file that is missing, holds no token, or that others than owner and group may use.
+/// [`Error`] if the file is missing, contains no token, or can be used by other users than owner and group.
 pub fn read_admin_token(path: &Path) -> Result<TokenRecord, Error> {
     let failed = |source| Error::File { path: path.to_owned(), source };
     let mode = std::fs::metadata(path).map_err(failed)?.permissions().mode() & 0o777;
@@ -67,10 +68,10 @@ pub fn read_admin_token(path: &Path) -> Result<TokenRecord, Error> {
     Ok(new.record(&text, Timestamp::now()))
 }
 
-/// Makes a token and writes it into a new file that only its owner can read.
+/// Creates a token and writes it to a new file that only its owner can read.
 ///
 /// # Errors
-/// [`Error`], also when the file exists.
+/// [`Error`], also if the file exists.
 pub fn write_admin_token(path: &Path) -> Result<TokenText, Error> {
     let failed = |source| Error::File { path: path.to_owned(), source };
     let text = TokenText::generate()?;

@@ -8,16 +8,16 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::StructureId;
 
-/// What a token is for.
+/// Right of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 #[schema(as = TokenScope)]
 pub enum Scope {
     /// Post batches.
     Ingest,
-    /// Read everything but tokens, audit and other settings of the service.
+    /// Read everything except tokens, audit and other settings of the service.
     Read,
-    /// Everything, the other two included.
+    /// Everything, including the other two.
     Admin,
 }
 
@@ -25,7 +25,7 @@ impl Scope {
     /// All scopes.
     pub const ALL: [Self; 3] = [Self::Ingest, Self::Read, Self::Admin];
 
-    /// As it is written.
+    /// Name as text.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Ingest => "ingest",
@@ -46,7 +46,7 @@ impl std::str::FromStr for Scope {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let found = Self::ALL.into_iter().find(|scope| scope.as_str() == text);
-        found.ok_or_else(|| format!("{} is none of ingest, read, admin", crate::quantity::shown(text)))
+        found.ok_or_else(|| format!("{} is not one of ingest, read, admin", crate::quantity::shown(text)))
     }
 }
 
@@ -55,7 +55,7 @@ impl std::str::FromStr for Scope {
 pub struct Scopes(u8);
 
 impl Scopes {
-    /// The scopes that were given, without what `admin` includes.
+    /// The scopes that were granted, without those that `admin` includes.
     pub fn iter(self) -> impl Iterator<Item = Scope> {
         Scope::ALL.into_iter().filter(move |scope| self.0 & bit(*scope) != 0)
     }
@@ -65,7 +65,7 @@ impl Scopes {
         self.0 == 0
     }
 
-    /// Whether a request that needs `scope` is covered; `admin` covers all.
+    /// Whether a request that needs `scope` is allowed; `admin` includes all scopes.
     pub const fn cover(self, scope: Scope) -> bool {
         self.0 & (bit(scope) | bit(Scope::Admin)) != 0
     }
@@ -85,10 +85,10 @@ const fn bit(scope: Scope) -> u8 {
     }
 }
 
-/// Who makes a request.
+/// The maker of a request.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Actor {
-    /// Somebody on this machine: the command line, or a client of an open service.
+    /// A user of this machine: the command line, or a client of an open service.
     Local,
     /// The holder of a token.
     Token {
@@ -97,12 +97,12 @@ pub enum Actor {
         /// Its name.
         name: String,
     },
-    /// Somebody who asks for what needs no token.
+    /// The client of a route that needs no token.
     Nobody,
 }
 
 impl Actor {
-    /// As the audit and the log write it.
+    /// Name in the audit and the log.
     pub fn as_str(&self) -> &str {
         match self {
             Self::Local => "local",
@@ -120,56 +120,56 @@ impl Actor {
     }
 }
 
-/// What the maker of a request may do.
+/// The rights of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Grant {
     actor: Actor,
     scopes: Scopes,
-    /// The only structures; `None` stands for all.
+    /// Structures to which it is limited; `None` means all.
     structures: Option<Arc<BTreeSet<StructureId>>>,
 }
 
 impl Grant {
-    /// Of a token.
+    /// A grant of these scopes, for these structures.
     pub fn new(actor: Actor, scopes: Scopes, structures: Option<Arc<BTreeSet<StructureId>>>) -> Self {
         Self { actor, scopes, structures }
     }
 
-    /// Everything, on this machine.
+    /// The grant of a user of this machine: everything.
     pub fn local() -> Self {
         Self::new(Actor::Local, Scopes::from_iter([Scope::Admin]), None)
     }
 
-    /// Nothing but what needs no token.
+    /// The grant of a request without a token: only routes that need none.
     pub fn nobody() -> Self {
         Self::new(Actor::Nobody, Scopes::default(), Some(Arc::default()))
     }
 
-    /// Who it is.
+    /// The maker of the request.
     pub fn actor(&self) -> &Actor {
         &self.actor
     }
 
-    /// Whether a list may show this structure, and what hangs on it.
+    /// Whether a list may show this structure and the data that belong to it.
     pub fn may_see(&self, structure: &StructureId) -> bool {
         self.scopes.cover(Scope::Read) && self.reaches(structure.as_str())
     }
 
-    /// Whether nothing has to be left out of a list.
+    /// Whether lists are shown in full.
     pub fn sees_all(&self) -> bool {
         self.scopes.cover(Scope::Read) && self.structures.is_none()
     }
 
     fn reaches(&self, structure: &str) -> bool {
-        // Compared as text: what is no structure id is none of those allowed.
+        // Compared as text: an invalid structure id equals none of the allowed ones.
         self.structures.as_ref().is_none_or(|allowed| allowed.iter().any(|id| id.as_str() == structure))
     }
 }
 
-/// What a route asks for.
+/// Requirement of a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Need {
-    /// Anybody may.
+    /// No token is needed.
     Nothing,
     /// A token with this scope.
     Scope(Scope),
@@ -180,31 +180,31 @@ pub enum Need {
 pub enum About<'a> {
     /// One structure, by its id as it came.
     Structure(&'a str),
-    /// A list that shows only what [`Grant::may_see`].
+    /// A list that shows only structures that [`Grant::may_see`].
     Filtered,
-    /// The whole service: not for tokens limited to structures.
+    /// The whole service; refused to tokens that are limited to structures.
     Service,
 }
 
-/// Why a known token may not do what it asked for.
+/// Why a valid token may not make a request.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Denied {
-    /// It lacks the scope.
-    #[error("this needs a token with the scope {needed}; this one has {}", listed(*.scopes))]
+    /// It does not have the scope.
+    #[error("this request needs a token with the scope {needed}; this token has {}", listed(*.scopes))]
     Scope {
-        /// The scope.
+        /// The required scope.
         needed: Scope,
-        /// Those it has.
+        /// The scopes of the token.
         scopes: Scopes,
     },
     /// It is limited to other structures.
-    #[error("this token is limited to other structures than {}", crate::quantity::shown(.structure))]
+    #[error("this token is limited to structures other than {}", crate::quantity::shown(.structure))]
     Structure {
-        /// The structure asked for.
+        /// The requested structure.
         structure: String,
     },
-    /// It is limited to structures, and this concerns all.
-    #[error("this concerns the whole service, and this token is limited to single structures")]
+    /// It is limited to structures, and the request concerns the whole service.
+    #[error("this request concerns the whole service, and this token is limited to certain structures")]
     WholeService,
 }
 
@@ -217,7 +217,7 @@ fn listed(scopes: Scopes) -> String {
     }
 }
 
-/// The decision: scope first, then structure.
+/// Decides whether a request is allowed: first by scope, then by structure.
 ///
 /// # Errors
 /// [`Denied`] with the reason.

@@ -1,13 +1,13 @@
-//! Who may do what: tokens, scopes, and the decision on a request. Knows neither HTTP nor SQL.
+//! Tokens, scopes, and the decision whether a request is allowed. This module knows neither HTTP nor SQL.
 //!
 //! ```text
-//!  mw_<id>_<secret>      what a client holds: id 16, secret 52 characters of base32
-//!      │      └────────  256 random bits, shown once; stored is their SHA-256
-//!      └───────────────  public: finds the row, and names the token in lists, logs and the audit
+//!  mw_<id>_<secret>      held by the client: id of 16, secret of 52 characters of base32
+//!      │      └────────  256 random bits, shown once; the service stores their SHA-256
+//!      └───────────────  public: key of the database row, and name of the token in lists, logs and the audit
 //! ```
 //!
-//! A plain SHA-256 is enough for a secret of 256 random bits: nobody can try them all. (Passwords, which people choose,
-//! would need a slow hash.)
+//! A plain SHA-256 is sufficient for a secret of 256 random bits, since nobody can try them all. Passwords, which
+//! people choose, would need a slow hash.
 
 mod admin_file;
 mod grant;
@@ -23,13 +23,13 @@ pub use grant::{allow, About, Actor, Denied, Grant, Need, Scope, Scopes};
 pub use table::{Refused, TokenTable};
 pub use token::{token_like, Malformed, NewToken, NoRandomness, SecretDigest, TokenId, TokenRecord, TokenText};
 
-/// Who gets in before and without the stored tokens.
+/// Access to the service before and without stored tokens.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AccessSettings {
-    /// A file with one token that counts as admin; readable by its owner (and group) only.
+    /// File with one token of the scope admin; only its owner and group may be able to read it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub admin_token_file: Option<PathBuf>,
-    /// Serve a public address without any token. Everybody who reaches it may do everything.
+    /// Serve a public address without any token. Everybody who reaches it may change everything.
     pub insecure_public: bool,
 }

@@ -1,4 +1,4 @@
-//! All tokens, and who holds one.
+//! All tokens, and authentication by them.
 
 use std::collections::HashMap;
 
@@ -7,29 +7,29 @@ use subtle::ConstantTimeEq as _;
 use super::token::{SecretDigest, TokenId, TokenRecord, TokenText};
 use crate::quantity::Timestamp;
 
-/// Why a token opens nothing.
+/// Why a token is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
-    /// No such id, or another secret: which of them is not said.
-    #[error("this token is not known here")]
+    /// The id or the secret is wrong; the answer does not reveal which.
+    #[error("this token is not known to the service")]
     Unknown,
-    /// Its time is over.
+    /// It has expired.
     #[error("this token expired at {0}")]
     Expired(Timestamp),
-    /// Its secret was replaced, and the overlap is over.
-    #[error("this token's secret was replaced; the old one was good until {0}")]
+    /// Its secret was replaced, and the previous one is no longer valid.
+    #[error("the secret of this token was replaced; the previous one was valid until {0}")]
     RotatedOut(Timestamp),
-    /// Somebody revoked it.
+    /// It was revoked.
     #[error("this token was revoked at {0}")]
     Revoked(Timestamp),
 }
 
-/// All tokens, revoked and expired ones included.
+/// All tokens, including revoked and expired ones.
 #[derive(Debug, Default)]
 pub struct TokenTable(HashMap<TokenId, TokenRecord>);
 
 impl TokenTable {
-    /// Whether no token was ever made.
+    /// Whether no token was ever created.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
@@ -44,15 +44,16 @@ impl TokenTable {
         self.0.insert(record.id.clone(), record);
     }
 
-    /// All of them.
+    /// All tokens.
     pub fn records(&self) -> impl Iterator<Item = &TokenRecord> {
         self.0.values()
     }
 
     /// The token that a client presents.
     ///
-    /// Both digests of its row are compared in constant time; an unknown id is compared with a dummy, so that the answer
-    /// takes as long. Expiry and revocation are told only to who knows the secret.
+    /// Both digests of the record are compared in constant time, and an unknown id is compared with a dummy digest, so
+    /// that the time of the answer reveals nothing. Only a client that knows the secret learns that a token is expired
+    /// or revoked.
     ///
     /// # Errors
     /// [`Refused`].
@@ -86,7 +87,8 @@ impl FromIterator<TokenRecord> for TokenTable {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{NewToken, Scope};
+    use super::super::grant::Scope;
+    use super::super::token::NewToken;
     use super::*;
 
     fn at(seconds: i64) -> Timestamp {

@@ -1,4 +1,4 @@
-//! The token: its text, its secret, and what is kept of it.
+//! A token: its text, its secret, and the record that the service stores.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -14,7 +14,7 @@ use super::grant::{Actor, Grant, Scope, Scopes};
 use crate::measurement::check::Problem;
 use crate::quantity::{shown, StructureId, Timestamp};
 
-/// What a token begins with: tools that look for leaked secrets can find it.
+/// Prefix of every token, by which tools that search for leaked secrets can find it.
 const PREFIX: &str = "mw_";
 /// 80 bits: 16 characters of base32 (`0–9 a–v`, the alphabet that sorts like its bytes).
 const ID_BYTES: usize = 10;
@@ -27,14 +27,14 @@ const LONGEST_NAME: usize = 100;
 /// Most structures that a token is limited to.
 const MOST_STRUCTURES: usize = 1_000;
 
-/// The operating system gave no random bytes.
+/// The operating system provided no random bytes.
 #[derive(Debug, thiserror::Error)]
-#[error("the operating system gave no random numbers: {0}")]
+#[error("the operating system provided no random numbers: {0}")]
 pub struct NoRandomness(String);
 
-/// Text that is no token. It does not say what came: that may be half a secret.
+/// Text that is not a token. The error does not contain the text, which may be part of a secret.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("a token reads mw_<16 characters>_<52 characters>")]
+#[error("a token has the form mw_<16 characters>_<52 characters>")]
 pub struct Malformed;
 
 /// The public part of a token.
@@ -45,13 +45,13 @@ impl TokenId {
     /// Checks an id.
     ///
     /// # Errors
-    /// [`Malformed`] unless it has 16 characters of base32.
+    /// [`Malformed`] unless the text has 16 characters of base32.
     pub fn parse(text: &str) -> Result<Self, Malformed> {
         let valid = text.len() == ID_LENGTH && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'v'));
         valid.then(|| Self(text.to_owned())).ok_or(Malformed)
     }
 
-    /// As it is written.
+    /// The id as text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -63,20 +63,20 @@ impl fmt::Display for TokenId {
     }
 }
 
-/// SHA-256 of a secret. Equality only in constant time.
+/// SHA-256 of a secret. It can be compared only in constant time.
 #[derive(Clone, Copy)]
 pub struct SecretDigest([u8; 32]);
 
 impl SecretDigest {
-    /// Equal to no digest of a secret that anybody knows.
+    /// Differs from the digest of every known secret.
     pub(super) const DUMMY: Self = Self([0; 32]);
 
-    /// Read back from where it was stored.
+    /// A digest that was read from the store.
     pub const fn from_stored(bytes: [u8; 32]) -> Self {
         Self(bytes)
     }
 
-    /// To store it.
+    /// Bytes to be stored.
     pub const fn as_bytes(&self) -> &[u8; 32] {
         &self.0
     }
@@ -94,14 +94,14 @@ impl fmt::Debug for SecretDigest {
     }
 }
 
-/// A token as its holder has it. `Debug` and `Display` do not show the secret.
+/// A token with its secret. `Debug` does not show the secret.
 pub struct TokenText {
     id: TokenId,
     secret: [u8; SECRET_BYTES],
 }
 
 impl TokenText {
-    /// A new token, from the random numbers of the operating system.
+    /// A new token from random numbers of the operating system.
     ///
     /// # Errors
     /// [`NoRandomness`].
@@ -111,7 +111,7 @@ impl TokenText {
         Self::with_id(TokenId(BASE32.encode(&id)))
     }
 
-    /// A new secret under an id that is there already.
+    /// A new secret for an existing id.
     ///
     /// # Errors
     /// [`NoRandomness`].
@@ -121,7 +121,7 @@ impl TokenText {
         Ok(Self { id, secret })
     }
 
-    /// Reads what a client sent.
+    /// Parses a token that a client sent.
     ///
     /// # Errors
     /// [`Malformed`].
@@ -137,12 +137,12 @@ impl TokenText {
         &self.id
     }
 
-    /// What is kept of the secret.
+    /// Digest of the secret.
     pub fn digest(&self) -> SecretDigest {
         SecretDigest(Sha256::digest(self.secret).into())
     }
 
-    /// The whole token: to be shown once, to whoever asked for it.
+    /// The whole token, to be shown once to the client that created it.
     pub fn reveal(&self) -> String {
         format!("{PREFIX}{}_{}", self.id, BASE32.encode(&self.secret))
     }
@@ -154,27 +154,27 @@ impl fmt::Debug for TokenText {
     }
 }
 
-/// Whether a text holds something that looks like a token of ours; it would be refused, but should not be written down.
+/// Whether a text contains something that looks like a token. Such text should not be stored or logged.
 pub fn token_like(text: &str) -> bool {
     let secret = |rest: &str| rest.split_once('_').is_some_and(|(id, _)| TokenId::parse(id).is_ok());
     text.match_indices(PREFIX).any(|(at, _)| secret(&text[at + PREFIX.len()..]))
 }
 
-/// What is asked of a new token.
+/// Properties of a token to be created.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewToken {
-    /// For people.
+    /// Name for people.
     pub name: String,
-    /// What it is for.
+    /// Scopes.
     pub scopes: Scopes,
-    /// The only structures; `None` stands for all.
+    /// Structures to which it is limited; `None` means all.
     pub structures: Option<BTreeSet<StructureId>>,
-    /// From when on it is refused.
+    /// When it expires.
     pub expires_at: Option<Timestamp>,
 }
 
 impl NewToken {
-    /// What is wrong with it, by JSON pointer.
+    /// Invalid properties by JSON pointer.
     pub fn problems(&self, now: Timestamp) -> Vec<Problem> {
         let mut problems = Vec::new();
         let length = self.name.chars().count();
@@ -183,7 +183,7 @@ impl NewToken {
             problems.push(Problem::new("/name", message));
         }
         if token_like(&self.name) {
-            problems.push(Problem::new("/name", "a name is public: it must not hold a token"));
+            problems.push(Problem::new("/name", "a name is public: it must not contain a token"));
         }
         if self.scopes.is_empty() {
             problems.push(Problem::new("/scopes", "name at least one of ingest, read, admin"));
@@ -201,7 +201,7 @@ impl NewToken {
         problems
     }
 
-    /// What is kept of it, with the digest of its secret.
+    /// The record to be stored, with the digest of the secret.
     pub fn record(self, text: &TokenText, now: Timestamp) -> TokenRecord {
         TokenRecord {
             id: text.id().clone(),
@@ -217,31 +217,31 @@ impl NewToken {
     }
 }
 
-/// A token as the service keeps it.
+/// A token as the service stores it.
 #[derive(Debug, Clone)]
 pub struct TokenRecord {
-    /// Its public id.
+    /// Public id.
     pub id: TokenId,
-    /// For people.
+    /// Name for people.
     pub name: String,
-    /// What it is for.
+    /// Scopes.
     pub scopes: Scopes,
-    /// The only structures; `None` stands for all.
+    /// Structures to which it is limited; `None` means all.
     pub structures: Option<Arc<BTreeSet<StructureId>>>,
-    /// Of its secret.
+    /// Digest of its secret.
     pub digest: SecretDigest,
-    /// Of the secret before the last rotation, and until when that is good.
+    /// Digest of the secret from before the last rotation, and until when it is valid.
     pub previous: Option<(SecretDigest, Timestamp)>,
-    /// When it was made.
+    /// When it was created.
     pub created_at: Timestamp,
-    /// From when on it is refused.
+    /// When it expires.
     pub expires_at: Option<Timestamp>,
     /// When it was revoked.
     pub revoked_at: Option<Timestamp>,
 }
 
 impl TokenRecord {
-    /// Neither expired nor revoked.
+    /// Whether it is neither expired nor revoked.
     pub fn is_active(&self, now: Timestamp) -> bool {
         self.revoked_at.is_none() && self.expires_at.is_none_or(|at| now < at)
     }
@@ -255,18 +255,18 @@ impl TokenRecord {
         }
     }
 
-    /// Whether it manages the whole service.
+    /// Whether it can manage the whole service.
     pub fn manages_service(&self) -> bool {
         self.scopes.cover(Scope::Admin) && self.structures.is_none()
     }
 
-    /// What its holder may do.
+    /// Rights of its holder.
     pub fn grant(&self) -> Grant {
         let actor = Actor::Token { id: self.id.to_string(), name: self.name.clone() };
         Grant::new(actor, self.scopes, self.structures.clone())
     }
 
-    /// With a new secret; the old one stays good until `overlap_until`.
+    /// The record with a new secret; the previous one stays valid until `overlap_until`.
     #[must_use]
     pub fn rotated(&self, text: &TokenText, overlap_until: Timestamp) -> Self {
         Self { digest: text.digest(), previous: Some((self.digest, overlap_until)), ..self.clone() }

@@ -157,7 +157,7 @@ async fn post_case_1(url: &str, seed: u64) -> anyhow::Result<Report> {
         let body = json!({ "source": "demo", "measurements": drawn.measurements });
         let answer = post(&client, &format!("{structure_url}/batches"), &body).await?;
         if index == 0 {
-            post(&client, &format!("{structure_url}/baseline"), &json!({ "batches": [answer["batch"]] })).await?;
+            post(&client, &format!("{structure_url}/reference"), &json!({ "batches": [answer["batch"]] })).await?;
             for (k, threshold) in realised_thresholds.iter_mut().enumerate() {
                 let std = crate::stats::sample_std(&drawn.stiffness[k]).context("fifty values have a spread")?;
                 *threshold = crate::stats::mean(&drawn.stiffness[k]) + crate::stats::normal_quantile(0.05) * std;

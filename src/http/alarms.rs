@@ -1,4 +1,4 @@
-//! `/v1/structures/{id}/alarms`, `/charts`, `/maintenance`: alarms, what leads to them, and when there are none.
+//! `/v1/structures/{id}/alarms`, `/charts`, `/maintenance`, `/identifiability`.
 
 use axum::body::Body;
 use axum::extract::State;
@@ -12,12 +12,12 @@ use super::answer::ChartBody;
 use super::error::ApiError;
 use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
-use super::Shared;
+use super::shared::Shared;
 use crate::baseline::identifiability::ParameterIdentifiability;
+use crate::monitor::stored::{Acknowledgement, Episode, MaintenanceWindow};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
-use crate::store::{Acknowledgement, Episode, MaintenanceWindow};
 
-/// Longest name or note.
+/// Maximum length of a name or note, characters.
 const LONGEST_TEXT: usize = 500;
 
 /// Query of the alarms.
@@ -25,18 +25,18 @@ const LONGEST_TEXT: usize = 500;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct AlarmQuery {
-    /// `open` for those that last; all without.
+    /// `open` for alarms that have not ended. Default: all.
     #[param(value_type = Option<AlarmFilter>, inline)]
     state: Option<String>,
-    /// Most alarms of the page; 100 without.
+    /// Maximum number of alarms on the page. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
-    /// `next` of the page before.
+    /// `next` of the previous page.
     #[param(pattern = "^[0-9]{1,18}$")]
     cursor: Option<String>,
 }
 
-/// Which alarms.
+/// Filter of the alarms.
 #[derive(ToSchema)]
 #[schema(rename_all = "lowercase")]
 #[expect(dead_code, reason = "only its description is used")]
@@ -50,7 +50,7 @@ enum AlarmFilter {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct ChartQuery {
-    /// Most points of each chart; 100 without.
+    /// Maximum number of points on each chart. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
 }
@@ -78,17 +78,17 @@ struct MaintenanceList {
     items: Vec<MaintenanceItem>,
 }
 
-/// What the modes can tell apart.
+/// Which parameters the measured modes can distinguish.
 #[derive(Debug, Serialize, ToSchema)]
 struct Identifiability {
     structure: StructureId,
     model_digest: Digest,
     parameters: Vec<ParameterIdentifiability>,
-    /// Groups of parameters that cannot be told apart, by name: their damage is told for the group.
+    /// Names in each group of parameters that the modes cannot distinguish; their damage is reported for the group.
     groups: Vec<Vec<String>>,
 }
 
-/// An episode: from the alarm to its end.
+/// An alarm episode, from its start to its end.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Alarm)]
 struct AlarmItem {
@@ -96,10 +96,10 @@ struct AlarmItem {
     alarm: i64,
     /// `damage`, `simulation_does_not_fit` or `silence`.
     kind: String,
-    /// Of a damage alarm.
+    /// Only for a damage alarm.
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
-    /// `open`, `ended`, or `withdrawn` when late data showed that there was none.
+    /// `open`, `ended`, or `withdrawn` if data that arrived later showed that there was no alarm.
     state: &'static str,
     opened_at: Timestamp,
     opened_batch: Option<String>,
@@ -112,7 +112,7 @@ struct AlarmItem {
     acknowledgement: Option<AcknowledgementItem>,
 }
 
-/// Who has seen an alarm.
+/// Acknowledgement of an alarm.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Acknowledgement)]
 struct AcknowledgementItem {
@@ -121,7 +121,7 @@ struct AcknowledgementItem {
     note: Option<String>,
 }
 
-/// Who has seen an alarm, and what they say of it.
+/// Acknowledgement of an alarm by a person.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = AcknowledgementInput)]
@@ -132,7 +132,7 @@ struct AcknowledgementBody {
     note: Option<String>,
 }
 
-/// A time in which batches move no chart.
+/// A time interval in which batches do not change the alarm charts.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = MaintenanceInput)]
@@ -146,7 +146,7 @@ struct MaintenanceBody {
     reason: String,
 }
 
-/// A time in which batches move no chart.
+/// A time interval in which batches do not change the alarm charts.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Maintenance)]
 struct MaintenanceItem {
@@ -174,13 +174,13 @@ impl From<Episode> for AlarmItem {
     }
 }
 
-/// `GET /v1/structures/{id}/alarms`: episodes, newest first; `state=open` for those that last.
+/// `GET /v1/structures/{id}/alarms`: alarm episodes, newest first.
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/alarms", tag = "alarms", operation_id = "list_alarms",
-    summary = "Alarms", description = "Alarms with their beginning and end, newest first, a page at a time.",
+    summary = "Alarms", description = "Alarms with their start and end, newest first, in pages.",
     params(StructurePath, AlarmQuery),
     responses((status = 200, description = "A page", body = AlarmPage), Unknown, Invalid)
 )]
@@ -205,13 +205,14 @@ pub async fn list(
     Ok(Json(AlarmPage { structure: id, items: found.into_iter().map(AlarmItem::from).collect(), next }).into_response())
 }
 
-/// `POST /v1/structures/{id}/alarms/{n}/acknowledgement`: somebody has seen it; the first stays.
+/// `POST /v1/structures/{id}/alarms/{n}/acknowledgement`: records who has seen the alarm. The first acknowledgement is
+/// kept.
 ///
 /// # Errors
 /// 400, 415, 422 for the body, 404 for structure or alarm.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/alarms/{alarm}/acknowledgement", tag = "alarms", operation_id = "acknowledge_alarm",
-    summary = "Acknowledge an alarm", description = "Somebody has seen it; the first acknowledgement stays.",
+    summary = "Acknowledge an alarm", description = "Records who has seen the alarm. The first acknowledgement is kept.",
     params(AlarmPath),
     request_body(content = AcknowledgementBody, example = json!({"by": "A. Engineer", "note": "inspection on Monday"})),
     responses((status = 200, description = "The alarm", body = AlarmItem), Unknown, BodyRefused)
@@ -259,13 +260,13 @@ pub async fn charts(
     Ok(Json(ChartPage { structure: id, items }).into_response())
 }
 
-/// `POST /v1/structures/{id}/maintenance`: batches measured in the window move no chart.
+/// `POST /v1/structures/{id}/maintenance`: batches measured in the interval do not change the alarm charts.
 ///
 /// # Errors
 /// 400, 415, 422 for the body, 404 for the structure.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/maintenance", tag = "alarms", operation_id = "add_maintenance",
-    summary = "Announce maintenance", description = "Batches measured in the window move no chart.",
+    summary = "Announce maintenance", description = "Batches measured in the interval do not change the alarm charts.",
     params(StructurePath),
     request_body(content = MaintenanceBody, example = json!(
         {"from": "2026-03-01T08:00:00Z", "to": "2026-03-01T16:00:00Z", "reason": "bearing replaced"})),
@@ -293,7 +294,7 @@ pub async fn add_maintenance(
     Ok((StatusCode::CREATED, Json(MaintenanceItem { from, to, reason: body.reason })).into_response())
 }
 
-/// `GET /v1/structures/{id}/maintenance`: windows, newest first.
+/// `GET /v1/structures/{id}/maintenance`: maintenance windows, newest first.
 ///
 /// # Errors
 /// 404 for the structure.
@@ -312,13 +313,14 @@ pub async fn maintenance(State(shared): State<Shared>, ApiPath(id): ApiPath<Stri
     Ok(Json(MaintenanceList { structure: id, items }).into_response())
 }
 
-/// `GET /v1/structures/{id}/identifiability`: what the modes can tell apart, by the trained baseline in use.
+/// `GET /v1/structures/{id}/identifiability`: which parameters the modes can distinguish, according to the trained
+/// model.
 ///
 /// # Errors
-/// 404 for the structure, 409 without a trained baseline.
+/// 404 for the structure, 409 without a trained model.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/identifiability", tag = "structures", operation_id = "read_identifiability",
-    summary = "What the modes can tell apart", description = "By the trained baseline in use.",
+    summary = "Identifiability", description = "Which parameters the measured modes can distinguish, according to the trained model in use.",
     params(StructurePath),
     responses((status = 200, description = "For each parameter", body = Identifiability), Unknown, Invalid, Conflict)
 )]

@@ -3,13 +3,13 @@
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::table::{Cell, Kind};
+use super::cell::{Cell, ColumnKind};
 use crate::assessment::{Assessment, BatchState};
 use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
+use crate::monitor::stored::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
 use crate::monitor::{BatchView, Missing};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
 use crate::trust::{Finding, TrustVerdict};
 
 /// One batch.
@@ -29,14 +29,14 @@ pub struct Batch {
     next_step: Option<String>,
     content_digest: String,
     assessment: Option<AssessmentBody>,
-    /// Its points on the alarm charts.
+    /// Points of the batch on the alarm charts.
     charts: Vec<ChartBody>,
     #[serde(skip_serializing_if = "Option::is_none")]
     measurements: Option<Vec<ModalMeasurement>>,
 }
 
 impl Batch {
-    /// The answer for a batch, with its measurements if they are wanted.
+    /// The answer for a batch, with its measurements if requested.
     pub fn new(view: BatchView, with_measurements: bool) -> Self {
         let BatchView { record, assessment, charts, missing } = view;
         let next_step = missing.map(|missing| next_step(&record, &missing));
@@ -80,14 +80,14 @@ pub fn location(record: &BatchRecord) -> String {
     format!("/v1/structures/{}/batches/{}", record.batch.structure, record.batch_id)
 }
 
-/// What a batch says of the structure.
+/// Assessment of a batch.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Assessment)]
 pub struct AssessmentBody {
     model_digest: String,
     structure_digest: String,
     undamaged_version: Option<u32>,
-    /// As text: JSON numbers lose digits above 2^53 in many readers.
+    /// As text: many JSON readers lose digits of numbers above 2^53.
     seed: String,
     draws_per_measurement: usize,
     measurements_used: usize,
@@ -97,20 +97,20 @@ pub struct AssessmentBody {
     misfit_percent: Vec<Option<f64>>,
     assessed_at: Timestamp,
     exceeds: bool,
-    /// `accepted` or `rejected`; rejected withholds the probabilities of damage.
+    /// `accepted` or `rejected`. A rejected assessment has no probabilities of damage.
     trust: TrustVerdict,
     extrapolated: bool,
     fit_p_value: Option<f64>,
-    /// √(χ²/degrees of freedom): 1 where noise explains all that the simulation does not.
+    /// √(χ²/degrees of freedom): 1 if noise explains the whole difference between measurement and simulation.
     fit_distance: Option<f64>,
     fit_degrees_of_freedom: usize,
-    /// What a reader must know before believing the figures.
+    /// Findings that qualify the results.
     findings: Vec<Finding>,
     parameters: Vec<ParameterBody>,
 }
 
-/// One monitored quantity of a batch: mean and standard deviation are those of the population behind the batch, intervals
-/// have 90 % probability.
+/// Results for one monitored quantity. Mean and standard deviation are those of the population from which the
+/// measurements of the batch were drawn; intervals have 90 % probability.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ParameterAssessment)]
 pub struct ParameterBody {
@@ -133,7 +133,7 @@ pub struct ParameterBody {
     pooled: PooledBody,
 }
 
-/// The estimate of the paper: moments of all samples together.
+/// Estimate of the paper: moments of all posterior samples pooled.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = PooledEstimate)]
 pub struct PooledBody {
@@ -151,14 +151,14 @@ pub struct ChartBody {
     batch: String,
     measured_to: Timestamp,
     chart: String,
-    /// Towards damage, in standard errors; on the chart of the fit, 1 stands for rejected.
+    /// Shift towards damage in standard errors. On the chart of the fit, 1 means rejected.
     shift: f64,
     shift_limit: f64,
     ewma: f64,
     ewma_limit: Option<f64>,
-    /// Probability of damage that stands at the limit, if the spread is the undamaged one.
+    /// Probability of damage at which the shift reaches its limit, if the spread is that of the undamaged reference.
     probability_of_damage_limit: Option<f64>,
-    /// True when the batch moved nothing: maintenance, or a finding that holds alarms.
+    /// True if the batch did not change the chart, because of maintenance or a finding that suspends alarms.
     held: bool,
     state: String,
 }
@@ -268,33 +268,34 @@ impl From<HistoryEntry> for HistoryItem {
     }
 }
 
-/// Columns of the history as a table: one row for each batch and quantity, or one with empty places without an assessment.
-pub const HISTORY_COLUMNS: [(&str, Kind); 25] = [
-    ("batch", Kind::Text),
-    ("source", Kind::Text),
-    ("measured_from", Kind::Time),
-    ("measured_to", Kind::Time),
-    ("measurement_count", Kind::Count),
-    ("state", Kind::Text),
-    ("parameter", Kind::Text),
-    ("unit", Kind::Text),
-    ("mean", Kind::Number),
-    ("mean_low", Kind::Number),
-    ("mean_high", Kind::Number),
-    ("std", Kind::Number),
-    ("std_low", Kind::Number),
-    ("std_high", Kind::Number),
-    ("edge_mass", Kind::Number),
-    ("threshold", Kind::Number),
-    ("probability_of_damage", Kind::Number),
-    ("probability_of_damage_low", Kind::Number),
-    ("probability_of_damage_high", Kind::Number),
-    ("exceeds", Kind::Flag),
-    ("relative_change", Kind::Number),
-    ("pooled_mean", Kind::Number),
-    ("pooled_std", Kind::Number),
-    ("trust", Kind::Text),
-    ("model_digest", Kind::Text),
+/// Columns of the history as a table: one row for each batch and quantity; a batch without an assessment has one row
+/// with empty cells.
+pub const HISTORY_COLUMNS: [(&str, ColumnKind); 25] = [
+    ("batch", ColumnKind::Text),
+    ("source", ColumnKind::Text),
+    ("measured_from", ColumnKind::Time),
+    ("measured_to", ColumnKind::Time),
+    ("measurement_count", ColumnKind::Count),
+    ("state", ColumnKind::Text),
+    ("parameter", ColumnKind::Text),
+    ("unit", ColumnKind::Text),
+    ("mean", ColumnKind::Number),
+    ("mean_low", ColumnKind::Number),
+    ("mean_high", ColumnKind::Number),
+    ("std", ColumnKind::Number),
+    ("std_low", ColumnKind::Number),
+    ("std_high", ColumnKind::Number),
+    ("edge_mass", ColumnKind::Number),
+    ("threshold", ColumnKind::Number),
+    ("probability_of_damage", ColumnKind::Number),
+    ("probability_of_damage_low", ColumnKind::Number),
+    ("probability_of_damage_high", ColumnKind::Number),
+    ("exceeds", ColumnKind::Flag),
+    ("relative_change", ColumnKind::Number),
+    ("pooled_mean", ColumnKind::Number),
+    ("pooled_std", ColumnKind::Number),
+    ("trust", ColumnKind::Text),
+    ("model_digest", ColumnKind::Text),
 ];
 
 impl HistoryItem {
@@ -343,7 +344,7 @@ impl HistoryItem {
     }
 }
 
-/// The undamaged state of a structure.
+/// The undamaged reference of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct Undamaged {
     structure: String,
@@ -353,15 +354,15 @@ pub struct Undamaged {
     threshold_probability: f64,
     measurement_count: usize,
     batches: Vec<String>,
-    /// Covariates under which it was taken.
+    /// Ranges of the covariates in its batches.
     conditions: std::collections::BTreeMap<String, crate::damage::SeenCovariate>,
-    /// What is doubtful about it.
+    /// Reasons to doubt the reference.
     doubts: Vec<String>,
     parameters: Vec<crate::damage::UndamagedQuantity>,
 }
 
 impl Undamaged {
-    /// The answer for an undamaged state.
+    /// The answer for an undamaged reference.
     pub fn new(structure: &crate::quantity::StructureId, record: &UndamagedRecord) -> Self {
         Self {
             structure: structure.to_string(),

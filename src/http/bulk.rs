@@ -1,8 +1,9 @@
-//! Many batches in one request: NDJSON, one batch a line, each stored by itself and answered in its place.
+//! Many batches in one request: NDJSON with one batch per line. Each line is stored and answered independently.
 //!
-//! Nothing is half-silent: a line that is refused says so and the next goes on. What stops the whole request (too many bytes or
-//! lines, a body that breaks off, an error of the service) is a problem that carries what was done before; posting the same
-//! again is safe. One line at a time is in memory, whatever the length of the body.
+//! A line that is refused is reported in the answer, and the next line is processed. An error that stops the whole
+//! request (too many bytes or lines, a broken connection, an internal error) is answered by a problem that lists the
+//! outcome of the lines before it; the client may repeat the whole request safely. Only one line is in memory at a
+//! time.
 
 use std::time::Duration;
 
@@ -11,74 +12,35 @@ use axum::http::{header, HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use http_body_util::BodyExt as _;
-use serde::Serialize;
-use utoipa::ToSchema;
 
 use super::access::Client;
 use super::answer;
-use super::error::{ApiError, ProblemBody};
-use super::request::{broken_body, refuse_encoding, slow_body, BodyLimits};
-use super::Shared;
-use crate::assessment::BatchState;
+use super::error::ApiError;
+use super::problem::{BulkAnswer, BulkItem};
+use super::request::{broken_body, refuse_encoding, slow_body, BodyLimits, IDEMPOTENCY_KEY};
+use super::shared::Shared;
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::check_idempotency_key;
 use crate::measurement::MeasurementBatch;
 use crate::monitor::{Ingested, Monitor};
 use crate::quantity::StructureId;
 
-/// Most batches of one request: each has an entry in the answer.
+/// Maximum number of batches in one request: each has an entry in the answer.
 const MOST_LINES: usize = 10_000;
 
-/// How many times the limit is read and thrown away before the connection is cut, so that a client that is still sending sees
-/// the answer.
+/// An oversized body is read and discarded up to this multiple of the limit before the connection is closed: a client
+/// that is still sending would see a broken connection instead of the answer.
 const DRAINED_LIMITS: usize = 2;
 
-/// Longest wait of a line for a place in the queue.
+/// Maximum time that a line waits for a free slot in the queue.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// What became of each line.
-#[derive(Debug, Default, Serialize, ToSchema)]
-pub struct BulkAnswer {
-    /// One entry for each line that is not blank, in their order.
-    items: Vec<BulkItem>,
-    /// Lines whose batch is stored now and was not before.
-    stored: usize,
-    /// Lines whose batch had been stored before.
-    replayed: usize,
-    /// Lines that were refused.
-    refused: usize,
-}
-
-/// What became of one line.
-#[derive(Debug, Serialize, ToSchema)]
-struct BulkItem {
-    /// Line of the body, from 1.
-    line: usize,
-    /// The status that the batch alone would have been answered with.
-    status: u16,
-    /// Id of the batch.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    batch: Option<String>,
-    /// How far the batch has come.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    state: Option<BatchState>,
-    /// Whether it had been stored before.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    replayed: Option<bool>,
-    /// Path of the batch.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    location: Option<String>,
-    /// Why it was refused.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(no_recursion)]
-    problem: Option<Box<ProblemBody>>,
-}
-
-/// Takes a body of NDJSON; the source of the query stands for lines without one.
+/// Stores the batches of an NDJSON body. `source` applies to lines that do not name one.
 ///
 /// # Errors
-/// 400, 408, 413, 415 for the body as a whole, 422 for a key in the header, 429 beyond the measurements a second of
-/// `http.rate_limit`, 503 when no place becomes free in time; those that come after the first line carry what was done.
+/// 400, 408, 413, 415 for the body as a whole, 422 for an idempotency key in the header, 429 if the rate limit of
+/// measurements is exceeded, 503 when the queue stays full. Errors after the first line carry the outcome of the lines
+/// before.
 pub async fn create(
     shared: &Shared,
     client: &Client,
@@ -87,8 +49,8 @@ pub async fn create(
     body: Body,
 ) -> Result<Response, ApiError> {
     refuse_encoding(headers)?;
-    if headers.contains_key(super::batches::IDEMPOTENCY_KEY) {
-        let message = "a key in the header cannot stand for many batches: give each line its own \"idempotency_key\"";
+    if headers.contains_key(IDEMPOTENCY_KEY) {
+        let message = "a key in the header cannot identify many batches: give each line its own \"idempotency_key\"";
         return Err(ApiError::invalid_field("header/Idempotency-Key", message));
     }
     let announced = headers.get(header::CONTENT_LENGTH).and_then(|v| v.to_str().ok()).and_then(|v| v.parse().ok());
@@ -106,7 +68,7 @@ pub async fn create(
         };
         if answer.items.len() == MOST_LINES {
             lines.drain().await;
-            let detail = format!("more than {MOST_LINES} lines: send those from line {line} on in another request");
+            let detail = format!("more than {MOST_LINES} lines: send the lines from {line} on in another request");
             return Err(ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_many_lines", detail).after(answer));
         }
         let taken = match text {
@@ -114,7 +76,8 @@ pub async fn create(
             Err(too_large) => Err(too_large),
         };
         match taken {
-            // What is wrong with the service, or comes too soon, is not wrong with the line: the client should send it again.
+            // An error of the service, or an exceeded rate limit, is not an error of the line: the client should repeat
+            // it.
             Err(error) if error.status().is_server_error() || error.status() == StatusCode::TOO_MANY_REQUESTS => {
                 lines.drain().await;
                 return Err(error.after(answer));
@@ -144,9 +107,9 @@ fn parse(
     source: Option<String>,
     text: &[u8],
 ) -> Result<MeasurementBatch, ApiError> {
-    // The structure may have been extended since the line before.
+    // The structure may have been extended since the previous line.
     let active = monitor.structure(structure)?;
-    // A line has no headers: its key is a field, as in a message.
+    // A line has no headers: its idempotency key is a field of the JSON.
     let mut line = RawBatch::of_message(text)?;
     line.source = line.source.or(source);
     if let Some(key) = &line.idempotency_key {
@@ -190,14 +153,14 @@ impl BulkAnswer {
     }
 }
 
-/// A line's number and text; `Err` for one that is too long, of which nothing was kept.
+/// Number and text of a line; `Err` for a line that is too long and was discarded.
 type Line = (usize, Result<Vec<u8>, ApiError>);
 
 /// The lines of a body as they arrive.
 struct Lines {
     body: Body,
     limits: BodyLimits,
-    /// What has arrived and not been read.
+    /// Bytes that have arrived but have not been processed.
     chunk: Bytes,
     bytes: usize,
     line: usize,
@@ -208,7 +171,7 @@ impl Lines {
         Self { body, limits, chunk: Bytes::new(), bytes: 0, line: 0 }
     }
 
-    /// The next line that is not blank; the time limit is for its arrival, not for the work between.
+    /// The next non-blank line. The time limit applies to its arrival, not to the processing between lines.
     async fn next(&mut self) -> Result<Option<Line>, ApiError> {
         let time = self.limits.time;
         tokio::time::timeout(time, self.read()).await.unwrap_or_else(|_| Err(slow_body(time)))
@@ -249,7 +212,7 @@ impl Lines {
         }
     }
 
-    /// Gets the next part of the body; false at its end.
+    /// Receives the next part of the body; false at its end.
     async fn fetch(&mut self) -> Result<bool, ApiError> {
         while let Some(frame) = self.body.frame().await {
             let Ok(data) = frame.map_err(|_| broken_body())?.into_data() else { continue };
@@ -270,8 +233,8 @@ impl Lines {
         ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "body_too_large", detail)
     }
 
-    /// Reads on and throws away, within limits: a client that is still sending would see a broken connection instead of the
-    /// answer.
+    /// Reads and discards the rest of the body, within limits: a client that is still sending would see a broken
+    /// connection instead of the answer.
     async fn drain(&mut self) {
         let most = DRAINED_LIMITS * self.limits.bulk_bytes;
         let body = &mut self.body;

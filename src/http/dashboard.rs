@@ -1,9 +1,10 @@
-//! `/` and `/assets/…`: the dashboard, a page of plain ES modules inside the program.
+//! `/` and `/assets/…`: the dashboard, plain ES modules that are embedded in the program.
 //!
-//! Its files carry no secret, so they need no token; what they fetch does.
+//! Its files contain no secrets, so they need no token; the data that they request does.
 
 use axum::http::{header, HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
+use data_encoding::HEXLOWER;
 
 use super::error::ApiError;
 use super::request::ApiPath;
@@ -13,13 +14,13 @@ use crate::quantity::shown;
 #[folder = "src/http/dashboard/"]
 struct Files;
 
-/// What the page may load and do: only what this service serves. Charts set styles through the CSSOM, which needs no
-/// exception for inline styles.
+/// Content security policy of the page: it may load only files of this service. Charts set styles through the CSSOM,
+/// which needs no exception for inline styles.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Headers of every file beside its type and tag. `no-cache` asks for the tag each time: file names do not change with a
-/// release, and a page from two releases would break.
+/// Headers of every file besides its type and entity tag. `no-cache` makes the browser revalidate each time: file names
+/// do not change with a release, and a page with files of two releases would not work.
 const HEADERS: [(HeaderName, &str); 5] = [
     (header::CONTENT_SECURITY_POLICY, POLICY),
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
@@ -31,7 +32,7 @@ const HEADERS: [(HeaderName, &str); 5] = [
 /// `GET /`: the page.
 ///
 /// # Errors
-/// None: the page is part of the program.
+/// None: the page is embedded in the program.
 pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
     file("index.html", &headers)
 }
@@ -39,7 +40,7 @@ pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
 /// `GET /assets/{path}`: a file of the page.
 ///
 /// # Errors
-/// 404 for a file that is none of its.
+/// 404 if the dashboard has no such file.
 pub async fn asset(ApiPath(path): ApiPath<String>, headers: HeaderMap) -> Result<Response, ApiError> {
     file(&path, &headers)
 }
@@ -65,7 +66,7 @@ fn file(path: &str, request: &HeaderMap) -> Result<Response, ApiError> {
     Ok(response)
 }
 
-/// Type of a file by its ending; `None` for a file that is not for browsers.
+/// Media type of a file by its extension; `None` for a file that is not served.
 fn content_type(path: &str) -> Option<&'static str> {
     match path.rsplit_once('.')?.1 {
         "html" => Some("text/html; charset=utf-8"),
@@ -77,13 +78,12 @@ fn content_type(path: &str) -> Option<&'static str> {
     }
 }
 
-/// Strong tag: SHA-256 of the file.
+/// Strong entity tag: SHA-256 of the file.
 fn etag(sha256: &[u8; 32]) -> String {
-    let digits: Vec<String> = sha256.iter().map(|byte| format!("{byte:02x}")).collect();
-    format!("\"{}\"", digits.concat())
+    format!("\"{}\"", HEXLOWER.encode(sha256))
 }
 
-/// True when the browser already has this version.
+/// Whether the browser has this version of the file.
 fn is_known(request: &HeaderMap, tag: &str) -> bool {
     let given = request.get_all(header::IF_NONE_MATCH).into_iter().filter_map(|value| value.to_str().ok());
     given.flat_map(|value| value.split(',')).map(str::trim).any(|t| t == "*" || t.trim_start_matches("W/") == tag)

@@ -1,4 +1,5 @@
-//! `/v1/structures/{id}/diagnoses`, `/v1/diagnoses/{id}`: what the simulation gets wrong, and the extension by it.
+//! `/v1/structures/{id}/diagnoses`, `/v1/diagnoses/{id}`: diagnoses of the simulation, and extensions of the structure
+//! by them.
 
 use axum::body::Body;
 use axum::extract::State;
@@ -12,13 +13,13 @@ use utoipa::ToSchema;
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Busy, Conflict, DiagnosisPath, Invalid, StructurePath, Unknown};
 use super::request::{json_body, structure_id, whole_number, ApiPath};
-use super::Shared;
+use super::shared::Shared;
 use crate::discrepancy::Diagnosis;
+use crate::monitor::stored::{DiagnosisRecord, JobState};
 use crate::monitor::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
 use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::store::{DiagnosisRecord, JobState};
 
-/// Diagnoses listed of one structure.
+/// Maximum number of diagnoses in the list of a structure.
 const LISTED: usize = 100;
 
 /// Body of a request for a diagnosis; `{}` diagnoses all batches.
@@ -26,35 +27,35 @@ const LISTED: usize = 100;
 #[serde(deny_unknown_fields, default)]
 #[schema(as = DiagnosisInput)]
 struct DiagnosisBody {
-    /// Ids of batches; all without.
+    /// Ids of batches. Default: all.
     batches: Vec<String>,
-    /// Measurements kept for measuring the gain, such as `last:0.25`; that without.
+    /// Measurements that are held out to evaluate the gain. Default `last:0.25`.
     #[schema(pattern = r"^(last:0?\.[0-9]{1,6}|where:[^=]+=.+)$", examples("last:0.25", "where:operator=anna"))]
     holdout: Option<String>,
-    /// Seed of the bootstrap; 1 without.
+    /// Seed of the bootstrap. Default 1.
     #[serde(deserialize_with = "whole_number")]
     #[schema(value_type = Option<u64>, maximum = 9_007_199_254_740_991_i64)]
     seed: Option<u64>,
 }
 
-/// Body of a request for an extension; `{}` trains as the baseline before was trained.
+/// Body of a request for an extension; `{}` uses the training settings of the present model.
 #[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 #[schema(as = ExtensionInput)]
 struct ExtensionBody {
-    /// Simulated pairs.
+    /// Number of simulated training samples.
     #[serde(deserialize_with = "whole_number")]
     #[schema(value_type = Option<u64>, minimum = 1000, maximum = 2_000_000)]
     samples: Option<u64>,
-    /// Passes over them.
+    /// Number of training epochs.
     #[serde(deserialize_with = "whole_number")]
     #[schema(value_type = Option<u64>, minimum = 1, maximum = 2000)]
     epochs: Option<u64>,
-    /// Use the flow even if it fails its calibration; every answer says so then.
+    /// Use the model even if it fails its calibration; every assessment then carries a finding.
     accept_uncalibrated: bool,
 }
 
-/// A diagnosis as it is answered.
+/// A diagnosis with its job.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = DiagnosisJob)]
 struct DiagnosisAnswer {
@@ -70,12 +71,12 @@ struct DiagnosisAnswer {
     finished_at: Option<Timestamp>,
     #[schema(value_type = Option<Diagnosis>)]
     result: Option<Box<RawValue>>,
-    /// Path of the page, when it is done.
+    /// Path of the report, once the diagnosis is done.
     report: Option<String>,
     extension: Option<ExtensionAnswer>,
 }
 
-/// The extension by a diagnosis.
+/// The extension of the structure by a diagnosis.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ExtensionJob)]
 struct ExtensionAnswer {
@@ -105,11 +106,11 @@ struct DiagnosisList {
     items: Vec<Listed>,
 }
 
-/// A step back.
+/// Result of reverting an extension.
 #[derive(Debug, Serialize, ToSchema)]
 struct SteppedBack {
     structure: StructureId,
-    /// The version that is in use now.
+    /// Version of the structure that is now in use.
     structure_digest: Digest,
 }
 
@@ -140,18 +141,18 @@ fn answer(record: DiagnosisRecord, progress: Option<String>) -> Result<Diagnosis
     })
 }
 
-/// `POST /v1/structures/{id}/diagnoses`: 202, the job runs on.
+/// `POST /v1/structures/{id}/diagnoses`: 202, starts a background job.
 ///
 /// # Errors
 /// 404 for structure and batches, 422 for the hold-out.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/diagnoses", tag = "diagnoses", operation_id = "start_diagnosis",
     summary = "Diagnose the simulation",
-    description = "Looks for what the simulation gets wrong, by batches that are stored; a job that runs on.",
+    description = "Starts a background job that looks for systematic errors of the simulation in stored batches.",
     params(StructurePath),
     request_body(content = DiagnosisBody, example = json!({"holdout": "last:0.25"})),
     responses(
-        (status = 202, description = "The job has begun", body = DiagnosisAnswer,
+        (status = 202, description = "The job has started", body = DiagnosisAnswer,
          headers(("Location" = String, description = "Path of the diagnosis"))),
         Unknown, BodyRefused, Conflict, Busy
     )
@@ -178,7 +179,7 @@ pub async fn create(
 /// 404.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/diagnoses", tag = "diagnoses", operation_id = "list_diagnoses",
-    summary = "Diagnoses of a structure", description = "The newest hundred, newest first.",
+    summary = "Diagnoses of a structure", description = "The 100 newest, newest first.",
     params(StructurePath),
     responses((status = 200, description = "The diagnoses", body = DiagnosisList), Unknown, Invalid)
 )]
@@ -207,7 +208,7 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 /// 404.
 #[utoipa::path(
     get, path = "/v1/diagnoses/{id}", tag = "diagnoses", operation_id = "read_diagnosis",
-    summary = "A diagnosis", description = "State and progress of the job, and its result when it is done.",
+    summary = "A diagnosis", description = "State and progress of the job, and its result once it is done.",
     params(DiagnosisPath),
     responses((status = 200, description = "The diagnosis", body = DiagnosisAnswer), Unknown)
 )]
@@ -216,15 +217,15 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     Ok(Json(answer(record, progress)?).into_response())
 }
 
-/// `GET /v1/diagnoses/{id}/report`: the page.
+/// `GET /v1/diagnoses/{id}/report`: the report as HTML.
 ///
 /// # Errors
-/// 404, 409 while there is none.
+/// 404, 409 while the report does not exist.
 #[utoipa::path(
     get, path = "/v1/diagnoses/{id}/report", tag = "diagnoses", operation_id = "read_report",
-    summary = "The page of a diagnosis", description = "One page of HTML that needs nothing else.",
+    summary = "Report of a diagnosis", description = "One self-contained HTML page.",
     params(DiagnosisPath),
-    responses((status = 200, description = "The page", body = String, content_type = "text/html"), Unknown, Conflict)
+    responses((status = 200, description = "The report", body = String, content_type = "text/html"), Unknown, Conflict)
 )]
 pub async fn report(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let Some(html) = shared.monitor.jobs().report(&id).await? else {
@@ -235,18 +236,18 @@ pub async fn report(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) 
     Ok((headers, html).into_response())
 }
 
-/// `POST /v1/diagnoses/{id}/extension`: 202, the job runs on.
+/// `POST /v1/diagnoses/{id}/extension`: 202, starts a background job.
 ///
 /// # Errors
-/// 404, 409 when it cannot be extended, 422 for the training.
+/// 404, 409 if the structure cannot be extended by this diagnosis, 422 for the training settings.
 #[utoipa::path(
     post, path = "/v1/diagnoses/{id}/extension", tag = "diagnoses", operation_id = "extend_structure",
     summary = "Extend the structure by a diagnosis",
-    description = "Makes a new version of the structure with the causes as effects, and trains its baseline; a job that runs on.",
+    description = "Starts a background job that adds the causes to a new version of the structure and trains a model for it.",
     params(DiagnosisPath),
     request_body(content = ExtensionBody, example = json!({"samples": 200_000, "epochs": 80})),
     responses(
-        (status = 202, description = "The job has begun", body = DiagnosisAnswer,
+        (status = 202, description = "The job has started", body = DiagnosisAnswer,
          headers(("Location" = String, description = "Path of the diagnosis"))),
         Unknown, BodyRefused, Conflict, Busy
     )
@@ -273,15 +274,15 @@ pub async fn extend(
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
 }
 
-/// `DELETE /v1/structures/{id}/extension`: one step back.
+/// `DELETE /v1/structures/{id}/extension`: reverts the last extension.
 ///
 /// # Errors
-/// 404, 409 when the structure extends none.
+/// 404, 409 if the structure has no extension.
 #[utoipa::path(
     delete, path = "/v1/structures/{id}/extension", tag = "diagnoses", operation_id = "step_back",
-    summary = "One step back", description = "Goes back to the version that the present one extends.",
+    summary = "Revert the last extension", description = "Returns to the version that the present one extends.",
     params(StructurePath),
-    responses((status = 200, description = "The version in use now", body = SteppedBack), Unknown, Invalid, Conflict)
+    responses((status = 200, description = "The version that is now in use", body = SteppedBack), Unknown, Invalid, Conflict)
 )]
 pub async fn step_back(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;

@@ -12,7 +12,7 @@ use utoipa::openapi::OpenApi;
 use utoipa_swagger_ui::Config;
 
 use super::error::ApiError;
-use super::Shared;
+use super::shared::Shared;
 
 /// Scripts and styles from this service only, and none within the page; Swagger UI draws its arrows as `data:` images.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \

@@ -1,4 +1,4 @@
-//! `/v1/events`: what happens, as server-sent events.
+//! `/v1/events`: events of the structures, as server-sent events.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -16,73 +16,75 @@ use utoipa::ToSchema;
 use super::access::AccessControl;
 use super::error::ApiError;
 use super::openapi::StreamBusy;
-use super::Shared;
+use super::shared::Shared;
 use crate::access::Grant;
 use crate::monitor::events::News;
 use crate::quantity::StructureId;
 
-/// Streams at a time.
+/// Maximum number of open streams.
 pub const MOST_STREAMS: usize = 64;
 
-/// Time between two comments that keep proxies from closing a stream on which nothing happens.
+/// Interval of the comments that keep proxies from closing an idle stream.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
-/// Seconds after which a place may be free.
+/// Value of `Retry-After` when all streams are in use, seconds.
 const RETRY_AFTER_S: u32 = 10;
 
-/// Seconds after which a service that stops may be there again.
+/// Value of `Retry-After` while the service stops, seconds.
 const RETRY_AFTER_STOP_S: u32 = 5;
 
-/// Asks proxies such as nginx to pass events on at once.
+/// Asks proxies such as nginx not to buffer the stream.
 const NO_BUFFERING: (HeaderName, &str) = (HeaderName::from_static("x-accel-buffering"), "no");
 
-/// An event of the stream, as the document describes it.
+/// An event of the stream, as the OpenAPI document describes it.
 #[derive(ToSchema)]
 #[expect(dead_code, reason = "written as lines of the event stream, never as JSON")]
 struct StreamedEvent {
     /// `batch`, `alarm`, `job`, `structure` or `resync`.
     event: String,
-    /// A line of JSON.
+    /// One line of JSON.
     data: String,
 }
 
-/// `GET /v1/events`: what happens to the structures that the token may see; a stream that ends with the
-/// token, or when the service stops. A client that is too slow misses events, is told so by an
-/// event `resync`, and goes on with what happens then.
+/// `GET /v1/events`: events of the structures that the token may see. The stream ends when the token expires or is
+/// revoked, or when the service stops. A client that is too slow loses events, receives the event `resync`, and
+/// continues with new ones.
 ///
 /// # Errors
-/// 503 when there are too many streams, or the service stops.
+/// 503 when the maximum number of streams is open, or when the service stops.
 #[utoipa::path(
     get, path = "/v1/events", tag = "results", operation_id = "watch_events",
-    summary = "What happens, as it happens",
+    summary = "Event stream",
     description = "Server-sent events of the structures that the token may see: `batch`, `alarm`, `job` and `structure`, each with \
-                   a line of JSON, and `resync` for a client that was too slow and missed some. A comment comes every 15 s. \
-                   The stream ends with the token, or when the service stops.",
+                   one line of JSON, and `resync` for a client that was too slow and lost events. A comment is sent every 15 s. \
+                   The stream ends when the token expires or is revoked, or when the service stops.",
     responses(
-        (status = 200, description = "The events; the schema is that of one", body = StreamedEvent, content_type = "text/event-stream"),
+        (status = 200, description = "The events; the schema describes one event", body = StreamedEvent, content_type = "text/event-stream"),
         StreamBusy
     )
 )]
 pub async fn events(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
-    let place = Arc::clone(&shared.streams).try_acquire_owned().map_err(|_| {
-        let detail = format!("{MOST_STREAMS} event streams are open, which is the most: close one, or ask again later");
+    let permit = Arc::clone(&shared.streams).try_acquire_owned().map_err(|_| {
+        let detail =
+            format!("{MOST_STREAMS} event streams are open, which is the maximum: close one, or try again later");
         ApiError::unavailable("too_many_streams", detail, RETRY_AFTER_S)
     })?;
     let news = shared.monitor.events().watch().ok_or_else(|| {
-        ApiError::unavailable("stopping", "the service stops: ask again when it is back", RETRY_AFTER_STOP_S)
+        ApiError::unavailable("stopping", "the service is stopping: try again when it is running", RETRY_AFTER_STOP_S)
     })?;
-    let body = Sse::new(stream_of(news, move |about| holds(&shared.access, &grant, about), place))
+    let body = Sse::new(stream_of(news, move |about| holds(&shared.access, &grant, about), permit))
         .keep_alive(KeepAlive::new().interval(KEEP_ALIVE).text("still here"));
     Ok((StatusCode::OK, [NO_BUFFERING], body).into_response())
 }
 
-/// The events of a watcher, as long as the bus is open and `may_see` answers; `place` is held until then.
+/// The events of a receiver until the bus is closed or `may_see` returns `None`. The permit is held until the stream
+/// ends.
 fn stream_of<P: Send>(
     news: broadcast::Receiver<News>,
     may_see: impl Fn(Option<&StructureId>) -> Option<bool> + Send,
-    place: P,
+    permit: P,
 ) -> impl Stream<Item = Result<Event, Infallible>> + Send {
-    stream::unfold((news, may_see, place), |(mut news, may_see, place)| async move {
+    stream::unfold((news, may_see, permit), |(mut news, may_see, permit)| async move {
         let event = loop {
             let Ok(received) = tokio::time::timeout(KEEP_ALIVE, news.recv()).await else {
                 may_see(None)?;
@@ -97,11 +99,11 @@ fn stream_of<P: Send>(
                 Err(RecvError::Closed) => return None,
             }
         };
-        Some((Ok(event), (news, may_see, place)))
+        Some((Ok(event), (news, may_see, permit)))
     })
 }
 
-/// Whether the token may see the structure; `None` once it was revoked or has expired.
+/// Whether the token may see the structure; `None` once it is revoked or expired.
 fn holds(access: &AccessControl, grant: &Grant, structure: Option<&StructureId>) -> Option<bool> {
     access.still_holds(grant).then(|| structure.is_none_or(|id| grant.may_see(id)))
 }

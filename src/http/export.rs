@@ -1,7 +1,8 @@
-//! `/v1/structures/{id}/measurements`: what was measured, as it was measured.
+//! `/v1/structures/{id}/measurements`: the measurements as they were received.
 //!
-//! JSON comes a page at a time; CSV, NDJSON and Parquet come as one file for the whole window. A file is made page by page while
-//! it is sent: memory stays the same whatever its size, and no transaction stays open for a slow reader.
+//! JSON is sent in pages; CSV, NDJSON and Parquet as one file for the whole interval. A file is written page by page
+//! while it is sent, so that the memory needed does not depend on its size and no transaction stays open for a slow
+//! reader.
 
 use axum::body::{Body, Bytes};
 use axum::extract::State;
@@ -12,21 +13,22 @@ use futures_util::stream::try_unfold;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
+use super::cell::{Cell, ColumnKind};
 use super::error::ApiError;
 use super::history::link_next;
 use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
 use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
-use super::table::{Cell, Format, Kind, TableWriter};
-use super::Shared;
+use super::shared::Shared;
+use super::table::{Format, TableWriter};
 use crate::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
+use crate::monitor::stored::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
 use crate::monitor::{ActiveStructure, Records};
 use crate::quantity::{shown, Hertz, StructureId, Timestamp};
-use crate::store::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
 
-/// Measurements read at a time.
+/// Measurements read from the store at a time.
 const PAGE: usize = 2_000;
 
-/// Of Parquet, whose row groups are better large.
+/// The same for Parquet, which is smaller and faster with large row groups.
 const ROW_GROUP: usize = 10_000;
 
 /// Query of the measurements.
@@ -34,24 +36,24 @@ const ROW_GROUP: usize = 10_000;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct MeasurementParams {
-    /// Taken at this time or later.
+    /// Measured at this time or later.
     #[param(value_type = Option<String>, format = DateTime)]
     from: Option<String>,
-    /// Taken before this time.
+    /// Measured before this time.
     #[param(value_type = Option<String>, format = DateTime)]
     to: Option<String>,
-    /// Without it, `Accept` decides.
+    /// Format of the answer; by default the one named in `Accept`.
     #[param(value_type = Option<ExportFormat>, inline)]
     format: Option<String>,
-    /// Most measurements; without it 100 as JSON, all of them as another format.
+    /// Maximum number of measurements. Default: 100 for JSON, all for other formats.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
-    /// `next` of the page before.
+    /// `next` of the previous page.
     #[param(pattern = "^[0-9]{1,16}~[0-9a-z-]{1,64}~[0-9]{1,9}$")]
     cursor: Option<String>,
 }
 
-/// How measurements are written.
+/// Formats of measurements.
 #[derive(ToSchema)]
 #[schema(rename_all = "lowercase")]
 #[expect(dead_code, reason = "only its description is used")]
@@ -72,7 +74,7 @@ struct MeasurementPage {
     next: Option<String>,
 }
 
-/// A measurement with where it came from.
+/// A measurement with its batch and source.
 #[derive(Debug, Serialize, ToSchema)]
 struct MeasurementItem {
     batch: String,
@@ -87,18 +89,18 @@ impl From<StoredMeasurement> for MeasurementItem {
     }
 }
 
-/// `GET /v1/structures/{id}/measurements`: raw measurements of a window.
+/// `GET /v1/structures/{id}/measurements`: raw measurements in a time interval.
 ///
 /// # Errors
-/// 404 for the structure, 406 for Parquet where it is not built in, 422 for the query.
+/// 404 for the structure, 406 for Parquet if it is not built in, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/measurements", tag = "batches", operation_id = "export_measurements",
     summary = "Raw measurements",
-    description = "What was measured, in the order of the history: batches by their first measurement, in a batch as they came. \
-                   JSON comes a page at a time, the header `Link` has the path of the next; CSV, NDJSON and Parquet come as \
-                   one file for the whole window. A table has the columns `measured_at`, `source`, `batch`, `f1_hz` …, \
-                   `std_f1_hz` …, the declared covariates, `set_<parameter>` (mode shapes in JSON and NDJSON only); posted again with `ignore=source,batch` it is \
-                   the same batch.",
+    description = "Measurements in the order of the history: batches by the time of their first measurement, and within a batch \
+                   in the order received. JSON is sent in pages, and the `Link` header has the path of the next page; CSV, NDJSON \
+                   and Parquet are sent as one file for the whole interval. A table has the columns `measured_at`, `source`, \
+                   `batch`, `f1_hz` …, `std_f1_hz` …, the declared covariates and `set_<parameter>`; mode shapes are in JSON and \
+                   NDJSON only. A table posted again with `ignore=source,batch` is recognised as the same batch.",
     params(StructurePath, MeasurementParams),
     responses(
         (status = 200, description = "Measurements", content(
@@ -119,7 +121,7 @@ pub async fn measurements(
     let allowed = [Format::Json, Format::Csv, Format::Ndjson, Format::Parquet];
     let format = Format::of(query.format.as_deref(), &headers, &allowed)?;
     let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
-    let after = query.cursor.as_deref().map(place).transpose()?;
+    let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
     let limit = query.limit.as_deref().map(|limit| page_limit(Some(limit))).transpose()?;
     let records = shared.monitor.records().clone();
     let mut page = MeasurementQuery { from: window.from, to: window.to, limit: page_limit(None)?, after };
@@ -139,39 +141,39 @@ pub async fn measurements(
     Ok(response)
 }
 
-fn cursor(place: &MeasurementPlace) -> String {
-    format!("{}~{}~{}", place.batch_from.micros(), place.batch_id, place.ordinal)
+fn cursor(position: &MeasurementPlace) -> String {
+    format!("{}~{}~{}", position.batch_from.micros(), position.batch_id, position.ordinal)
 }
 
-fn place(text: &str) -> Result<MeasurementPlace, ApiError> {
+fn parse_cursor(text: &str) -> Result<MeasurementPlace, ApiError> {
     let mut parts = text.splitn(3, '~');
     let time = parts.next().and_then(|t| t.parse().ok()).and_then(|t| Timestamp::from_micros(t).ok());
     let batch = parts.next().filter(|batch| batch.len() <= 64);
     if let (Some(batch_from), Some(batch), Some(ordinal)) = (time, batch, parts.next().and_then(|n| n.parse().ok())) {
         return Ok(MeasurementPlace { batch_from, batch_id: batch.to_owned(), ordinal });
     }
-    let message = format!("{} was not given out by this service", shown(text));
+    let message = format!("{} is not a cursor of this service", shown(text));
     Err(ApiError::invalid_field("query/cursor", message))
 }
 
-/// A file on its way.
+/// A file that is being sent.
 struct Export {
     records: Records,
     structure: StructureId,
     /// The next page to read.
     page: MeasurementQuery,
-    /// Measurements left of those asked for; `None` for all.
+    /// Number of requested measurements that are still to be sent; `None` for all.
     left: Option<usize>,
     writer: Writer,
 }
 
-/// A part of the file, and the rest of it; no rest behind the last part.
+/// A part of the file, and the state for the next part; `None` after the last.
 type Part = (Bytes, Option<Export>);
 
 impl Export {
     async fn answer(self, format: Format) -> Result<Response, ApiError> {
         let name = format!("attachment; filename=\"{}-measurements.{}\"", self.structure, format.name());
-        // The first part before the status: what fails at once is still an answer of its own.
+        // The first part is made before the status is sent, so that an early error can be answered as a problem.
         let first = self.part().await?;
         let parts = try_unfold(Some(first), |part: Option<Part>| async {
             let Some((bytes, rest)) = part else { return Ok(None) };
@@ -195,7 +197,7 @@ impl Export {
         self.left = self.left.map(|left| left - found.len());
         let last = found.len() < self.page.limit || self.left == Some(0);
         self.page.after = found.last().map(|m| m.place.clone()).or(self.page.after);
-        // Thousands of rows take milliseconds to write: not on an async thread.
+        // Writing thousands of rows takes milliseconds: on a blocking thread.
         let mut writer = self.writer;
         let write = move || {
             let bytes = writer.write(found)?;
@@ -207,7 +209,7 @@ impl Export {
     }
 }
 
-/// Writes measurements as one of the formats that are files.
+/// Writes measurements as a file.
 enum Writer {
     Ndjson,
     Table { table: TableWriter, columns: Columns },
@@ -258,19 +260,19 @@ impl Writer {
 }
 
 impl Columns {
-    fn header(&self) -> Vec<(String, Kind)> {
+    fn header(&self) -> Vec<(String, ColumnKind)> {
         let mut header = vec![
-            ("measured_at".to_owned(), Kind::Time),
-            ("source".to_owned(), Kind::Text),
-            ("batch".to_owned(), Kind::Text),
+            ("measured_at".to_owned(), ColumnKind::Time),
+            ("source".to_owned(), ColumnKind::Text),
+            ("batch".to_owned(), ColumnKind::Text),
         ];
-        header.extend((1..=self.modes).map(|mode| (format!("f{mode}_hz"), Kind::Number)));
-        header.extend((1..=self.modes).map(|mode| (format!("std_f{mode}_hz"), Kind::Number)));
+        header.extend((1..=self.modes).map(|mode| (format!("f{mode}_hz"), ColumnKind::Number)));
+        header.extend((1..=self.modes).map(|mode| (format!("std_f{mode}_hz"), ColumnKind::Number)));
         header.extend(self.covariates.iter().map(|c| {
-            let kind = if c.kind == CovariateKind::Number { Kind::Number } else { Kind::Text };
+            let kind = if c.kind == CovariateKind::Number { ColumnKind::Number } else { ColumnKind::Text };
             (c.name.clone(), kind)
         }));
-        header.extend(self.settings.iter().map(|name| (format!("set_{name}"), Kind::Number)));
+        header.extend(self.settings.iter().map(|name| (format!("set_{name}"), ColumnKind::Number)));
         header
     }
 

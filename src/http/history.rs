@@ -1,25 +1,22 @@
-//! `/v1/structures/{id}/history`, `/baseline` and `/exceedances`: what the batches say over time.
+//! `/v1/structures/{id}/history` and `/exceedances`: results of the batches over time.
 
-use axum::body::Body;
 use axum::extract::State;
-use axum::http::{header, HeaderMap, HeaderValue, StatusCode};
+use axum::http::{header, HeaderMap, HeaderValue};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
-use super::answer::{HistoryItem, Undamaged, HISTORY_COLUMNS};
+use super::answer::{HistoryItem, HISTORY_COLUMNS};
+use super::cell::Cell;
 use super::error::ApiError;
-use super::openapi::{BodyRefused, Busy, Conflict, Invalid, NotAcceptable, StructurePath, Unknown};
-use super::request::{json_body, page_limit, structure_id, ApiPath, ApiQuery, Window};
-use super::table::{Cell, Format, TableWriter};
-use super::Shared;
+use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
+use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
+use super::shared::Shared;
+use super::table::{Format, TableWriter};
+use crate::monitor::stored::HistoryQuery;
 use crate::monitor::ActiveStructure;
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::HistoryQuery;
-
-/// p of the damage threshold unless the client gives another (paper §4).
-const DEFAULT_THRESHOLD_PROBABILITY: f64 = 0.05;
 
 /// Query of the history.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -35,13 +32,13 @@ pub struct HistoryParams {
     /// Only this parameter, spring stiffness or group.
     #[param(min_length = 1, example = "k1")]
     parameter: Option<String>,
-    /// Most batches of the page; 100 without.
+    /// Maximum number of batches on the page. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
-    /// `next` of the page before.
+    /// `next` of the previous page.
     #[param(pattern = "^[0-9]{1,16}~[0-9a-z-]{1,64}$")]
     cursor: Option<String>,
-    /// Without it, `Accept` decides.
+    /// Format of the answer; by default the one named in `Accept`.
     #[param(value_type = Option<TableFormat>, inline)]
     format: Option<String>,
 }
@@ -60,15 +57,15 @@ pub struct ExceedanceParams {
     /// Only this parameter, spring stiffness or group.
     #[param(min_length = 1, example = "k1")]
     parameter: Option<String>,
-    /// Most exceedances of the page; 100 without.
+    /// Maximum number of exceedances on the page. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
-    /// `next` of the page before.
+    /// `next` of the previous page.
     #[param(pattern = "^[0-9]{1,16}~[0-9a-z-]{1,64}~.{1,200}$")]
     cursor: Option<String>,
 }
 
-/// How a table is written.
+/// Formats of a table.
 #[derive(ToSchema)]
 #[schema(rename_all = "lowercase")]
 #[expect(dead_code, reason = "only its description is used")]
@@ -97,7 +94,7 @@ struct ExceedancePage {
     next: Option<String>,
 }
 
-/// A probability of damage above the undamaged threshold.
+/// A probability of damage that is larger than its threshold probability.
 #[derive(Debug, Serialize, ToSchema)]
 struct ExceedanceItem {
     batch: String,
@@ -113,28 +110,15 @@ struct ExceedanceItem {
     model_digest: String,
 }
 
-/// The undamaged state.
-#[derive(Debug, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields)]
-#[schema(as = BaselineInput)]
-struct BaselineBody {
-    /// Ids of the batches that it is taken from; ten measurements at least, all together.
-    #[schema(min_items = 1)]
-    batches: Vec<String>,
-    /// Probability below the threshold in the undamaged state; also that above which a batch exceeds. 0.05 without.
-    #[schema(exclusive_minimum = 0, maximum = 0.5)]
-    threshold_probability: Option<f64>,
-}
-
 /// `GET /v1/structures/{id}/history`: assessed batches, oldest first, as JSON, CSV or Parquet.
 ///
 /// # Errors
-/// 404 for the structure, 406 for Parquet where it is not built in, 422 for the query.
+/// 404 for the structure, 406 for Parquet if it is not built in, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/history", tag = "results", operation_id = "read_history",
     summary = "Batches over time",
-    description = "Batches with their current assessments by the time of their first measurement, a page at a time; the header \
-                   `Link` has the path of the next. As CSV or Parquet one row for each batch and parameter.",
+    description = "Batches with their current assessments, ordered by the time of their first measurement, in pages; the `Link` \
+                   header has the path of the next page. CSV and Parquet have one row for each batch and parameter.",
     params(StructurePath, HistoryParams),
     responses(
         (status = 200, description = "A page", content(
@@ -187,15 +171,15 @@ pub async fn history(
     Ok(response)
 }
 
-/// `GET /v1/structures/{id}/exceedances`: probabilities of damage above the undamaged threshold, newest first.
+/// `GET /v1/structures/{id}/exceedances`: probabilities of damage above the threshold probability, newest first.
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/exceedances", tag = "results", operation_id = "list_exceedances",
     summary = "Exceedances",
-    description = "Probabilities of damage above the threshold probability of the undamaged state, newest first, a page at a \
-                   time; the header `Link` has the path of the next. An exceedance is no alarm.",
+    description = "Probabilities of damage above the threshold probability of the undamaged reference, newest first, in pages; the \
+                   `Link` header has the path of the next page. An exceedance does not by itself raise an alarm.",
     params(StructurePath, ExceedanceParams),
     responses(
         (status = 200, description = "A page", body = ExceedancePage,
@@ -221,7 +205,7 @@ pub async fn exceedances(
     let next = (found.len() == limit)
         .then(|| found.last().map(|e| format!("{}~{}", cursor(e.measured_from, &e.batch_id), e.quantity)))
         .flatten();
-    let item = |e: crate::store::Exceedance| ExceedanceItem {
+    let item = |e: crate::monitor::stored::Exceedance| ExceedanceItem {
         batch: e.batch_id,
         measured_from: e.measured_from,
         measured_to: e.measured_to,
@@ -241,39 +225,7 @@ pub async fn exceedances(
     Ok(response)
 }
 
-/// `POST /v1/structures/{id}/baseline`: takes batches as the undamaged state; 201 with its new version.
-///
-/// # Errors
-/// 400, 415, 422 for the body, 404 for structure or batch, 409 without a trained baseline, 503 when the queue is full.
-#[utoipa::path(
-    post, path = "/v1/structures/{id}/baseline", tag = "results", operation_id = "declare_undamaged",
-    summary = "Declare the undamaged state",
-    description = "Takes batches as the undamaged state, in a new version; batches from before are compared with it too.",
-    params(StructurePath),
-    request_body(content = BaselineBody, example = json!({"batches": ["0199a0c6-7d5e-7c3a-a5b1-0d7e6a3f9b10"]})),
-    responses(
-        (status = 201, description = "The new version of the undamaged state", body = Undamaged),
-        Unknown, BodyRefused, Conflict, Busy
-    )
-)]
-pub async fn declare_baseline(
-    State(shared): State<Shared>,
-    ApiPath(id): ApiPath<String>,
-    headers: HeaderMap,
-    body: Body,
-) -> Result<Response, ApiError> {
-    let id = structure_id(&id)?;
-    shared.monitor.structure(&id)?;
-    let body: BaselineBody = json_body(&headers, body, shared.limits).await?;
-    if body.batches.is_empty() {
-        return Err(ApiError::invalid_field("/batches", "name at least one batch"));
-    }
-    let probability = body.threshold_probability.unwrap_or(DEFAULT_THRESHOLD_PROBABILITY);
-    let record = shared.monitor.replay().declare_reference(&id, body.batches, probability).await?;
-    Ok((StatusCode::CREATED, Json(Undamaged::new(&id, &record))).into_response())
-}
-
-/// 422 for a name that this structure does not estimate.
+/// 422 for a name that is not a quantity of this structure.
 fn check_parameter(name: Option<&str>, active: &ActiveStructure) -> Result<(), ApiError> {
     let Some(name) = name else { return Ok(()) };
     let mut names: Vec<String> = active.simulator.space().iter().map(|p| p.name.clone()).collect();
@@ -282,7 +234,7 @@ fn check_parameter(name: Option<&str>, active: &ActiveStructure) -> Result<(), A
     if names.iter().any(|known| known == name) {
         return Ok(());
     }
-    let message = format!("{} is none of {}", crate::quantity::shown(name), names.join(", "));
+    let message = format!("{} is not one of {}", crate::quantity::shown(name), names.join(", "));
     Err(ApiError::invalid_field("query/parameter", message))
 }
 
@@ -296,15 +248,15 @@ fn parse_cursor(text: &str) -> Result<(Timestamp, String, Option<String>), ApiEr
     match (time, parts.next()) {
         (Some(time), Some(batch)) if batch.len() <= 64 => Ok((time, batch.to_owned(), parts.next().map(str::to_owned))),
         _ => {
-            let message = format!("{} was not given out by this service", crate::quantity::shown(text));
+            let message = format!("{} is not a cursor of this service", crate::quantity::shown(text));
             Err(ApiError::invalid_field("query/cursor", message))
         }
     }
 }
 
-/// `Link: …; rel="next"` with the query of this page and the cursor of the next.
+/// Adds `Link: …; rel="next"` with the query of this page and the cursor of the next.
 pub fn link_next(response: &mut Response, path: &str, given: &[(&str, &Option<String>)], next: Option<&str>) {
-    // Batches arrive all the time: no page is kept.
+    // Batches arrive at any time, so a page must not be cached.
     response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     let Some(next) = next else { return };
     let given = given.iter().filter_map(|(name, value)| value.as_ref().map(|v| format!("{name}={}&", encoded(v))));

@@ -1,12 +1,12 @@
-//! The door for programs: routes, and what each request passes on its way.
-//!
-//! `openapi` says how a route is added.
+//! The HTTP API: its routes, and the layers that every request passes. `openapi` describes how a route is added.
 
 pub mod access;
 mod alarms;
 mod answer;
+mod audit;
 mod batches;
 mod bulk;
+mod cell;
 mod dashboard;
 mod diagnoses;
 mod docs;
@@ -14,19 +14,26 @@ mod error;
 mod events;
 mod export;
 mod history;
+mod observe;
 mod openapi;
 mod operations;
 #[cfg(feature = "parquet")]
 mod parquet;
+mod problem;
 mod quarantine;
+mod reference;
 mod request;
+mod request_id;
 mod safekeeping;
 mod series;
 pub mod server;
+mod settings;
+mod shared;
 mod structures;
 mod table;
 #[cfg(test)]
 mod tests;
+mod tokens;
 #[cfg(feature = "otel")]
 mod traceparent;
 mod views;
@@ -41,7 +48,6 @@ use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 use axum::{middleware, Router};
 use metrics_exporter_prometheus::PrometheusHandle;
-use serde::{Deserialize, Serialize};
 use tokio::sync::Semaphore;
 use tower_http::catch_panic::CatchPanicLayer;
 use utoipa::OpenApi as _;
@@ -50,80 +56,26 @@ use utoipa_axum::routes;
 
 use crate::monitor::Monitor;
 use crate::notify::Notifier;
-use access::{AccessControl, RateLimitSettings};
+use access::AccessControl;
 use error::ApiError;
 use request::BodyLimits;
+pub use settings::{HttpSettings, RateLimitSettings};
+use shared::Shared;
 
-/// Limits of the service towards its clients.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct HttpSettings {
-    /// Address and port; port 0 takes a free one.
-    pub listen: String,
-    /// Most bytes of a body; of NDJSON, those of a line.
-    pub max_body_bytes: usize,
-    /// Most bytes of NDJSON.
-    pub max_bulk_bytes: usize,
-    /// Longest time for a request's header, seconds.
-    pub header_timeout_s: u64,
-    /// Longest time for a request's body, seconds.
-    pub body_timeout_s: u64,
-    /// Most connections at a time; further ones wait to be accepted.
-    pub max_connections: usize,
-    /// Longest time open requests get to end when the service stops, seconds.
-    pub drain_s: u64,
-    /// Addresses and networks of proxies whose `X-Forwarded-For` is believed.
-    pub trusted_proxies: Vec<String>,
-    /// How much one client may ask for.
-    pub rate_limit: RateLimitSettings,
-}
-
-impl Default for HttpSettings {
-    fn default() -> Self {
-        Self {
-            listen: "127.0.0.1:8080".to_owned(),
-            max_body_bytes: 4 << 20,
-            max_bulk_bytes: 32 << 20,
-            header_timeout_s: 10,
-            body_timeout_s: 30,
-            max_connections: 1_024,
-            drain_s: 30,
-            trusted_proxies: Vec::new(),
-            rate_limit: RateLimitSettings::default(),
-        }
-    }
-}
-
-/// What the routes answer from.
+/// The parts of the service that the routes use.
 pub struct Service {
-    /// Takes and assesses batches.
+    /// Receives and assesses batches.
     pub monitor: Monitor,
-    /// Sends events to webhooks.
+    /// Sends alarm events to webhooks.
     pub notifier: Notifier,
-    /// Who may do what.
+    /// Tokens, rate limits and audit.
     pub access: AccessControl,
-    /// What `/metrics` shows.
+    /// Source of the text at `/metrics`.
     pub metrics: PrometheusHandle,
 }
 
-/// What every handler has at hand.
-#[derive(Clone)]
-pub struct Shared {
-    monitor: Monitor,
-    notifier: Notifier,
-    metrics: Arc<PrometheusHandle>,
-    limits: BodyLimits,
-    /// Places for event streams.
-    streams: Arc<Semaphore>,
-    /// Turns to read a series.
-    series: Arc<Semaphore>,
-    access: AccessControl,
-}
-
-/// Series read at a time, by three of the store's eight connections each.
-const SERIES_AT_A_TIME: usize = 2;
-
-/// The operations of the service with their description: one line makes both.
+/// All operations of the service together with their OpenAPI description.
+#[expect(deprecated, reason = "deprecated routes are served as well")]
 fn api() -> OpenApiRouter<Shared> {
     OpenApiRouter::with_openapi(openapi::Base::openapi())
         .routes(routes!(structures::list))
@@ -134,7 +86,8 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(export::measurements))
         .routes(routes!(series::series))
         .routes(routes!(history::history))
-        .routes(routes!(history::declare_baseline))
+        .routes(routes!(reference::put, reference::post))
+        .routes(routes!(reference::post_baseline))
         .routes(routes!(history::exceedances))
         .routes(routes!(alarms::list))
         .routes(routes!(alarms::acknowledge))
@@ -149,10 +102,10 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(views::overview))
         .routes(routes!(views::jobs))
         .routes(routes!(events::events))
-        .routes(routes!(access::tokens::list, access::tokens::create))
-        .routes(routes!(access::tokens::revoke))
-        .routes(routes!(access::tokens::rotate))
-        .routes(routes!(access::audit::list))
+        .routes(routes!(tokens::list, tokens::create))
+        .routes(routes!(tokens::revoke))
+        .routes(routes!(tokens::rotate))
+        .routes(routes!(audit::list))
         .routes(routes!(webhooks::list, webhooks::create))
         .routes(routes!(webhooks::read, webhooks::put, webhooks::remove))
         .routes(routes!(webhooks::test))
@@ -185,7 +138,7 @@ pub fn router(service: Service, settings: &HttpSettings) -> Router {
         metrics: Arc::new(metrics),
         limits,
         streams: Arc::new(Semaphore::new(events::MOST_STREAMS)),
-        series: Arc::new(Semaphore::new(SERIES_AT_A_TIME)),
+        series: Arc::new(Semaphore::new(series::MOST_AT_A_TIME)),
         access: access.clone(),
     };
     let (operations, mut document) = api().split_for_parts();
@@ -196,25 +149,21 @@ pub fn router(service: Service, settings: &HttpSettings) -> Router {
         .route("/assets/{*path}", get(dashboard::asset))
         .method_not_allowed_fallback(method_not_allowed)
         .fallback(not_found)
-        // Bodies are read by `request::read_body`, which has its own limit and its own error.
+        // Bodies are read by `request::read_body`, which has a limit and an error of its own.
         .layer(DefaultBodyLimit::disable())
         .layer(middleware::from_fn_with_state(access, access::guard))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::from_fn(access::headers::secure))
-        .layer(middleware::from_fn(request::with_id_and_log))
+        .layer(middleware::from_fn(observe::with_id_and_log))
         .with_state(shared)
 }
 
 async fn not_found() -> ApiError {
-    ApiError::new(
-        StatusCode::NOT_FOUND,
-        "unknown_route",
-        "there is nothing at this path; /openapi.json lists the routes",
-    )
+    ApiError::new(StatusCode::NOT_FOUND, "unknown_route", "this path does not exist; /openapi.json lists the routes")
 }
 
 async fn method_not_allowed() -> ApiError {
-    ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", "this path does not take this method")
+    ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", "this path does not support this method")
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "the shape that CatchPanicLayer takes")]

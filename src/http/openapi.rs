@@ -1,24 +1,24 @@
-//! The API document (OpenAPI 3.1), made from the lines that make the router: what is not annotated does not compile, and what
-//! is not in the router is not in the document.
+//! The OpenAPI 3.1 document. It is generated from the same lines as the router: a handler without a description does
+//! not compile, and a route that is not in the router is not in the document.
 //!
 //! # How a route is added
 //!
 //! 1. Write the handler and put `#[utoipa::path(...)]` above it: method, path, `tag` (one of [`Base`]), the parameters
-//!    ([`StructurePath`] and its like for the path, the `IntoParams` of the query), the request body with an example of each
-//!    content type, and every response. The name of the function becomes the `operationId`, unless two modules have one of
-//!    that name: then give `operation_id`. The first line of its doc comment is the summary, the rest the description; end it
-//!    before `# Errors` with `summary`/`description` of the attribute where it says more than a client needs.
+//!    ([`StructurePath`] and the like for the path, the `IntoParams` of the query), the request body with an example of each
+//!    content type, and every response. The name of the function becomes the `operationId`, unless two modules use the same
+//!    name: then give `operation_id`. The first line of the doc comment is the summary and the rest the description; set
+//!    `summary` and `description` in the attribute if the doc comment is not meant for clients.
 //! 2. Successes are `(status = 200, description = "…", body = Type)` with a type that derives `ToSchema`; `Option` fields that
-//!    are always sent get `#[schema(required)]`. What is not a success is one of the sets below ([`Unknown`], [`Invalid`],
-//!    [`BodyRefused`], [`Conflict`], [`Busy`]), all of them `application/problem+json`. 500 and the header `X-Request-Id` are
-//!    added to every operation by [`complete`]; so is what a layer in front of the handlers answers, such as 401 and 403, and
-//!    the scope that a token must have, by `access::route`.
-//! 3. Put it into `http::api` as `.routes(routes!(module::handler))`; handlers of one path go into one `routes!`. A new `code`
-//!    of a problem goes into `error::CODES`.
+//!    are always sent get `#[schema(required)]`. Problems are one of the sets below ([`Unknown`], [`Invalid`],
+//!    [`BodyRefused`], [`Conflict`], [`Busy`]), all of them `application/problem+json`. [`complete`] adds to every operation the
+//!    status 500, the header `X-Request-Id`, the answers of the layers before the handlers, such as 401 and 403, and the scope
+//!    that a token needs, by `access::route`.
+//! 3. Add it to `http::api` as `.routes(routes!(module::handler))`; handlers of one path go into one `routes!`. A new `code`
+//!    of a problem goes into `problem::CODES`.
 //!
-//! Plain `.route` is for [`super::docs`], which serves this document and the page that shows it, and for the files of the
-//! dashboard. `tests/api/openapi.rs`
-//! looks after all of this, and `tests/schemathesis.sh` sets document and service against each other.
+//! Plain `.route` is only for [`super::docs`], which serves this document and the page that shows it, and for the files
+//! of the dashboard. `tests/api/openapi.rs` checks these rules, and `tests/schemathesis.sh` tests the service against
+//! the document.
 
 use std::collections::BTreeMap;
 
@@ -30,32 +30,32 @@ use utoipa::openapi::{ContentBuilder, HeaderBuilder, OpenApi, Ref, RefOr, Respon
 use utoipa::{IntoParams, IntoResponses};
 
 use super::access::route::classify;
-use super::error::{ProblemBody, PROBLEM_JSON};
+use super::problem::{ProblemBody, PROBLEM_JSON};
 use crate::access::Need;
 
-/// What the document says beside its operations.
+/// General part of the document.
 #[derive(utoipa::OpenApi)]
 #[openapi(
     info(
         title = "modalwatch",
-        description = "Watches structures through their natural frequencies: measured frequencies go in by batches; out come \
-                       stiffnesses with their spread, probabilities of damage, and alarms.\n\n\
-                       Units stand in the names of fields. Times are RFC 3339: with an offset in requests, UTC in answers. A \
-                       number that is none is `null`. Everything but a success is `application/problem+json` with a stable \
-                       `code`. Posting the same batch again is safe: it is known by structure, source and time, or by the \
-                       client's own key.\n\n\
-                       A service with tokens asks for one: `Authorization: Bearer mw_…`, of the scope that the operation \
-                       names; `admin` includes the others. One without any serves this machine only, and needs none."
+        description = "Structural health monitoring by natural frequencies. Measured frequencies are posted in batches; the results are \
+                       stiffnesses with their uncertainty, probabilities of damage, and alarms.\n\n\
+                       Field names contain the unit. Times are RFC 3339: with a UTC offset in requests, in UTC in answers. A number \
+                       that does not exist is `null`. Every answer except a success is `application/problem+json` with a stable \
+                       `code`. Posting the same batch again is safe: it is recognised by structure, source and time, or by a key that \
+                       the client chose.\n\n\
+                       If the service has tokens, requests need one: `Authorization: Bearer mw_…` with the scope that the operation \
+                       names; the scope `admin` includes the others. A service without tokens answers only requests from its own machine."
     ),
     tags(
-        (name = "structures", description = "Structures, their simulation and trained baseline"),
-        (name = "batches", description = "Measurements in and out"),
-        (name = "results", description = "What the batches say over time, against the undamaged state"),
-        (name = "alarms", description = "Alarms, the charts behind them, maintenance"),
-        (name = "access", description = "Tokens, and who changed what"),
-        (name = "webhooks", description = "Who is told of alarms"),
-        (name = "diagnoses", description = "What the simulation gets wrong, and its extension"),
-        (name = "operations", description = "For those who run the service")
+        (name = "structures", description = "Structures, their simulation and trained model"),
+        (name = "batches", description = "Posting and exporting measurements"),
+        (name = "results", description = "Results over time, compared with the undamaged reference"),
+        (name = "alarms", description = "Alarms, alarm charts and maintenance"),
+        (name = "access", description = "Tokens and the audit of changes"),
+        (name = "webhooks", description = "Receivers of alarm events"),
+        (name = "diagnoses", description = "Diagnoses of systematic errors of the simulation, and extensions by them"),
+        (name = "operations", description = "Operation of the service")
     ),
     components(schemas(ProblemBody))
 )]
@@ -64,7 +64,10 @@ pub struct Base;
 /// Path of a structure.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
-#[expect(dead_code, reason = "only its description is used: handlers check the text themselves, with our own errors")]
+#[expect(
+    dead_code,
+    reason = "only its description is used: handlers check the text themselves and answer with a problem"
+)]
 pub struct StructurePath {
     /// Id of the structure.
     #[param(value_type = String, min_length = 1, max_length = 64, pattern = "^[a-z0-9][a-z0-9._-]*$", example = "three-dof")]
@@ -127,7 +130,7 @@ pub struct WebhookPath {
     id: String,
 }
 
-/// Path of a message to a webhook.
+/// Path of a delivery to a webhook.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "as in StructurePath")]
@@ -150,7 +153,7 @@ pub struct MessagePath {
     message: String,
 }
 
-/// A set of responses that are problems.
+/// Defines a set of responses that are problems.
 macro_rules! problems {
     ($($(#[$doc:meta])* $name:ident { $($status:literal: $description:literal),+ $(,)? })+) => {$(
         $(#[$doc])*
@@ -165,37 +168,37 @@ macro_rules! problems {
 }
 
 problems! {
-    /// Something that the path names is not there.
+    /// Something in the path does not exist.
     Unknown {
-        "404": "`unknown_structure`, `unknown_batch`, `unknown_alarm` and so on: it is not here."
+        "404": "`unknown_structure`, `unknown_batch`, `unknown_alarm` and so on: it does not exist."
     }
-    /// A value of path or query that cannot be.
+    /// An invalid value in path or query.
     Invalid {
-        "422": "`invalid`, `invalid_id`: a value of path or query is out of range; `errors` names it."
+        "422": "`invalid`, `invalid_id`: a value in path or query is invalid; `errors` names it."
     }
-    /// A body that was not taken.
+    /// A body that was refused.
     BodyRefused {
         "400": "`malformed_json`, `not_utf8`, `body_unreadable`: the body cannot be read.",
-        "408": "`body_timeout`: the body came too slowly.",
-        "413": "`body_too_large`; for NDJSON also `too_many_lines`, with what was done before in `done`.",
+        "408": "`body_timeout`: the body did not arrive in time.",
+        "413": "`body_too_large`; for NDJSON also `too_many_lines`, with the outcome of the lines before in `done`.",
         "415": "`unsupported_media_type`, `unsupported_encoding`.",
-        "422": "It was read, but a value is out of range or does not fit what is stored; `errors` names each.",
+        "422": "A value is invalid or contradicts what is stored; `errors` lists each one.",
     }
-    /// It does not fit the present state.
+    /// The request conflicts with the present state.
     Conflict {
-        "409": "It does not fit the present state; `code` says which."
+        "409": "The request conflicts with the present state; `code` says how."
     }
     /// The queue is full.
     Busy {
         "503": "`queue_full`: try again after the seconds of `Retry-After`."
     }
-    /// No more streams.
+    /// The maximum number of streams is open.
     StreamBusy {
         "503": "`too_many_streams`, `stopping`: try again after the seconds of `Retry-After`."
     }
-    /// A format that is not written.
+    /// A format that the service cannot write.
     NotAcceptable {
-        "406": "`not_acceptable`: this service does not write the format asked for."
+        "406": "`not_acceptable`: the service cannot write the requested format."
     }
 }
 
@@ -215,12 +218,13 @@ fn problem(status: &str, description: &str) -> Response {
 /// Name of the security scheme.
 const BEARER: &str = "bearer";
 
-/// Adds what holds for every operation: what the layers before the handlers answer, and what a token must be good for.
+/// Adds what applies to every operation: the answers of the layers before the handlers, and the scope that a token
+/// needs.
 pub fn complete(document: &mut OpenApi) {
     let scheme = HttpBuilder::new()
         .scheme(HttpAuthScheme::Bearer)
         .description(Some(
-            "A token, made by `modalwatch token create` or `POST /v1/tokens`; without any stored, none is needed.",
+            "A token, created by `modalwatch token create` or `POST /v1/tokens`. A service without stored tokens needs none.",
         ))
         .build();
     let components = document.components.get_or_insert_default();
@@ -243,26 +247,30 @@ pub fn complete(document: &mut OpenApi) {
 
 fn complete_operation(operation: &mut Operation, method: &Method, path: &str) {
     let responses = &mut operation.responses.responses;
-    also(responses, "400", "`token_in_address`: a token stands in the address.");
-    also(responses, "429", "`too_many_requests` and its like: try again after the seconds of `Retry-After`.");
+    also(responses, "400", "`token_in_address`: the URL contains a token.");
+    also(responses, "429", "`too_many_requests` and other rate limits: try again after the seconds of `Retry-After`.");
     also(responses, "500", "`internal`: an error of the service; its log has the cause under the request id.");
     if path.starts_with("/v1/") {
         also(
             responses,
             "503",
-            "`database_busy`, `disk_failed`, `read_only`, `database_gone`: it cannot be read or stored now.",
+            "`database_busy`, `disk_failed`, `read_only`, `database_gone`: the data cannot be read or stored at present.",
         );
         if method != Method::GET {
-            also(responses, "507", "`disk_full`: there is no room to store it.");
+            also(responses, "507", "`disk_full`: there is no space to store the data.");
         }
     }
     match classify(method, Some(path)).need {
-        // Nobody is asked.
+        // No token is needed.
         Need::Nothing => operation.security = Some(Vec::new()),
         Need::Scope(scope) => {
-            also(responses, "401", "`unauthorized`, `token_expired`, `token_revoked`: it needs a token.");
+            also(
+                responses,
+                "401",
+                "`unauthorized`, `token_expired`, `token_revoked`: the operation needs a valid token.",
+            );
             let missing = format!(
-                "`forbidden_scope`: it needs the scope `{scope}`; `forbidden_structure`: the token is for other structures; \
+                "`forbidden_scope`: the operation needs the scope `{scope}`; `forbidden_structure`: the token is limited to other structures; \
                  `forbidden_origin`."
             );
             also(responses, "403", &missing);
@@ -279,7 +287,7 @@ fn complete_operation(operation: &mut Operation, method: &Method, path: &str) {
     }
 }
 
-/// A problem that the operation can answer as well.
+/// Adds a problem to the responses of an operation.
 fn also(responses: &mut BTreeMap<String, RefOr<Response>>, status: &str, description: &str) {
     match responses.get_mut(status) {
         Some(RefOr::T(there)) => there.description = format!("{} {description}", there.description),

@@ -1,4 +1,4 @@
-//! `/healthz /readyz /metrics /version`: for those who run the service.
+//! `/healthz`, `/readyz`, `/metrics`, `/version`: for operators of the service.
 
 use axum::extract::State;
 use axum::http::{header, StatusCode};
@@ -8,34 +8,34 @@ use serde::Serialize;
 use tracing::error;
 use utoipa::ToSchema;
 
-use super::Shared;
+use super::shared::Shared;
 use crate::baseline::library::Refusal;
+use crate::monitor::stored::schema_version;
 use crate::monitor::Health;
-use crate::store::Store;
 
-/// The process answers.
+/// The process is running.
 #[derive(Debug, Serialize, ToSchema)]
 struct Alive {
     /// `alive`.
     status: &'static str,
 }
 
-/// Program and SQLite.
+/// Versions of the program and of SQLite.
 #[derive(Debug, Serialize, ToSchema)]
 struct Version {
     name: &'static str,
     version: &'static str,
     sqlite_version: String,
-    /// Migrations of the database.
+    /// Number of the last migration of the database.
     schema_version: i64,
-    /// Layout of the manifests of trained baselines.
+    /// Format version of the manifests of trained models.
     manifest_format: u32,
 }
 
-/// Whether batches can be stored and assessed.
+/// Readiness to store and assess batches.
 #[derive(Debug, Serialize, ToSchema)]
 struct Readiness {
-    /// Ready or not, why not, and what is degraded.
+    /// Whether the service is ready, why not, and which parts are degraded.
     #[serde(flatten)]
     health: Health,
     baselines_in_use: usize,
@@ -43,20 +43,20 @@ struct Readiness {
     free_places_in_queue: usize,
 }
 
-/// `GET /healthz`: the process answers. No look at the database, so that a slow disk does not get it killed.
+/// `GET /healthz`: the process is running. The database is not checked, so that a slow disk does not cause a restart.
 #[utoipa::path(
     get, path = "/healthz", tag = "operations", operation_id = "health",
-    summary = "Alive?", description = "The process answers; without a look at the database.",
-    responses((status = 200, description = "It does", body = Alive))
+    summary = "Liveness", description = "Answers while the process is running. The database is not checked.",
+    responses((status = 200, description = "The process is running", body = Alive))
 )]
 pub async fn health() -> Response {
     Json(Alive { status: "alive" }).into_response()
 }
 
-/// `GET /readyz`: 200 when batches can be stored and assessed, else 503 with the reasons.
+/// `GET /readyz`: 200 if batches can be stored and assessed, otherwise 503 with the reasons.
 #[utoipa::path(
     get, path = "/readyz", tag = "operations", operation_id = "ready",
-    summary = "Ready?", description = "Batches can be stored and assessed.",
+    summary = "Readiness", description = "Whether batches can be stored and assessed.",
     responses(
         (status = 200, description = "Ready", body = Readiness),
         (status = 503, description = "Not ready; `reasons` says why", body = Readiness)
@@ -76,12 +76,11 @@ pub async fn ready(State(shared): State<Shared>) -> Response {
     (status, Json(readiness)).into_response()
 }
 
-/// `GET /metrics`: Prometheus text. Whether the service is ready is asked anew for it: a scraper knows without a probe.
-///
-/// It answers with a database that cannot be read too: that is when it is looked at.
+/// `GET /metrics`: metrics in the text format of Prometheus. Readiness is evaluated for each request, so that a scraper
+/// sees it without calling `/readyz`. The route also answers if the database cannot be read.
 #[utoipa::path(
     get, path = "/metrics", tag = "operations", operation_id = "metrics",
-    summary = "Metrics", description = "For Prometheus.",
+    summary = "Metrics", description = "Metrics in the text format of Prometheus.",
     responses((status = 200, description = "Prometheus text", body = String, content_type = "text/plain"))
 )]
 pub async fn metrics(State(shared): State<Shared>) -> Response {
@@ -95,17 +94,17 @@ pub async fn metrics(State(shared): State<Shared>) -> Response {
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
 }
 
-/// `GET /version`: program and SQLite.
+/// `GET /version`: versions of the program and of SQLite.
 #[utoipa::path(
     get, path = "/version", tag = "operations", operation_id = "version",
-    summary = "Version", description = "Of the program and its SQLite.",
+    summary = "Version", description = "Versions of the program and of SQLite.",
     responses((status = 200, description = "The versions", body = Version))
 )]
 pub async fn version(State(shared): State<Shared>) -> Response {
     let version = Version {
         name: env!("CARGO_PKG_NAME"),
         version: env!("CARGO_PKG_VERSION"),
-        sqlite_version: shared.monitor.store().file().sqlite_version().to_owned(),
+        sqlite_version: shared.monitor.sqlite_version().to_owned(),
         schema_version: schema_version(),
         manifest_format: crate::baseline::manifest::FORMAT,
     };

@@ -1,4 +1,4 @@
-//! Tables as Parquet: flat columns that may be empty, one row group for each part.
+//! Tables as Parquet files: flat optional columns, one row group for each part.
 
 use std::io::Write;
 use std::sync::{Arc, Mutex};
@@ -10,26 +10,26 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::{SerializedColumnWriter, SerializedFileWriter};
 use parquet::schema::types::{Type, TypePtr};
 
-use super::table::{Cell, Kind};
+use super::cell::{Cell, ColumnKind};
 
 /// Writes a Parquet file part by part.
 pub struct ParquetWriter {
-    kinds: Vec<Kind>,
-    writer: SerializedFileWriter<Shared>,
-    written: Shared,
+    kinds: Vec<ColumnKind>,
+    writer: SerializedFileWriter<Written>,
+    written: Written,
 }
 
-/// Memory that the file is written to and parts are taken from.
+/// Buffer that the Parquet library writes to and from which the parts are taken.
 #[derive(Clone, Default)]
-struct Shared(Arc<Mutex<Vec<u8>>>);
+struct Written(Arc<Mutex<Vec<u8>>>);
 
-impl Shared {
+impl Written {
     fn take(&self) -> Vec<u8> {
         std::mem::take(&mut self.0.lock().expect("no holder of this lock panics"))
     }
 }
 
-impl Write for Shared {
+impl Write for Written {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         self.0.lock().expect("no holder of this lock panics").extend_from_slice(bytes);
         Ok(bytes.len())
@@ -44,18 +44,18 @@ impl ParquetWriter {
     /// A file with these columns.
     ///
     /// # Errors
-    /// [`ParquetError`] for names that cannot be.
-    pub fn new<N: AsRef<str>>(columns: &[(N, Kind)]) -> Result<Self, ParquetError> {
+    /// [`ParquetError`] for invalid column names.
+    pub fn new<N: AsRef<str>>(columns: &[(N, ColumnKind)]) -> Result<Self, ParquetError> {
         let fields: Vec<TypePtr> =
             columns.iter().map(|(name, kind)| field(name.as_ref(), *kind).map(Arc::new)).collect::<Result<_, _>>()?;
         let schema = Type::group_type_builder("modalwatch").with_fields(fields).build()?;
         let properties = WriterProperties::builder().set_compression(Compression::SNAPPY).build();
-        let written = Shared::default();
+        let written = Written::default();
         let writer = SerializedFileWriter::new(written.clone(), Arc::new(schema), Arc::new(properties))?;
         Ok(Self { kinds: columns.iter().map(|(_, kind)| *kind).collect(), writer, written })
     }
 
-    /// Writes a row group and gives out what is written so far.
+    /// Writes a row group and returns the bytes written so far.
     ///
     /// # Errors
     /// [`ParquetError`] for a row that does not fit the columns.
@@ -67,7 +67,8 @@ impl ParquetWriter {
         for (index, kind) in self.kinds.iter().enumerate() {
             let cells: Vec<&Cell> = rows.iter().filter_map(|row| row.get(index)).collect();
             let column = group.next_column()?.filter(|_| cells.len() == rows.len());
-            let column = column.ok_or_else(|| ParquetError::General("a row of another length".to_owned()))?;
+            let column =
+                column.ok_or_else(|| ParquetError::General("a row has another length than the header".to_owned()))?;
             write_column(column, *kind, &cells)?;
         }
         group.close()?;
@@ -75,7 +76,7 @@ impl ParquetWriter {
         Ok(self.written.take())
     }
 
-    /// Writes what stands behind the last row group and gives it out.
+    /// Writes the footer and returns it.
     ///
     /// # Errors
     /// [`ParquetError`].
@@ -85,44 +86,44 @@ impl ParquetWriter {
     }
 }
 
-fn field(name: &str, kind: Kind) -> Result<Type, ParquetError> {
+fn field(name: &str, kind: ColumnKind) -> Result<Type, ParquetError> {
     let (physical, logical) = match kind {
-        Kind::Text => (Physical::BYTE_ARRAY, Some(LogicalType::String)),
-        Kind::Number => (Physical::DOUBLE, None),
-        Kind::Count => (Physical::INT64, None),
-        Kind::Flag => (Physical::BOOLEAN, None),
-        Kind::Time => (Physical::INT64, Some(LogicalType::timestamp(true, TimeUnit::MICROS))),
+        ColumnKind::Text => (Physical::BYTE_ARRAY, Some(LogicalType::String)),
+        ColumnKind::Number => (Physical::DOUBLE, None),
+        ColumnKind::Count => (Physical::INT64, None),
+        ColumnKind::Flag => (Physical::BOOLEAN, None),
+        ColumnKind::Time => (Physical::INT64, Some(LogicalType::timestamp(true, TimeUnit::MICROS))),
     };
     let field = Type::primitive_type_builder(name, physical);
     field.with_repetition(Repetition::OPTIONAL).with_logical_type(logical).build()
 }
 
-fn write_column(column: SerializedColumnWriter<'_>, kind: Kind, cells: &[&Cell]) -> Result<(), ParquetError> {
+fn write_column(column: SerializedColumnWriter<'_>, kind: ColumnKind, cells: &[&Cell]) -> Result<(), ParquetError> {
     match kind {
-        Kind::Text => write::<ByteArrayType>(column, cells, |cell| match cell {
+        ColumnKind::Text => write::<ByteArrayType>(column, cells, |cell| match cell {
             Cell::Text(text) => Some(ByteArray::from(text.as_str())),
             _ => None,
         }),
-        Kind::Number => write::<DoubleType>(column, cells, |cell| match cell {
+        ColumnKind::Number => write::<DoubleType>(column, cells, |cell| match cell {
             Cell::Number(number) => Some(*number),
             _ => None,
         }),
-        Kind::Count => write::<Int64Type>(column, cells, |cell| match cell {
+        ColumnKind::Count => write::<Int64Type>(column, cells, |cell| match cell {
             Cell::Count(count) => Some(*count),
             _ => None,
         }),
-        Kind::Flag => write::<BoolType>(column, cells, |cell| match cell {
+        ColumnKind::Flag => write::<BoolType>(column, cells, |cell| match cell {
             Cell::Flag(flag) => Some(*flag),
             _ => None,
         }),
-        Kind::Time => write::<Int64Type>(column, cells, |cell| match cell {
+        ColumnKind::Time => write::<Int64Type>(column, cells, |cell| match cell {
             Cell::Time(time) => Some(time.micros()),
             _ => None,
         }),
     }
 }
 
-/// Writes the cells that `value` takes; an empty cell is a null, any other is of another kind than its column.
+/// Writes a column. `value` returns the value of a cell of this type; an empty cell becomes a null.
 fn write<T: DataType>(
     mut column: SerializedColumnWriter<'_>,
     cells: &[&Cell],
@@ -132,7 +133,7 @@ fn write<T: DataType>(
     for cell in cells {
         let value = value(cell);
         if value.is_none() && **cell != Cell::Empty {
-            return Err(ParquetError::General(format!("{cell:?} is of another kind than its column")));
+            return Err(ParquetError::General(format!("{cell:?} has another type than its column")));
         }
         levels.push(i16::from(value.is_some()));
         values.extend(value);

@@ -1,4 +1,4 @@
-//! `/v1/quarantine`: messages from the broker that can never become a batch, and why.
+//! `/v1/quarantine`: MQTT messages that cannot be stored as a batch, with the reason.
 
 use axum::extract::State;
 use axum::http::StatusCode;
@@ -10,11 +10,11 @@ use utoipa::{IntoParams, ToSchema};
 use super::error::ApiError;
 use super::openapi::{Invalid, MessagePath, Unknown};
 use super::request::{page_cursor, page_limit, ApiPath, ApiQuery};
-use super::Shared;
+use super::shared::Shared;
+use crate::monitor::stored::QuarantinedMessage;
 use crate::quantity::{shown, Timestamp};
-use crate::store::QuarantinedMessage;
 
-/// Characters of a payload in a list; the item has all that was kept.
+/// Number of characters of a payload in the list.
 const PREVIEW: usize = 500;
 
 /// Query of the list.
@@ -22,15 +22,15 @@ const PREVIEW: usize = 500;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct QuarantineQuery {
-    /// Most items; 100 without.
+    /// Maximum number of items. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
-    /// `next` of the page before.
+    /// `next` of the previous page.
     #[param(pattern = "^[0-9]{1,18}$")]
     cursor: Option<String>,
 }
 
-/// A message that can never become a batch.
+/// An MQTT message that cannot be stored as a batch.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = QuarantinedMessage)]
 struct QuarantineItem {
@@ -42,7 +42,7 @@ struct QuarantineItem {
     last_at: Timestamp,
     payload_sha256: String,
     payload_bytes: u64,
-    /// As text; what is no UTF-8 is replaced.
+    /// The payload as text; invalid UTF-8 is replaced.
     payload: String,
 }
 
@@ -68,14 +68,14 @@ fn item(m: QuarantinedMessage) -> QuarantineItem {
     }
 }
 
-/// `GET /v1/quarantine`: newest first.
+/// `GET /v1/quarantine`: messages, newest first.
 ///
 /// # Errors
 /// 422 for the query.
 #[utoipa::path(
     get, path = "/v1/quarantine", tag = "operations", operation_id = "list_quarantine",
-    summary = "Messages that became no batch",
-    description = "From the broker, with the reason, newest first, a page at a time; of each payload the first 500 characters.",
+    summary = "Quarantined messages",
+    description = "MQTT messages that cannot be stored as a batch, with the reason, newest first, in pages. Each payload is cut to its first 500 characters.",
     params(QuarantineQuery),
     responses((status = 200, description = "A page", body = QuarantinePage), Invalid)
 )]
@@ -84,25 +84,25 @@ pub async fn list(
     ApiQuery(query): ApiQuery<QuarantineQuery>,
 ) -> Result<Response, ApiError> {
     let (limit, before) = (page_limit(query.limit.as_deref())?, page_cursor(query.cursor.as_deref())?);
-    let found = shared.monitor.store().quarantine().quarantined(before, limit).await?;
+    let found = shared.monitor.quarantine().quarantined(before, limit).await?;
     let next = (found.len() == limit).then(|| found.last().map(|m| m.number.to_string())).flatten();
     Ok(Json(QuarantinePage { items: found.into_iter().map(item).collect(), next }).into_response())
 }
 
-/// `GET /v1/quarantine/{message}`: with all of the payload that was kept, at most 64 KiB.
+/// `GET /v1/quarantine/{message}`: a message with its stored payload, at most 64 KiB.
 ///
 /// # Errors
 /// 404.
 #[utoipa::path(
     get, path = "/v1/quarantine/{message}", tag = "operations", operation_id = "read_quarantined",
-    summary = "A message that became no batch", description = "With all of the payload that was kept, at most 64 KiB.",
+    summary = "A quarantined message", description = "With its stored payload, at most 64 KiB.",
     params(MessagePath),
     responses((status = 200, description = "The message", body = QuarantineItem), Unknown)
 )]
 pub async fn read(State(shared): State<Shared>, ApiPath(message): ApiPath<String>) -> Result<Response, ApiError> {
     let number: i64 = message.parse().map_err(|_| unknown(&message))?;
-    // The page of one that begins behind the next number.
-    let found = shared.monitor.store().quarantine().quarantined(number.checked_add(1), 1).await?;
+    // The message is on the page of one item that begins after the next number.
+    let found = shared.monitor.quarantine().quarantined(number.checked_add(1), 1).await?;
     let found = found.into_iter().find(|m| m.number == number).ok_or_else(|| unknown(&message))?;
     let payload = String::from_utf8_lossy(&found.payload).into_owned();
     Ok(Json(QuarantineItem { payload, ..item(found) }).into_response())
@@ -114,13 +114,13 @@ pub async fn read(State(shared): State<Shared>, ApiPath(message): ApiPath<String
 /// 404.
 #[utoipa::path(
     delete, path = "/v1/quarantine/{message}", tag = "operations", operation_id = "delete_quarantined",
-    summary = "Forget a message", description = "It is deleted from the quarantine.",
+    summary = "Delete a quarantined message", description = "Deletes the message from the quarantine.",
     params(MessagePath),
-    responses((status = 204, description = "It is gone"), Unknown)
+    responses((status = 204, description = "It was deleted"), Unknown)
 )]
 pub async fn remove(State(shared): State<Shared>, ApiPath(message): ApiPath<String>) -> Result<Response, ApiError> {
     let number: i64 = message.parse().map_err(|_| unknown(&message))?;
-    if shared.monitor.store().quarantine().delete_quarantined(number).await? {
+    if shared.monitor.quarantine().delete_quarantined(number).await? {
         Ok(StatusCode::NO_CONTENT.into_response())
     } else {
         Err(unknown(&message))

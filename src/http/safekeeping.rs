@@ -1,4 +1,4 @@
-//! Backups, exports, retention and reloads: for those who keep the service.
+//! Backups, exports, retention and model reloads.
 
 use axum::body::{Body, Bytes};
 use axum::extract::State;
@@ -14,34 +14,34 @@ use super::answer::declare_reference;
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{parse_json, read_body, structure_id, ApiPath, ApiQuery};
-use super::Shared;
+use super::shared::Shared;
 use crate::monitor::retention::RetentionPlan;
+use crate::monitor::stored::backup::Manifest;
 use crate::monitor::Reloaded;
 use crate::quantity::{shown, Digest, StructureId};
-use crate::store::backup::Manifest;
 
-/// Lines of an archive on their way to the client.
+/// Maximum number of archive lines that wait to be sent.
 const BUFFERED: usize = 16;
 
-/// Most days of retention: beyond, the calendar ends.
+/// Maximum number of days of retention; larger values leave the range of the calendar.
 const MOST_DAYS: u32 = 36_500;
 
-/// A backup to make; `{}`, or no body, is enough.
+/// Body of a request for a backup; may be `{}` or absent.
 #[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = BackupInput)]
 struct BackupBody {
-    /// Name of its folder; one made of the time without.
+    /// Name of the backup's folder. Default: made from the time.
     #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     name: Option<String>,
 }
 
-/// How to reload; `{}`, or no body, is enough.
+/// Body of a request for a reload; may be `{}` or absent.
 #[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = ReloadInput)]
 struct ReloadBody {
-    /// Take the undamaged batches as that under the new baseline too; `true` without.
+    /// Renew the undamaged reference from the same batches under the new model. Default `true`.
     retake_undamaged: Option<bool>,
 }
 
@@ -50,7 +50,7 @@ struct ReloadBody {
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct RetentionQuery {
-    /// Days to keep, instead of those of the settings.
+    /// Number of days to keep batches, instead of the configured one.
     #[param(value_type = Option<u32>, minimum = 0, maximum = 36_500)]
     days: Option<String>,
 }
@@ -59,7 +59,7 @@ pub struct RetentionQuery {
 #[derive(Debug, Serialize, ToSchema)]
 struct BackupList {
     items: Vec<Manifest>,
-    /// Folders that are no backup that can be read, and why.
+    /// Folders that cannot be read as a backup, with the reason.
     unreadable: Vec<String>,
 }
 
@@ -104,17 +104,17 @@ impl From<Reloaded> for ReloadedBody {
     }
 }
 
-/// `POST /v1/backups`: a backup under `backups/` of the data folder, made while everything goes on; 201 when it is checked and
-/// on disk.
+/// `POST /v1/backups`: makes a backup in `backups/` of the data folder while the service runs; 201 when it is verified
+/// and on disk.
 ///
 /// # Errors
-/// 409 when one is being made or the name is taken, 422 for the name, 507 without room.
+/// 409 if a backup is being made or the name exists, 422 for the name, 507 without enough space.
 #[utoipa::path(
     post, path = "/v1/backups", tag = "operations", operation_id = "create_backup",
-    summary = "Make a backup",
-    description = "Under `backups/` of the data folder, while everything goes on; answered when it is checked and on disk.",
+    summary = "Create a backup",
+    description = "Makes a backup in `backups/` of the data folder while the service runs. The answer is sent when it is verified and on disk.",
     request_body(content = Option<BackupBody>, example = json!({"name": "before-the-update"})),
-    responses((status = 201, description = "What is in it", body = Manifest), BodyRefused, Conflict)
+    responses((status = 201, description = "Contents of the backup", body = Manifest), BodyRefused, Conflict)
 )]
 pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, ApiError> {
     let body: BackupBody = optional_json(&shared, &headers, body).await?;
@@ -122,13 +122,13 @@ pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, bod
     Ok((StatusCode::CREATED, Json(manifest)).into_response())
 }
 
-/// `GET /v1/backups`: the service's own backups, newest first.
+/// `GET /v1/backups`: the backups in the data folder, newest first.
 ///
 /// # Errors
-/// 500 when the folder cannot be listed.
+/// 500 if the folder cannot be listed.
 #[utoipa::path(
     get, path = "/v1/backups", tag = "operations", operation_id = "list_backups",
-    summary = "All backups", description = "The service's own, newest first.",
+    summary = "All backups", description = "The backups in the data folder, newest first.",
     responses((status = 200, description = "The backups", body = BackupList))
 )]
 pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiError> {
@@ -136,15 +136,15 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
     Ok(Json(BackupList { items, unreadable }).into_response())
 }
 
-/// `GET /v1/structures/{id}/export`: everything of a structure that another installation needs, as lines of JSON.
+/// `GET /v1/structures/{id}/export`: all data of a structure that another installation needs, as lines of JSON.
 ///
 /// # Errors
-/// 404 for the structure. A failure on the way breaks the connection, and the last line is missing.
+/// 404 for the structure. A later failure closes the connection before the last line.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/export", tag = "operations", operation_id = "export_structure",
-    summary = "Everything of a structure",
-    description = "What another installation needs, as lines of JSON. A failure on the way breaks the connection, and the last \
-                   line, whose `record` is `end`, is missing.",
+    summary = "Export a structure",
+    description = "All data that another installation needs, as lines of JSON. If the export fails, the connection is closed before \
+                   the last line, whose `record` is `end`.",
     params(StructurePath),
     responses(
         (status = 200, description = "The archive; the schema is that of a line", body = Object, content_type = "application/x-ndjson"),
@@ -164,7 +164,7 @@ pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) 
                     }
                 }
                 Err(failure) => {
-                    error!(error = %failure, "An export broke off: {failure}");
+                    error!(error = %failure, "An export failed: {failure}");
                     sender.abort(failure);
                     return;
                 }
@@ -176,18 +176,18 @@ pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) 
     Ok((headers, Body::new(body)).into_response())
 }
 
-/// `POST /v1/structures/{id}/model/reload`: reads the models folder again and swaps the trained baseline; the one in use stays
-/// when the new one is refused.
+/// `POST /v1/structures/{id}/model/reload`: reads the models folder again and replaces the trained model; the previous
+/// model stays in use if the new one is refused.
 ///
 /// # Errors
-/// 404 for the structure, 409 with the reason when the new one is refused.
+/// 404 for the structure, 409 with the reason if the new model is refused.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/model/reload", tag = "structures", operation_id = "reload_model",
-    summary = "Put another trained baseline into use",
-    description = "Reads the models folder again; the baseline in use stays when the new one is refused.",
+    summary = "Reload the trained model",
+    description = "Reads the models folder again and replaces the trained model. The previous model stays in use if the new one is refused.",
     params(StructurePath),
     request_body(content = Option<ReloadBody>, example = json!({"retake_undamaged": false})),
-    responses((status = 200, description = "What is in use now", body = ReloadedBody), Unknown, BodyRefused, Conflict)
+    responses((status = 200, description = "The model that is now in use", body = ReloadedBody), Unknown, BodyRefused, Conflict)
 )]
 pub async fn reload_model(
     State(shared): State<Shared>,
@@ -201,14 +201,14 @@ pub async fn reload_model(
     Ok(Json(ReloadedBody::from(reloaded)).into_response())
 }
 
-/// `GET /v1/retention`: what is kept, what would go now, and what the last look did; `days` asks for another number. Nothing is
-/// deleted by it.
+/// `GET /v1/retention`: the retention setting, what would be deleted now, and the result of the last run; `days`
+/// replaces the setting. This request deletes nothing.
 ///
 /// # Errors
 /// 422 for the query.
 #[utoipa::path(
     get, path = "/v1/retention", tag = "operations", operation_id = "retention",
-    summary = "What is kept, and what would go", description = "And what the last look did. Nothing is deleted by asking.",
+    summary = "Retention", description = "The setting, what would be deleted now, and the result of the last run. This request deletes nothing.",
     params(RetentionQuery),
     responses((status = 200, description = "The plan", body = RetentionPlan), Invalid)
 )]
@@ -226,14 +226,14 @@ pub async fn retention(
     Ok(Json(shared.monitor.upkeep().retention().plan(days.transpose()?).await?).into_response())
 }
 
-/// A JSON body, or its default where there is none.
+/// Reads a JSON body, or returns the default if there is none.
 async fn optional_json<T: serde::de::DeserializeOwned + Default>(
     shared: &Shared,
     headers: &HeaderMap,
     body: Body,
 ) -> Result<T, ApiError> {
     let bytes = read_body(body, headers, shared.limits).await?;
-    // `null` says the same as nothing.
+    // `null` is treated like an empty body.
     if bytes.is_empty() || bytes.trim_ascii() == b"null" {
         return Ok(T::default());
     }

@@ -1,4 +1,4 @@
-//! `/v1/structures/{id}/series`: all that can be drawn over time, short enough for a screen.
+//! `/v1/structures/{id}/series`: all time series of a structure, reduced to the resolution of a screen.
 
 use std::collections::BTreeMap;
 
@@ -12,22 +12,24 @@ use utoipa::{IntoParams, ToSchema};
 use super::error::ApiError;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery, Window};
-use super::Shared;
+use super::shared::Shared;
 use crate::damage::{QuantityKind, UndamagedState};
 use crate::measurement::CovariateKind;
+use crate::monitor::stored::{
+    ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
+};
 use crate::monitor::Series;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::reduction::{Reduced, Row};
-use crate::store::{
-    ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
-};
 use crate::trust::{FindingCode, TrustVerdict};
 
-/// Points unless the client asks for another number.
+/// Series that are read at a time; each uses three of the eight connections of the store.
+pub const MOST_AT_A_TIME: usize = 2;
+/// Number of points if the client does not specify one.
 const DEFAULT_POINTS: usize = 1_000;
-/// Fewest and most points.
+/// Minimum and maximum number of points.
 const POINTS: [usize; 2] = [10, 5_000];
-/// Most alarms looked through, the newest.
+/// Number of newest alarms that are considered.
 const MOST_ALARMS: usize = 1_000;
 
 /// Query of the series.
@@ -38,29 +40,29 @@ pub struct SeriesQuery {
     /// Batches that begin at this time or later.
     #[param(value_type = Option<String>, format = DateTime)]
     from: Option<String>,
-    /// Batches that begin before this time; it must be after `from`.
+    /// Batches that begin before this time, which must be after `from`.
     #[param(value_type = Option<String>, format = DateTime)]
     to: Option<String>,
-    /// About how many points a series may have; 1000 without.
+    /// Approximate number of points of a series. Default 1000.
     #[param(value_type = Option<u32>, minimum = 10, maximum = 5000)]
     points: Option<String>,
 }
 
-/// All that can be drawn over time.
+/// All time series of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Series)]
 struct SeriesBody {
     structure: StructureId,
-    /// As asked for; else the first and the last measurement.
+    /// As requested; otherwise the times of the first and last measurement.
     #[schema(required)]
     from: Option<Timestamp>,
     #[schema(required)]
     to: Option<Timestamp>,
     batches: u64,
     measurements: u64,
-    /// True when not every row of every series is there.
+    /// True if any series was reduced.
     reduced: bool,
-    /// Every how many measurements one was looked at; only where there are too many for all.
+    /// Only every n-th measurement was considered; absent if all were.
     #[serde(skip_serializing_if = "Option::is_none")]
     thinned_to_every: Option<u64>,
     frequencies: Frequencies,
@@ -71,7 +73,7 @@ struct SeriesBody {
     maintenance: Vec<MaintenanceSpan>,
 }
 
-/// One entry a kept measurement, in `values_hz` with one value a mode; entries without any value are gaps in time.
+/// One entry per selected measurement; `values_hz` has one value per mode. An entry without values marks a gap in time.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = FrequencySeries)]
 struct Frequencies {
@@ -82,7 +84,7 @@ struct Frequencies {
     covariates: BTreeMap<String, Vec<Option<f64>>>,
 }
 
-/// A monitored quantity; `low` and `high` are the ends of the 90 % interval of the mean.
+/// A monitored quantity; `low` and `high` bound the 90 % interval of the mean.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ParameterSeries)]
 struct Track {
@@ -103,7 +105,7 @@ struct Track {
     pod_high: Vec<Option<f64>>,
 }
 
-/// A control chart, one entry a batch.
+/// A control chart with one entry per batch.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ChartSeries)]
 struct Chart {
@@ -142,7 +144,7 @@ struct AlarmSpan {
     state: &'static str,
 }
 
-/// A time without alarms.
+/// A maintenance window.
 #[derive(Debug, Serialize, ToSchema)]
 struct MaintenanceSpan {
     from: Timestamp,
@@ -150,16 +152,16 @@ struct MaintenanceSpan {
     reason: String,
 }
 
-/// `GET /v1/structures/{id}/series`: frequencies, parameters, charts, trust, alarms and maintenance of the batches that begin
-/// in a window.
+/// `GET /v1/structures/{id}/series`: frequencies, parameters, charts, trust, alarms and maintenance of the batches that
+/// begin in a time interval.
 ///
 /// # Errors
 /// 404 for the structure, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/series", tag = "results", operation_id = "read_series",
-    summary = "All that can be drawn over time",
-    description = "Frequencies, parameters, charts, trust, alarms and maintenance of the batches that begin in a window. Long \
-                   series are reduced; the extremes of each piece are kept.",
+    summary = "All time series",
+    description = "Frequencies, parameters, charts, trust, alarms and maintenance of the batches that begin in a time interval. Long \
+                   series are reduced; the extremes of each segment are kept.",
     params(StructurePath, SeriesQuery),
     responses((status = 200, description = "The series", body = SeriesBody), Unknown, Invalid)
 )]
@@ -171,7 +173,7 @@ pub async fn series(
     let id = structure_id(&id)?;
     let active = shared.monitor.structure(&id)?;
     let window = window(&query)?;
-    // A long window keeps three connections of the store busy: others have to find one free.
+    // A long interval occupies three connections of the store; the others must stay available.
     let _turn = shared.series.acquire().await.map_err(|e| ApiError::internal(&e))?;
     let (modes, declared) = (active.simulator.modes(), active.simulator.covariates().iter());
     let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
@@ -184,7 +186,7 @@ pub async fn series(
         || quantities.iter().any(|q| q.batches.reduced)
         || charts.iter().any(|c| c.points.reduced);
 
-    // Its levels are drawn where batches are compared with it.
+    // The reference applies only if it was made with the trained model in use.
     let in_use = active.baseline.as_ref().ok().map(|baseline| baseline.digest());
     let undamaged = shared.monitor.records().reference(&id).await?.filter(|u| in_use == Some(&u.model_digest));
     let within = |begin: Timestamp, end: Option<Timestamp>| {
@@ -230,7 +232,7 @@ fn window(query: &SeriesQuery) -> Result<SeriesWindow, ApiError> {
     Ok(SeriesWindow { from, to, points })
 }
 
-/// Measurements with an empty entry in each gap.
+/// Measurements, with an empty entry in each gap.
 fn frequencies(measured: Reduced<()>, nominal_hz: Vec<f64>, covariates: &[String]) -> Result<Frequencies, ApiError> {
     let modes = nominal_hz.len();
     let entries = measured.rows.len() + measured.gaps.len();

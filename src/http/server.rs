@@ -1,6 +1,5 @@
-//! The accept loop: our own, because `axum::serve` 0.8 sets no time limit for a request's header.
-//!
-//! A client that never ends its header would hold its connection for ever and keep the service from stopping.
+//! The accept loop. `axum::serve` 0.8 is not used because it has no time limit for the header of a request: a client
+//! that never completes its header would keep its connection open for ever and prevent the service from stopping.
 
 use std::future::Future;
 use std::net::SocketAddr;
@@ -15,39 +14,37 @@ use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto::Builder;
 use hyper_util::server::graceful::GracefulShutdown;
 use hyper_util::service::TowerToHyperService;
+use rustix::process::{getrlimit, Resource};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tower::Service;
 use tracing::{debug, info, warn};
 
-use super::HttpSettings;
+use super::settings::HttpSettings;
 
-/// Pause after a failed accept: when the process is out of file handles, trying at once would spin.
+/// Pause after a failed accept: if the process has no free file descriptor, an immediate retry would loop.
 const PAUSE_AFTER_FAILED_ACCEPT: Duration = Duration::from_millis(50);
 
-/// File handles kept free of connections: for the database, its log, files of models, and what the service itself asks for.
+/// File descriptors reserved for other uses than connections: database, log, model files, outgoing requests.
 const RESERVED_FILES: usize = 64;
 
-/// Connections that may be open at a time: as many as wanted, unless the process may not have so many files.
-///
-/// Without this, idle connections take the last handle, and the database cannot be opened for the next reader.
+/// Maximum number of open connections: `wanted`, or fewer if the process may not open so many files. Otherwise idle
+/// connections could use the last descriptor, and the database could not be opened for the next reader.
 fn most_connections(wanted: usize, files: Option<usize>) -> usize {
     let Some(files) = files else { return wanted };
     let possible = files.saturating_sub(RESERVED_FILES).max(files / 4).max(1);
     if possible < wanted {
-        warn!("The limit of open files is {files}: at most {possible} connections at a time, not {wanted}; raise it with `ulimit -n`");
+        warn!("The limit of open files is {files}: at most {possible} connections are accepted at a time instead of {wanted}; raise the limit with `ulimit -n`");
     }
     wanted.min(possible)
 }
 
-/// The soft limit of open files; `None` where it is not known or there is none.
+/// Soft limit of open files; `None` if there is no limit.
 fn open_files_limit() -> Option<usize> {
-    let limits = std::fs::read_to_string("/proc/self/limits").ok()?;
-    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files"))?;
-    line.split_whitespace().next()?.parse().ok()
+    getrlimit(Resource::Nofile).current.and_then(|files| usize::try_from(files).ok())
 }
 
-/// Serves until `shutdown` is done, then lets open requests end within the drain time.
+/// Serves until `shutdown` completes, then lets open requests finish within the drain time.
 pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings, shutdown: impl Future<Output = ()>) {
     let mut builder = Builder::new(TokioExecutor::new()).http1_only();
     builder
@@ -59,8 +56,8 @@ pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings,
     let graceful = GracefulShutdown::new();
     let mut shutdown = std::pin::pin!(shutdown);
     loop {
-        let place = tokio::select! {
-            place = Arc::clone(&connections).acquire_owned() => place.expect("the semaphore is never closed"),
+        let permit = tokio::select! {
+            permit = Arc::clone(&connections).acquire_owned() => permit.expect("the semaphore is never closed"),
             () = &mut shutdown => break,
         };
         let (stream, peer) = tokio::select! {
@@ -74,7 +71,7 @@ pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings,
             },
             () = &mut shutdown => break,
         };
-        // Answers are small; waiting to fill a packet would only add latency.
+        // Answers are small; waiting to fill a packet (Nagle) would only add latency.
         let _ = stream.set_nodelay(true);
         let service = TowerToHyperService::new(WithPeer { router: router.clone(), peer });
         let connection = builder.serve_connection(TokioIo::new(stream), service).into_owned();
@@ -83,17 +80,17 @@ pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings,
             if let Err(error) = connection.await {
                 debug!(%error, "A connection ended early: {error}");
             }
-            drop(place);
+            drop(permit);
         });
     }
     drop(listener);
-    info!("Stopping: no new connections, open requests get {} s", settings.drain_s);
+    info!("Stopping: no new connections are accepted, open requests have {} s to finish", settings.drain_s);
     if tokio::time::timeout(Duration::from_secs(settings.drain_s), graceful.shutdown()).await.is_err() {
-        warn!("Some requests did not end in time and were cut off");
+        warn!("Some requests did not finish in time and were aborted");
     }
 }
 
-/// The router, with the address of the connection among the extensions of each request.
+/// The router; adds the peer address to the extensions of each request.
 #[derive(Clone)]
 struct WithPeer {
     router: Router,

@@ -1,4 +1,4 @@
-//! `/v1/structures`: define and read.
+//! `/v1/structures`: defines and reads structures.
 
 use axum::body::Body;
 use axum::extract::State;
@@ -12,15 +12,15 @@ use utoipa::ToSchema;
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath};
-use super::Shared;
+use super::shared::Shared;
 use crate::access::Grant;
 use crate::measurement::check::Problem;
+use crate::monitor::stored::PutStructure;
 use crate::monitor::ActiveStructure;
 use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
-use crate::store::PutStructure;
 
-/// A structure with the state of its trained baseline.
+/// A structure with its trained model and its undamaged reference.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Structure)]
 struct StructureBody {
@@ -32,24 +32,24 @@ struct StructureBody {
     #[serde(skip_serializing_if = "Option::is_none")]
     emulator: Option<EmulatorBody>,
     model: Option<ModelBody>,
-    /// Why there is no model, and the next step.
+    /// Why there is no model, and how to get one.
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
     undamaged: Option<super::answer::Undamaged>,
 }
 
-/// How well the emulator of a table follows its runs; one entry a measured mode.
+/// Accuracy of the emulator of a table of simulation runs. Lists have one entry per measured mode.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Emulator)]
 struct EmulatorBody {
     runs: usize,
-    /// Root mean square error on runs left out, % of the frequency; added to the noise.
+    /// Root mean square error on runs that were left out of the fit, % of the frequency. It is added to the measurement noise.
     error_percent: Vec<f64>,
     r_squared: Vec<f64>,
     warnings: Vec<String>,
 }
 
-/// The trained baseline in use.
+/// The trained model in use.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Model)]
 struct ModelBody {
@@ -67,7 +67,7 @@ struct StructureList {
     items: Vec<ListedStructure>,
 }
 
-/// One line of the list.
+/// One structure of the list.
 #[derive(Debug, Serialize, ToSchema)]
 struct ListedStructure {
     id: StructureId,
@@ -76,18 +76,18 @@ struct ListedStructure {
     batches: u64,
     last_measured_at: Option<Timestamp>,
     model_digest: Option<String>,
-    /// Why this version of the program does not take its stored definition.
+    /// Why this version of the program does not accept the stored definition.
     #[serde(skip_serializing_if = "Option::is_none")]
     definition_refused: Option<String>,
 }
 
-/// `GET /v1/structures`: those that the token may see.
+/// `GET /v1/structures`: the structures that the token may see.
 ///
 /// # Errors
 /// 500.
 #[utoipa::path(
     get, path = "/v1/structures", tag = "structures", operation_id = "list_structures",
-    summary = "All structures", description = "Each with its digest, number of batches and trained baseline.",
+    summary = "All structures", description = "Each with its digest, number of batches and trained model.",
     responses((status = 200, description = "The structures by id", body = StructureList))
 )]
 pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
@@ -113,7 +113,7 @@ pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response
 /// 404, 422.
 #[utoipa::path(
     get, path = "/v1/structures/{id}", tag = "structures", operation_id = "read_structure",
-    summary = "A structure", description = "Its definition, its trained baseline with the calibration, its undamaged state.",
+    summary = "A structure", description = "Its definition, its trained model with the calibration, and its undamaged reference.",
     params(StructurePath),
     responses((status = 200, description = "The structure", body = StructureBody), Unknown, Invalid)
 )]
@@ -124,15 +124,16 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     Ok(Json(body(&id, &active, undamaged.map(|u| super::answer::Undamaged::new(&id, &u)))).into_response())
 }
 
-/// `PUT /v1/structures/{id}`: a structure as JSON or TOML; 201 when it is new, 200 when it was there already.
+/// `PUT /v1/structures/{id}`: defines a structure by JSON or TOML; 201 if it is new, 200 if it exists with this
+/// definition.
 ///
 /// # Errors
-/// 400 and 422 with the place in the file; 409 when it has batches under another definition.
+/// 400 and 422 with the location in the file; 409 if the structure has batches under another definition.
 #[utoipa::path(
     put, path = "/v1/structures/{id}", tag = "structures", operation_id = "put_structure",
     summary = "Define a structure",
-    description = "JSON or TOML of the same keys; `id` must be that of the path. A structure that has batches cannot be \
-                   defined anew: take another id.",
+    description = "JSON or TOML with the same keys; `id` must equal the id in the path. A structure that has batches cannot be \
+                   redefined: use another id.",
     params(StructurePath),
     request_body(content(
         (StructureDefinition = "application/json", example = json!({
@@ -145,7 +146,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
              prior = { uniform = [30.0, 70.0] }\nsets = { spring = \"k1\" }\n"))
     )),
     responses(
-        (status = 200, description = "It was there already", body = StructureBody,
+        (status = 200, description = "It existed already", body = StructureBody,
          headers(("Location" = String, description = "Path of the structure"))),
         (status = 201, description = "It is new", body = StructureBody,
          headers(("Location" = String, description = "Path of the structure"))),
@@ -166,7 +167,7 @@ pub async fn put(
         Some("application/toml") => |bytes| StructureDefinition::parse_toml(utf8(bytes)?).map_err(refused),
         other => return Err(unsupported_media_type(other, "application/json or application/toml")),
     };
-    // Large structures are solved, and tables of runs fitted, while they are checked.
+    // The check solves the eigenproblem and fits tables of runs, which takes time for large structures.
     let parsed = tokio::task::spawn_blocking(move || parse(&bytes)).await.map_err(|e| ApiError::internal(&e))?;
     let definition = parsed?;
     if definition.id != id.as_str() {
@@ -181,7 +182,7 @@ pub async fn put(
     Ok((status, location, Json(self::body(&id, &active, undamaged))).into_response())
 }
 
-/// Malformed JSON is told apart from JSON that is no structure.
+/// Malformed JSON is answered 400, JSON that does not define a structure 422.
 fn parse_definition_json(bytes: &[u8]) -> Result<StructureDefinition, ApiError> {
     parse_json::<Value>(bytes)?;
     StructureDefinition::parse_json(utf8(bytes)?).map_err(refused)

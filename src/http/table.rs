@@ -1,78 +1,29 @@
-//! Tables for spreadsheets and programs: the same rows as CSV or, where it is built in, Parquet.
+//! Tables as CSV or, if built in, Parquet.
 
 use axum::http::{header, HeaderMap, StatusCode};
 
+use super::cell::{Cell, ColumnKind};
 use super::error::ApiError;
-use crate::quantity::{shown, Timestamp};
+use crate::quantity::shown;
 
-/// What the cells of a column hold.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
-    /// Text.
-    Text,
-    /// A number.
-    Number,
-    /// A whole number.
-    Count,
-    /// Yes or no.
-    Flag,
-    /// A point in time.
-    Time,
-}
-
-/// A cell.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Cell {
-    /// Nothing.
-    Empty,
-    /// Of a column of [`Kind::Text`].
-    Text(String),
-    /// Of a column of [`Kind::Number`].
-    Number(f64),
-    /// Of a column of [`Kind::Count`].
-    Count(i64),
-    /// Of a column of [`Kind::Flag`].
-    Flag(bool),
-    /// Of a column of [`Kind::Time`].
-    Time(Timestamp),
-}
-
-impl Cell {
-    /// A number that may be missing.
-    pub fn number(value: Option<f64>) -> Self {
-        value.map_or(Self::Empty, Self::Number)
-    }
-
-    fn into_text(self) -> String {
-        match self {
-            Self::Empty => String::new(),
-            Self::Text(text) => text,
-            Self::Number(number) => number.to_string(),
-            Self::Count(count) => count.to_string(),
-            Self::Flag(flag) => flag.to_string(),
-            Self::Time(time) => time.to_string(),
-        }
-    }
-}
-
-/// How an answer is written.
+/// Format of an answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// One JSON object, a page.
+    /// One JSON object with one page.
     Json,
     /// Comma-separated values.
     Csv,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Ndjson,
     /// Apache Parquet.
     Parquet,
 }
 
 impl Format {
-    /// The format that the query names, or else `Accept`; JSON without either.
+    /// The format named in the query, else the one in `Accept`, else JSON.
     ///
     /// # Errors
-    /// 422 for another name than those `allowed`, 406 for Parquet where it is not built in.
+    /// 422 for a format that is not `allowed`, 406 for Parquet if it is not built in.
     pub fn of(name: Option<&str>, headers: &HeaderMap, allowed: &[Self]) -> Result<Self, ApiError> {
         let accepted = |format: &Self| {
             let accept = headers.get(header::ACCEPT).map_or(&b""[..], header::HeaderValue::as_bytes);
@@ -88,13 +39,13 @@ impl Format {
             })?,
         };
         if format == Self::Parquet && !cfg!(feature = "parquet") {
-            let detail = "this modalwatch was built without Parquet (cargo feature \"parquet\"): take csv or json";
+            let detail = "this modalwatch was built without Parquet (cargo feature \"parquet\"): use csv or json";
             return Err(ApiError::new(StatusCode::NOT_ACCEPTABLE, "not_acceptable", detail));
         }
         Ok(format)
     }
 
-    /// Its name in a query, and the ending of a file's name.
+    /// Name in a query, and extension of a file.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Json => "json",
@@ -104,7 +55,7 @@ impl Format {
         }
     }
 
-    /// Its media type.
+    /// Media type.
     pub const fn content_type(self) -> &'static str {
         match self {
             Self::Json => "application/json",
@@ -115,9 +66,9 @@ impl Format {
     }
 }
 
-/// Writes a table part by part; each part is given out as soon as it is written.
+/// Writes a table in parts.
 pub enum TableWriter {
-    /// CSV, with the header until it has been given out.
+    /// CSV. Holds the header until it has been written.
     Csv(Option<Vec<String>>),
     /// Parquet.
     #[cfg(feature = "parquet")]
@@ -128,22 +79,22 @@ impl TableWriter {
     /// A table with these columns.
     ///
     /// # Errors
-    /// 500 for columns that the format cannot have: a bug.
+    /// 500 if the format cannot represent the columns, which is a bug.
     #[cfg_attr(not(feature = "parquet"), expect(clippy::unnecessary_wraps, reason = "Parquet can fail"))]
-    pub fn new<N: AsRef<str>>(format: Format, columns: &[(N, Kind)]) -> Result<Self, ApiError> {
+    pub fn new<N: AsRef<str>>(format: Format, columns: &[(N, ColumnKind)]) -> Result<Self, ApiError> {
         #[cfg(feature = "parquet")]
         if format == Format::Parquet {
             let writer = super::parquet::ParquetWriter::new(columns).map_err(|e| ApiError::internal(&e))?;
             return Ok(Self::Parquet(Box::new(writer)));
         }
-        debug_assert!(format == Format::Csv, "{format:?} is no table");
+        debug_assert!(format == Format::Csv, "{format:?} is not a table");
         Ok(Self::Csv(Some(columns.iter().map(|(name, _)| name.as_ref().to_owned()).collect())))
     }
 
-    /// The next rows as bytes.
+    /// Writes the next rows and returns their bytes.
     ///
     /// # Errors
-    /// 500 for a row that does not fit the columns: a bug.
+    /// 500 if a row does not fit the columns, which is a bug.
     #[cfg_attr(not(feature = "parquet"), expect(clippy::unnecessary_wraps, reason = "Parquet can fail"))]
     pub fn rows(&mut self, rows: Vec<Vec<Cell>>) -> Result<Vec<u8>, ApiError> {
         match self {
@@ -153,10 +104,10 @@ impl TableWriter {
         }
     }
 
-    /// What stands behind the last row.
+    /// Returns the bytes after the last row.
     ///
     /// # Errors
-    /// 500 for a bug.
+    /// 500 if the file cannot be completed, which is a bug.
     #[cfg_attr(not(feature = "parquet"), expect(clippy::unnecessary_wraps, reason = "Parquet can fail"))]
     pub fn end(self) -> Result<Vec<u8>, ApiError> {
         match self {

@@ -1,4 +1,4 @@
-//! `traceparent`: the trace that a client began goes on here.
+//! `traceparent`: continues a trace that the client began.
 //!
 //! Source: W3C (2021), Trace Context – Level 1.
 
@@ -20,9 +20,10 @@ impl Extractor for Headers<'_> {
     }
 }
 
-/// Makes the span of the headers the parent of one that has not begun yet; what is no `traceparent` begins a new trace.
+/// Makes the span in the headers the parent of `span`, which must not have begun. Without a valid `traceparent` a new
+/// trace begins.
 pub fn continue_in(span: &tracing::Span, headers: &HeaderMap) {
     let parent = TraceContextPropagator::new().extract_with_context(&Context::new(), &Headers(headers));
-    // An error says that nobody takes this span.
+    // It fails if no layer records this span.
     let _ = span.set_parent(parent);
 }

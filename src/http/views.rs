@@ -1,4 +1,4 @@
-//! What a dashboard shows at a glance: `/v1/overview`, `/v1/jobs`, `/v1/structures/{id}/batches/{batch}/detail`.
+//! Views for the dashboard: `/v1/overview`, `/v1/jobs`, `/v1/structures/{id}/batches/{batch}/detail`.
 
 use std::sync::Arc;
 
@@ -11,27 +11,27 @@ use utoipa::ToSchema;
 use super::error::ApiError;
 use super::openapi::{BatchPath, Busy, Conflict, Invalid, Unknown};
 use super::request::{structure_id, ApiPath};
-use super::Shared;
+use super::shared::Shared;
 use crate::access::Grant;
 use crate::alarm::machine::State as AlarmState;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
+use crate::monitor::stored::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
 use crate::monitor::ActiveStructure;
 use crate::quantity::{Hertz, StructureId, Timestamp};
-use crate::store::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
 use crate::trust::TrustVerdict;
 
-/// Jobs listed.
+/// Maximum number of jobs in the list.
 const LISTED_JOBS: usize = 100;
 
-/// All structures at a glance.
+/// Overview of all structures.
 #[derive(Debug, Serialize, ToSchema)]
 struct Overview {
     items: Vec<OverviewItem>,
-    /// Diagnoses and extensions that run or wait.
+    /// Number of diagnoses and extensions that are running or waiting.
     jobs_running: usize,
 }
 
-/// A structure at a glance.
+/// Overview of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 struct OverviewItem {
     id: StructureId,
@@ -56,7 +56,7 @@ struct OverviewItem {
     undamaged_version: Option<u32>,
 }
 
-/// The assessed batch that was measured last.
+/// The most recently measured batch that is assessed.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = LatestAssessment)]
 struct Latest {
@@ -97,7 +97,7 @@ struct JobItem {
     summary: Option<String>,
 }
 
-/// The densities behind a batch, and what they predict.
+/// Densities of the parameters for a batch, and the predicted frequencies.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = BatchDetail)]
 struct DetailBody {
@@ -105,18 +105,17 @@ struct DetailBody {
     batch: String,
     model_digest: String,
     measurement_count: usize,
-    /// Measurements whose values are in `measured_hz`, evenly chosen.
+    /// Number of measurements in `measured_hz`, evenly selected.
     measurements_shown: usize,
-    /// Posterior samples behind the predictions, evenly chosen.
+    /// Number of posterior samples behind the predictions, evenly selected.
     simulations: usize,
-    parameters: Vec<ParameterBody>,
-    modes: Vec<ModeBody>,
+    parameters: Vec<ParameterDensities>,
+    modes: Vec<ModeFrequencies>,
 }
 
-/// Densities of a parameter, per unit, on one grid.
+/// Densities of a parameter on one grid, per unit of the parameter.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = ParameterDensities)]
-struct ParameterBody {
+struct ParameterDensities {
     name: String,
     unit: String,
     grid: Vec<f64>,
@@ -128,10 +127,9 @@ struct ParameterBody {
     threshold: Option<f64>,
 }
 
-/// A mode, counted from 1; 90 % of the predicted frequencies lie between `low` and `high`, which hold no noise.
+/// A mode, numbered from 1. 90 % of the predicted frequencies, without measurement noise, lie between `low` and `high`.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = ModeFrequencies)]
-struct ModeBody {
+struct ModeFrequencies {
     mode: usize,
     measured_hz: Vec<Option<Hertz>>,
     predicted_mean_hz: f64,
@@ -139,14 +137,14 @@ struct ModeBody {
     predicted_high_hz: f64,
 }
 
-/// `GET /v1/overview`: all structures that the token may see, with the state of their alarms and their newest answer.
+/// `GET /v1/overview`: all structures that the token may see, with their alarm state and latest assessment.
 ///
 /// # Errors
 /// 500.
 #[utoipa::path(
     get, path = "/v1/overview", tag = "results", operation_id = "overview",
-    summary = "All structures at a glance",
-    description = "Those that the token may see, each with the state of its alarms and its newest assessment.",
+    summary = "Overview of all structures",
+    description = "The structures that the token may see, each with its alarm state and latest assessment.",
     responses((status = 200, description = "The structures by id", body = Overview))
 )]
 pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
@@ -186,7 +184,7 @@ fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>) 
     }
 }
 
-/// The one word for a structure: the weightiest of what is true of it.
+/// The state of a structure in one word: the most serious condition that applies.
 fn state(found: &StructureOverview, has_model: bool) -> &'static str {
     let on_a_chart = |state: AlarmState| found.chart_states.contains(&state);
     if on_a_chart(AlarmState::Alarming) {
@@ -224,7 +222,7 @@ fn latest(found: LatestAssessment) -> Latest {
 /// 500.
 #[utoipa::path(
     get, path = "/v1/jobs", tag = "diagnoses", operation_id = "list_jobs",
-    summary = "Jobs", description = "Diagnoses and extensions of all structures that the token may see: the newest hundred, newest first.",
+    summary = "Jobs", description = "Diagnoses and extensions of all structures that the token may see: the 100 newest, newest first.",
     responses((status = 200, description = "The jobs", body = JobList))
 )]
 pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
@@ -245,14 +243,15 @@ pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response
     Ok(Json(JobList { items }).into_response())
 }
 
-/// `GET /v1/structures/{id}/batches/{batch}/detail`: densities and predicted frequencies, drawn as the assessment was.
+/// `GET /v1/structures/{id}/batches/{batch}/detail`: densities and predicted frequencies, sampled as for the
+/// assessment.
 ///
 /// # Errors
-/// 404 for structure or batch, 409 when it is not assessed, 503 when the queue is full.
+/// 404 for structure or batch, 409 if the batch is not assessed, 503 when the queue is full.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/batches/{batch}/detail", tag = "results", operation_id = "read_batch_detail",
-    summary = "A batch in detail",
-    description = "The densities of the parameters, and the frequencies that the posterior predicts beside those measured.",
+    summary = "Details of a batch",
+    description = "Densities of the parameters, and the predicted frequencies beside the measured ones.",
     params(BatchPath),
     responses((status = 200, description = "The densities", body = DetailBody), Unknown, Invalid, Conflict, Busy)
 )]
@@ -266,7 +265,7 @@ pub async fn detail(
 }
 
 fn detail_body(structure: StructureId, batch: String, detail: BatchDetail) -> DetailBody {
-    let parameter = |p: ParameterDetail| ParameterBody {
+    let parameter = |p: ParameterDetail| ParameterDensities {
         name: p.name,
         unit: p.unit,
         grid: p.grid,
@@ -275,7 +274,7 @@ fn detail_body(structure: StructureId, batch: String, detail: BatchDetail) -> De
         undamaged: p.undamaged,
         threshold: p.threshold,
     };
-    let mode = |(index, m): (usize, ModeDetail)| ModeBody {
+    let mode = |(index, m): (usize, ModeDetail)| ModeFrequencies {
         mode: index + 1,
         measured_hz: m.measured_hz,
         predicted_mean_hz: m.predicted_mean_hz,

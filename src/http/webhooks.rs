@@ -1,4 +1,4 @@
-//! `/v1/webhooks`: who is told of alarms, what was sent, and what could not be.
+//! `/v1/webhooks`: receivers of alarm events, and the deliveries to them.
 
 use axum::body::Body;
 use axum::extract::State;
@@ -12,14 +12,14 @@ use utoipa::{IntoParams, ToSchema};
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, DeliveryPath, Invalid, Unknown, WebhookPath};
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
-use super::Shared;
+use super::shared::Shared;
 use crate::alarm::ALARM_KINDS;
 use crate::measurement::check::Problem;
+use crate::monitor::stored::{Delivery, DeliveryState, EventFilter, WebhookRecord};
 use crate::notify::{new_secret, EVENT_KINDS};
 use crate::quantity::{shown, StructureId, Timestamp};
-use crate::store::{Delivery, DeliveryState, EventFilter, WebhookRecord};
 
-/// Most webhooks of a service: each may have a connection of its own.
+/// Maximum number of webhooks: each may need a connection.
 const MOST_WEBHOOKS: usize = 100;
 
 /// Query of the deliveries.
@@ -27,24 +27,24 @@ const MOST_WEBHOOKS: usize = 100;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct DeliveryQuery {
-    /// Only those in this state; `dead` for dead letters.
+    /// Only deliveries in this state; `dead` means that the service has given up.
     #[param(pattern = "^(pending|delivered|dead)$")]
     state: Option<String>,
-    /// Most items; 100 without.
+    /// Maximum number of items. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
-    /// `next` of the page before.
+    /// `next` of the previous page.
     #[param(pattern = "^[0-9]{1,18}$")]
     cursor: Option<String>,
 }
 
-/// A webhook: where to, and what of.
+/// A webhook: its URL and the events that it receives.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = WebhookInput)]
 struct WebhookBody {
-    /// Where messages are posted to: `http` or `https`, without user name and password. An address that is not on the open
-    /// internet is refused, unless the setting `notify.allow_private_targets` has it.
+    /// URL to which messages are posted: `http` or `https`, without user name and password. An address that is not on
+    /// the public internet is refused unless `notify.allow_private_targets` contains it.
     #[schema(max_length = 2000, pattern = "^https?://[^/?#@]+([/?#].*)?$", examples("https://example.com/alarms"))]
     url: String,
     #[serde(default)]
@@ -53,10 +53,10 @@ struct WebhookBody {
     #[serde(default)]
     #[schema(schema_with = alarm_kinds)]
     alarm_kinds: Vec<String>,
-    /// Ids of structures; all without.
+    /// Ids of structures. Default: all.
     #[serde(default)]
     structures: Vec<String>,
-    /// Whether anything is sent; `true` without.
+    /// Whether events are sent. Default `true`.
     #[serde(default = "yes")]
     #[schema(default = true)]
     enabled: bool,
@@ -66,18 +66,18 @@ fn yes() -> bool {
     true
 }
 
-/// A list of some of these words.
+/// Schema of a list of these words.
 fn list_of(words: &[&'static str], description: &str) -> Array {
     let word = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(words.iter().copied())).build();
     ArrayBuilder::new().items(word).description(Some(description)).build()
 }
 
 fn event_kinds() -> Array {
-    list_of(&EVENT_KINDS, "Kinds of events; all without.")
+    list_of(&EVENT_KINDS, "Kinds of events. Default: all.")
 }
 
 fn alarm_kinds() -> Array {
-    list_of(&ALARM_KINDS, "Kinds of alarms; all without.")
+    list_of(&ALARM_KINDS, "Kinds of alarms. Default: all.")
 }
 
 /// Webhooks, oldest first.
@@ -86,29 +86,29 @@ struct WebhookList {
     items: Vec<WebhookItem>,
 }
 
-/// A webhook; its secret is in the answers that make one, and in no other.
+/// A webhook. Its secret is contained only in answers that create one.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Webhook)]
 struct WebhookItem {
     webhook: String,
     url: String,
-    /// Empty for all.
+    /// Empty means all.
     events: Vec<String>,
-    /// Empty for all.
+    /// Empty means all.
     alarm_kinds: Vec<String>,
-    /// Empty for all.
+    /// Empty means all.
     structures: Vec<String>,
     enabled: bool,
     created_at: Timestamp,
     updated_at: Timestamp,
-    /// Until when the secret before signs too.
+    /// Until when messages are also signed with the previous secret.
     #[schema(required)]
     previous_secret_until: Option<Timestamp>,
     #[serde(skip_serializing_if = "Option::is_none")]
     secret: Option<String>,
 }
 
-/// A message to a webhook, and what became of it.
+/// Delivery of a message to a webhook.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Delivery)]
 struct DeliveryItem {
@@ -131,7 +131,7 @@ struct DeliveryItem {
     last_error: Option<String>,
 }
 
-/// Messages, newest first.
+/// Deliveries, newest first.
 #[derive(Debug, Serialize, ToSchema)]
 struct DeliveryPage {
     webhook: String,
@@ -140,7 +140,7 @@ struct DeliveryPage {
     next: Option<String>,
 }
 
-/// What came of a test.
+/// Result of a test message.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = WebhookTest)]
 struct TestAnswer {
@@ -190,28 +190,29 @@ impl From<Delivery> for DeliveryItem {
     }
 }
 
-/// `GET /v1/webhooks`: all of them, oldest first.
+/// `GET /v1/webhooks`: all webhooks, oldest first.
 ///
 /// # Errors
 /// 500.
 #[utoipa::path(
     get, path = "/v1/webhooks", tag = "webhooks", operation_id = "list_webhooks",
-    summary = "All webhooks", description = "Without their secrets, oldest first.",
+    summary = "All webhooks", description = "All webhooks without their secrets, oldest first.",
     responses((status = 200, description = "The webhooks", body = WebhookList))
 )]
 pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
-    let items: Vec<WebhookItem> = shared.monitor.store().webhooks().list().await?.into_iter().map(Into::into).collect();
+    let items: Vec<WebhookItem> = shared.monitor.webhooks().list().await?.into_iter().map(Into::into).collect();
     Ok(Json(WebhookList { items }).into_response())
 }
 
-/// `POST /v1/webhooks`: 201 with the secret, which no other answer has.
+/// `POST /v1/webhooks`: 201 with the secret, which cannot be read again.
 ///
 /// # Errors
-/// 400, 415, 422 for the body, 409 when there are too many.
+/// 400, 415, 422 for the body, 409 if the maximum number of webhooks exists.
 #[utoipa::path(
     post, path = "/v1/webhooks", tag = "webhooks", operation_id = "create_webhook",
-    summary = "Make a webhook",
-    description = "Messages are signed as Standard Webhooks has it; the secret is in this answer and in that of a rotation only.",
+    summary = "Create a webhook",
+    description = "Messages are signed according to Standard Webhooks. The secret is contained only in this answer and in that of a \
+                   rotation.",
     request_body(content = WebhookBody, example = json!({"url": "https://example.com/alarms", "structures": ["three-dof"]})),
     responses(
         (status = 201, description = "The webhook with its secret", body = WebhookItem,
@@ -233,8 +234,8 @@ pub async fn create(State(shared): State<Shared>, headers: HeaderMap, body: Body
         created_at: now,
         updated_at: now,
     };
-    if !shared.monitor.store().webhooks().insert_webhook(record.clone(), MOST_WEBHOOKS).await? {
-        let detail = format!("there are {MOST_WEBHOOKS} webhooks already: delete one first");
+    if !shared.monitor.webhooks().insert_webhook(record.clone(), MOST_WEBHOOKS).await? {
+        let detail = format!("there are already {MOST_WEBHOOKS} webhooks: delete one first");
         return Err(ApiError::new(StatusCode::CONFLICT, "too_many_webhooks", detail));
     }
     let (location, secret) = (format!("/v1/webhooks/{}", record.id), record.secret.reveal().to_owned());
@@ -256,13 +257,13 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     Ok(Json(WebhookItem::from(webhook(&shared, &id).await?)).into_response())
 }
 
-/// `PUT /v1/webhooks/{id}`: another address, filter or switch; secret and outbox stay.
+/// `PUT /v1/webhooks/{id}`: changes URL, filter or `enabled`. The secret and pending deliveries are kept.
 ///
 /// # Errors
 /// 404; 400, 415, 422 for the body.
 #[utoipa::path(
     put, path = "/v1/webhooks/{id}", tag = "webhooks", operation_id = "put_webhook",
-    summary = "Change a webhook", description = "Another address, filter or switch; secret and outbox stay.",
+    summary = "Change a webhook", description = "Changes URL, filter or `enabled`. The secret and pending deliveries are kept.",
     params(WebhookPath),
     request_body(content = WebhookBody, example = json!({"url": "https://example.com/alarms", "enabled": false})),
     responses((status = 200, description = "The webhook", body = WebhookItem), Unknown, BodyRefused)
@@ -277,37 +278,37 @@ pub async fn put(
     let body: WebhookBody = json_body(&headers, body, shared.limits).await?;
     check(&shared, &body).await?;
     let filter = EventFilter { events: body.events, alarm_kinds: body.alarm_kinds, structures: body.structures };
-    shared.monitor.store().webhooks().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
+    shared.monitor.webhooks().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
     read(State(shared), ApiPath(id)).await
 }
 
-/// `DELETE /v1/webhooks/{id}`: 204; its outbox goes with it.
+/// `DELETE /v1/webhooks/{id}`: 204. Deletes its deliveries too.
 ///
 /// # Errors
 /// 404.
 #[utoipa::path(
     delete, path = "/v1/webhooks/{id}", tag = "webhooks", operation_id = "delete_webhook",
-    summary = "Delete a webhook", description = "Its outbox goes with it.",
+    summary = "Delete a webhook", description = "Deletes the webhook and its deliveries.",
     params(WebhookPath),
-    responses((status = 204, description = "It is gone"), Unknown)
+    responses((status = 204, description = "It was deleted"), Unknown)
 )]
 pub async fn remove(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    if shared.monitor.store().webhooks().delete_webhook(&id).await? {
+    if shared.monitor.webhooks().delete_webhook(&id).await? {
         Ok(StatusCode::NO_CONTENT.into_response())
     } else {
         Err(unknown_webhook(&id))
     }
 }
 
-/// `POST /v1/webhooks/{id}/test`: sends a message now, once, and answers what came of it.
+/// `POST /v1/webhooks/{id}/test`: sends one test message immediately and returns the result.
 ///
 /// # Errors
 /// 404.
 #[utoipa::path(
     post, path = "/v1/webhooks/{id}/test", tag = "webhooks", operation_id = "test_webhook",
-    summary = "Try a webhook", description = "Sends a message now, once, and answers what came of it.",
+    summary = "Test a webhook", description = "Sends one test message immediately and returns the result.",
     params(WebhookPath),
-    responses((status = 200, description = "What came of it", body = TestAnswer), Unknown)
+    responses((status = 200, description = "Result of the test", body = TestAnswer), Unknown)
 )]
 pub async fn test(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let webhook = webhook(&shared, &id).await?;
@@ -322,33 +323,34 @@ pub async fn test(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     Ok(Json(answer).into_response())
 }
 
-/// `POST /v1/webhooks/{id}/secret`: a new secret; for a time the one before signs too, so that receivers can change over.
+/// `POST /v1/webhooks/{id}/secret`: creates a new secret. For some time the previous one signs too, so that receivers
+/// can change over.
 ///
 /// # Errors
 /// 404.
 #[utoipa::path(
     post, path = "/v1/webhooks/{id}/secret", tag = "webhooks", operation_id = "rotate_webhook_secret",
-    summary = "Give a webhook another secret", description = "For a time the one before signs too.",
+    summary = "Rotate the secret of a webhook", description = "Creates a new secret. For some time the previous one signs too, so that receivers can change over.",
     params(WebhookPath),
     responses((status = 200, description = "The webhook with its new secret", body = WebhookItem), Unknown)
 )]
 pub async fn rotate(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let (now, secret) = (Timestamp::now(), new_secret().map_err(|e| ApiError::internal(&e))?);
     let until = shared.notifier.overlap_until(now);
-    if !shared.monitor.store().webhooks().rotate_secret(&id, secret.clone(), until, now).await? {
+    if !shared.monitor.webhooks().rotate_secret(&id, secret.clone(), until, now).await? {
         return Err(unknown_webhook(&id));
     }
     let item = WebhookItem { secret: Some(secret.reveal().to_owned()), ..webhook(&shared, &id).await?.into() };
     Ok(Json(item).into_response())
 }
 
-/// `GET /v1/webhooks/{id}/deliveries`: messages, newest first; `state=dead` for dead letters.
+/// `GET /v1/webhooks/{id}/deliveries`: deliveries, newest first; `state=dead` lists those that were given up.
 ///
 /// # Errors
 /// 404, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/webhooks/{id}/deliveries", tag = "webhooks", operation_id = "list_deliveries",
-    summary = "Messages of a webhook", description = "Newest first, a page at a time.",
+    summary = "Deliveries of a webhook", description = "Newest first, in pages.",
     params(WebhookPath, DeliveryQuery),
     responses((status = 200, description = "A page", body = DeliveryPage), Unknown, Invalid)
 )]
@@ -361,25 +363,26 @@ pub async fn deliveries(
     let limit = page_limit(query.limit.as_deref())?;
     let state = |text: &str| {
         let found = DeliveryState::ALL.into_iter().find(|state| state.as_str() == text);
-        let message = || format!("{} is none of pending, delivered, dead", shown(text));
+        let message = || format!("{} is not one of pending, delivered, dead", shown(text));
         found.ok_or_else(|| ApiError::invalid_field("query/state", message()))
     };
     let state = query.state.as_deref().map(state).transpose()?;
     let before = page_cursor(query.cursor.as_deref())?;
-    let found = shared.monitor.store().outbox().deliveries(&id, state, before, limit).await?;
+    let found = shared.monitor.outbox().deliveries(&id, state, before, limit).await?;
     let next = (found.len() == limit).then(|| found.last().map(|d| d.id.to_string())).flatten();
     Ok(Json(DeliveryPage { webhook: id, items: found.into_iter().map(Into::into).collect(), next }).into_response())
 }
 
-/// `POST /v1/webhooks/{id}/deliveries/{delivery}/retry`: 202; it is tried now, and its retries begin anew.
+/// `POST /v1/webhooks/{id}/deliveries/{delivery}/retry`: 202. The message is sent immediately, and its schedule of
+/// retries starts again.
 ///
 /// # Errors
-/// 404, 409 for one that was delivered.
+/// 404, 409 if it was delivered.
 #[utoipa::path(
     post, path = "/v1/webhooks/{id}/deliveries/{delivery}/retry", tag = "webhooks", operation_id = "retry_delivery",
-    summary = "Send a message again", description = "It is tried now, and its retries begin anew.",
+    summary = "Send a message again", description = "Sends the message immediately and restarts its schedule of retries.",
     params(DeliveryPath),
-    responses((status = 202, description = "It is on its way", body = DeliveryItem), Unknown, Conflict)
+    responses((status = 202, description = "It is being sent", body = DeliveryItem), Unknown, Conflict)
 )]
 pub async fn retry(
     State(shared): State<Shared>,
@@ -391,16 +394,16 @@ pub async fn retry(
         ApiError::new(StatusCode::NOT_FOUND, "unknown_delivery", detail)
     };
     let number: i64 = delivery.parse().map_err(|_| unknown())?;
-    let found = shared.monitor.store().outbox().retry_delivery(&id, number, Timestamp::now()).await?.ok_or_else(unknown)?;
+    let found = shared.monitor.outbox().retry_delivery(&id, number, Timestamp::now()).await?.ok_or_else(unknown)?;
     if found.state == DeliveryState::Delivered {
-        let detail = format!("delivery {number} was taken by the receiver: there is nothing to try again");
+        let detail = format!("delivery {number} was accepted by the receiver: it cannot be sent again");
         return Err(ApiError::new(StatusCode::CONFLICT, "already_delivered", detail));
     }
     Ok((StatusCode::ACCEPTED, Json(DeliveryItem::from(found))).into_response())
 }
 
 async fn webhook(shared: &Shared, id: &str) -> Result<WebhookRecord, ApiError> {
-    shared.monitor.store().webhooks().webhook(id).await?.ok_or_else(|| unknown_webhook(id))
+    shared.monitor.webhooks().webhook(id).await?.ok_or_else(|| unknown_webhook(id))
 }
 
 fn unknown_webhook(id: &str) -> ApiError {
@@ -416,7 +419,7 @@ async fn check(shared: &Shared, body: &WebhookBody) -> Result<(), ApiError> {
         [("events", &body.events, &EVENT_KINDS[..]), ("alarm_kinds", &body.alarm_kinds, &ALARM_KINDS[..])]
     {
         for (index, value) in values.iter().enumerate().filter(|(_, value)| !known.contains(&value.as_str())) {
-            let message = format!("{} is none of {}", shown(value), known.join(", "));
+            let message = format!("{} is not one of {}", shown(value), known.join(", "));
             problems.push(Problem::new(format!("/{field}/{index}"), message));
         }
     }

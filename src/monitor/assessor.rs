@@ -229,7 +229,8 @@ impl Assessor {
         // A reference declared while this was computed did not find the batch assessed and so did not reset it: it is compared
         // with that reference now.
         if stored.newest_undamaged != newest_undamaged {
-            let present = self.store.reference().undamaged(structure).await?.filter(|record| task.is_comparable(record));
+            let present =
+                self.store.reference().undamaged(structure).await?.filter(|record| task.is_comparable(record));
             if present.map(|record| record.state.version) != assessment.undamaged_version {
                 return Ok(Settled::Again(task));
             }

@@ -36,9 +36,10 @@ impl Backups {
 
     async fn make_here(&self, name: Option<String>) -> Result<backup::Manifest, BackupError> {
         let _turn = self.running.try_lock().map_err(|_| BackupError::Running)?;
-        let name = name.unwrap_or_else(backup::name_of_now);
+        let now = Timestamp::now();
+        let name = name.unwrap_or_else(|| backup::name_of(now));
         let started = Instant::now();
-        let made = self.store.file().backup(&name, self.models_in_use().await).await;
+        let made = self.store.file().backup(&name, self.models_in_use().await, now).await;
         let outcome = if made.is_ok() { "done" } else { "failed" };
         metrics::counter!("modalwatch_backups_total", "outcome" => outcome).increment(1);
         match &made {
@@ -64,14 +65,14 @@ impl Backups {
     }
 
     /// The trained baselines in use that are not in the database.
-    async fn models_in_use(&self) -> Vec<backup::Model> {
+    async fn models_in_use(&self) -> Vec<backup::BackupModel> {
         let (in_use, library) = (self.structures.models_in_use(), self.structures.library());
         // Reads and hashes files: not on an async thread.
         let found = tokio::task::spawn_blocking(move || {
             let model = |(structure, digest): (crate::quantity::StructureId, crate::quantity::Digest)| {
                 let files = library.files_of(&digest).ok().flatten()?;
                 let structure = structure.to_string();
-                Some(backup::Model { structure, digest: digest.to_string(), kept_in: files.kept_in })
+                Some(backup::BackupModel { structure, digest: digest.to_string(), kept_in: files.kept_in })
             };
             in_use.into_iter().filter_map(model).collect()
         });

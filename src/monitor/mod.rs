@@ -34,6 +34,7 @@ mod replay;
 pub mod retention;
 mod settings;
 mod silence;
+pub mod stored;
 mod structures;
 mod supervise;
 #[cfg(test)]
@@ -68,7 +69,7 @@ pub use self::upkeep::{Health, Upkeep};
 pub use self::versions::Versions;
 use crate::baseline::library::Library;
 use crate::quantity::StructureId;
-use crate::store::Store;
+use crate::store::{Audit, Outbox, Quarantine, Store, Webhooks};
 
 /// The application: a cheap handle on its parts.
 #[derive(Clone)]
@@ -200,7 +201,32 @@ impl Monitor {
         &self.events
     }
 
-    /// The store.
+    /// The registered webhooks.
+    pub fn webhooks(&self) -> Webhooks<'_> {
+        self.store.webhooks()
+    }
+
+    /// The deliveries to webhooks.
+    pub fn outbox(&self) -> Outbox<'_> {
+        self.store.outbox()
+    }
+
+    /// Messages that were refused and kept.
+    pub fn quarantine(&self) -> Quarantine<'_> {
+        self.store.quarantine()
+    }
+
+    /// The audit log.
+    pub fn audit(&self) -> Audit<'_> {
+        self.store.audit()
+    }
+
+    /// Version of SQLite.
+    pub fn sqlite_version(&self) -> &str {
+        self.store.file().sqlite_version()
+    }
+
+    /// The store, for the command line and tests, which open and close it.
     pub fn store(&self) -> &Store {
         &self.store
     }

@@ -98,7 +98,8 @@ impl References {
             }
             ReferenceError::State(error) => DeclareError::Reference(error),
         })?;
-        let version = store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
+        let version =
+            store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
         let batches = batch_ids.len();
         info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches");
         alarms.publish_changes(structure).await;

@@ -66,7 +66,8 @@ impl ActiveStructures {
         }
         for (id, entry) in library.iter() {
             let json = entry.simulator.definition().canonical_json();
-            let outcome = store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            let outcome =
+                store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
             if outcome == PutStructure::Refused {
                 warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches, and the library's definition differs");
             }

@@ -50,7 +50,8 @@ impl Versions {
         let present = active.simulator.digest().clone();
         let (_, parent) = self.store.structures().structure_version(structure, &present).await?.ok_or_else(none)?;
         let parent = parent.ok_or_else(none)?;
-        let (definition, grandparent) = self.store.structures().structure_version(structure, &parent).await?.ok_or_else(none)?;
+        let (definition, grandparent) =
+            self.store.structures().structure_version(structure, &parent).await?.ok_or_else(none)?;
         let simulator = Simulator::new(StructureDefinition::parse_json(&definition)?)?;
         let missing = |reason| Error::NoModel { structure: structure.clone(), reason };
         let baseline = self.structures.baseline_for(&simulator).await?.map_err(missing)?;

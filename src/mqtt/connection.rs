@@ -1,4 +1,4 @@
-//! The connection to the broker: subscribe, hand messages on, acknowledge what is settled, come back after a loss.
+//! The connection to the broker: subscribes, passes messages on, acknowledges processed messages, and reconnects.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::Arc;
@@ -10,38 +10,40 @@ use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
 use super::message::Intake;
-use super::{MqttSettings, MqttStatus, SettingError, Topic};
+use super::settings::{MqttSettings, SettingError};
+use super::status::MqttStatus;
 use crate::monitor::Monitor;
 
-/// Messages that wait here. When they are too many the connection is not read any further: the broker keeps the rest.
+/// Maximum number of waiting messages. When it is reached, the connection is not read, and the broker keeps further
+/// messages.
 const WAITING: usize = 64;
 
-/// Messages that are worked on at a time.
+/// Maximum number of messages that are processed at a time.
 const AT_A_TIME: usize = 8;
 
-/// First and longest pause before the next attempt to connect.
-const FIRST_PAUSE: Duration = Duration::from_millis(500);
-const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+/// Shortest and longest delay before a reconnection.
+const FIRST_DELAY: Duration = Duration::from_millis(500);
+const LONGEST_DELAY: Duration = Duration::from_secs(30);
 
-/// Pause before asking again for a subscription that the broker refused.
+/// Delay before a refused subscription is repeated.
 const SUBSCRIBE_AGAIN: Duration = Duration::from_secs(30);
 
-/// A message and the connection that it came by.
+/// A message and the number of the connection on which it arrived.
 struct Arrived {
     connection: u64,
     publish: Publish,
 }
 
-/// A message being worked on.
+/// A message that is being processed.
 struct InWork {
     arrived: Arrived,
     work: JoinHandle<()>,
 }
 
-/// Takes batches from the broker until `stop` becomes true; returns at once when there is no broker.
+/// Receives batches from the broker until `stop` becomes true; returns `None` if no broker is configured.
 ///
 /// # Errors
-/// [`SettingError`] for settings or files that cannot be used; trouble with the broker is no error, it heals.
+/// [`SettingError`] for settings or files that cannot be used. A failing connection is not an error: it is retried.
 pub fn run(
     settings: &MqttSettings,
     monitor: Monitor,
@@ -51,11 +53,12 @@ pub fn run(
     if settings.is_off() {
         return Ok(None);
     }
-    let (options, topic) = (settings.options()?, Topic::new(&settings.topic)?);
+    let (options, topic) = (settings.options()?, settings.topic()?);
     let (client, events) = AsyncClient::new(options, 2 * WAITING);
     status.set(false, None);
     let intake = Arc::new(Intake { monitor, topic: topic.clone(), max_payload_bytes: settings.max_payload_bytes });
-    // Raised with every connection: an acknowledgement may go only to the connection that its message came by.
+    // Incremented with every connection: an acknowledgement is only valid on the connection on which its message
+    // arrived.
     let connection = Arc::new(AtomicU64::new(0));
     let (arrived, to_work) = mpsc::channel(WAITING);
     let (in_work, to_acknowledge) = mpsc::channel(AT_A_TIME);
@@ -65,13 +68,13 @@ pub fn run(
         let acknowledging = tokio::spawn(acknowledge(to_acknowledge, client.clone(), Arc::clone(&connection)));
         let link = Link { client, filter: topic.filter(), status, url, connection, arrived, trouble: None };
         link.hold(events, stop).await;
-        // What is not acknowledged comes again after the next start.
+        // Unacknowledged messages are delivered again after the next start.
         working.abort();
         acknowledging.abort();
     })))
 }
 
-/// Starts the work on messages, in the order they came.
+/// Starts to process messages in the order of their arrival.
 async fn work(mut arrived: mpsc::Receiver<Arrived>, in_work: mpsc::Sender<InWork>, intake: Arc<Intake>) {
     while let Some(arrived) = arrived.recv().await {
         let (intake, topic, payload) =
@@ -83,15 +86,15 @@ async fn work(mut arrived: mpsc::Receiver<Arrived>, in_work: mpsc::Sender<InWork
     }
 }
 
-/// Acknowledges messages in the order they came, as the protocol demands.
+/// Acknowledges messages in the order of their arrival, as the protocol requires.
 async fn acknowledge(mut in_work: mpsc::Receiver<InWork>, client: AsyncClient, connection: Arc<AtomicU64>) {
     while let Some(InWork { arrived, work }) = in_work.recv().await {
         if let Err(panicked) = work.await {
-            // Not acknowledged: it comes again after the next connection.
-            error!(error = %panicked, "The work on an MQTT message broke off: {panicked}");
+            // The message is not acknowledged, so the broker delivers it again on the next connection.
+            error!(error = %panicked, "The processing of an MQTT message failed: {panicked}");
             continue;
         }
-        // Packet ids begin anew with a new session: an old one could acknowledge a message that nobody has read yet.
+        // Packet ids restart with a new session: an old id could acknowledge a message that was not processed.
         if arrived.connection == connection.load(Ordering::SeqCst) {
             if let Err(failure) = client.ack(&arrived.publish).await {
                 warn!(error = %failure, "Could not acknowledge an MQTT message: {failure}");
@@ -100,7 +103,7 @@ async fn acknowledge(mut in_work: mpsc::Receiver<InWork>, client: AsyncClient, c
     }
 }
 
-/// The connection itself.
+/// The connection.
 struct Link {
     client: AsyncClient,
     filter: String,
@@ -108,13 +111,13 @@ struct Link {
     url: String,
     connection: Arc<AtomicU64>,
     arrived: mpsc::Sender<Arrived>,
-    /// The last trouble, so that the log has each once.
+    /// The last failure, so that repeated failures are logged once.
     trouble: Option<String>,
 }
 
 impl Link {
     async fn hold(mut self, mut events: EventLoop, mut stop: watch::Receiver<bool>) {
-        let mut pause = FIRST_PAUSE;
+        let mut delay = FIRST_DELAY;
         loop {
             let event = tokio::select! {
                 () = stopped(&mut stop) => return,
@@ -123,7 +126,7 @@ impl Link {
             match event {
                 Ok(event) => {
                     if matches!(event, Event::Incoming(Packet::ConnAck(_))) {
-                        pause = FIRST_PAUSE;
+                        delay = FIRST_DELAY;
                     }
                     tokio::select! {
                         () = stopped(&mut stop) => return,
@@ -131,14 +134,14 @@ impl Link {
                     }
                 }
                 Err(failure) => {
-                    // Before anything else: what comes by the next connection is not acknowledged by this one's numbers.
+                    // First of all: messages of the next connection must not be acknowledged by packet ids of this one.
                     self.connection.fetch_add(1, Ordering::SeqCst);
                     self.lost(failure.to_string());
                     tokio::select! {
                         () = stopped(&mut stop) => return,
-                        () = tokio::time::sleep(pause) => {}
+                        () = tokio::time::sleep(delay) => {}
                     }
-                    pause = (2 * pause).min(LONGEST_PAUSE);
+                    delay = (2 * delay).min(LONGEST_DELAY);
                 }
             }
         }
@@ -150,12 +153,13 @@ impl Link {
                 self.trouble = None;
                 self.status.set(false, Some("connected, not subscribed yet".to_owned()));
                 info!(broker = %self.url, "Connected to the MQTT broker {}", self.url);
-                // Always, not only without a session: the topic may be another one since the session began.
+                // Subscribe in every case, not only without a session: the topic may have changed since the session
+                // began.
                 self.subscribe(Duration::ZERO);
             }
             Event::Incoming(Packet::SubAck(answer)) => {
                 if answer.return_codes.contains(&SubscribeReasonCode::Failure) {
-                    let trouble = format!("it refused the subscription of {}", self.filter);
+                    let trouble = format!("the subscription to {} was refused", self.filter);
                     error!(broker = %self.url, topic = %self.filter, "The MQTT broker {}: {trouble}", self.url);
                     self.status.set(false, Some(trouble));
                     self.subscribe(SUBSCRIBE_AGAIN);
@@ -165,20 +169,20 @@ impl Link {
             }
             Event::Incoming(Packet::Publish(publish)) => {
                 let connection = self.connection.load(Ordering::SeqCst);
-                // Waits when many wait already; the other end lives as long as this task.
+                // Blocks while the queue is full; the receiver lives as long as this task.
                 let _ = self.arrived.send(Arrived { connection, publish }).await;
             }
             _ => {}
         }
     }
 
-    /// Asks for the topic, in a task of its own: the queue of requests is emptied by the loop that calls this.
+    /// Subscribes in a separate task, because the request queue is emptied by the loop that calls this.
     fn subscribe(&self, after: Duration) {
         let (client, filter) = (self.client.clone(), self.filter.clone());
         tokio::spawn(async move {
             tokio::time::sleep(after).await;
             if let Err(failure) = client.subscribe(filter, QoS::AtLeastOnce).await {
-                warn!(error = %failure, "Could not ask the MQTT broker for the topic: {failure}");
+                warn!(error = %failure, "Could not subscribe at the MQTT broker: {failure}");
             }
         });
     }
@@ -192,8 +196,8 @@ impl Link {
     }
 }
 
-/// Done when the service stops.
+/// Completes when the service stops.
 async fn stopped(stop: &mut watch::Receiver<bool>) {
-    // Without a sender there is nobody left to stop it.
+    // Without a sender no stop signal can come, and the service has ended.
     let _ = stop.wait_for(|stopped| *stopped).await;
 }

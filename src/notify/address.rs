@@ -1,8 +1,10 @@
-//! Where webhooks may go: the open internet, and private addresses only where the configuration allows them.
+//! Addresses that webhooks may reach: the public internet, and private addresses only where the configuration allows
+//! them.
 //!
-//! Whoever may make a webhook must not reach through it what only this machine can reach: its own services, the network
-//! behind it, the metadata of a cloud. So addresses are looked at when the connection is made, after the name was resolved:
-//! a name that changes its address between two looks gains nothing.
+//! A user who may create webhooks must not be able to reach services that only this machine can reach: its own ports,
+//! the internal network, the metadata service of a cloud (server-side request forgery). Addresses are therefore checked
+//! when the connection is made, after the name was resolved, so that a name that changes its address between two
+//! lookups (DNS rebinding) gains nothing.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
@@ -14,23 +16,23 @@ use reqwest::Url;
 
 use crate::quantity::shown;
 
-/// Longest URL of a webhook.
+/// Maximum length of a URL, bytes.
 const LONGEST_URL: usize = 2_000;
 
-/// Longest time to resolve a name when a webhook is made.
+/// Time limit for resolving a name when a webhook is created.
 const RESOLVE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Decides what may be reached.
+/// Decides which addresses may be reached.
 #[derive(Debug, Clone, Default)]
 pub struct Guard {
     allowed: Vec<(IpNet, Option<u16>)>,
 }
 
 impl Guard {
-    /// A guard that lets these private targets through: addresses, address:port, or networks.
+    /// A guard that allows these private targets: addresses, address:port, or networks.
     ///
     /// # Errors
-    /// The entry that is none of these.
+    /// The entry that has none of these forms.
     pub fn new(allowed: &[String]) -> Result<Self, String> {
         let target = |text: &String| {
             let parsed = text.parse::<SocketAddr>().map(|socket| (IpNet::from(socket.ip()), Some(socket.port())));
@@ -43,29 +45,29 @@ impl Guard {
     /// Whether an address may be reached.
     ///
     /// # Errors
-    /// A sentence with the address and what it is.
+    /// A message with the address and its kind.
     pub fn check(&self, address: IpAddr, port: u16) -> Result<(), String> {
         let canonical = address.to_canonical();
         let allowed = |(net, on): &(IpNet, Option<u16>)| net.contains(&canonical) && on.is_none_or(|on| on == port);
         match reserved(canonical) {
-            Some(kind) if !self.allowed.iter().any(allowed) => {
-                Err(format!("{address} is {kind}: webhooks reach it only when notify.allow_private_targets has it"))
-            }
+            Some(kind) if !self.allowed.iter().any(allowed) => Err(format!(
+                "{address} is {kind}: webhooks may reach it only if notify.allow_private_targets contains it"
+            )),
             _ => Ok(()),
         }
     }
 
-    /// A URL that a webhook may have. A name in it is looked at later, when it is resolved.
+    /// Checks the URL of a webhook. A name in it is checked later, when it is resolved.
     ///
     /// # Errors
-    /// A sentence with what is wrong.
+    /// A message with the reason.
     pub fn check_url(&self, text: &str) -> Result<Url, String> {
         if text.len() > LONGEST_URL {
-            return Err(format!("{} bytes: a URL has at most {LONGEST_URL}", text.len()));
+            return Err(format!("the URL has {} bytes: at most {LONGEST_URL} are allowed", text.len()));
         }
-        let url = Url::parse(text).map_err(|e| format!("{} is no URL: {e}", shown(text)))?;
+        let url = Url::parse(text).map_err(|e| format!("{} is not a valid URL: {e}", shown(text)))?;
         if !["http", "https"].contains(&url.scheme()) {
-            return Err(format!("{} has the scheme {}: only http and https are used", shown(text), url.scheme()));
+            return Err(format!("{} has the scheme {}: only http and https are supported", shown(text), url.scheme()));
         }
         if !url.username().is_empty() || url.password().is_some() {
             return Err("a URL with a user name or password is refused: messages are signed instead".to_owned());
@@ -76,11 +78,11 @@ impl Guard {
         Ok(url)
     }
 
-    /// As [`Guard::check_url`], and looks whether the name in it leads to an address that may be reached. A name that does
-    /// not resolve now may do so later.
+    /// As [`Guard::check_url`], and checks the addresses to which a name in the URL resolves. A name that does not
+    /// resolve now is accepted, because it may resolve later.
     ///
     /// # Errors
-    /// A sentence with what is wrong.
+    /// A message with the reason.
     pub async fn check_new_url(&self, text: &str) -> Result<(), String> {
         let url = self.check_url(text)?;
         let Some(host) = url.host_str().filter(|_| literal(&url).is_none()) else { return Ok(()) };
@@ -91,7 +93,7 @@ impl Guard {
         }
     }
 
-    /// Those of a name's addresses that may be reached.
+    /// The addresses of a name that may be reached.
     fn reachable(
         &self,
         host: &str,
@@ -106,13 +108,13 @@ impl Guard {
             }
         }
         match refused {
-            Some(reason) if reachable.is_empty() => Err(format!("{} leads to {reason}", shown(host))),
+            Some(reason) if reachable.is_empty() => Err(format!("{} resolves to {reason}", shown(host))),
             _ => Ok(reachable),
         }
     }
 }
 
-/// The address that stands in a URL, in whatever notation.
+/// The IP address in a URL, in any notation.
 fn literal(url: &Url) -> Option<IpAddr> {
     url.host_str()?.trim_start_matches('[').trim_end_matches(']').parse().ok()
 }
@@ -121,7 +123,7 @@ fn port(url: &Url) -> u16 {
     url.port_or_known_default().unwrap_or_default()
 }
 
-/// Resolves names for connections to one port, and leaves out addresses that may not be reached.
+/// Resolves names for connections to one port, and omits addresses that may not be reached.
 pub struct GuardedResolver {
     guard: Arc<Guard>,
     port: u16,
@@ -145,7 +147,7 @@ impl Resolve for GuardedResolver {
     }
 }
 
-/// What an address is that is not on the open internet (IANA's registries of special-purpose addresses).
+/// Kind of an address that is not on the public internet, after the IANA registries of special-purpose addresses.
 fn reserved(address: IpAddr) -> Option<&'static str> {
     match address {
         IpAddr::V4(v4) => reserved_v4(v4),
@@ -160,7 +162,7 @@ fn reserved_v4(address: Ipv4Addr) -> Option<&'static str> {
         (127, ..) => Some("a loopback address"),
         (10, ..) | (172, 16..=31, _) | (192, 168, _) => Some("a private address"),
         (169, 254, _) => Some("a link-local address, where clouds keep their metadata"),
-        (100, 64..=127, _) => Some("an address behind a carrier's translation"),
+        (100, 64..=127, _) => Some("an address of carrier-grade NAT"),
         (192, 0, 0) | (192, 88, 99) | (198, 18..=19, _) => Some("an address for special use"),
         (192, 0, 2) | (198, 51, 100) | (203, 0, 113) => Some("an address for examples"),
         (224..=239, ..) => Some("a multicast address"),
@@ -179,14 +181,14 @@ fn reserved_v6(address: Ipv6Addr) -> Option<&'static str> {
     match s {
         _ if address.is_unspecified() => Some("an address of this machine"),
         _ if address.is_loopback() => Some("a loopback address"),
-        // Translation (RFC 6052) and 6to4 lead to the address of version 4 inside.
+        // IPv4-embedded addresses (RFC 6052) and 6to4 addresses contain an IPv4 address.
         [0x64, 0xff9b, 0, 0, 0, 0, high, low] | [0x2002, high, low, ..] => embedded(high, low),
         [0x2001, 0..=0x1ff, ..] => Some("an address for special use"),
         [0x2001, 0xdb8, ..] | [0x3fff, 0..=0xfff, ..] => Some("an address for examples"),
         [0xfc00..=0xfdff | 0xfec0..=0xfeff, ..] => Some("a private address"),
         [0xfe80..=0xfebf, ..] => Some("a link-local address"),
         [0xff00..=0xffff, ..] => Some("a multicast address"),
-        // The open internet has no others yet.
+        // Only this range is allocated to the public internet so far.
         [0x2000..=0x3fff, ..] => None,
         _ => Some("an address for special use"),
     }
@@ -280,9 +282,9 @@ mod tests {
             ("gopher://example.org/", "scheme gopher"),
             ("https://user@example.org/", "user name"),
             ("https://:secret@example.org/", "user name"),
-            ("example.org/hook", "no URL"),
-            ("", "no URL"),
-            ("http://", "no URL"),
+            ("example.org/hook", "not a valid URL"),
+            ("", "not a valid URL"),
+            ("http://", "not a valid URL"),
         ] {
             let error = guard.check_url(url).expect_err(url);
             assert!(error.contains(reason), "{url}: {error}");

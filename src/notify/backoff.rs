@@ -1,44 +1,49 @@
-//! When a message is tried again, and when no more.
+//! The time of the next attempt after a failed delivery.
 
 use rand::rngs::OsRng;
 use rand::TryRngCore as _;
 
-use super::{later, NotifySettings};
+use super::settings::NotifySettings;
 use crate::quantity::Timestamp;
 
-/// Each pause is so many times the one before.
+/// Ratio of successive delays.
 const GROWTH: u64 = 3;
 
-/// What follows a failed attempt.
+/// Consequence of a failed attempt.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Next {
-    /// Another attempt then.
+    /// The message is sent again at this time.
     At(Timestamp),
-    /// None: it is a dead letter.
+    /// The message is given up as a dead letter.
     GiveUp,
 }
 
-/// What follows the `attempts`-th failure in a row of a message whose attempts began at `started`.
+/// Consequence of the `attempts`-th failure in a row of a message whose first attempt was planned for `started`.
 ///
 /// ```text
-///  pause = min(first · 3^(attempts−1), longest) · (0.8 + 0.4 u),    u uniform in [0, 1)
+///  delay = min(first · 3^(attempts−1), longest) · (0.8 + 0.4 u),    u uniform in [0, 1)
 /// ```
 ///
-/// The last attempt is at the very end of the time that a message gets, so that it gets all of it. `u` keeps the messages of
-/// many services from coming back to a receiver at the same moment.
+/// The last attempt is made at the end of the time for which a message is retried. The random factor u prevents the
+/// messages of many services from reaching a receiver at the same moment.
 pub fn after_failure(settings: &NotifySettings, attempts: u32, started: Timestamp, now: Timestamp, u: f64) -> Next {
     let end = later(started, settings.give_up_after_s);
-    // A clock that was set back before the beginning would make the end seem far away.
+    // If the clock was set back to before the first attempt, the end would seem far away.
     if now >= end || now < started {
         return if now < started { Next::At(later(now, settings.longest_retry_s)) } else { Next::GiveUp };
     }
     let growth = GROWTH.saturating_pow(attempts.saturating_sub(1));
-    let pause_s = settings.first_retry_s.saturating_mul(growth).min(settings.longest_retry_s);
-    let pause_micros = (pause_s as f64 * 1e6 * (0.8 + 0.4 * u)) as i64;
-    Next::At(Timestamp::from_micros(now.micros() + pause_micros).unwrap_or(end).min(end))
+    let delay_s = settings.first_retry_s.saturating_mul(growth).min(settings.longest_retry_s);
+    let delay_micros = (delay_s as f64 * 1e6 * (0.8 + 0.4 * u)) as i64;
+    Next::At(Timestamp::from_micros(now.micros() + delay_micros).unwrap_or(end).min(end))
 }
 
-/// A number in [0, 1) of the operating system; the middle when it gives none.
+/// `at` plus seconds; the ranges of the settings keep the result within the calendar.
+pub(super) fn later(at: Timestamp, seconds: u64) -> Timestamp {
+    Timestamp::from_micros(at.micros() + seconds as i64 * 1_000_000).unwrap_or(at)
+}
+
+/// A random number in [0, 1) from the operating system; 0.5 if it provides none.
 pub fn jitter() -> f64 {
     OsRng.try_next_u32().map_or(0.5, |n| f64::from(n) / (f64::from(u32::MAX) + 1.0))
 }

@@ -1,9 +1,9 @@
-//! The round: who has a message due, and sending it, each webhook in its own task.
+//! Delivery: finds the webhooks with a due message, and sends to each one in a task of its own.
 //!
-//! A webhook gets one request at a time. Each message is tried again on its own schedule; but after a failure, whichever message
-//! it was, the webhook gets none for the shortest pause between attempts. So a receiver that fails gets at most one
-//! request in that pause, however many messages wait for it, and one that refuses some messages gets the others that
-//! much later at most: those that were never tried go first.
+//! A webhook receives one request at a time. Each message is retried on its own schedule; in addition, after any
+//! failure the webhook receives no message for the shortest delay between attempts. A failing receiver therefore gets
+//! at most one request in that time, however many messages wait for it, and a receiver that refuses only some messages
+//! gets the others with at most that delay: messages that were never tried are sent first.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -12,24 +12,25 @@ use tokio::sync::watch;
 use tokio::task::{Id, JoinSet};
 use tracing::{debug, error, info, warn};
 
-use super::backoff::{after_failure, jitter, Next};
-use super::{later, Attempt, Notifier};
+use super::backoff::{after_failure, jitter, later, Next};
+use super::notifier::{Attempt, Notifier};
 use crate::quantity::Timestamp;
 use crate::store::{Delivery, DeliveryState, Error, Settlement, WebhookRecord};
 
-/// Longest time between two looks: a clock that jumps is noticed within it.
+/// Maximum time between two checks for due messages, so that a jump of the clock is noticed.
 const LONGEST_WAIT: Duration = Duration::from_mins(1);
 
-/// Shortest time between two looks: a burst of batches is one look.
+/// Minimum time between two checks for due messages, so that a burst of batches causes one check.
 const SHORTEST_WAIT: Duration = Duration::from_millis(200);
 
-/// Pause after the store failed. What was sent and could not be noted is sent again, so not at once.
+/// Delay after an error of the store. A message that was sent but not recorded as such will be sent again, so not
+/// immediately.
 const PAUSE_AFTER_FAILURE: Duration = Duration::from_secs(10);
 
-/// Time that attempts under way get when the service stops.
+/// Time limit for attempts in progress when the service stops.
 const GRACE: Duration = Duration::from_secs(3);
 
-/// Between two removals of what is old.
+/// Interval of the removal of old events.
 const PRUNE_EVERY: Duration = Duration::from_hours(1);
 
 impl Notifier {
@@ -59,11 +60,12 @@ impl Notifier {
         }
         let rest = async { while turns.join_next().await.is_some() {} };
         if tokio::time::timeout(GRACE, rest).await.is_err() {
-            debug!("Left messages that were on their way: they are sent again after the next start");
+            debug!("Stopped with deliveries in progress: they are sent again after the next start");
         }
     }
 
-    /// Starts a task for each webhook that has a message due and none under way; the time until the next one has.
+    /// Starts a task for each webhook that has a due message and no running task; returns the time until the next
+    /// message is due.
     async fn start_turns(
         &self,
         turns: &mut JoinSet<()>,
@@ -86,7 +88,7 @@ impl Notifier {
         Ok(found.next_at.map_or(LONGEST_WAIT, until).clamp(SHORTEST_WAIT, LONGEST_WAIT))
     }
 
-    /// Sends the messages of a webhook that are due, until none is left.
+    /// Sends the due messages of a webhook until none is left.
     async fn take_turn(&self, webhook: &str, mut stop: watch::Receiver<bool>) {
         loop {
             let pause = match self.send_due(webhook).await {
@@ -96,7 +98,7 @@ impl Notifier {
                     Duration::from_secs(self.settings.first_retry_s)
                 }
                 Err(failure) => {
-                    error!(webhook.id = %webhook, error = %failure, "Could not read or note a message: {failure}");
+                    error!(webhook.id = %webhook, error = %failure, "Could not read or update a delivery: {failure}");
                     PAUSE_AFTER_FAILURE
                 }
             };
@@ -106,7 +108,7 @@ impl Notifier {
         }
     }
 
-    /// Sends the message of a webhook whose turn it is; what came of it, or `None` when none is due.
+    /// Sends the next due message of a webhook; returns its new state, or `None` if no message is due.
     async fn send_due(&self, webhook: &str) -> Result<Option<DeliveryState>, Error> {
         let now = Timestamp::now();
         let Some((hook, delivery)) = self.store.outbox().due_delivery(webhook, now, self.latest(now)).await? else {
@@ -131,7 +133,7 @@ impl Notifier {
         Settlement { state, at: now, next_at, status: attempt.status, error: attempt.error.clone() }
     }
 
-    /// No attempt is planned later than this; one that seems so was planned before the clock was set back.
+    /// Latest possible time of an attempt. An attempt planned for later was planned before the clock was set back.
     fn latest(&self, now: Timestamp) -> Timestamp {
         later(now, 2 * self.settings.longest_retry_s)
     }
@@ -141,15 +143,15 @@ impl Notifier {
         let Ok(before) = Timestamp::from_micros(Timestamp::now().micros() - days * 86_400_000_000) else { return };
         match self.store.outbox().prune_outbox(before).await {
             Ok(0) => {}
-            Ok(events) => info!(events, "Forgot {events} old events of the outbox"),
-            Err(failure) => error!(error = %failure, "Could not forget old events of the outbox: {failure}"),
+            Ok(events) => info!(events, "Deleted {events} old events of the outbox"),
+            Err(failure) => error!(error = %failure, "Could not delete old events of the outbox: {failure}"),
         }
     }
 }
 
-/// Done when the service stops.
+/// Completes when the service stops.
 async fn stopped(stop: &mut watch::Receiver<bool>) {
-    // Without a sender there is nobody left to stop it.
+    // Without a sender no stop signal can come, and the service has ended.
     let _ = stop.wait_for(|stopped| *stopped).await;
 }
 
@@ -165,7 +167,7 @@ fn report(webhook: &WebhookRecord, delivery: &Delivery, attempt: &Attempt, state
     match &attempt.error {
         None => info!(webhook.id = %id, message, duration_ms, attempts, "Delivered {kind} to webhook {id}"),
         Some(error) if state == DeliveryState::Dead => {
-            warn!(webhook.id = %id, message, attempts, error, "Gave up {kind} for webhook {id}: {error}");
+            warn!(webhook.id = %id, message, attempts, error, "Gave up the delivery of {kind} to webhook {id}: {error}");
         }
         Some(error) => {
             warn!(webhook.id = %id, message, attempts, error, "Could not deliver {kind} to webhook {id}: {error}");

@@ -1,11 +1,10 @@
-//! A message: CloudEvents 1.0 as JSON, signed after the Standard Webhooks.
+//! A message: CloudEvents 1.0 as JSON, signed according to Standard Webhooks.
 //!
 //! Source: CNCF (2022), CloudEvents – Version 1.0.2, §3.1 and JSON event format §3; Standard Webhooks specification 1.0.0.
 
 use serde::{Deserialize, Serialize};
 use standardwebhooks::{Webhook, WebhookError};
 
-use super::seconds;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{OutboxEvent, Secret};
 
@@ -13,31 +12,31 @@ use crate::store::{OutboxEvent, Secret};
 pub const EVENT_KINDS: [&str; 5] =
     ["alarm.opened", "alarm.reopened", "alarm.ended", "alarm.withdrawn", "alarm.acknowledged"];
 
-/// Stands before the kind of an event in its type.
+/// Prefix of the kind of an event in the CloudEvents type.
 const TYPE_PREFIX: &str = "org.modalwatch.";
 
-/// Source of the events of a service that does not know its own address.
+/// Source of the events if the service has no public URL.
 const NAMELESS_SOURCE: &str = "urn:modalwatch";
 
-/// Why the facts of an event make no message: the database was changed by hand, or a bug.
+/// Why a stored event cannot be read. This means that the database was changed by hand, or a bug.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// They are not what the triggers write.
+    /// Its JSON has another form than the triggers write.
     #[error("the stored event cannot be read: {0}")]
     Facts(#[from] serde_json::Error),
-    /// A time beyond the calendar.
+    /// A time is outside the range of the calendar.
     #[error("the stored event cannot be read: {0}")]
     Time(#[from] crate::quantity::OutOfRange),
 }
 
-/// A message, ready to be signed.
+/// A message that is ready to be signed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Message {
     id: String,
     body: String,
 }
 
-/// The envelope.
+/// CloudEvents envelope.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "lowercase")]
 struct CloudEvent<'a, D> {
@@ -51,7 +50,7 @@ struct CloudEvent<'a, D> {
     data: D,
 }
 
-/// An alarm as its receiver reads it.
+/// An alarm as it is sent to receivers.
 #[derive(Debug, Serialize)]
 struct AlarmData<'a> {
     structure: &'a StructureId,
@@ -69,9 +68,9 @@ struct AlarmData<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     undamaged_version: Option<u32>,
     acknowledgement: Option<AcknowledgementData>,
-    /// Where the alarm can be read.
+    /// URL of the alarm.
     alarm_url: String,
-    /// Where the batch can be read that made it an alarm.
+    /// URL of the batch that raised the alarm.
     batch_url: Option<String>,
 }
 
@@ -87,7 +86,7 @@ struct TestData {
     message: &'static str,
 }
 
-/// An alarm as the triggers write it.
+/// An alarm as the triggers of the database write it.
 #[derive(Debug, Deserialize)]
 struct Facts {
     kind: String,
@@ -105,10 +104,10 @@ struct Facts {
 }
 
 impl Message {
-    /// The message of an event; the same bytes at every attempt.
+    /// The message of an event; its bytes are the same at every attempt.
     ///
     /// # Errors
-    /// [`Error`] for a row that is not what the triggers write.
+    /// [`Error`] if the stored event cannot be read.
     pub fn of_event(event: &OutboxEvent, public_url: &str) -> Result<Self, Error> {
         let facts: Facts = serde_json::from_str(&event.facts)?;
         let (structure, number) = (&event.structure, event.alarm);
@@ -134,7 +133,7 @@ impl Message {
             peak_shift_standard_errors: facts.peak_shift.filter(|_| damage),
             undamaged_version: damage.then_some(facts.undamaged_version),
             acknowledgement,
-            // The page of alarms that begins behind the next one and has one item.
+            // The alarm is on the page of one item that begins after the next number.
             alarm_url: format!("{root}/v1/structures/{structure}/alarms?limit=1&cursor={}", number + 1),
             batch_url: facts.opened_batch.as_ref().map(|id| format!("{root}/v1/structures/{structure}/batches/{id}")),
             opened_batch: facts.opened_batch,
@@ -165,7 +164,7 @@ impl Message {
         Self { id: id.to_owned(), body }
     }
 
-    /// Its id: the receiver knows by it a message that comes twice.
+    /// Id by which the receiver recognises a message that it receives twice.
     pub fn id(&self) -> &str {
         &self.id
     }
@@ -175,10 +174,10 @@ impl Message {
         &self.body
     }
 
-    /// The header `webhook-signature`: one signature for each secret, separated by blanks.
+    /// Value of the header `webhook-signature`: one signature for each secret, separated by spaces.
     ///
     /// # Errors
-    /// [`WebhookError`] for a secret that is no Base64.
+    /// [`WebhookError`] if a secret is not valid Base64.
     pub fn signature<'a>(
         &self,
         secrets: impl Iterator<Item = &'a Secret>,
@@ -187,6 +186,11 @@ impl Message {
         let sign = |secret: &Secret| Webhook::new(secret.reveal())?.sign(&self.id, seconds(now), self.body.as_bytes());
         Ok(secrets.map(sign).collect::<Result<Vec<_>, _>>()?.join(" "))
     }
+}
+
+/// Seconds since 1970, as the Standard Webhooks sign them.
+pub(super) fn seconds(at: Timestamp) -> i64 {
+    at.micros().div_euclid(1_000_000)
 }
 
 #[cfg(test)]

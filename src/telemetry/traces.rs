@@ -1,7 +1,7 @@
-//! Traces by OpenTelemetry: spans are sent as protobuf over HTTP, by a thread of their own.
+//! OpenTelemetry traces: a thread sends spans as protobuf over HTTP.
 //!
-//! What is on its way is bounded: while the collector is away, spans are dropped and nothing waits. How many may wait, how
-//! often they are sent, which are taken and how the service is called are set by the standard variables `OTEL_…`.
+//! The number of waiting spans is bounded: while the collector is unreachable, spans are dropped and nothing blocks.
+//! Queue size, interval, sampling and the name of the service are set by the standard variables `OTEL_…`.
 
 use std::time::Duration;
 
@@ -14,18 +14,18 @@ use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::Layer;
 use tracing_subscriber::Registry;
 
-/// Any of them stands for a wish to send traces; the exporter reads them.
+/// Traces are sent if one of these variables is set; the exporter reads them.
 const STANDARD_VARIABLES: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT"];
 
-/// Time that the last spans get when the service stops.
+/// Time limit for sending the last spans when the service stops.
 const LAST_WORDS: Duration = Duration::from_secs(5);
 
-/// What sends traces, if they are wanted.
+/// The exporter of traces, if they are configured.
 #[derive(Default)]
 pub struct Traces(Option<SdkTracerProvider>);
 
 impl Traces {
-    /// Sends to `endpoint`, or to where the standard variables say; nowhere when there is neither.
+    /// Sends to `endpoint`, otherwise to the address in the standard variables; sends nothing if neither is set.
     pub(super) fn start(endpoint: &str) -> Result<Self, String> {
         let wanted = |name: &&str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
         if endpoint.is_empty() && !STANDARD_VARIABLES.iter().any(wanted) {
@@ -33,10 +33,11 @@ impl Traces {
         }
         let wrong =
             |e: &dyn std::fmt::Display| format!("traces cannot be sent (log.otlp_endpoint, OTEL_EXPORTER_OTLP_…): {e}");
-        // Mozilla's certificates too: without any there would be no client, as in small container images.
+        // Mozilla's certificates are added because small container images have none, and the client cannot be built
+        // without any.
         let mozilla = webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter().filter_map(|der| Certificate::from_der(der).ok());
         let client = reqwest::blocking::Client::builder().tls_certs_merge(mozilla);
-        // A blocking client cannot be made on an async thread.
+        // A blocking client cannot be created on an async thread.
         let client = std::thread::spawn(|| client.build()).join().map_err(|_| wrong(&"the client panicked"))?;
         let client = client.map_err(|e| wrong(&e))?;
         let mut exporter = SpanExporter::builder().with_http().with_http_client(client);
@@ -47,7 +48,7 @@ impl Traces {
             exporter = exporter.with_endpoint(format!("{}/v1/traces", endpoint.trim_end_matches('/')));
         }
         let exporter = exporter.build().map_err(|e| wrong(&e))?;
-        // The variables of the service's name go over this one.
+        // The variables that name the service take precedence over this name.
         let resource = match std::env::var_os("OTEL_SERVICE_NAME") {
             Some(_) => Resource::builder().build(),
             None => Resource::builder().with_service_name(env!("CARGO_PKG_NAME")).build(),
@@ -55,7 +56,7 @@ impl Traces {
         Ok(Self(Some(SdkTracerProvider::builder().with_resource(resource).with_batch_exporter(exporter).build())))
     }
 
-    /// Takes the spans that are meant for traces.
+    /// Layer that records the spans meant for traces.
     pub(super) fn layer(&self) -> impl Layer<Registry> {
         self.0.as_ref().map(|provider| {
             tracing_opentelemetry::layer()
@@ -68,7 +69,7 @@ impl Traces {
         })
     }
 
-    /// Sends what is left, for five seconds at most.
+    /// Sends the remaining spans, for five seconds at most.
     pub fn end(self) {
         if let Some(Err(failure)) = self.0.map(|provider| provider.shutdown_with_timeout(LAST_WORDS)) {
             tracing::warn!(error = %failure, "Could not send the last spans: {failure}");

@@ -1,4 +1,4 @@
-//! Who changed what: nothing is left out, and nothing else is in it.
+//! The audit: it contains every change and nothing else.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};
@@ -22,14 +22,14 @@ async fn each_change_is_written_down_with_who_where_and_what_came_of_it() {
     let path = "/v1/structures/three-dof/maintenance";
     let request = world.ask(Method::POST, path, &keeper).header("x-request-id", "window-1").json(&window);
     created(request.send().await.unwrap()).await;
-    // None of these is a change: a batch, a read, what was refused before it was tried.
+    // None of these is a change: a batch, a read, a request that is refused before its handler.
     let batch = json!({ "measurements": measurements([4.0, 5.0, 6.0], 12, 0) });
     let batch = created(world.post("/v1/structures/three-dof/batches", &world.admin, &batch).await).await;
     world.read("/v1/structures", &world.admin).await;
     problem(world.post("/v1/tokens", &keeper, &json!({})).await, 403, "forbidden_structure").await;
-    // These are tried, one with success.
+    // These are attempted changes, one of them successful.
     let undamaged = json!({ "batches": [batch["batch"]] });
-    created(world.post("/v1/structures/three-dof/baseline", &world.admin, &undamaged).await).await;
+    created(world.post("/v1/structures/three-dof/reference", &world.admin, &undamaged).await).await;
     let acknowledgement = "/v1/structures/three-dof/alarms/999/acknowledgement";
     problem(world.post(acknowledgement, &keeper, &json!({ "by": "me" })).await, 404, "unknown_alarm").await;
 
@@ -41,7 +41,7 @@ async fn each_change_is_written_down_with_who_where_and_what_came_of_it() {
     let (admin, keeper) = (id_of(&world.admin), id_of(&keeper));
     let expected = [
         ("POST /v1/structures/{id}/alarms/{alarm}/acknowledgement", keeper, "refused"),
-        ("POST /v1/structures/{id}/baseline", admin, "done"),
+        ("POST /v1/structures/{id}/reference", admin, "done"),
         ("POST /v1/structures/{id}/maintenance", keeper, "done"),
         ("POST /v1/tokens", admin, "done"),
         ("modalwatch token create", "local", "done"),
@@ -96,7 +96,7 @@ async fn a_client_that_goes_away_leaves_a_whole_entry() {
         );
         let mut connection = std::net::TcpStream::connect(world.service.address()).unwrap();
         connection.write_all(request.as_bytes()).unwrap();
-        // From at once to 19 ms later: one that is gone before it was heard leaves nothing.
+        // The client disconnects after 0 to 19 ms; a request that was never received leaves no entry.
         std::thread::sleep(Duration::from_millis(day - 10));
     }
     let started = Instant::now();

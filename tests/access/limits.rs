@@ -1,4 +1,4 @@
-//! How often one may ask, and the headers of every answer.
+//! Rate limits, and the headers of every answer.
 
 use serde_json::json;
 
@@ -7,7 +7,7 @@ use crate::world::{first_token, World};
 
 const LIST: &str = "/v1/structures";
 
-/// Asks until a 429 comes; how many answers of another kind there were.
+/// Repeats a request until it is answered 429; returns the number of other answers.
 async fn until_429(ask: impl AsyncFn() -> reqwest::Response, expected: u16, code: &str) -> usize {
     for answered in 0..60 {
         let response = ask().await;
@@ -36,7 +36,7 @@ async fn tokens_cannot_be_tried_one_after_the_other_and_a_known_one_still_passes
     let tried = until_429(async || from("203.0.113.9", unknown.clone()).await, 401, "too_many_failures").await;
     assert!((10..20).contains(&tried), "{tried} were tried");
     assert_eq!(from("203.0.113.9", world.admin.clone()).await.status(), 200);
-    // Another address has its own allowance; what a client writes into the header itself does not count.
+    // Another address has its own allowance; addresses that the client writes into the header itself are ignored.
     problem(from("203.0.113.10", unknown.clone()).await, 401, "unauthorized").await;
     let spoofed = from("198.51.100.1, 203.0.113.9", unknown.clone()).await;
     problem(spoofed, 429, "too_many_failures").await;

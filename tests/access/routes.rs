@@ -1,6 +1,7 @@
-//! Each route, asked with each kind of token, against a table of what it should need.
+//! Each route is requested with each kind of token and compared with a table of the scope that it should need.
 //!
-//! The routes are found in the sources and asked of the running program: one that has no row here fails the test.
+//! The routes are found in the sources and requested from the running program: a route without a row here fails the
+//! test.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -21,7 +22,7 @@ enum Needs {
 }
 use Needs::{Admin, Ingest, Nothing, Read};
 
-/// What it is about: one structure (also by a diagnosis), a list that is filtered, or the whole service.
+/// What a route is about: one structure (also by a diagnosis), a filtered list, or the whole service.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum About {
     Structure,
@@ -30,13 +31,15 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 58] = [
+const TABLE: [(&str, &str, Needs, About); 60] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
     ("POST", "/v1/structures/{}/batches", Ingest, Structure),
     ("GET", "/v1/structures/{}/batches/{}", Read, Structure),
     ("GET", "/v1/structures/{}/history", Read, Structure),
+    ("PUT", "/v1/structures/{}/reference", Admin, Structure),
+    ("POST", "/v1/structures/{}/reference", Admin, Structure),
     ("POST", "/v1/structures/{}/baseline", Admin, Structure),
     ("GET", "/v1/structures/{}/exceedances", Read, Structure),
     ("GET", "/v1/structures/{}/alarms", Read, Structure),
@@ -60,7 +63,7 @@ const TABLE: [(&str, &str, Needs, About); 58] = [
     ("GET", "/healthz", Nothing, Service),
     ("GET", "/readyz", Nothing, Service),
     ("GET", "/version", Nothing, Service),
-    // For the dashboard, with its files and the documentation.
+    // The dashboard with its files, and the documentation.
     ("GET", "/v1/overview", Read, List),
     ("GET", "/v1/jobs", Read, List),
     ("GET", "/v1/events", Read, List),
@@ -96,7 +99,7 @@ const TABLE: [(&str, &str, Needs, About); 58] = [
 const OWN: &str = "three-dof";
 const OTHER: &str = "ruler-frame-4dof";
 
-/// All text in quotes in the sources of the HTTP door that could be a route, with `{}` for each parameter.
+/// All text in quotes in the sources of `src/http` that could be a route, with `{}` for each parameter.
 fn candidates(folder: &Path, found: &mut BTreeSet<String>) {
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
@@ -115,13 +118,13 @@ fn candidates(folder: &Path, found: &mut BTreeSet<String>) {
     }
 }
 
-/// A path of a pattern that names `structure`; all other parameters name nothing that is there.
+/// A path of a pattern that names `structure`; all other parameters name nothing that exists.
 fn path_of(pattern: &str, structure: &str, diagnosis: &str) -> String {
     let first = if pattern.starts_with("/v1/diagnoses/") { diagnosis } else { structure };
     pattern.replacen("{}", first, 1).replace("{}", "1")
 }
 
-/// Methods that a path takes, by the `Allow` of the answer to one that it does not take.
+/// Methods that a path supports, from the `Allow` header of the answer to an unsupported one.
 async fn methods(world: &World, path: &str) -> Vec<String> {
     let response = world.ask(Method::from_bytes(b"PROBE").unwrap(), path, &world.admin).send().await.unwrap();
     if response.status() == 404 {
@@ -229,7 +232,7 @@ async fn a_limited_token_sees_only_its_structures() {
     created(own).await;
     let other = world.post(&format!("/v1/structures/{OTHER}/batches"), &limited, &batch).await;
     problem(other, 403, "forbidden_structure").await;
-    // The same id in other letters is another path, and no way around.
+    // The same id in other letters is a different path and does not circumvent the check.
     for path in ["/v1/structures/%72uler-frame-4dof", "/v1/structures/three-dof%2F..%2Fruler-frame-4dof"] {
         problem(world.get(path, &limited).await, 403, "forbidden_structure").await;
     }

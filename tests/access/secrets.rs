@@ -1,4 +1,5 @@
-//! No secret is ever written down: not in the log at its most talkative, not in the database, not in the metrics.
+//! No secret is ever stored in plain text: not in the log at its most verbose level, not in the database, not in the
+//! metrics.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -75,7 +76,7 @@ async fn no_secret_is_in_log_database_or_metrics() {
     let database: Vec<_> = while_running.into_iter().chain(files(&data)).collect();
     assert!(database.iter().any(|(_, bytes)| contains(bytes, id_of(&secrets[2]))), "the ids are in the database");
     for secret in &secrets {
-        // The second half alone would do for somebody who has the rest.
+        // The second half alone would be enough for somebody who has the first.
         let secret = &secret.rsplit('_').next().unwrap()[26..];
         assert!(!contains(&log, secret), "a secret is in the log");
         assert!(!contains(metrics.as_bytes(), secret), "a secret is in the metrics");

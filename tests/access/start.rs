@@ -1,4 +1,4 @@
-//! What the service starts with, and whom it serves before there is a token.
+//! Which requests the service accepts before there is a token, and when it refuses to start.
 
 use std::io::Read as _;
 use std::os::unix::fs::PermissionsExt as _;
@@ -13,7 +13,7 @@ use crate::world::{first_token, program};
 
 const LIST: &str = "/v1/structures";
 
-/// A service on an address that other machines could reach (nobody asks it from there).
+/// A service on an address that other machines could reach (none does).
 fn public(data_dir: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
     command.args(["serve", "--listen", "0.0.0.0:0", "--data-dir"]).arg(data_dir);
@@ -21,7 +21,7 @@ fn public(data_dir: &Path) -> Command {
     command
 }
 
-/// What a service says that must not start.
+/// The message of a service that must not start.
 fn refusal(command: &mut Command) -> String {
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let started = Instant::now();
@@ -91,7 +91,7 @@ async fn the_admin_token_file_opens_a_service_without_other_tokens() {
     let token = token.trim();
     assert_eq!(std::fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
 
-    // By the variable of its own, and by the setting.
+    // By its own variable, and by the setting.
     for (name, listen) in
         [("MODALWATCH_ADMIN_TOKEN_FILE", public(&data)), ("MODALWATCH__ACCESS__ADMIN_TOKEN_FILE", command(&data))]
     {
@@ -101,7 +101,7 @@ async fn the_admin_token_file_opens_a_service_without_other_tokens() {
         let ask = |path: &str| service.client.get(format!("{url}{path}"));
         problem(ask(LIST).send().await.unwrap(), 401, "unauthorized").await;
         assert_eq!(ask(LIST).bearer_auth(token).send().await.unwrap().status(), 200);
-        // With it, the first stored token need be no admin.
+        // With the file, the first stored token may have any scope.
         let body = json!({ "name": "gateway", "scopes": ["ingest"] });
         let create = service.client.post(format!("{url}/v1/tokens")).bearer_auth(token).json(&body);
         created(create.send().await.unwrap()).await;
@@ -117,7 +117,7 @@ async fn the_admin_token_file_opens_a_service_without_other_tokens() {
     let readable = refused(0o644, token);
     assert!(readable.contains("chmod 600") && !readable.contains(token), "{readable}");
     let other = refused(0o600, "hunter2");
-    assert!(other.contains("holds no token") && !other.contains("hunter2"), "{other}");
+    assert!(other.contains("contains no token") && !other.contains("hunter2"), "{other}");
     let missing = refusal(command(&data).env("MODALWATCH_ADMIN_TOKEN_FILE", "/no/such/file"));
     assert!(missing.contains("/no/such/file"), "{missing}");
 }

@@ -63,7 +63,7 @@ async fn a_rotated_secret_is_good_during_the_overlap_and_not_after() {
         assert_eq!(world.get(LIST, token).await.status(), 200);
     }
     let newest = rotate(0).await;
-    // The one before the last is gone altogether; the last one is told that its time is over.
+    // The secret before the previous one is unknown; the previous one is refused as expired.
     problem(world.get(LIST, &old).await, 401, "unauthorized").await;
     let over = world.get(LIST, &new).await;
     assert!(over.headers()["www-authenticate"].to_str().unwrap().contains("error=\"invalid_token\""));
@@ -173,7 +173,7 @@ async fn tokens_are_managed_offline_and_a_running_service_is_asked_instead() {
     for (arguments, expected) in [
         (vec!["token", "revoke", "nothing"], "there is no token \"nothing\""),
         (vec!["token", "rotate", id_of(admin)], "revoked: make a new one"),
-        (vec!["token", "create", "--name", "x", "--scope", "root"], "none of ingest, read, admin"),
+        (vec!["token", "create", "--name", "x", "--scope", "root"], "not one of ingest, read, admin"),
         (vec!["token", "create", "--name", "x", "--scope", "read", "--structure", "A"], "structure id"),
         (vec!["token", "create", "--name", "x", "--scope", "read", "--expires-at", "2020-01-01T00:00:00Z"], "future"),
     ] {

@@ -10,7 +10,7 @@ use tempfile::TempDir;
 
 use crate::helpers::{command, created, Service};
 
-/// A service that asks for tokens, and its first one.
+/// A service that requires tokens, and its first token.
 pub struct World {
     pub service: Service,
     pub folder: TempDir,
@@ -23,7 +23,7 @@ pub fn program(arguments: &[&str], data_dir: &Path) -> Output {
     command.args(arguments).arg("--data-dir").arg(data_dir).output().unwrap()
 }
 
-/// Makes a token by the command line, as the first one is made.
+/// Creates a token on the command line, as the first token is created.
 pub fn first_token(data_dir: &Path) -> String {
     let made = program(&["token", "create", "--name", "first", "--scope", "admin"], data_dir);
     let text = String::from_utf8(made.stdout).unwrap();
@@ -41,7 +41,7 @@ impl World {
         Self::with(|command| command)
     }
 
-    /// With settings of its own.
+    /// A service with these settings.
     pub fn with(prepare: impl FnOnce(&mut Command) -> &mut Command) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let admin = first_token(folder.path());
@@ -80,7 +80,7 @@ impl World {
     }
 }
 
-/// Asks again until an answer has this status and code.
+/// Repeats a request until its answer has this status and code.
 pub async fn eventually(world: &World, path: &str, token: &str, status: u16, code: &str) {
     let started = Instant::now();
     loop {

@@ -1,4 +1,4 @@
-//! Each way a request can be wrong, over HTTP: its own answer, and nothing stored.
+//! Each kind of invalid request over HTTP: it has its own answer, and nothing is stored.
 
 use std::fmt::Write as _;
 
@@ -147,7 +147,7 @@ async fn a_batch_that_is_too_long_or_a_body_that_is_too_large_is_refused() {
 
     let huge = vec![b' '; 5 << 20];
     problem(service.post_text(BATCHES, "application/json", huge.clone()).await, 413, "body_too_large").await;
-    // Without a length, which is found out while reading.
+    // Without a declared length, the size is found while reading.
     let chunks = without_length(&huge);
     problem(service.post_text(BATCHES, "application/json", chunks).await, 413, "body_too_large").await;
     nothing_is_stored(&service).await;
@@ -204,7 +204,7 @@ async fn ids_and_keys_that_are_none_are_refused() {
     problem(service.post("/v1/structures/unheard-of/batches", &body).await, 404, "unknown_structure").await;
     problem(service.get(&format!("{BATCHES}/nothing")).send().await.unwrap(), 404, "unknown_batch").await;
     let unknown = json!({ "batches": ["nothing"] });
-    problem(service.post("/v1/structures/three-dof/baseline", &unknown).await, 404, "unknown_batch").await;
+    problem(service.post("/v1/structures/three-dof/reference", &unknown).await, 404, "unknown_batch").await;
     for key in ["", "a b", "ü", &"k".repeat(129)] {
         let request = service.request(reqwest::Method::POST, BATCHES).json(&body);
         let value = reqwest::header::HeaderValue::from_bytes(key.as_bytes()).unwrap();
@@ -220,7 +220,7 @@ async fn ids_and_keys_that_are_none_are_refused() {
 async fn a_baseline_that_is_none_is_refused() {
     let (service, _folder) = spawn();
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 5, 0)).await["batch"].clone();
-    let path = "/v1/structures/three-dof/baseline";
+    let path = "/v1/structures/three-dof/reference";
     problem(service.post(path, &json!({ "batches": [] })).await, 422, "invalid").await;
     problem(service.post(path, &json!({ "batches": [batch, batch] })).await, 422, "unusable_baseline").await;
     for probability in [0.0, -0.1, 0.6, 2.0] {
@@ -284,10 +284,10 @@ async fn a_structure_with_mistakes_is_refused_with_its_place() {
     problem(service.get("/v1/structures/x").send().await.unwrap(), 404, "unknown_structure").await;
 }
 
-/// What a test does to the files of a baseline's folder.
+/// Change of the files of a trained model.
 type Change<'a> = Box<dyn Fn(&std::path::Path) + 'a>;
 
-/// A models folder whose one baseline was changed by `change`.
+/// A models folder with one model that was changed by `change`.
 fn models_with(change: impl Fn(&std::path::Path)) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let target = folder.path().join("three-dof");
@@ -307,7 +307,7 @@ async fn a_baseline_file_that_is_damaged_is_named_and_the_others_serve() {
         change(&mut bytes);
         std::fs::write(path, bytes).unwrap();
     };
-    // Changed weights get a manifest that fits, so that each case meets the check it is meant for.
+    // Changed weights get a matching manifest, so that each case reaches the check that it is meant for.
     let sign = |folder: &std::path::Path| {
         let digest = modalwatch::quantity::Digest::of_file(&std::fs::read(weights(folder)).unwrap());
         let path = folder.join("baseline.json");

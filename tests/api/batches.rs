@@ -1,4 +1,4 @@
-//! Post, read, post again: the path of a batch.
+//! Posting, reading and repeating a batch.
 
 use serde_json::{json, Value};
 
@@ -18,14 +18,14 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
     assert_eq!(k1["probability_of_damage"], Value::Null);
 
     let baseline = json!({ "batches": [first["batch"]] });
-    let undamaged = created(service.post("/v1/structures/three-dof/baseline", &baseline).await).await;
+    let undamaged = created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
     assert_eq!(undamaged["version"], 1);
     assert_eq!(undamaged["measurement_count"], 20);
     let delta = undamaged["parameters"][1]["threshold"].as_f64().unwrap();
     let (mean, std) = (&undamaged["parameters"][1]["mean"], &undamaged["parameters"][1]["std"]);
     assert!((delta - (mean.as_f64().unwrap() - 1.645 * std.as_f64().unwrap())).abs() < 1e-4, "{undamaged}");
 
-    // Ten per cent off k2 alone.
+    // A loss of 10 % in k2 alone.
     let damaged = service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 100_000)).await;
     let parameters = damaged["assessment"]["parameters"].as_array().unwrap();
     assert_eq!(parameters[1]["probability_of_damage"], 1.0, "{damaged}");
@@ -33,7 +33,7 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
     assert_eq!(parameters[1]["probability_of_damage_interval"][0], 1.0, "{damaged}");
     assert!((parameters[1]["relative_change"].as_f64().unwrap() + 0.1).abs() < 0.01, "{damaged}");
     for other in [0, 2] {
-        // Their means are known to some of their small spread only.
+        // The uncertainty of the means is a small part of their already small spread.
         let least = parameters[other]["probability_of_damage_interval"][0].as_f64().unwrap();
         assert!(least < 0.05, "only k2 lost stiffness: {damaged}");
     }
@@ -74,7 +74,7 @@ async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
     let damaged = service.post_batch("three-dof", &measurements([4.0, 4.0, 6.0], 20, 100_000)).await;
     assert_eq!(damaged["assessment"]["undamaged_version"], Value::Null);
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
     let path = |batch: &Value| format!("{BATCHES}/{}", batch["batch"].as_str().unwrap());
     let mut compared = Value::Null;
     for _ in 0..100 {
@@ -100,7 +100,7 @@ async fn an_undamaged_state_declared_among_posts_misses_none_of_them() {
         .map(tokio::spawn)
         .collect();
     let baseline = json!({ "batches": [healthy["batch"]] });
-    let path = "/v1/structures/three-dof/baseline";
+    let path = "/v1/structures/three-dof/reference";
     tasks.insert(20, tokio::spawn(service.request(reqwest::Method::POST, path).json(&baseline).send()));
     for task in tasks {
         created(task.await.unwrap().unwrap()).await;
@@ -147,7 +147,7 @@ async fn the_same_batch_sent_twice_is_stored_once_and_answered_the_same() {
     overlapping["measurements"] = json!(measurements([4.0, 5.0, 6.0], 6, 0));
     let refused = problem(post(None, overlapping.clone()).await, 422, "measurement_exists").await;
     assert_eq!(refused["errors"][0]["pointer"], "/measurements/0", "{refused}");
-    // Nothing of it was stored: from another source it is new, and whole.
+    // Nothing of it was stored: from another source the whole batch is new.
     overlapping["source"] = json!("logger-2");
     assert_eq!(created(post(None, overlapping).await).await["measurement_count"], 6);
 }
@@ -230,7 +230,7 @@ fn codes(answer: &Value) -> Vec<&str> {
 async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
     let changed = |start: usize, change: &dyn Fn(&mut Vec<f64>)| {
         let mut rows = measurements([4.0, 5.0, 6.0], 10, start);
         for row in &mut rows {
@@ -263,10 +263,11 @@ async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
         for p in answer["assessment"]["parameters"].as_array().unwrap() {
             assert_eq!((&p["probability_of_damage"], &p["exceeds"]), (&Value::Null, &Value::Null), "{code}: {answer}");
         }
-        let refused = service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [answer["batch"]] })).await;
+        let refused =
+            service.post("/v1/structures/three-dof/reference", &json!({ "batches": [answer["batch"]] })).await;
         problem(refused, 422, "unusable_baseline").await;
     }
-    // Three misfits in a row are an event of their own, and no damage.
+    // Three consecutive misfits are an event of their own kind, not damage.
     let alarms = service.read("/v1/structures/three-dof/alarms?state=open").await;
     let kinds: Vec<&str> = alarms["items"].as_array().unwrap().iter().map(|a| a["kind"].as_str().unwrap()).collect();
     assert_eq!(kinds, ["simulation_does_not_fit"], "{alarms}");
@@ -288,7 +289,7 @@ async fn one_bad_measurement_is_named_and_the_others_are_believed() {
 async fn damage_becomes_one_alarm_which_somebody_sees() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
     for i in 1..=2 {
         let answer = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 100_000 * i)).await;
         let states: Vec<&Value> = answer["charts"].as_array().unwrap().iter().map(|c| &c["state"]).collect();
@@ -299,7 +300,7 @@ async fn damage_becomes_one_alarm_which_somebody_sees() {
         let k2 = answer["charts"].as_array().unwrap().iter().find(|c| c["chart"] == "k2").unwrap();
         assert_eq!(k2["state"], "alarming", "{answer}");
         assert!(k2["shift"].as_f64() > k2["shift_limit"].as_f64());
-        // The answer is made of what was stored, without reading it back: whoever reads it finds the same.
+        // The answer is made from the stored values without reading them back: a later read must return the same.
         let read = service.read(&format!("{BATCHES}/{}", answer["batch"].as_str().unwrap())).await;
         for part in ["state", "assessment", "charts", "next_step"] {
             assert_eq!(read[part], answer[part], "{part}");
@@ -316,7 +317,7 @@ async fn damage_becomes_one_alarm_which_somebody_sees() {
     problem(unknown, 404, "unknown_alarm").await;
     problem(service.post(path, &json!({ "by": "" })).await, 422, "invalid").await;
 
-    // In maintenance nothing is charted.
+    // During maintenance no chart changes.
     let window = json!({ "from": time(900_000), "to": time(1_000_000), "reason": "new bearings" });
     created(service.post("/v1/structures/three-dof/maintenance", &window).await).await;
     let answer = service.post_batch("three-dof", &measurements([4.0, 5.0, 5.0], 20, 910_000)).await;
@@ -335,7 +336,7 @@ async fn one_measurement_has_a_mean_and_no_spread() {
     let answer = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 1, 0)).await;
     assert!(answer["assessment"]["parameters"][0]["mean"].is_f64(), "{answer}");
     assert_eq!(answer["assessment"]["parameters"][0]["std"], Value::Null);
-    let refused = service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [answer["batch"]] })).await;
+    let refused = service.post("/v1/structures/three-dof/reference", &json!({ "batches": [answer["batch"]] })).await;
     let refused = problem(refused, 422, "unusable_baseline").await;
     assert!(refused["detail"].as_str().unwrap().contains("at least 10"), "{refused}");
 }
@@ -364,7 +365,7 @@ async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_baseline() 
     let path = format!("/v1/structures/tower-1/batches/{}", answer["batch"].as_str().unwrap());
     assert_eq!(service.read(&path).await["measurements"][0], measurement);
 
-    let baseline = service.post("/v1/structures/tower-1/baseline", &json!({ "batches": [answer["batch"]] })).await;
+    let baseline = service.post("/v1/structures/tower-1/reference", &json!({ "batches": [answer["batch"]] })).await;
     problem(baseline, 409, "no_model").await;
     let mut heavier = definition.clone();
     heavier["mass"][0]["kg"] = json!(101.0);

@@ -41,7 +41,7 @@ async fn each_line_is_answered_in_its_place() {
     wrong["measurements"][1]["frequencies_hz"] = json!([0.4, 0.7]);
     let unknown_key = json!({ "source": "tower", "measurements": [], "colour": "red" });
     let bad_key = json!({ "idempotency_key": "a b", "measurements": line(4, 1)["measurements"] });
-    // A byte order mark, CRLF, blank lines and no newline at the end: as files come.
+    // A byte order mark, CRLF, blank lines and no newline at the end, as files often have.
     let body = format!(
         "\u{feff}{}\r\n\r\n{}\nhello\n{wrong}\n{unknown_key}\n{bad_key}\n[]\n   \n{}",
         line(1, 2),
@@ -118,18 +118,18 @@ async fn limits_of_lines_and_bodies() {
     let taken = answer(post(&service, format!("{}\n{long}\n{}\n", line(1, 2), line(2, 2))).await).await;
     assert_eq!(statuses(&taken), [(1, 201), (2, 413), (3, 201)]);
     assert_eq!(taken["items"][1]["problem"]["code"], "line_too_large");
-    // A body that says it is too large stores nothing.
+    // A body that announces too large a size stores nothing.
     let body =
         problem(post(&service, format!("{}\n{}", line(3, 2), " ".repeat(20_000))).await, 413, "body_too_large").await;
     assert_eq!(body["done"], Value::Null, "{body}");
     assert_eq!(stored(&service).await, 2);
-    // One that does not say tells what was done.
+    // A body without an announced size is answered with what was stored.
     let parts = [format!("{}\n", line(3, 2)), "x".repeat(1_000), " ".repeat(19_500)];
     let stream = futures_util::stream::iter(parts.map(Ok::<_, std::io::Error>));
     let refused = problem(post(&service, reqwest::Body::wrap_stream(stream)).await, 413, "body_too_large").await;
     assert_eq!((&refused["done"]["stored"], statuses(&refused["done"])), (&json!(1), vec![(1, 201)]), "{refused}");
     assert_eq!(stored(&service).await, 3);
-    // So many lines that the answer would be without end.
+    // More lines than the answer may have entries.
     let body = problem(post(&service, "1\n".repeat(10_000) + "2\n").await, 413, "body_too_large").await;
     assert_eq!(body["done"], Value::Null);
 }
@@ -195,7 +195,7 @@ async fn a_client_that_goes_away_stops_it_between_two_lines() {
     }
     assert_eq!(stored(&service).await, 1, "a line is stored before the next has come");
     sending.abort();
-    // The service goes on, and what was done is there.
+    // The service continues, and what was acknowledged is stored.
     let batch = service.read("/v1/structures/three-dof/history").await["items"][0].clone();
     assert_eq!(batch["measurement_count"], 2);
     assert_eq!(answer(post(&service, line(1, 2).to_string()).await).await["replayed"], 1);

@@ -1,4 +1,4 @@
-//! A season's false alarms, their cause, the structure extended by it, and a real loss afterwards: all through HTTP.
+//! Seasonal false alarms, their cause, the structure extended by it, and a real loss afterwards, all through HTTP.
 
 use std::process::Command;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use crate::helpers::{command, created, spawn, Service};
 #[path = "../discrepancy/world.rs"]
 mod world;
 
-/// Two springs of a chain are unknown; the simulation knows nothing of temperature.
+/// Two springs of a chain are unknown; the simulation does not depend on temperature.
 const STRUCTURE: &str = r#"
 id = "soft"
 modes = 3
@@ -42,7 +42,7 @@ fn temperature_c(day: f64) -> f64 {
     10.0 - 13.0 * (std::f64::consts::TAU * day / 365.0).cos()
 }
 
-/// A batch of one day; `k1_factor` is what is left of k1.
+/// A batch of one day; `k1_factor` is the remaining fraction of k1.
 fn batch(day: f64, k1_factor: f64, rng: &mut impl rand::Rng) -> Vec<Value> {
     let mut one = |i: i64| {
         let mut normal = || rng.sample::<f64, _>(StandardNormal);
@@ -58,7 +58,7 @@ fn batch(day: f64, k1_factor: f64, rng: &mut impl rand::Rng) -> Vec<Value> {
     (0..PER_BATCH).map(&mut one).collect()
 }
 
-/// Waits until a path of a diagnosis's answer is no longer "running".
+/// Waits until a state in the answer of a diagnosis is no longer "running".
 async fn finished(service: &Service, id: &str, pointer: &str) -> Value {
     for _ in 0..3_000 {
         let answer = service.read(&format!("/v1/diagnoses/{id}")).await;
@@ -81,7 +81,7 @@ async fn damage_alarms(service: &Service) -> Vec<(String, String)> {
         .collect()
 }
 
-/// Waits until so many batches are assessed under the present version.
+/// Waits until this number of batches is assessed under the present version.
 async fn wait_until_assessed(service: &Service, batches: usize) {
     for _ in 0..600 {
         let history = service.read("/v1/structures/soft/history?limit=1000").await;
@@ -101,7 +101,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     let own = models.join("soft");
     std::fs::create_dir_all(&own).unwrap();
     std::fs::write(own.join("structure.toml"), STRUCTURE).unwrap();
-    // A narrow range of noise: a small training passes its calibration.
+    // With a narrow range of noise, a model with little training passes its calibration.
     let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
         .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", "0.5,2", "--structure"])
         .arg(own.join("structure.toml"))
@@ -125,10 +125,10 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
         let answer = created(service.post(path, &json!({ "measurements": batch(day, 1.0, &mut rng) })).await).await;
         ids.push(answer["batch"].as_str().unwrap().to_owned());
     }
-    // Undamaged: the first winter, and two hot days, so that no batch is beyond the temperatures that were seen: such a one
-    // would raise no alarm anyway.
+    // The undamaged reference: the first winter and two hot days, so that it covers all temperatures. A batch outside
+    // the covered temperatures would raise no alarm.
     let undamaged: Vec<&String> = ids[..20].iter().chain(&ids[60..62]).collect();
-    created(service.post("/v1/structures/soft/baseline", &json!({ "batches": undamaged })).await).await;
+    created(service.post("/v1/structures/soft/reference", &json!({ "batches": undamaged })).await).await;
     wait_until_assessed(&service, ids.len()).await;
     let before = damage_alarms(&service).await;
     println!("damage alarms under the original model: {before:?}");
@@ -151,7 +151,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     assert_eq!(asked.status(), 202);
     let extended = finished(&service, &id, "/extension/state").await;
     println!("{}", extended["extension"]["result"]);
-    // A second one finds the structure changed.
+    // A second extension finds the structure changed.
     assert_eq!(service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await.status(), 409);
     wait_until_assessed(&service, ids.len()).await;
     let since = extended["extension"]["result"]["undamaged_version"].as_i64().unwrap();
@@ -163,7 +163,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     let now = alarms(service.read("/v1/structures/soft/alarms?limit=200").await);
     assert!(now.is_empty(), "alarms of the re-assessed year: {now:?}");
 
-    // The next spring: a tenth of k1 is lost. The service was restarted in between.
+    // The next spring: 10 % of k1 is lost. The service was restarted in between.
     service.stop("TERM");
     let service = start();
     for number in 0..20 {
@@ -177,7 +177,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     assert!(found.contains(&"k1".to_owned()), "the loss of k1 was not alarmed");
     assert!(!found.contains(&"k2".to_owned()), "k2 was alarmed, which lost nothing");
 
-    // A batch without its temperature is taken at all temperatures, and says so.
+    // A batch without a temperature is assessed over all temperatures, with a finding that says so.
     let mut blind = batch(430.0, 0.9, &mut rng);
     for m in &mut blind {
         m["covariates"] = json!({});
@@ -186,7 +186,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     let findings = answer.to_string();
     assert!(findings.contains("covariate_missing"), "{findings}");
 
-    // One step back.
+    // The extension is reverted.
     let back = service.request(reqwest::Method::DELETE, "/v1/structures/soft/extension").send().await.unwrap();
     assert_eq!(back.status(), 200);
     let structure = service.read("/v1/structures/soft").await;
@@ -220,7 +220,7 @@ async fn diagnoses_that_cannot_be_made_say_why() {
     let back = service.request(reqwest::Method::DELETE, "/v1/structures/three-dof/extension").send().await.unwrap();
     assert_eq!(code(back).await, (409, "no_step_back".to_owned()));
 
-    // Too few measurements: the job ends and says how many are needed.
+    // With too few measurements the job ends and reports how many are needed.
     let asked: Value = service.post(path, &json!({})).await.json().await.unwrap();
     let id = asked["diagnosis"].as_str().unwrap();
     let mut answer = service.read(&format!("/v1/diagnoses/{id}")).await;

@@ -1,4 +1,4 @@
-//! Raw measurements out: pages, files, and the way back in.
+//! Export of raw measurements: pages, files, and importing them again.
 
 use std::collections::BTreeSet;
 
@@ -9,7 +9,7 @@ use crate::helpers::{created, measurements, problem, spawn, time, Service};
 const MEASUREMENTS: &str = "/v1/structures/three-dof/measurements";
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
-/// Batches whose times overlap: 4 sources of 7 measurements each, and one with all that a measurement can have.
+/// Batches whose times overlap: 4 sources of 7 measurements each, and one batch with all optional fields.
 async fn with_batches() -> (Service, tempfile::TempDir) {
     let (service, folder) = spawn();
     for source in 0..4 {
@@ -47,7 +47,7 @@ async fn pages_walk_every_measurement_once() {
     let full = all.last().unwrap();
     assert_eq!(full["frequencies_hz"], json!([0.4949, null, 1.2434]));
     assert_eq!((&full["std_hz"], &full["settings"]), (&json!([0.001, null, null]), &json!({ "k2": 5.0 })));
-    // Pages that end inside batches and at their ends.
+    // Pages that end inside batches and at the ends of batches.
     for limit in [1, 3, 7, 28, 29] {
         let (mut walked, mut path) = (Vec::new(), format!("{MEASUREMENTS}?limit={limit}"));
         for _ in 0..40 {

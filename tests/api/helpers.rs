@@ -76,14 +76,14 @@ impl Service {
         self.request(Method::POST, path).header("content-type", content_type).body(body).send().await.unwrap()
     }
 
-    /// Reads JSON that must be there.
+    /// Reads JSON; the answer must be a success.
     pub async fn read(&self, path: &str) -> Value {
         let response = self.get(path).send().await.unwrap();
         assert!(response.status().is_success(), "GET {path}: {}", response.text().await.unwrap());
         response.json().await.unwrap()
     }
 
-    /// Posts a batch that must be taken; returns the answer.
+    /// Posts a batch that must be accepted; returns the answer.
     pub async fn post_batch(&self, structure: &str, measurements: &[Value]) -> Value {
         let body = json!({ "measurements": measurements });
         created(self.post(&format!("/v1/structures/{structure}/batches"), &body).await).await
@@ -95,7 +95,7 @@ impl Service {
         self.child.wait().unwrap();
     }
 
-    /// Sends a signal by name and waits for the end; returns the exit status.
+    /// Sends a signal by name and waits for the process to end; returns its exit status.
     pub fn stop(&mut self, signal: &str) -> std::process::ExitStatus {
         self.signal(signal);
         self.wait(Duration::from_secs(40))
@@ -156,7 +156,8 @@ pub async fn problem(response: Response, status: u16, code: &str) -> Value {
     body
 }
 
-/// Frequencies of `three-dof` by its characteristic polynomial: the tests' own physics, Hz, ascending.
+/// Frequencies of `three-dof` from its characteristic polynomial, Hz, ascending. This is independent of the program's
+/// own physics.
 ///
 /// det(K − λM) = 0 is a cubic in λ with three positive roots, found by bisection between its turning points.
 pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {

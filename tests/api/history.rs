@@ -1,5 +1,6 @@
 //! Pages, filters and CSV of the history.
 
+use reqwest::Method;
 use serde_json::{json, Value};
 
 use crate::helpers::{created, measurements, problem, spawn, Service};
@@ -9,7 +10,7 @@ const HISTORY: &str = "/v1/structures/three-dof/history";
 async fn with_batches(count: usize) -> (Service, tempfile::TempDir) {
     let (service, folder) = spawn();
     let first = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 10, 0)).await;
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [first["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [first["batch"]] })).await).await;
     for i in 1..count {
         service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0 - 0.2 * i as f64], 3, i * 86_400)).await;
     }
@@ -51,7 +52,7 @@ async fn from_and_to_cut_out_a_part_and_a_parameter_is_picked() {
         assert_eq!(parameters.len(), 1);
         assert_eq!(parameters[0]["name"], "k3");
     }
-    // An offset's plus sign that was not escaped is read as one.
+    // An unescaped plus sign of an offset is read as a plus sign.
     let page = service.read(&format!("{HISTORY}?from=2026-01-02T01:00:00+01:00")).await;
     assert_eq!(ids(&page).len(), 4);
 }
@@ -107,5 +108,38 @@ async fn a_query_that_makes_no_sense_is_named() {
         let response = service.get(&format!("{HISTORY}?{query}")).send().await.unwrap();
         let body = problem(response, 422, "invalid").await;
         assert_eq!(body["errors"][0]["pointer"], place, "{body}");
+    }
+}
+
+#[tokio::test]
+async fn the_earlier_name_of_the_reference_route_answers_the_same_and_is_marked_as_deprecated() {
+    let (service, _folder) = spawn();
+    let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 10, 0)).await;
+    let body = json!({ "batches": [batch["batch"]] });
+    let path = |name: &str| format!("/v1/structures/three-dof/{name}");
+    let mut answers = Vec::new();
+    for (method, name) in [(Method::PUT, "reference"), (Method::POST, "reference"), (Method::POST, "baseline")] {
+        let response = service.request(method, &path(name)).json(&body).send().await.unwrap();
+        assert_eq!(response.headers().contains_key("deprecation"), name == "baseline");
+        let mut answer = created(response).await;
+        // Each declaration is a new version, made at another time.
+        answer.as_object_mut().unwrap().retain(|key, _| !["version", "created_at"].contains(&key.as_str()));
+        answers.push(answer);
+    }
+    assert!(answers.windows(2).all(|pair| pair[0] == pair[1]), "{answers:#?}");
+
+    let refused = service.post(&path("baseline"), &json!({ "batches": [] })).await;
+    assert_eq!(refused.headers()["deprecation"], "@1795392000");
+    assert_eq!(refused.headers()["link"], "</v1/structures/three-dof/reference>; rel=\"successor-version\"");
+    problem(refused, 422, "invalid").await;
+
+    let document = service.read("/openapi.json").await;
+    let paths = &document["paths"];
+    let earlier = &paths["/v1/structures/{id}/baseline"]["post"];
+    assert_eq!(earlier["deprecated"], true);
+    for method in ["put", "post"] {
+        let operation = &paths["/v1/structures/{id}/reference"][method];
+        assert_ne!(operation["deprecated"], true);
+        assert_eq!(operation["requestBody"], earlier["requestBody"]);
     }
 }

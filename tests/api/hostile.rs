@@ -1,4 +1,4 @@
-//! Batches that are legal and mean: whatever comes, no answer holds a number that is none.
+//! Extreme but valid batches: no answer contains a number that is not finite.
 
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
@@ -9,7 +9,7 @@ use crate::helpers::{created, measurements, spawn, time};
 /// Frequency and standard deviation of one mode, Hz.
 type Mode = (Option<f64>, Option<f64>);
 
-/// One mode: missing, far off within the limits, or near what the structure has; with or without its noise.
+/// One mode: missing, far from the structure but within the limits, or near it; with or without its standard deviation.
 fn mode(nominal: f64) -> impl Strategy<Value = Mode> {
     let frequency = prop_oneof![
         1 => Just(None),
@@ -29,12 +29,12 @@ fn measurement() -> impl Strategy<Value = [Mode; 3]> {
 fn batch() -> impl Strategy<Value = Vec<[Mode; 3]>> {
     prop_oneof![
         prop::collection::vec(measurement(), 1..12),
-        // The same again and again.
+        // Repeated identical values.
         (measurement(), 1..12_usize).prop_map(|(one, count)| vec![one; count]),
     ]
 }
 
-/// Every probability and share lies in [0, 1], every estimate is a number.
+/// Every probability and fraction lies in [0, 1], and every estimate is finite.
 fn check(answer: &Value) -> Result<(), TestCaseError> {
     let assessment = &answer["assessment"];
     for p in assessment["parameters"].as_array().into_iter().flatten() {
@@ -56,7 +56,7 @@ fn check(answer: &Value) -> Result<(), TestCaseError> {
 async fn no_number_that_is_none_leaves_the_service() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
     let (service, runtime) = (&service, tokio::runtime::Handle::current());
     tokio::task::block_in_place(move || {
         let mut runner = TestRunner::new_with_rng(
@@ -76,7 +76,7 @@ async fn no_number_that_is_none_leaves_the_service() {
                 let response = service.post("/v1/structures/three-dof/batches", &body).await;
                 (response.status().as_u16(), response.json::<Value>().await.unwrap())
             });
-            // Out of the structure's range is refused, never answered with nonsense.
+            // Values outside the range of the structure are refused, never answered with meaningless results.
             prop_assert!(status == 201 || status == 422, "{status}: {answer}");
             check(&answer)
         });

@@ -1,4 +1,4 @@
-//! The API document: valid, complete, and true of the answers.
+//! The OpenAPI document is valid, complete, and agrees with the answers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -104,7 +104,7 @@ async fn the_document_is_whole() {
     }
 }
 
-/// The text of each file of the HTTP door, without comments and unit tests, by its path in the folder.
+/// The text of each file of `src/http`, without comments and unit tests, by its path in the folder.
 fn sources() -> BTreeMap<String, String> {
     fn walk(folder: &Path, prefix: &str, found: &mut BTreeMap<String, String>) {
         for entry in std::fs::read_dir(folder).unwrap() {
@@ -125,7 +125,7 @@ fn sources() -> BTreeMap<String, String> {
     found
 }
 
-/// The router and the document are one, as long as nobody goes past it.
+/// Router and document agree, provided that every route is added through the document.
 #[test]
 fn routes_are_made_with_their_description_only() {
     let mut plain = BTreeMap::new();
@@ -155,10 +155,10 @@ async fn every_code_of_a_problem_is_listed() {
     for (name, text) in sources {
         // `ApiError::new(StatusCode::X, "code", …)` and `invalid("code", …)`, over line breaks too.
         let text = text.split_whitespace().collect::<Vec<_>>().join(" ").replace("( ", "(");
-        // What stands before a code, and which quoted text behind it the code is.
+        // Text before a code, and the number of the quoted text after it that is the code.
         let mut calls = vec![("::new(StatusCode::", 1), ("::invalid(\"", 0), ("::unavailable(\"", 0)];
         match name.as_str() {
-            "access/mod.rs" => calls.push(("=> \"", 0)),
+            "access/control.rs" => calls.push(("=> \"", 0)),
             "access/limit.rs" => calls.push(("Limit::new(\"", 2)),
             "failure.rs" => calls.push(("=> Some(\"", 0)),
             _ => {}
@@ -174,12 +174,12 @@ async fn every_code_of_a_problem_is_listed() {
     sent.retain(|code| code.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_'));
     assert!(sent.len() > 50, "{}: {sent:?}", sent.len());
     let missing: Vec<&String> = sent.iter().filter(|code| !listed.contains(code.as_str())).collect();
-    assert!(missing.is_empty(), "{missing:?} belong into error::CODES");
+    assert!(missing.is_empty(), "{missing:?} belong into problem::CODES");
     let unused: Vec<&&str> = listed.iter().filter(|code| !sent.contains(**code)).collect();
-    assert!(unused.is_empty(), "{unused:?} are in error::CODES, and nothing answers them");
+    assert!(unused.is_empty(), "{unused:?} are in problem::CODES, and nothing answers them");
 }
 
-/// What needs a token says so, with its scope; the rest says that it needs none.
+/// Every operation states whether it needs a token, and which scope.
 #[tokio::test]
 async fn every_operation_says_which_token_it_needs() {
     let (service, _folder) = spawn();
@@ -226,7 +226,7 @@ async fn examples_are_valid() {
         }
     }
     assert!(checked >= 7, "{checked}");
-    // And the service takes those of a batch and of a structure, in every content type.
+    // The service accepts the examples of a batch and of a structure in every content type.
     for (path, method, at) in [
         ("/v1/structures/{id}/batches", "post", "/v1/structures/three-dof/batches"),
         ("/v1/structures/{id}", "put", "/v1/structures/one-mass"),
@@ -246,7 +246,7 @@ async fn examples_are_valid() {
     }
 }
 
-/// Asks, and holds the answer against the document.
+/// Requests a path and checks the answer against the document.
 async fn check(service: &Service, document: &Value, template: &str, path: &str) -> (u16, Value) {
     let answer = service.get(path).send().await.unwrap();
     let status = answer.status().as_u16();
@@ -254,7 +254,7 @@ async fn check(service: &Service, document: &Value, template: &str, path: &str) 
     let schema = response_schema(document, template, "get", status, &content_type);
     let text = answer.text().await.unwrap();
     let validator = validator(document, &schema);
-    // Of lines of JSON the schema is that of a line.
+    // For lines of JSON the schema describes one line.
     let values: Vec<Value> = match content_type.as_str() {
         lines if lines.contains("ndjson") => text.lines().map(|line| serde_json::from_str(line).unwrap()).collect(),
         one if one.contains("json") => vec![serde_json::from_str(&text).unwrap()],
@@ -276,7 +276,7 @@ async fn a_real_answer_of_each_get_is_as_the_document_says() {
     first[0]["std_hz"] = json!([0.001, null, 0.002]);
     first[1]["settings"] = json!({ "k1": 4.0 });
     let first = service.post_batch("three-dof", &first).await;
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [first["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [first["batch"]] })).await).await;
     for i in 1..4 {
         service.post_batch("three-dof", &measurements([4.0, 4.2, 6.0], 12, i * 100_000)).await;
     }
@@ -306,14 +306,14 @@ async fn a_real_answer_of_each_get_is_as_the_document_says() {
     let mut asked = BTreeSet::new();
     for (path, _, _) in operations(&document).iter().filter(|(_, method, _)| method == "get") {
         if path == "/v1/events" {
-            // It does not end.
+            // The stream does not end.
             let answer = service.get(path).send().await.unwrap();
             let content_type = answer.headers()["content-type"].to_str().unwrap();
             response_schema(&document, path, "get", 200, content_type);
             continue;
         }
         if path == "/v1/quarantine/{message}" {
-            // Only a broker brings one.
+            // Messages come only from a broker.
             assert_eq!(check(&service, &document, path, "/v1/quarantine/1").await.0, 404);
             continue;
         }
@@ -354,7 +354,7 @@ async fn a_structure_as_the_schema_has_it_is_what_the_service_gives() {
     assert!(!validator.is_valid(&json!({ "modes": 1 })));
 }
 
-/// What the document allows the service takes, and what it forbids the service refuses.
+/// The service accepts what the document allows, and refuses what it forbids.
 #[tokio::test]
 async fn bodies_are_valid_by_the_document_exactly_when_the_service_takes_them() {
     let (service, _folder) = spawn();
@@ -402,7 +402,7 @@ async fn bodies_are_valid_by_the_document_exactly_when_the_service_takes_them() 
         limited(json!((0..1_001).map(|i| format!("s{i}")).collect::<Vec<_>>())),
     ];
     let mut bearer = String::new();
-    // Tokens last: the first closes the service to those without.
+    // Tokens come last: the first one closes the service to requests without a token.
     for (path, bodies) in [("/v1/webhooks", &webhooks[..]), ("/v1/backups", &backups), ("/v1/tokens", &tokens)] {
         let schema = &document["paths"][path]["post"]["requestBody"]["content"]["application/json"]["schema"];
         let validator = validator(&document, schema);

@@ -1,4 +1,4 @@
-//! Start, stop, health, and what keeps the service from starting.
+//! Start, stop, health, and the conditions under which the service does not start.
 
 use std::io::{Read as _, Write as _};
 use std::process::Stdio;
@@ -29,7 +29,7 @@ async fn health_readiness_version_and_metrics_are_answered() {
     }
 }
 
-/// Every transaction adds a page at least to the log, so the log counts them.
+/// Every transaction adds at least one page to the write-ahead log, so the log counts them.
 #[tokio::test]
 async fn whoever_asks_for_readiness_makes_the_writer_work_once_a_second_at_most() {
     const PAGE_BYTES: u64 = 4_096;
@@ -142,7 +142,7 @@ async fn sigterm_under_load_answers_what_was_taken_and_exits_with_0() {
     assert!(history["items"].as_array().unwrap().len() >= taken, "{taken} were answered 201");
 }
 
-/// What a command that must not start prints; it is ended when it starts all the same.
+/// Output of a command that must not start; it is ended if it does start.
 fn fails(command: &mut std::process::Command) -> String {
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let started = Instant::now();
@@ -215,7 +215,7 @@ async fn a_database_that_is_not_ours_or_cannot_be_written_is_refused_and_left_as
     set(false);
 
     let mut bytes = std::fs::read(&path).unwrap();
-    // The head of a page in the middle: what lies between its head and its rows is not looked at by anybody.
+    // The header of a page in the middle: no check reads the space between its header and its rows.
     let half = bytes.len() / 2 / 4_096 * 4_096;
     bytes[half..half + 2_000].fill(0xa5);
     std::fs::write(&path, &bytes).unwrap();
@@ -320,7 +320,8 @@ fn the_command_line_assesses_what_it_simulates_like_the_service() {
         let (service, _folder) = spawn();
         let path = "/v1/structures/three-dof/batches";
         let first = created(service.post_text(path, "text/csv", undamaged).await).await;
-        created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [first["batch"]] })).await).await;
+        created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [first["batch"]] })).await)
+            .await;
         let online = created(service.post_text(path, "text/csv", damaged).await).await;
         let parameters = online["assessment"]["parameters"].as_array().unwrap();
         assert_eq!(parameters.len(), 3);

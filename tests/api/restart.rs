@@ -37,7 +37,8 @@ async fn every_201_is_in_the_history_exactly_once_whenever_the_service_is_killed
                         if response.status() != 201 {
                             return;
                         }
-                        // The status line is the promise, even where the body breaks off.
+                        // The status line is the acknowledgement, even if the connection breaks before the end of the
+                        // body.
                         let Ok(answer) = response.json::<serde_json::Value>().await else { return };
                         let id = answer["batch"].as_str().unwrap().to_owned();
                         assert!(acknowledged.lock().unwrap().insert(id), "one id was given out twice");
@@ -45,7 +46,7 @@ async fn every_201_is_in_the_history_exactly_once_whenever_the_service_is_killed
                 })
             })
             .collect();
-        // A machine that is busy takes its time for the first answers; the kill comes at a random moment after some.
+        // The first answers may take long on a busy machine; the kill comes at a random moment after some of them.
         let enough = acknowledged.lock().unwrap().len() + LEAST_IN_A_LIFE;
         let deadline = Instant::now() + Duration::from_secs(30);
         while acknowledged.lock().unwrap().len() < enough && Instant::now() < deadline {

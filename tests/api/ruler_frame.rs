@@ -32,7 +32,7 @@ async fn two_laboratories_are_taken_with_their_missing_values() {
     };
     let (service, _folder) = spawn();
     let undamaged = service.post_batch("ruler-frame-4dof", &br[..50]).await;
-    let path = "/v1/structures/ruler-frame-4dof/baseline";
+    let path = "/v1/structures/ruler-frame-4dof/reference";
     created(service.post(path, &json!({ "batches": [undamaged["batch"]] })).await).await;
     let mut left_out = 0;
     for batch in br[50..].chunks(10).chain(de.chunks(10)) {
@@ -40,7 +40,7 @@ async fn two_laboratories_are_taken_with_their_missing_values() {
         assert_eq!(answer["state"], "assessed", "{answer}");
         left_out += answer["assessment"]["measurements_left_out"].as_u64().unwrap();
     }
-    // Rows that lack a mode (four of de) are used; outliers are left out by name.
+    // Rows that lack a mode (four of laboratory de) are used; outliers are excluded by name.
     println!("{left_out} measurements left out");
     let history = service.read("/v1/structures/ruler-frame-4dof/history").await;
     assert_eq!(history["items"].as_array().unwrap().len(), 16);

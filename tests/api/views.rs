@@ -1,4 +1,4 @@
-//! What a dashboard lives on: overview, series, details, jobs and events.
+//! The routes used by the dashboard: overview, series, details, jobs and events.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ use crate::helpers::{created, measurements, problem, spawn, three_dof_hz, time, 
 
 const SERIES: &str = "/v1/structures/three-dof/series";
 
-/// A structure without a trained baseline: its batches are stored and wait.
+/// A structure without a trained model: its batches are stored and wait.
 const BARE: &str = r#"
 id = "bare"
 modes = 2
@@ -30,12 +30,13 @@ async fn put_bare(service: &Service) {
     created(put.body(BARE).send().await.unwrap()).await;
 }
 
-/// Three healthy batches of which the first is the undamaged state, one with a tenth less of k2, and one in rad/s.
+/// Three healthy batches, the first of which is the undamaged reference, one with a loss of 10 % in k2, and one in
+/// rad/s.
 async fn with_a_damage() -> (Service, tempfile::TempDir, Vec<Value>) {
     let (service, folder) = spawn();
     let mut batches = vec![service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await];
     let baseline = json!({ "batches": [batches[0]["batch"]] });
-    created(service.post("/v1/structures/three-dof/baseline", &baseline).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
     for (i, k2) in [(1, 5.0), (2, 5.0), (3, 4.5)] {
         batches.push(service.post_batch("three-dof", &measurements([4.0, k2, 6.0], 20, 100_000 * i)).await);
     }
@@ -134,7 +135,7 @@ async fn a_series_holds_all_that_can_be_drawn_over_time() {
         assert_eq!(track["probability_of_damage"][3], assessed["probability_of_damage"]);
         let interval = [0, 1].map(|end| &assessed["probability_of_damage_interval"][end]);
         assert_eq!([&track["pod_low"][3], &track["pod_high"][3]], interval);
-        // The first is the undamaged state itself, the last is rejected.
+        // The first is the undamaged reference itself, the last is rejected.
         let pod = numbers(&track["probability_of_damage"]);
         assert_eq!(pod.iter().map(Option::is_some).collect::<Vec<_>>(), [false, true, true, true, false], "{pod:?}");
         assert!(track["undamaged_mean"].as_f64().unwrap() > track["threshold"].as_f64().unwrap());
@@ -159,7 +160,7 @@ async fn a_series_holds_all_that_can_be_drawn_over_time() {
     assert_eq!((&alarm["state"], &alarm["ended_at"]), (&json!("open"), &Value::Null));
     assert_eq!(alarm["opened_at"], batches[3]["measured_to"]);
 
-    // A part of it, by the beginning of the batches.
+    // A part of it, selected by the start of the batches.
     let part = service.read(&format!("{SERIES}?from={}&to={}", time(100_000), time(300_000))).await;
     assert_eq!((&part["batches"], &part["from"]), (&json!(2), &json!(time(100_000))));
     assert_eq!(length(&part["alarms"]), 0, "it was opened later");
@@ -250,7 +251,7 @@ async fn a_detail_has_the_densities_of_the_assessment_and_what_they_predict() {
             // Edges of the box lie between places, and the pool's kernels are cut at 4.5 standard deviations.
             assert!((area - 1.0).abs() < 0.03, "the {key} of {name} has area {area}");
         }
-        // By the samples of the assessment, to the bit: the mean of their density is the mean of the pool.
+        // From the samples of the assessment, bit for bit: the mean of their density is the mean of the pooled samples.
         let mean = integral(&|i| grid[i] * posterior[i]) / integral(&|i| posterior[i]);
         let (pooled, std) = (&assessed["pooled"]["mean"], assessed["pooled"]["std"].as_f64().unwrap());
         assert!((mean - pooled.as_f64().unwrap()).abs() < 0.02 * std, "{name}: {mean}, {pooled}, {std}");
@@ -266,7 +267,7 @@ async fn a_detail_has_the_densities_of_the_assessment_and_what_they_predict() {
     }
     assert_eq!(length(&detail["modes"]), 3);
     assert_eq!(service.read(&path).await, detail, "asked again, it answers the same");
-    // Nothing undamaged before there is an undamaged state, and at most 200 values of a mode.
+    // Nothing for the reference before there is one, and at most 200 values of a mode.
     let (service, _folder) = spawn();
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 300, 0)).await;
     let path = format!("/v1/structures/three-dof/batches/{}/detail", batch["batch"].as_str().unwrap());
@@ -329,7 +330,7 @@ async fn events_tell_of_batches_alarms_structures_and_jobs() {
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
     let expected = json!({ "structure": "three-dof", "batch": healthy["batch"], "state": "assessed" });
     assert_eq!(watcher.next().await.unwrap(), ("batch".to_owned(), expected));
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
     assert_eq!(watcher.next().await.unwrap(), ("structure".to_owned(), json!({ "structure": "three-dof" })));
 
     let damaged = service.post_batch("three-dof", &measurements([4.0, 4.4, 6.0], 20, 100_000)).await;
@@ -390,7 +391,7 @@ async fn sigterm_ends_an_open_stream_of_events_and_does_not_wait_for_it() {
     service.signal("TERM");
     assert_eq!(watcher.next().await, None, "it ends as a stream ends, not as a connection that breaks");
     assert!(service.wait(Duration::from_secs(20)).success());
-    // Without an end of its own, the stream would be cut off after the 30 s that open requests get.
+    // If the stream did not end by itself, it would be aborted after the 30 s that open requests have.
     assert!(started.elapsed() < Duration::from_secs(15), "stopping took {:?}", started.elapsed());
 }
 

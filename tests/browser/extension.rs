@@ -102,7 +102,7 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undo
     for number in 0..40 {
         batches.push(service.post_batch("tiny", &batch(6 * number, &mut rng)).await["batch"].clone());
     }
-    created(service.post("/v1/structures/tiny/baseline", &json!({ "batches": &batches[..6] })).await).await;
+    created(service.post("/v1/structures/tiny/reference", &json!({ "batches": &batches[..6] })).await).await;
     let before = service.read("/v1/structures/tiny").await;
 
     let mut page = Page::open();

@@ -71,7 +71,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     let early = created(service.post(BATCHES, &early).await).await;
     assert!(early["received_at"].as_str() < Some("2026"), "the clock is not set back: {early}");
     // What is decided now counts, although it is "earlier" than what was decided before.
-    let declared = service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [undamaged] })).await;
+    let declared = service.post("/v1/structures/three-dof/reference", &json!({ "batches": [undamaged] })).await;
     created(declared).await;
     let path = format!("{BATCHES}/{other}");
     let mut answer = Value::Null;

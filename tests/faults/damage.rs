@@ -30,7 +30,7 @@ async fn filled(folder: &Path) -> Acknowledged {
         acknowledged.add(&given, &answer);
         if number == 3 {
             let ids: Vec<&String> = acknowledged.0.keys().collect();
-            created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": ids })).await).await;
+            created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": ids })).await).await;
         }
     }
     all_assessed(&service, Duration::from_secs(20)).await;

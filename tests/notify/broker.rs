@@ -8,7 +8,7 @@ use std::time::Duration;
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
 use tempfile::TempDir;
 
-/// Where Debian puts it, which is not in everybody's search path.
+/// Its location on Debian, which is not in every search path.
 const PLACES: [&str; 3] = ["mosquitto", "/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"];
 
 pub struct Broker {
@@ -18,7 +18,7 @@ pub struct Broker {
 }
 
 impl Broker {
-    /// A broker on a free port; `None`, with a line, where there is no mosquitto.
+    /// A broker on a free port; `None`, with a message, if mosquitto is not installed.
     pub fn start() -> Option<Self> {
         Self::start_with("")
     }
@@ -45,7 +45,7 @@ impl Broker {
         format!("mqtt://127.0.0.1:{}", self.port)
     }
 
-    /// Ends the broker; what it kept for its clients is lost.
+    /// Ends the broker; the messages that it kept for its clients are lost.
     pub fn stop(&mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();

@@ -1,4 +1,4 @@
-//! Webhooks as a resource: who wants what, and what no webhook may be.
+//! Webhooks as a resource: their filters, and the targets that are refused.
 
 use serde_json::{json, Value};
 
@@ -55,7 +55,7 @@ async fn what_no_webhook_may_be_is_a_422_that_says_why() {
         (json!({ "url": "http://0x0a000001/" }), "/url", "private"),
         (json!({ "url": "ftp://example.org/" }), "/url", "only http and https"),
         (json!({ "url": "https://u:p@example.org/" }), "/url", "user name"),
-        (json!({ "url": "hook" }), "/url", "no URL"),
+        (json!({ "url": "hook" }), "/url", "not a valid URL"),
         (json!({ "url": format!("https://93.184.216.34/{}", "a".repeat(3_000)) }), "/url", "at most 2000"),
         (json!({ "url": "https://93.184.216.34/", "events": ["alarm.closed"] }), "/events/0", "alarm.opened"),
         (json!({ "url": "https://93.184.216.34/", "alarm_kinds": ["fire"] }), "/alarm_kinds/0", "damage"),
@@ -78,7 +78,8 @@ async fn what_no_webhook_may_be_is_a_422_that_says_why() {
     problem(service.get("/v1/quarantine/1").send().await.unwrap(), 404, "unknown_message").await;
 }
 
-/// A webhook made while an address was allowed is not sent to when it no longer is: the address is looked at every time.
+/// A webhook that was created while its address was allowed gets no messages once the address is not: the address is
+/// checked for every message.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_address_that_is_no_longer_allowed_is_not_reached() {
     let folder = tempfile::tempdir().unwrap();

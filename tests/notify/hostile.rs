@@ -1,4 +1,4 @@
-//! Receivers that refuse some messages, or all: what they hold back, and how often they are asked.
+//! Receivers that refuse some or all messages: which other messages they delay, and how often they are contacted.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use crate::helpers::{measurements, Service};
 use crate::receiver::{Answer, Received, Receiver};
 use crate::webhooks::{acknowledge, declare_undamaged, deliveries, settled, start, webhook, HEALTHY};
 
-/// A batch with a loss of all three stiffnesses; the number of alarms it makes.
+/// Posts a batch with a loss of all three stiffnesses; returns the number of alarms.
 async fn damage_everything(service: &Service) -> usize {
     service.post_batch("three-dof", &measurements([3.4, 4.4, 5.2], 20, 100_000)).await;
     let alarms = service.read("/v1/structures/three-dof/alarms").await["items"].as_array().unwrap().len();
@@ -35,7 +35,7 @@ async fn a_refused_message_holds_back_those_of_its_own_alarm_and_no_other() {
     for i in 2..=9 {
         service.post_batch("three-dof", &measurements(HEALTHY, 20, 100_000 * i)).await;
     }
-    // All that the other alarms had to tell has arrived, and the refused message was tried again meanwhile.
+    // All messages of the other alarms have arrived, and the refused message was retried meanwhile.
     settled(&service, &hook, "delivered", 2 * (alarms - 1)).await;
     let refused = eventually("a second attempt", async || {
         let waiting = deliveries(&service, &hook, "pending").await;
@@ -65,9 +65,9 @@ async fn a_receiver_that_refuses_everything_is_left_alone_for_a_pause_after_each
     declare_undamaged(&service).await;
     let alarms = damage_everything(&service).await;
     let received = receiver.wait_for(2 * alarms).await;
-    // Each message has its first attempt before any has a second: none waits behind the failure of another.
+    // Each message has its first attempt before any has a second one: none waits for the failure of another.
     assert_eq!(received[..alarms].iter().map(Received::id).collect::<BTreeSet<_>>().len(), alarms);
-    // The pause is a second here, whatever number of messages wait.
+    // The delay is one second here, however many messages wait.
     let pauses = received.windows(2).map(|pair| pair[1].at - pair[0].at);
     let pauses: Vec<Duration> = pauses.collect();
     assert!(pauses.iter().all(|pause| *pause >= Duration::from_secs(1)), "{pauses:?}");

@@ -1,4 +1,4 @@
-//! The real program, a receiver of webhooks and a real broker: what others are told, and what they tell us.
+//! The real program with a receiver of webhooks and a real MQTT broker.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use helpers::Service;
 
-/// Waits until `found` gives something; panics with `what` after 20 s.
+/// Waits until `found` returns a value; panics with `what` after 20 s.
 async fn eventually<T>(what: &str, mut found: impl AsyncFnMut() -> Option<T>) -> T {
     for _ in 0..400 {
         if let Some(value) = found().await {
@@ -28,7 +28,7 @@ async fn eventually<T>(what: &str, mut found: impl AsyncFnMut() -> Option<T>) ->
     panic!("{what}: not within 20 s");
 }
 
-/// A figure of `/metrics`, by its name and labels as they are written there; 0 while it is not there.
+/// A value of `/metrics` by its name and labels as they are written there; 0 if it does not exist.
 async fn metric(service: &Service, name: &str) -> f64 {
     let text = service.get("/metrics").send().await.unwrap().text().await.unwrap();
     let value = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' ')?.parse().ok());

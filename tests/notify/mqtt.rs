@@ -1,4 +1,5 @@
-//! Batches from a broker: once each, whoever is killed; what is no batch is put aside and stops nothing.
+//! Batches from a broker: each is stored once, also if a program is killed; messages that are not batches are
+//! quarantined and do not block others.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -16,7 +17,7 @@ fn start(data_dir: &Path, broker: &Broker) -> Service {
     Service::spawn(command(data_dir).env("MODALWATCH__MQTT__URL", broker.url()))
 }
 
-/// A batch of three measurements whose times no other `number` has.
+/// A batch of three measurements at times that no other `number` has.
 fn batch(number: usize) -> Vec<u8> {
     json!({ "measurements": measurements([4.0, 5.0, 6.0], 3, number * 2_000) }).to_string().into_bytes()
 }
@@ -57,7 +58,7 @@ async fn a_message_is_a_batch_and_twice_the_same_is_one() {
     assert_eq!(items.len(), 2);
     assert!(items.iter().all(|item| item["state"] == "assessed" && item["measurement_count"] == 3), "{items:?}");
     assert_eq!(items.iter().filter(|item| item["source"] == "gateway-7").count(), 1);
-    // Over HTTP it is known too.
+    // It is recognised over HTTP too.
     let again = service.post("/v1/structures/three-dof/batches", &serde_json::from_slice(&batch(1)).unwrap()).await;
     assert_eq!(again.headers()["idempotency-replayed"], "true");
 }
@@ -100,7 +101,7 @@ async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
         "/sorce: unknown field",
         "/measurements/1/frequencies_hz/2",
         "which has other content",
-        "more than mqtt.max_payload_bytes",
+        "exceeds mqtt.max_payload_bytes",
         "no structure nowhere",
         "structure id",
     ] {
@@ -112,7 +113,7 @@ async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
     let whole = service.read(&format!("/v1/quarantine/{}", large["message"])).await;
     assert_eq!(whole["payload"].as_str().unwrap().len(), 64 * 1024, "its beginning is kept");
 
-    // The same again is counted, not kept twice.
+    // The same message again is counted but not stored twice.
     broker.publish(&[(TOPIC, b"\xff\x00 hello".to_vec())]).await;
     count(&service, "quarantined", 8).await;
     let again = service.read("/v1/quarantine?limit=1000").await;
@@ -134,7 +135,7 @@ async fn a_broker_that_comes_back_without_its_memory_is_subscribed_again() {
     count(&service, "stored", 1).await;
     broker.stop();
     connected(&service, false).await;
-    // Meanwhile the other door is open.
+    // HTTP works meanwhile.
     let body = serde_json::from_slice(&batch(1)).unwrap();
     assert_eq!(service.post("/v1/structures/three-dof/batches", &body).await.status(), 201);
     broker.restart();
@@ -155,7 +156,7 @@ async fn every_message_is_stored_exactly_once_whenever_the_service_is_killed() {
     broker.publish(&messages).await;
     let mut seen = Vec::new();
     for _ in 0..3 {
-        // In the middle of the work: at least one more is stored, and not all are acknowledged.
+        // During processing: at least one more batch is stored, and not all messages are acknowledged.
         eventually("work", async || {
             let working = outcome(&service, "stored").await > 0 || stored(&service).await.len() >= MESSAGES;
             working.then_some(())
@@ -165,7 +166,7 @@ async fn every_message_is_stored_exactly_once_whenever_the_service_is_killed() {
         service.kill();
         service = start(folder.path(), &broker);
     }
-    // While nobody was there, one more came.
+    // One more message was published while the service was down.
     service.kill();
     broker.publish(&[(TOPIC, batch(MESSAGES))]).await;
     service = start(folder.path(), &broker);

@@ -1,4 +1,4 @@
-//! A receiver of webhooks: it notes what comes and answers as it is told to.
+//! A receiver of webhooks that records messages and answers as configured.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
@@ -19,13 +19,13 @@ use crate::eventually;
 #[derive(Debug, Clone)]
 pub enum Answer {
     Status(u16),
-    /// 500 to a body that has this text in it, 200 to others.
+    /// 500 to a body that contains this text, 200 to others.
     Refusing(String),
     RedirectTo(String),
     Never,
 }
 
-/// A message as it came.
+/// A received message.
 #[derive(Debug, Clone)]
 pub struct Received {
     pub at: Instant,
@@ -60,7 +60,7 @@ impl Received {
         self.json()["type"].as_str().unwrap().to_owned()
     }
 
-    /// Whether the library for receivers accepts the signature under a secret.
+    /// Whether the Standard Webhooks library accepts the signature under a secret.
     pub fn is_signed_with(&self, secret: &Value) -> bool {
         let webhook = standardwebhooks::Webhook::new(secret.as_str().unwrap()).unwrap();
         webhook.verify(&self.body, &self.headers).is_ok()
@@ -97,7 +97,7 @@ impl Receiver {
         self.all().into_iter().filter(|r| r.answered == 200).collect()
     }
 
-    /// Waits for so many messages, and returns all there are.
+    /// Waits for this number of messages, and returns all messages received.
     pub async fn wait_for(&self, count: usize) -> Vec<Received> {
         eventually("messages", async || Some(self.all()).filter(|all| all.len() >= count)).await
     }

@@ -1,4 +1,4 @@
-//! Encrypted connections: to those whose certificate is trusted, and to nobody else.
+//! Encrypted connections are made only to servers whose certificate is trusted.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -19,8 +19,8 @@ use crate::receiver::{Answer, Receiver};
 use crate::webhooks::{prepared, webhook};
 use crate::{eventually, metric};
 
-/// Makes `authority.pem` and a certificate of it for localhost, `server.pem` and `server.key`. False, with a line, where there
-/// is no openssl.
+/// Creates `authority.pem` and a certificate of it for localhost, `server.pem` and `server.key`. False, with a message,
+/// if openssl is not installed.
 fn certificates(folder: &Path) -> bool {
     std::fs::write(folder.join("extensions"), "subjectAltName=DNS:localhost\nbasicConstraints=CA:FALSE\n").unwrap();
     let key = "-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
@@ -52,7 +52,7 @@ impl axum::serve::Listener for TlsListener {
     async fn accept(&mut self) -> (Self::Io, Self::Addr) {
         loop {
             let (stream, address) = self.tcp.accept().await.unwrap();
-            // A client that does not trust us goes away in the middle.
+            // A client that does not trust the certificate disconnects during the handshake.
             if let Ok(stream) = self.acceptor.accept(stream).await {
                 return (stream, address);
             }
@@ -144,7 +144,7 @@ async fn a_broker_may_ask_for_a_password_over_an_encrypted_connection() {
     };
     eventually("the batch", stored).await;
 
-    // Without the authority the broker is a stranger, and hears no password.
+    // Without the authority the broker is not trusted and receives no password.
     let other = tempfile::tempdir().unwrap();
     let stranger = start(other.path(), None);
     tokio::time::sleep(std::time::Duration::from_secs(1)).await;

@@ -1,4 +1,4 @@
-//! From an alarm to the receiver: once, signed, in order; whoever fails, and whoever is killed.
+//! From an alarm to the receiver: once, signed, in order, also if the receiver fails or the service is killed.
 
 use std::collections::BTreeSet;
 use std::os::unix::fs::PermissionsExt as _;
@@ -15,7 +15,7 @@ use crate::{eventually, metric};
 pub const HEALTHY: [f64; 3] = [4.0, 5.0, 6.0];
 const DAMAGED: [f64; 3] = [4.0, 4.4, 6.0];
 
-/// A service that may reach this machine and retries every second.
+/// A service that may send to this machine and retries every second.
 pub fn start(data_dir: &Path, settings: &[(&str, &str)]) -> Service {
     Service::spawn(&mut prepared(data_dir, settings))
 }
@@ -33,13 +33,13 @@ pub async fn webhook(service: &Service, url: &str) -> Value {
     created(service.post("/v1/webhooks", &json!({ "url": url })).await).await
 }
 
-/// Declares an undamaged state.
+/// Declares an undamaged reference.
 pub async fn declare_undamaged(service: &Service) {
     let healthy = service.post_batch("three-dof", &measurements(HEALTHY, 50, 0)).await;
-    created(service.post("/v1/structures/three-dof/baseline", &json!({ "batches": [healthy["batch"]] })).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
 }
 
-/// A batch with a loss of k2, which makes alarm 1.
+/// Posts a batch with a loss of k2, which raises alarm 1.
 pub async fn damage(service: &Service) -> Value {
     let answer = service.post_batch("three-dof", &measurements(DAMAGED, 20, 100_000)).await;
     let k2 = answer["charts"].as_array().unwrap().iter().find(|c| c["chart"] == "k2").unwrap();
@@ -93,11 +93,11 @@ async fn an_alarm_is_told_once_signed_and_in_the_order_of_its_life() {
         (&json!("three-dof"), &json!(1), &json!("damage"), &json!("k2"), &json!("open"), &batch["batch"]),
     );
     assert!(data["peak_shift_standard_errors"].as_f64().unwrap() > 3.0, "{event}");
-    // What it links to is the alarm.
+    // Its link leads to the alarm.
     let page = service.read(data["alarm_url"].as_str().unwrap().strip_prefix("https://shm.example.org").unwrap()).await;
     assert_eq!((&page["items"][0]["alarm"], page["items"].as_array().unwrap().len()), (&json!(1), 1));
 
-    // Seen twice, posted twice, and over after some healthy batches: each is told once.
+    // The alarm is acknowledged twice, its batch is posted twice, and healthy batches end it: each event is sent once.
     acknowledge(&service).await;
     acknowledge(&service).await;
     damage(&service).await;
@@ -128,7 +128,7 @@ async fn a_receiver_that_fails_gets_the_same_message_again_and_a_redirect_is_not
     declare_undamaged(&service).await;
     damage(&service).await;
     receiver.wait_for(1).await;
-    // The attempt is written down after the answer has come.
+    // The attempt is stored after the answer has arrived.
     let tried = eventually("an attempt that failed", async || {
         deliveries(&service, &hook, "pending").await.into_iter().find(|d| d["last_status"] == 500)
     });
@@ -160,7 +160,7 @@ async fn a_receiver_that_never_answers_delays_no_other() {
     slow.wait_for(1).await;
     acknowledge(&service).await;
     settled(&service, &fast_hook, "delivered", 2).await;
-    // The other still waits for its answer to the first, and was not sent the second before it.
+    // The other receiver has not yet answered the first message and was not sent the second one.
     assert_eq!(slow.all().len(), 1);
     let waiting = deliveries(&service, &slow_hook, "pending").await;
     assert!(waiting.len() == 2 && waiting.iter().all(|d| d["attempts"] == 0), "{waiting:?}");
@@ -242,7 +242,7 @@ async fn while_secrets_change_over_both_sign_and_only_the_answers_that_make_one_
         assert!(!service.read(path).await.to_string().contains("whsec_"), "{path} shows a secret");
     }
 
-    // The file that has them is its owner's.
+    // Only its owner can read the file that contains them.
     for name in ["modalwatch.sqlite", "modalwatch.sqlite-wal"] {
         let mode = std::fs::metadata(folder.path().join(name)).unwrap().permissions().mode();
         assert_eq!(mode & 0o777, 0o600, "{name}");

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
+use data_encoding::HEXLOWER;
 use serde_json::{json, Value};
 use sha2::{Digest as _, Sha256};
 
@@ -35,8 +36,7 @@ fn put_manifest(models: &Path, manifest: &Value) {
 /// Puts weights there, and into the manifest what they are.
 fn put_weights(models: &Path, weights: &[u8]) {
     let mut manifest = manifest(models);
-    let digest: Vec<String> = Sha256::digest(weights).iter().map(|byte| format!("{byte:02x}")).collect();
-    manifest["weights_sha256"] = json!(digest.concat());
+    manifest["weights_sha256"] = json!(HEXLOWER.encode(&Sha256::digest(weights)));
     std::fs::write(models.join("three-dof/baseline.safetensors"), weights).unwrap();
     put_manifest(models, &manifest);
 }

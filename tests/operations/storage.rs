@@ -46,7 +46,7 @@ async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
     let refused = problem(refused, 507, "disk_full").await;
     assert!(refused["detail"].as_str().unwrap().contains("send it again"), "{refused}");
     let structure = json!({ "batches": ["x"] });
-    assert_ne!(service.post("/v1/structures/three-dof/baseline", &structure).await.status(), 500);
+    assert_ne!(service.post("/v1/structures/three-dof/reference", &structure).await.status(), 500);
     problem(service.post("/v1/backups", &json!({})).await, 507, "disk_full").await;
     let ready = service.get("/readyz").send().await.unwrap();
     assert_eq!(ready.status(), 503);

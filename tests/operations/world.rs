@@ -49,7 +49,7 @@ pub async fn with_past(service: &Service, later: usize) {
     let window = json!({ "from": "2026-01-10T00:00:00Z", "to": "2026-01-11T00:00:00Z", "reason": "new bearings" });
     created(service.post("/v1/structures/three-dof/maintenance", &window).await).await;
     let batches = json!({ "batches": [first["batch"], second["batch"]] });
-    created(service.post("/v1/structures/three-dof/baseline", &batches).await).await;
+    created(service.post("/v1/structures/three-dof/reference", &batches).await).await;
     for i in 0..later {
         let k2 = if i * 2 < later { 5.0 } else { 4.0 };
         service.post_batch("three-dof", &measurements([4.0, k2, 6.0], 10, 86_400 * (i + 2))).await;

@@ -3,9 +3,7 @@
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
 use modalwatch::assessment::NewChartPoint;
-use modalwatch::store::{
-    Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord,
-};
+use modalwatch::store::{Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
 

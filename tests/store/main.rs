@@ -14,7 +14,7 @@ use modalwatch::damage::{ChartReference, Damage, Hyperparameters, QuantityAssess
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
 use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
-use modalwatch::trust::{FindingCode, FindingEffect, Finding, Trust};
+use modalwatch::trust::{Finding, FindingCode, FindingEffect, Trust};
 
 fn bridge() -> StructureId {
     StructureId::parse("bridge").unwrap()

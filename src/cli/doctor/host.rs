@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use reqwest::Method;
+use rustix::process::{getrlimit, Resource};
 use serde_json::Value;
 
 use super::super::remote::{PlaceArgs, Service};
@@ -46,9 +47,7 @@ pub fn clock(newest: Option<Timestamp>) -> Check {
 
 /// Files that this process may open, against the connections that it is set to take.
 pub fn open_files(config: &Config) -> Check {
-    let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
-    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files"));
-    let soft = line.and_then(|line| line.split_whitespace().next()?.parse::<usize>().ok());
+    let soft = getrlimit(Resource::Nofile).current.and_then(|files| usize::try_from(files).ok());
     let needed = config.http.max_connections + OTHER_FILES;
     match soft {
         Some(soft) if soft < needed => {

@@ -1,4 +1,4 @@
-//! Where a request comes from, behind proxies or not.
+//! The address of a client, with or without proxies.
 
 use std::convert::Infallible;
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
@@ -15,23 +15,23 @@ use crate::quantity::shown;
 #[error("{0} is neither an address (10.0.0.7) nor a network (10.0.0.0/24)")]
 pub struct NotANetwork(String);
 
-/// Who asks, for limits and audit.
+/// The client of a request, for rate limits and audit.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Client {
     /// Address of the client, behind trusted proxies.
     pub address: Option<IpAddr>,
-    /// Under what its requests are counted.
+    /// Key under which its requests are counted.
     pub(super) key: Key,
 }
 
-/// Under what requests are counted: the token, else the address.
+/// Key under which requests are counted: the token, otherwise the address.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum Key {
     /// A token by its id.
     Token(String),
-    /// An address; of IPv6 the network of 64 bits, which one customer has.
+    /// An address; for IPv6 its /64 network, which usually belongs to one customer.
     Address(IpAddr),
-    /// Everybody else: clients without an address, and those beyond what is remembered.
+    /// Shared by clients without an address and those above the number of tracked clients.
     Others,
 }
 
@@ -67,12 +67,12 @@ impl<S: Send + Sync> FromRequestParts<S> for Client {
     }
 }
 
-/// The proxies whose `X-Forwarded-For` is believed.
+/// Proxies whose `X-Forwarded-For` header is trusted.
 #[derive(Debug, Default)]
 pub(super) struct Proxies(Vec<IpNet>);
 
 impl Proxies {
-    /// Reads addresses and networks.
+    /// Parses addresses and networks.
     pub(super) fn parse(texts: &[String]) -> Result<Self, NotANetwork> {
         let network = |text: &String| {
             let network = text.parse::<IpNet>().or_else(|_| text.parse::<IpAddr>().map(IpNet::from));
@@ -89,8 +89,9 @@ impl Proxies {
         self.0.iter().any(|network| network.contains(&address.to_canonical()))
     }
 
-    /// The address of the client: that of the connection, or, where it is a trusted proxy's, the last one in
-    /// `X-Forwarded-For` that is none. What stands before that one is the client's own word.
+    /// The address of the client: the peer address, or, if that is a trusted proxy, the last address in
+    /// `X-Forwarded-For` that is not a trusted proxy. Addresses before that one were sent by the client and are not
+    /// trusted.
     pub(super) fn client(&self, request: &Request) -> Option<IpAddr> {
         let peer = request.extensions().get::<ConnectInfo<SocketAddr>>()?.0.ip().to_canonical();
         if !self.trust(peer) {
@@ -109,7 +110,8 @@ impl Proxies {
     }
 }
 
-/// Whether a `Host` is this machine by address or by a name that no name server outside gives: `localhost`, a bare name.
+/// Whether a `Host` names this machine: a loopback address, `localhost`, or a name without a dot, which no public name
+/// server resolves.
 pub(super) fn is_local_name(host: &str) -> bool {
     if let Some(rest) = host.strip_prefix('[') {
         let address = rest.split(']').next().unwrap_or_default();

@@ -1,14 +1,14 @@
-//! Headers that every answer carries, unless its handler set them otherwise.
+//! Security headers of every answer, unless its handler sets them.
 
 use axum::extract::Request;
 use axum::http::{header, HeaderMap, HeaderName, HeaderValue};
 use axum::middleware::Next;
 use axum::response::Response;
 
-/// Pages that set no policy of their own: files of this service only.
+/// Content security policy of pages that do not set one: only files of this service.
 const PAGE_POLICY: &str = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; \
      object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
-/// All else is data: a browser that shows it loads and runs nothing.
+/// Content security policy of all other answers: a browser that shows them loads and runs nothing.
 const DATA_POLICY: &str = "default-src 'none'; frame-ancestors 'none'";
 
 const ALWAYS: [(HeaderName, &str); 5] = [
@@ -19,7 +19,7 @@ const ALWAYS: [(HeaderName, &str); 5] = [
     (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
 ];
 
-/// The middleware. (`Strict-Transport-Security` is set by the proxy that has the certificate.)
+/// Middleware that adds the headers. (`Strict-Transport-Security` belongs to the proxy that terminates TLS.)
 pub async fn secure(request: Request, next: Next) -> Response {
     let api = request.uri().path().starts_with("/v1");
     let mut response = next.run(request).await;

@@ -1,4 +1,4 @@
-//! How often: the generic cell rate algorithm (a leaky bucket), by token or address, in bounded memory.
+//! Rate limits: the generic cell rate algorithm (a leaky bucket) per token or address, in bounded memory.
 
 use std::net::IpAddr;
 use std::num::NonZeroU32;
@@ -8,35 +8,15 @@ use std::time::{Duration, Instant};
 use axum::http::{HeaderName, HeaderValue, StatusCode};
 use governor::clock::{Clock as _, DefaultClock};
 use governor::{DefaultKeyedRateLimiter, Quota, RateLimiter};
-use serde::{Deserialize, Serialize};
 
 use super::client::Key;
 use crate::http::error::ApiError;
+use crate::http::settings::RateLimitSettings;
 
-/// Clients that a limit remembers at a time; those beyond share one allowance.
+/// Number of clients that a limit tracks separately; further clients share one allowance.
 const MOST_KEYS: usize = 20_000;
-/// How often what is forgotten anyway is thrown away.
+/// Interval at which clients with a full allowance are removed.
 const PURGE_EVERY: Duration = Duration::from_secs(10);
-
-/// How much one client may ask for; a client is a token, else an address.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RateLimitSettings {
-    /// Requests a second over time; 0 sets no limit.
-    pub requests_per_s: u32,
-    /// Requests at once.
-    pub burst: u32,
-    /// Measurements a second over time; 0 sets no limit. The largest batch always fits in at once.
-    pub measurements_per_s: u32,
-    /// Unknown tokens from one address a minute; 0 sets no limit.
-    pub failed_authentications_per_min: u32,
-}
-
-impl Default for RateLimitSettings {
-    fn default() -> Self {
-        Self { requests_per_s: 0, burst: 200, measurements_per_s: 0, failed_authentications_per_min: 10 }
-    }
-}
 
 /// All limits of the service.
 pub(super) struct Limits {
@@ -61,12 +41,12 @@ impl Limits {
         }
     }
 
-    /// One request.
+    /// Counts one request.
     pub(super) fn take_request(&self, key: &Key) -> Result<(), ApiError> {
         self.requests.as_ref().map_or(Ok(()), |limit| limit.take(key, NonZeroU32::MIN))
     }
 
-    /// The measurements of a batch.
+    /// Counts the measurements of a batch.
     pub(super) fn take_measurements(&self, key: &Key, count: usize) -> Result<(), ApiError> {
         let (Some(limit), Some(count)) = (&self.measurements, u32::try_from(count).ok().and_then(NonZeroU32::new))
         else {
@@ -75,7 +55,7 @@ impl Limits {
         limit.take(key, count)
     }
 
-    /// One token that is not known.
+    /// Counts one failed authentication.
     pub(super) fn count_failure(&self, address: Option<IpAddr>) -> Result<(), ApiError> {
         self.failures.as_ref().map_or(Ok(()), |limit| limit.take(&Key::of_address(address), NonZeroU32::MIN))
     }
@@ -111,7 +91,7 @@ impl Limit {
     fn take(&self, key: &Key, count: NonZeroU32) -> Result<(), ApiError> {
         self.purge();
         let key = if self.buckets.len() < MOST_KEYS { key } else { &Key::Others };
-        // More than ever fits in at once is taken as what fits: a batch is refused by its own limit, not by this one.
+        // A count above the burst size is reduced to it: the size of a batch has a limit of its own.
         let count = count.min(self.quota.burst_size());
         let Ok(Err(not_until)) = self.buckets.check_key_n(key, count) else { return Ok(()) };
         let wait = not_until.wait_time_from(self.clock.now());
@@ -120,7 +100,7 @@ impl Limit {
         Err(self.refusal(wait_s))
     }
 
-    /// Throws away, now and then, what has refilled: it is as if it had never been.
+    /// Removes clients with a full allowance from time to time; a client that was never seen has one too.
     fn purge(&self) {
         let now_s = self.started.elapsed().as_secs();
         let last_s = self.purged_at_s.load(Ordering::Relaxed);

@@ -1,28 +1,28 @@
-//! What each route needs: by rule, so that a route that nobody thought of is never open.
+//! The scope that each route needs. It follows from rules, so that a new route is never open by accident.
 
 use axum::http::Method;
 
 use crate::access::{Need, Scope};
 
-/// Routes that need no token. They show nothing of any structure.
+/// Routes that need no token. They reveal nothing about any structure.
 const OPEN: [&str; 6] = ["/", "/healthz", "/readyz", "/version", "/openapi.json", "/docs"];
-/// Folders of files that need no token.
+/// Paths of files that need no token.
 const OPEN_FOLDERS: [&str; 2] = ["/assets/", "/docs/"];
 /// Methods that change something.
 const CHANGES: [Method; 4] = [Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
-/// Routes that take batches.
+/// Routes that accept batches.
 const INGEST: [&str; 1] = ["/v1/structures/{id}/batches"];
-/// Below `/v1`: what shows or changes the service itself, and needs admin even to read.
+/// Collections below `/v1` that concern the service itself. Reading them needs the scope admin too.
 const SERVICE: [&str; 6] = ["tokens", "audit", "webhooks", "backups", "quarantine", "retention"];
-/// Lists over all structures whose handlers leave out what the token may not see.
+/// Lists over all structures. Their handlers omit what the token may not see.
 const FILTERED: [&str; 4] = ["/v1/structures", "/v1/overview", "/v1/jobs", "/v1/events"];
 
-/// What a route is about; the id is in the path.
+/// What a route is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AboutWhat {
-    /// The structure that the first parameter names.
+pub enum Subject {
+    /// The structure named by the first path parameter.
     Structure,
-    /// The structure of the diagnosis that the first parameter names.
+    /// The structure of the diagnosis named by the first path parameter.
     Diagnosis,
     /// A list that the handler filters.
     Filtered,
@@ -30,27 +30,27 @@ pub enum AboutWhat {
     Service,
 }
 
-/// What a route needs, and what it is about.
+/// Scope that a route needs, and what it is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Class {
     /// The scope.
     pub need: Need,
     /// The structure.
-    pub about: AboutWhat,
+    pub about: Subject,
 }
 
-/// The class of a route by method and pattern; where there is no route (404), nothing is needed.
+/// Class of a route by method and pattern. An unknown path (404) needs nothing.
 pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
     let Some(pattern) = pattern else {
-        return Class { need: Need::Nothing, about: AboutWhat::Service };
+        return Class { need: Need::Nothing, about: Subject::Service };
     };
     let reads = method == Method::GET || method == Method::HEAD;
     let open = OPEN.contains(&pattern) || OPEN_FOLDERS.iter().any(|folder| pattern.starts_with(folder));
     let mut segments = pattern.trim_start_matches('/').split('/');
     let (version, collection, id) = (segments.next(), segments.next(), segments.next());
     let in_service = version == Some("v1") && collection.is_some_and(|c| SERVICE.contains(&c));
-    // They take GET alone; any other method is told so (405) rather than asked for a token. `tests/access` has a table of all
-    // routes and their methods, so that one that changes something cannot come to be open unseen.
+    // Open routes support only GET; other methods are answered 405 rather than 401. `tests/access` has a table of all
+    // routes and their methods, so that a route that changes something cannot become open unnoticed.
     let need = if open {
         Need::Nothing
     } else if reads && !in_service && (version == Some("v1") || pattern == "/metrics") {
@@ -61,15 +61,15 @@ pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
         Need::Scope(Scope::Admin)
     };
     let about = match (version, collection, id) {
-        (Some("v1"), Some("structures"), Some(id)) if id.starts_with('{') => AboutWhat::Structure,
-        (Some("v1"), Some("diagnoses"), Some(id)) if id.starts_with('{') => AboutWhat::Diagnosis,
-        _ if reads && FILTERED.contains(&pattern) => AboutWhat::Filtered,
-        _ => AboutWhat::Service,
+        (Some("v1"), Some("structures"), Some(id)) if id.starts_with('{') => Subject::Structure,
+        (Some("v1"), Some("diagnoses"), Some(id)) if id.starts_with('{') => Subject::Diagnosis,
+        _ if reads && FILTERED.contains(&pattern) => Subject::Filtered,
+        _ => Subject::Service,
     };
     Class { need, about }
 }
 
-/// Whether a request of this class belongs into the audit.
+/// Whether a request of this class is recorded in the audit.
 pub fn is_change(method: &Method, class: Class) -> bool {
     class.need == Need::Scope(Scope::Admin) && CHANGES.contains(method)
 }
@@ -85,7 +85,7 @@ mod tests {
         assert_eq!(need(Method::GET, "/secret"), admin);
         assert_eq!(need(Method::POST, "/v1/anything"), admin);
         assert_eq!(need(Method::GET, "/v1/anything"), Need::Scope(Scope::Read));
-        assert_eq!(classify(&Method::GET, Some("/v1/anything")).about, AboutWhat::Service);
+        assert_eq!(classify(&Method::GET, Some("/v1/anything")).about, Subject::Service);
         assert_eq!(need(Method::GET, "/docsecret"), admin);
         assert_eq!(need(Method::GET, "/v1/webhooks/{id}"), admin);
         assert_eq!(need(Method::from_bytes(b"PROPFIND").unwrap(), "/v1/structures"), admin);

@@ -8,7 +8,7 @@ use super::lines::line_of;
 use crate::monitor::assessor::Assessor;
 use crate::monitor::error::Error;
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::archive::{End, Head, Model, Record, FORMAT, NOT_CARRIED};
+use crate::store::archive::{ArchivedModel, End, Head, Record, FORMAT, NOT_CARRIED};
 
 /// Lines buffered between store and reader.
 const BUFFERED: usize = 64;
@@ -29,7 +29,7 @@ pub(super) async fn export(
             if let Some(files) = files.map_err(|_| Error::Panicked)?.ok().flatten() {
                 let version = baseline.manifest().structure_digest.to_string();
                 let accepted = !baseline.manifest().calibration.failures.is_empty();
-                models.push(Model::new(&version, digest.as_str(), &files.manifest, &files.weights, accepted));
+                models.push(ArchivedModel::new(&version, digest.as_str(), &files.manifest, &files.weights, accepted));
             }
         }
     }

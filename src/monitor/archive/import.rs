@@ -17,7 +17,7 @@ use crate::monitor::replay::Replay;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::archive::{Acknowledged, Batch, Model, Record};
+use crate::store::archive::{Acknowledged, ArchivedModel, Batch, Record};
 
 /// Lines buffered between the file and the store.
 const BUFFERED: usize = 64;
@@ -143,7 +143,8 @@ impl Import<'_> {
                 self.done.undamaged_states += u64::from(store.archive().import_undamaged(&structure, state).await?);
             }
             Record::Maintenance(window) => {
-                self.done.maintenance_windows += u64::from(store.archive().import_maintenance(&structure, window).await?);
+                self.done.maintenance_windows +=
+                    u64::from(store.archive().import_maintenance(&structure, window).await?);
             }
             Record::Acknowledgement(note) => self.acknowledgements.push(note),
         }
@@ -159,7 +160,7 @@ impl Import<'_> {
     }
 
     /// Stores a trained baseline that is not stored yet, after its self-test.
-    async fn take_model(&mut self, model: Model) -> Result<(), ImportError> {
+    async fn take_model(&mut self, model: ArchivedModel) -> Result<(), ImportError> {
         let structure = self.done.structure.clone();
         let library = self.assessor.structures.library();
         let here = library.get(&structure).and_then(|entry| entry.baseline.as_ref());
@@ -184,7 +185,8 @@ impl Import<'_> {
         if loaded.digest().as_str() != model.model_digest {
             return Err(invalid(&"a trained baseline does not match its digest").into());
         }
-        self.done.models += u64::from(self.assessor.store.archive().import_model(&structure, model, Timestamp::now()).await?);
+        self.done.models +=
+            u64::from(self.assessor.store.archive().import_model(&structure, model, Timestamp::now()).await?);
         Ok(())
     }
 

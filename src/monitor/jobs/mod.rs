@@ -168,7 +168,10 @@ impl Jobs {
             let stored = match kind {
                 JobKind::Diagnosis => jobs.store.diagnoses().finish_diagnosis(&id, output, Timestamp::now()).await,
                 JobKind::Extension => {
-                    jobs.store.diagnoses().finish_extension(&id, output.map(|(result, _)| result), Timestamp::now()).await
+                    jobs.store
+                        .diagnoses()
+                        .finish_extension(&id, output.map(|(result, _)| result), Timestamp::now())
+                        .await
                 }
             };
             if let Err(failure) = stored {
@@ -191,7 +194,8 @@ impl Jobs {
         simulator: Simulator,
         request: DiagnosisRequest,
     ) -> Result<Study, String> {
-        let measurements = self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
+        let measurements =
+            self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
         Ok(Study { id, simulator, measurements, request, progress: self.progress.clone() })
     }
 

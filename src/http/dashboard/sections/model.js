@@ -269,7 +269,7 @@ async function declare(structure, changed) {
       const batches = [...list.querySelectorAll("input:checked")].map((box) => box.value);
       if (batches.length === 0)
         throw Object.assign(new Error("Choose at least one batch."), { title: "No batch chosen" });
-      return send(at(structure, "/baseline"), { batches, threshold_probability: Number(p.replace(",", ".")) / 100 });
+      return send(at(structure, "/reference"), { batches, threshold_probability: Number(p.replace(",", ".")) / 100 });
     },
   });
   if (done) {

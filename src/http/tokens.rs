@@ -1,4 +1,4 @@
-//! `/v1/tokens`: make, list, rotate and revoke. A secret is in one answer, the one that makes it, and nowhere else.
+//! `/v1/tokens`: creates, lists, rotates and revokes tokens. A secret is shown once, in the answer that creates it.
 
 use std::collections::BTreeSet;
 
@@ -10,43 +10,42 @@ use axum::Json;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::AccessControl;
-use crate::access::{NewToken, Scope, TokenId, TokenRecord, TokenTable, TokenText};
-use crate::http::error::ApiError;
-use crate::http::openapi::{BodyRefused, Conflict, TokenPath, Unknown};
-use crate::http::request::{json_body, whole_number, ApiPath};
-use crate::http::Shared;
-use crate::quantity::{shown, StructureId, Timestamp};
+use super::error::ApiError;
+use super::openapi::{BodyRefused, Conflict, TokenPath, Unknown};
+use super::request::{json_body, whole_number, ApiPath};
+use super::shared::Shared;
+use crate::access::{NewToken, Scope, TokenRecord, TokenText};
+use crate::quantity::{StructureId, Timestamp};
 
-/// Seconds that the old secret stays good after a rotation, unless the client says otherwise.
+/// Time for which the previous secret stays valid after a rotation by default, seconds.
 const DEFAULT_OVERLAP_S: i64 = 3_600;
 /// Longest overlap: 30 days.
 const LONGEST_OVERLAP_S: i64 = 30 * 86_400;
 
-/// A token to make.
+/// Body of a request for a token.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = TokenInput)]
 struct TokenBody {
-    /// For people: who or what has it. It is shown in lists, logs and the audit.
+    /// Name of the holder. It is shown in lists, logs and the audit.
     #[schema(min_length = 1, max_length = 100, pattern = "^[^\\x00-\\x1f\\x7f-\\x9f]+$")]
     name: String,
     #[schema(min_items = 1)]
     scopes: Vec<Scope>,
-    /// The only structures it is for; all without.
+    /// Structures to which the token is limited. Default: all.
     #[schema(min_items = 1, max_items = 1000)]
     structures: Option<Vec<String>>,
-    /// Until when it is good, in the future: RFC 3339 with an offset; for ever without.
+    /// When the token expires: in the future, RFC 3339 with a UTC offset. Default: never.
     #[schema(value_type = Option<String>, format = DateTime)]
     expires_at: Option<String>,
 }
 
-/// How to rotate; `{}` is enough.
+/// Body of a request for a rotation; may be `{}`.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = RotationInput)]
 struct RotationBody {
-    /// Seconds that the old secret stays good; 3600 without.
+    /// Time for which the previous secret stays valid, seconds. Default 3600.
     #[schema(minimum = 0, maximum = 2_592_000)]
     #[serde(default, deserialize_with = "whole_number")]
     overlap_s: Option<u64>,
@@ -59,7 +58,7 @@ struct TokenItem {
     id: String,
     name: String,
     scopes: Vec<Scope>,
-    /// The only structures; `null` stands for all.
+    /// Structures to which the token is limited; `null` means all.
     #[schema(required)]
     structures: Option<Vec<StructureId>>,
     /// `active`, `expired` or `revoked`.
@@ -69,12 +68,12 @@ struct TokenItem {
     expires_at: Option<Timestamp>,
     #[schema(required)]
     revoked_at: Option<Timestamp>,
-    /// Until when the secret before the last rotation is good.
+    /// Until when the secret from before the last rotation is valid.
     #[schema(required)]
     old_secret_until: Option<Timestamp>,
 }
 
-/// All tokens, the oldest first.
+/// All tokens, oldest first.
 #[derive(Debug, Serialize, ToSchema)]
 struct TokenList {
     items: Vec<TokenItem>,
@@ -86,7 +85,7 @@ struct TokenList {
 struct Issued {
     #[serde(flatten)]
     item: TokenItem,
-    /// Shown this once.
+    /// The token. It cannot be read again.
     token: String,
 }
 
@@ -107,10 +106,10 @@ impl From<&TokenRecord> for TokenItem {
     }
 }
 
-/// `GET /v1/tokens`: all tokens, the oldest first.
+/// `GET /v1/tokens`: all tokens, oldest first.
 #[utoipa::path(
     get, path = "/v1/tokens", tag = "access", operation_id = "list_tokens",
-    summary = "All tokens", description = "Without their secrets, the oldest first.",
+    summary = "All tokens", description = "All tokens without their secrets, oldest first.",
     responses((status = 200, description = "The tokens", body = TokenList))
 )]
 pub async fn list(State(shared): State<Shared>) -> Response {
@@ -119,15 +118,15 @@ pub async fn list(State(shared): State<Shared>) -> Response {
     Json(TokenList { items }).into_response()
 }
 
-/// `POST /v1/tokens`: 201 with the token, shown this once.
+/// `POST /v1/tokens`: 201 with the token, which cannot be read again.
 ///
 /// # Errors
 /// 400, 415, 422 for the body.
 #[utoipa::path(
     post, path = "/v1/tokens", tag = "access", operation_id = "create_token",
-    summary = "Make a token",
-    description = "Its secret is in this answer and in no other. The first token closes the service to everybody without one, \
-                   and must have the scope `admin`, no `structures` and no `expires_at`.",
+    summary = "Create a token",
+    description = "The secret is contained only in this answer. The first token closes the service to everybody without a token. It \
+                   must have the scope `admin`, no `structures` and no `expires_at`.",
     request_body(content = TokenBody, example = json!({"name": "gateway", "scopes": ["ingest"], "structures": ["three-dof"]})),
     responses(
         (status = 201, description = "The token with its secret", body = Issued,
@@ -154,14 +153,14 @@ pub async fn create(State(shared): State<Shared>, headers: HeaderMap, body: Body
     Ok(issued(StatusCode::CREATED, &record, &text))
 }
 
-/// `POST /v1/tokens/{id}/rotation`: a new secret, shown this once; the old one stays good for `overlap_s`.
+/// `POST /v1/tokens/{id}/rotation`: creates a new secret; the previous one stays valid for `overlap_s`.
 ///
 /// # Errors
-/// 404, 409 for a token that is not active, 422 for the overlap.
+/// 404, 409 if the token is not active, 422 for the overlap.
 #[utoipa::path(
     post, path = "/v1/tokens/{id}/rotation", tag = "access", operation_id = "rotate_token",
-    summary = "Give a token another secret",
-    description = "The new secret is in this answer and in no other; the old one stays good for `overlap_s`.",
+    summary = "Rotate the secret of a token",
+    description = "Creates a new secret, which is contained only in this answer. The previous one stays valid for `overlap_s`.",
     params(TokenPath),
     request_body(content = RotationBody, example = json!({"overlap_s": 600})),
     responses(
@@ -186,13 +185,13 @@ pub async fn rotate(
     Ok(issued(StatusCode::CREATED, &record, &text))
 }
 
-/// `DELETE /v1/tokens/{id}`: revoked from now on; a second time changes nothing.
+/// `DELETE /v1/tokens/{id}`: revokes the token immediately. Revoking it again changes nothing.
 ///
 /// # Errors
-/// 404, 409 for the last token that manages the service.
+/// 404, 409 if it is the last token that can manage the service.
 #[utoipa::path(
     delete, path = "/v1/tokens/{id}", tag = "access", operation_id = "revoke_token",
-    summary = "Revoke a token", description = "From now on; a second time changes nothing.",
+    summary = "Revoke a token", description = "Takes effect immediately. Revoking it again changes nothing.",
     params(TokenPath),
     responses((status = 200, description = "The token", body = TokenItem), Unknown, Conflict)
 )]
@@ -205,73 +204,4 @@ fn issued(status: StatusCode, record: &TokenRecord, text: &TokenText) -> Respons
     let location = [(header::LOCATION, format!("/v1/tokens/{}", record.id))];
     let body = Issued { item: TokenItem::from(record), token: text.reveal() };
     (status, location, Json(body)).into_response()
-}
-
-/// Each change reaches the store first and memory after, one at a time. They run inside the task of the audit, which no
-/// client can end halfway.
-impl AccessControl {
-    async fn create_token(&self, new: NewToken) -> Result<(TokenRecord, TokenText), ApiError> {
-        let _one = self.0.changing.lock().await;
-        let now = Timestamp::now();
-        let problems = new.problems(now);
-        if !problems.is_empty() {
-            return Err(ApiError::invalid_input(problems));
-        }
-        let text = TokenText::generate().map_err(|e| ApiError::internal(&e))?;
-        let record = new.record(&text, now);
-        if self.is_open() && !(record.manages_service() && record.expires_at.is_none()) {
-            let detail =
-                "the first token closes the service to everybody without one: it must have the scope admin, no \
-                          structures and no expires_at, so that others can be made";
-            return Err(ApiError::invalid("first_token_must_be_admin", detail, Vec::new()));
-        }
-        self.0.store.tokens().insert_token(&record).await?;
-        self.remember(record.clone());
-        Ok((record, text))
-    }
-
-    async fn rotate_token(&self, id: &str, overlap_s: i64) -> Result<(TokenRecord, TokenText), ApiError> {
-        let _one = self.0.changing.lock().await;
-        let (record, now) = (self.stored_token(id)?, Timestamp::now());
-        if !record.is_active(now) {
-            let detail = format!("token {id} is {}: make a new one", record.state(now));
-            return Err(ApiError::new(StatusCode::CONFLICT, "token_not_active", detail));
-        }
-        let text = TokenText::with_id(record.id.clone()).map_err(|e| ApiError::internal(&e))?;
-        let until = Timestamp::from_micros(now.micros() + overlap_s * 1_000_000);
-        let rotated = record.rotated(&text, until.map_err(|e| ApiError::internal(&e))?);
-        self.0.store.tokens().update_token(&rotated).await?;
-        self.remember(rotated.clone());
-        Ok((rotated, text))
-    }
-
-    async fn revoke_token(&self, id: &str) -> Result<TokenRecord, ApiError> {
-        let _one = self.0.changing.lock().await;
-        let (record, now) = (self.stored_token(id)?, Timestamp::now());
-        if record.revoked_at.is_some() {
-            return Ok(record);
-        }
-        let others = |tokens: &TokenTable| {
-            tokens.records().any(|other| other.id != record.id && other.manages_service() && other.is_active(now))
-        };
-        let last = record.manages_service() && record.is_active(now) && self.0.file_token.is_empty();
-        if last && !self.read_tokens(others) {
-            let detail = "this is the last token that manages the service: make another one with the scope admin first";
-            return Err(ApiError::new(StatusCode::CONFLICT, "last_admin_token", detail));
-        }
-        let revoked = TokenRecord { revoked_at: Some(now), ..record };
-        self.0.store.tokens().update_token(&revoked).await?;
-        self.remember(revoked.clone());
-        Ok(revoked)
-    }
-
-    fn stored_token(&self, id: &str) -> Result<TokenRecord, ApiError> {
-        let found = TokenId::parse(id).ok().and_then(|id| self.read_tokens(|tokens| tokens.get(&id).cloned()));
-        let detail = || format!("there is no token {}", shown(id));
-        found.ok_or_else(|| ApiError::new(StatusCode::NOT_FOUND, "unknown_token", detail()))
-    }
-
-    fn remember(&self, record: TokenRecord) {
-        self.0.tokens.write().expect("no holder of the lock panics").insert(record);
-    }
 }

@@ -1,0 +1,223 @@
+//! Tokens, rate limits and trusted proxies of the service, and the authentication of requests.
+
+use std::net::{IpAddr, SocketAddr};
+use std::path::Path;
+use std::sync::{Arc, RwLock};
+
+use axum::http::{header, HeaderMap, HeaderValue, StatusCode};
+use tracing::{info, warn};
+
+use super::client::{is_local_name, Client, NotANetwork, Proxies};
+use super::limit::Limits;
+use crate::access::{
+    read_admin_token, AccessSettings, Actor, AdminFileError, Grant, Refused, TokenRecord, TokenTable, TokenText,
+};
+use crate::http::error::ApiError;
+use crate::http::settings::HttpSettings;
+use crate::monitor::Reason;
+use crate::quantity::Timestamp;
+use crate::store::{self, Store};
+
+/// Why the service does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Everybody could reach the service and change everything.
+    #[error(
+        "{address} can be reached from other machines, and there is no token: create one with \
+         `modalwatch token create --name me --scope admin --data-dir {data_dir}`, or set \
+         MODALWATCH_ADMIN_TOKEN_FILE, or listen on 127.0.0.1 (access.insecure_public = true allows this without a token)"
+    )]
+    PublicWithoutTokens {
+        /// Address on which the service would listen.
+        address: SocketAddr,
+        /// Folder of the database.
+        data_dir: String,
+    },
+    /// Requests come through a proxy, so that the listen address does not restrict who can reach the service.
+    #[error(
+        "http.trusted_proxies names a proxy, and there is no token: everybody who reaches the proxy could change everything; \
+         create one with `modalwatch token create --name me --scope admin --data-dir {data_dir}`"
+    )]
+    ProxyWithoutTokens {
+        /// Folder of the database.
+        data_dir: String,
+    },
+    /// The admin token file cannot be used.
+    #[error(transparent)]
+    AdminFile(#[from] AdminFileError),
+    /// A trusted proxy is not an address or network.
+    #[error("http.trusted_proxies: {0}")]
+    Proxy(#[from] NotANetwork),
+    /// The tokens cannot be read.
+    #[error(transparent)]
+    Store(#[from] store::Error),
+}
+
+/// Tokens, rate limits and audit of the service. Cloning is cheap.
+#[derive(Clone)]
+pub struct AccessControl(pub(super) Arc<Inner>);
+
+pub(super) struct Inner {
+    pub(super) store: Store,
+    /// Stored tokens; changed only by `issue`, which changes the store first.
+    pub(super) tokens: RwLock<TokenTable>,
+    /// The token of the admin token file, if there is one.
+    pub(super) file_token: TokenTable,
+    /// Held while tokens are changed.
+    pub(super) changing: tokio::sync::Mutex<()>,
+    pub(super) insecure_public: bool,
+    pub(super) proxies: Proxies,
+    pub(super) limits: Limits,
+}
+
+impl AccessControl {
+    /// Reads the tokens and checks whether the service may listen on `address` with them.
+    ///
+    /// # Errors
+    /// [`Error`], with the remedy.
+    pub async fn open(
+        store: Store,
+        settings: &AccessSettings,
+        http: &HttpSettings,
+        (address, data_dir): (SocketAddr, &Path),
+        largest_batch: usize,
+    ) -> Result<Self, Error> {
+        let tokens: TokenTable = store.tokens().list().await?.into_iter().collect();
+        let file_token: TokenTable =
+            settings.admin_token_file.as_deref().map(read_admin_token).transpose()?.into_iter().collect();
+        let proxies = Proxies::parse(&http.trusted_proxies)?;
+        let without = tokens.is_empty() && file_token.is_empty();
+        let data_dir = || data_dir.display().to_string();
+        if without && settings.insecure_public {
+            warn!(%address, "INSECURE: access.insecure_public is set and there is no token: everybody who reaches {address} may change everything");
+        } else if without && !address.ip().is_loopback() {
+            return Err(Error::PublicWithoutTokens { address, data_dir: data_dir() });
+        } else if without && !proxies.is_empty() {
+            return Err(Error::ProxyWithoutTokens { data_dir: data_dir() });
+        } else if without {
+            info!("There is no token: programs on this machine may change everything, others cannot reach the service");
+        }
+        Ok(Self(Arc::new(Inner {
+            store,
+            tokens: RwLock::new(tokens),
+            file_token,
+            changing: tokio::sync::Mutex::default(),
+            insecure_public: settings.insecure_public,
+            proxies,
+            limits: Limits::new(&http.rate_limit, largest_batch),
+        })))
+    }
+
+    /// Findings for `/readyz`.
+    pub fn findings(&self) -> Vec<Reason> {
+        if self.is_open() && self.0.insecure_public {
+            vec![Reason::new("insecure", "there is no token, and access.insecure_public allows every request")]
+        } else {
+            Vec::new()
+        }
+    }
+
+    /// Whether requests need no token.
+    pub(super) fn is_open(&self) -> bool {
+        self.0.file_token.is_empty() && self.read_tokens(TokenTable::is_empty)
+    }
+
+    /// What `read` returns for the stored tokens.
+    pub fn read_tokens<T>(&self, read: impl FnOnce(&TokenTable) -> T) -> T {
+        read(&self.0.tokens.read().expect("no holder of the lock panics"))
+    }
+
+    /// The grant of a token.
+    fn holder(&self, text: &TokenText) -> Result<Grant, Refused> {
+        let now = Timestamp::now();
+        let from_file = self.0.file_token.authenticate(text, now).map(TokenRecord::grant);
+        let stored = self.read_tokens(|tokens| tokens.authenticate(text, now).map(TokenRecord::grant));
+        from_file.or(stored)
+    }
+
+    /// Whether a grant is still valid: for answers that continue, such as an event stream.
+    pub fn still_holds(&self, grant: &Grant) -> bool {
+        let Actor::Token { id, .. } = grant.actor() else {
+            return *grant == Grant::nobody() || self.is_open();
+        };
+        let now = Timestamp::now();
+        let active = |tokens: &TokenTable| tokens.records().any(|t| t.id.as_str() == id && t.is_active(now));
+        active(&self.0.file_token) || self.read_tokens(active)
+    }
+
+    /// Counts measurements against the rate limit of the client.
+    ///
+    /// # Errors
+    /// 429 if the limit is exceeded.
+    pub fn take_measurements(&self, client: &Client, count: usize) -> Result<(), ApiError> {
+        self.0.limits.take_measurements(&client.key, count)
+    }
+
+    pub(super) fn grant(&self, headers: &HeaderMap, client: Option<IpAddr>) -> Result<Grant, ApiError> {
+        if self.is_open() {
+            return if self.0.insecure_public { Ok(Grant::local()) } else { directly_from_here(headers) };
+        }
+        let mut given = headers.get_all(header::AUTHORIZATION).iter();
+        let (Some(value), None) = (given.next(), given.next()) else {
+            return Err(unauthorized("this request needs a token: send it as Authorization: Bearer mw_…", None));
+        };
+        let bearer = value.to_str().ok().and_then(|text| text.split_once(' '));
+        let Some((_, text)) = bearer.filter(|(scheme, _)| scheme.eq_ignore_ascii_case("bearer")) else {
+            return Err(unauthorized("only bearer tokens are accepted: Authorization: Bearer mw_…", None));
+        };
+        let Ok(text) = TokenText::parse(text.trim()) else {
+            return Err(self.failed(client, &Refused::Unknown));
+        };
+        self.holder(&text).map_err(|refused| self.failed(client, &refused))
+    }
+
+    /// 401 for an invalid token, and 429 for an address that tries many of them.
+    ///
+    /// A valid token is always accepted, also from such an address: many clients may share it.
+    fn failed(&self, client: Option<IpAddr>, refused: &Refused) -> ApiError {
+        let code = match refused {
+            Refused::Unknown => "unauthorized",
+            Refused::Expired(_) | Refused::RotatedOut(_) => "token_expired",
+            Refused::Revoked(_) => "token_revoked",
+        };
+        metrics::counter!("modalwatch_authentication_failures_total", "code" => code).increment(1);
+        if *refused == Refused::Unknown {
+            if let Err(error) = self.0.limits.count_failure(client) {
+                return error;
+            }
+        }
+        unauthorized(&refused.to_string(), Some(code))
+    }
+}
+
+/// Grant of a request to an open service: only for programs on this machine, and not for pages of other web sites in a
+/// browser on it.
+fn directly_from_here(headers: &HeaderMap) -> Result<Grant, ApiError> {
+    let forwarded = ["forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via"];
+    if forwarded.into_iter().any(|name| headers.contains_key(name)) {
+        let detail =
+            "this request came through a proxy, and without tokens only this machine is served: create a token first \
+                      (modalwatch token create)";
+        return Err(unauthorized(detail, None));
+    }
+    let host = |name: header::HeaderName| headers.get(name).map(|value| value.to_str().unwrap_or(".").to_owned());
+    // `Host` differs if the page's domain name resolves to this machine (DNS rebinding), `Origin` for any other page.
+    let foreign = host(header::HOST).is_some_and(|host| !is_local_name(&host))
+        || host(header::ORIGIN).is_some_and(|origin| !is_local_name(origin.split("//").last().unwrap_or(".")));
+    if foreign {
+        let detail =
+            "this request comes from a page of another web site or uses another host name than localhost, and without tokens \
+             only this machine is served: create a token first (modalwatch token create)";
+        return Err(ApiError::new(StatusCode::FORBIDDEN, "forbidden_origin", detail));
+    }
+    Ok(Grant::local())
+}
+
+fn unauthorized(detail: &str, code: Option<&'static str>) -> ApiError {
+    let challenge = match code {
+        None => HeaderValue::from_static("Bearer realm=\"modalwatch\""),
+        Some(_) => HeaderValue::from_static("Bearer realm=\"modalwatch\", error=\"invalid_token\""),
+    };
+    ApiError::new(StatusCode::UNAUTHORIZED, code.unwrap_or("unauthorized"), detail)
+        .with_header(header::WWW_AUTHENTICATE, challenge)
+}

@@ -1,0 +1,68 @@
+//! The audit entry of a request that changes something: written before the request is answered, completed with its status
+//! afterwards. No change goes unrecorded, whatever happens to the client, the connection or the process in between.
+
+use axum::extract::Request;
+use axum::http::header;
+use axum::middleware::Next;
+use axum::response::{IntoResponse as _, Response};
+use tracing::{error, Instrument as _};
+
+use super::client::Client;
+use super::control::AccessControl;
+use crate::access::Grant;
+use crate::http::error::ApiError;
+use crate::http::request_id::{current_id, with_current_id};
+use crate::monitor::stored::NewAuditEntry;
+use crate::quantity::Timestamp;
+
+/// Maximum length of a stored path, characters.
+const LONGEST_SUBJECT: usize = 300;
+
+/// Audit entry of a request that changes something.
+pub(super) fn entry(
+    grant: &Grant,
+    client: &Client,
+    request: &Request,
+    pattern: &str,
+    structure: Option<String>,
+) -> NewAuditEntry {
+    let path = request.uri().path();
+    NewAuditEntry {
+        at: Timestamp::now(),
+        actor: grant.actor().as_str().to_owned(),
+        actor_name: grant.actor().name().map(str::to_owned),
+        peer: client.address.map(|address| address.to_string()),
+        request_id: current_id(),
+        action: format!("{} {pattern}", request.method()),
+        structure: structure.map(|id| id.chars().take(LONGEST_SUBJECT).collect()),
+        subject: Some(path.chars().take(LONGEST_SUBJECT).collect()),
+    }
+}
+
+/// Writes the entry, answers the request and adds its status, in a task that continues when the client disconnects.
+pub(super) async fn run(access: &AccessControl, entry: NewAuditEntry, request: Request, next: Next) -> Response {
+    let (store, id) = (access.0.store.clone(), current_id().unwrap_or_default());
+    let task = async move {
+        let number = match store.audit().begin_audit(entry).await {
+            Ok(number) => number,
+            // A change that cannot be recorded is not made.
+            Err(error) => return Ok(ApiError::from(error).into_response()),
+        };
+        // A second task, so that the entry is completed if the handler panics.
+        let answering = with_current_id(current_id().unwrap_or_default(), next.run(request)).in_current_span();
+        let answered = tokio::spawn(answering).await;
+        let status = answered.as_ref().map_or(500, |response| response.status().as_u16());
+        let made = answered.as_ref().ok().and_then(|response| response.headers().get(header::LOCATION));
+        let made = made.and_then(|value| value.to_str().ok()).map(str::to_owned);
+        if let Err(cause) = store.audit().end_audit(number, status, made).await {
+            // The entry exists and the change is made: the client receives its result.
+            error!(%cause, number, status, "Could not write the outcome of audit entry {number}: {cause}");
+        }
+        answered
+    };
+    match tokio::spawn(with_current_id(id, task).in_current_span()).await.and_then(|answered| answered) {
+        Ok(response) => response,
+        Err(ended) if ended.is_panic() => std::panic::resume_unwind(ended.into_panic()),
+        Err(ended) => ApiError::internal(&ended).into_response(),
+    }
+}

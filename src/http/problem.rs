@@ -1,0 +1,175 @@
+//! Problems (RFC 9457) and the answer to many batches, which contain each other.
+
+use axum::http::StatusCode;
+use serde::Serialize;
+use utoipa::openapi::schema::{Object, ObjectBuilder, Type};
+use utoipa::ToSchema;
+
+use crate::assessment::BatchState;
+use crate::measurement::check::Problem;
+
+/// Media type of every answer that reports a problem.
+pub const PROBLEM_JSON: &str = "application/problem+json";
+
+/// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
+pub const CODES: [(&str, StatusCode, &str); 63] = [
+    ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
+    ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
+    ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
+    ("token_in_address", StatusCode::BAD_REQUEST, "the URL contains a token; send it in the Authorization header"),
+    ("unauthorized", StatusCode::UNAUTHORIZED, "this request needs a token"),
+    ("token_expired", StatusCode::UNAUTHORIZED, "the token, or its secret from before the last rotation, has expired"),
+    ("token_revoked", StatusCode::UNAUTHORIZED, "the token was revoked"),
+    ("forbidden_scope", StatusCode::FORBIDDEN, "the token does not have the required scope"),
+    ("forbidden_structure", StatusCode::FORBIDDEN, "the token is limited to other structures"),
+    (
+        "forbidden_origin",
+        StatusCode::FORBIDDEN,
+        "without tokens the service answers only this machine, and no pages of other web sites",
+    ),
+    ("unknown_route", StatusCode::NOT_FOUND, "this path does not exist"),
+    ("unknown_structure", StatusCode::NOT_FOUND, "there is no structure with this id"),
+    ("unknown_batch", StatusCode::NOT_FOUND, "the structure has no such batch"),
+    ("unknown_alarm", StatusCode::NOT_FOUND, "the structure has no such alarm"),
+    ("unknown_diagnosis", StatusCode::NOT_FOUND, "there is no diagnosis with this id"),
+    ("unknown_token", StatusCode::NOT_FOUND, "there is no token with this id"),
+    ("unknown_webhook", StatusCode::NOT_FOUND, "there is no webhook with this id"),
+    ("unknown_delivery", StatusCode::NOT_FOUND, "the webhook has no such delivery"),
+    ("unknown_message", StatusCode::NOT_FOUND, "there is no quarantined message with this number"),
+    ("unknown_asset", StatusCode::NOT_FOUND, "the dashboard has no such file"),
+    (
+        "method_not_allowed",
+        StatusCode::METHOD_NOT_ALLOWED,
+        "the path does not support this method; see the Allow header",
+    ),
+    ("not_acceptable", StatusCode::NOT_ACCEPTABLE, "the service cannot write the requested format"),
+    ("body_timeout", StatusCode::REQUEST_TIMEOUT, "the body did not arrive in time"),
+    ("no_model", StatusCode::CONFLICT, "the structure has no trained model in use"),
+    ("structure_in_use", StatusCode::CONFLICT, "the structure has batches under another definition"),
+    ("no_report", StatusCode::CONFLICT, "the diagnosis has no report yet"),
+    ("no_extension", StatusCode::CONFLICT, "the diagnosis cannot be extended"),
+    ("version_changed", StatusCode::CONFLICT, "the structure was changed to another version in the meantime"),
+    ("no_step_back", StatusCode::CONFLICT, "the structure extends no earlier version"),
+    ("not_assessed", StatusCode::CONFLICT, "the batch has no assessment by the trained model in use"),
+    ("model_refused", StatusCode::CONFLICT, "the new trained model was refused; the previous one stays in use"),
+    ("definition_refused", StatusCode::CONFLICT, "this version of the program does not accept the stored definition"),
+    ("backup_running", StatusCode::CONFLICT, "a backup is being made"),
+    ("backup_exists", StatusCode::CONFLICT, "a backup with this name exists"),
+    ("token_not_active", StatusCode::CONFLICT, "the token was revoked or has expired"),
+    ("last_admin_token", StatusCode::CONFLICT, "this is the last token that can manage the service"),
+    ("too_many_webhooks", StatusCode::CONFLICT, "the maximum number of webhooks exists"),
+    ("already_delivered", StatusCode::CONFLICT, "the receiver has accepted the delivery"),
+    ("body_too_large", StatusCode::PAYLOAD_TOO_LARGE, "the body is larger than the limit"),
+    ("line_too_large", StatusCode::PAYLOAD_TOO_LARGE, "a line of NDJSON is larger than the limit"),
+    ("too_many_lines", StatusCode::PAYLOAD_TOO_LARGE, "the NDJSON has more lines than the limit"),
+    ("unsupported_media_type", StatusCode::UNSUPPORTED_MEDIA_TYPE, "the media type in Content-Type is not supported"),
+    ("unsupported_encoding", StatusCode::UNSUPPORTED_MEDIA_TYPE, "compressed bodies are not supported"),
+    ("invalid", StatusCode::UNPROCESSABLE_ENTITY, "a value is invalid; `errors` lists each one"),
+    ("invalid_id", StatusCode::UNPROCESSABLE_ENTITY, "the text is not a valid structure id"),
+    ("invalid_structure", StatusCode::UNPROCESSABLE_ENTITY, "the definition of the structure has errors"),
+    ("idempotency_key_reused", StatusCode::UNPROCESSABLE_ENTITY, "the key belongs to a batch with other content"),
+    (
+        "measurement_exists",
+        StatusCode::UNPROCESSABLE_ENTITY,
+        "a measurement is already stored in a batch with other content",
+    ),
+    ("unusable_baseline", StatusCode::UNPROCESSABLE_ENTITY, "the batches cannot be used as the undamaged reference"),
+    (
+        "too_many_measurements",
+        StatusCode::UNPROCESSABLE_ENTITY,
+        "the batches have more measurements than one diagnosis can use",
+    ),
+    ("first_token_must_be_admin", StatusCode::UNPROCESSABLE_ENTITY, "the first token must be able to create others"),
+    ("too_many_requests", StatusCode::TOO_MANY_REQUESTS, "the limit of requests is exceeded; see Retry-After"),
+    (
+        "too_many_measurements_a_second",
+        StatusCode::TOO_MANY_REQUESTS,
+        "the limit of measurements is exceeded; see Retry-After",
+    ),
+    (
+        "too_many_failures",
+        StatusCode::TOO_MANY_REQUESTS,
+        "too many failed authentications from one address; see Retry-After",
+    ),
+    ("internal", StatusCode::INTERNAL_SERVER_ERROR, "an internal error; the log has its cause under the request id"),
+    ("queue_full", StatusCode::SERVICE_UNAVAILABLE, "the queue of assessments is full; see Retry-After"),
+    ("too_many_streams", StatusCode::SERVICE_UNAVAILABLE, "the maximum number of event streams is open"),
+    ("stopping", StatusCode::SERVICE_UNAVAILABLE, "the service is stopping"),
+    ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; nothing was stored"),
+    ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing was stored"),
+    ("database_busy", StatusCode::SERVICE_UNAVAILABLE, "the database is busy; nothing was stored"),
+    ("database_gone", StatusCode::SERVICE_UNAVAILABLE, "the database was deleted or replaced; nothing was stored"),
+    ("disk_full", StatusCode::INSUFFICIENT_STORAGE, "the disk is full; nothing was stored"),
+];
+
+/// A problem (RFC 9457, `application/problem+json`). It has no `type`; `title` is the name of the HTTP status, and
+/// programs should decide by `code`.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Problem)]
+pub struct ProblemBody {
+    /// Name of the status.
+    pub(super) title: &'static str,
+    /// The HTTP status.
+    #[schema(minimum = 400, maximum = 599)]
+    pub(super) status: u16,
+    /// What happened and how to correct it, for people.
+    pub(super) detail: String,
+    #[schema(schema_with = code_schema)]
+    pub(super) code: &'static str,
+    /// Each error with its location in the request.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(super) errors: Vec<Problem>,
+    /// Id of the request, as in the header `X-Request-Id` and in the log.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) request_id: Option<String>,
+    /// Only for a request with many batches that stopped early: what was done before.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) done: Option<Box<BulkAnswer>>,
+}
+
+/// Outcome of each line of a request with many batches.
+#[derive(Debug, Default, Serialize, ToSchema)]
+pub struct BulkAnswer {
+    /// One entry for each non-blank line, in order.
+    pub(super) items: Vec<BulkItem>,
+    /// Number of lines whose batch was stored by this request.
+    pub(super) stored: usize,
+    /// Number of lines whose batch was already stored.
+    pub(super) replayed: usize,
+    /// Number of lines that were refused.
+    pub(super) refused: usize,
+}
+
+/// Outcome of one line.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct BulkItem {
+    /// Line number in the body, starting at 1.
+    pub(super) line: usize,
+    /// Status with which this batch alone would have been answered.
+    pub(super) status: u16,
+    /// Id of the batch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) batch: Option<String>,
+    /// Processing state of the batch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) state: Option<BatchState>,
+    /// Whether the batch was already stored.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) replayed: Option<bool>,
+    /// Path of the batch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) location: Option<String>,
+    /// Why the line was refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(no_recursion)]
+    pub(super) problem: Option<Box<ProblemBody>>,
+}
+
+fn code_schema() -> Object {
+    let meaning =
+        |(code, status, meaning): &(&str, StatusCode, &str)| format!("- `{code}` ({}): {meaning}", status.as_u16());
+    let meanings: Vec<String> = CODES.iter().map(meaning).collect();
+    let codes = CODES.iter().map(|(code, ..)| *code);
+    let description = format!("Stable name of the problem:\n\n{}", meanings.join("\n"));
+    ObjectBuilder::new().schema_type(Type::String).enum_values(Some(codes)).description(Some(description)).build()
+}

@@ -1,0 +1,25 @@
+//! What every handler works with.
+
+use std::sync::Arc;
+
+use metrics_exporter_prometheus::PrometheusHandle;
+use tokio::sync::Semaphore;
+
+use super::access::AccessControl;
+use super::request::BodyLimits;
+use crate::monitor::Monitor;
+use crate::notify::Notifier;
+
+/// State that every handler receives.
+#[derive(Clone)]
+pub struct Shared {
+    pub(super) monitor: Monitor,
+    pub(super) notifier: Notifier,
+    pub(super) metrics: Arc<PrometheusHandle>,
+    pub(super) limits: BodyLimits,
+    /// Permits for event streams.
+    pub(super) streams: Arc<Semaphore>,
+    /// Permits for reading a series.
+    pub(super) series: Arc<Semaphore>,
+    pub(super) access: AccessControl,
+}
