@@ -7,10 +7,10 @@ use clap::Args;
 
 use super::measurements::read_measurements;
 use super::model::load;
+use crate::assessment::{self, Draws};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::measurement::MeasurementBatch;
-use crate::monitor::assess::{self, Draws};
-use crate::monitor::MonitorSettings;
+use crate::quantity::Timestamp;
 
 /// Assess measurements without a service.
 #[derive(Debug, Args)]
@@ -49,18 +49,14 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let model = load(&args.structure, args.model.as_deref())?;
     let undamaged_batch = read_batch(args, &args.reference, &model)?;
     let batch = read_batch(args, &args.data, &model)?;
-    let draws = |batch: &MeasurementBatch| Draws {
-        per_measurement: MonitorSettings::default().draws_per_measurement,
-        for_population: MonitorSettings::default().draws_for_population,
-        seed: assessment_seed(&batch.content_digest(), model.digest()),
-    };
+    let draws = |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), model.digest()));
     let undamaged_draws = draws(&undamaged_batch);
     let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
-    let mut undamaged = assess::undamaged_state(&model, &batches, args.threshold_probability)
+    let mut undamaged = assessment::undamaged_state(&model, &batches, args.threshold_probability)
         .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
-    let context = assess::Context { undamaged: Some(&undamaged), previous: None };
-    let assessment = assess::assess(&model, &batch.measurements, context, draws(&batch))?;
+    let context = assessment::Context { undamaged: Some(&undamaged), previous: None };
+    let assessment = assessment::assess(&model, &batch.measurements, context, draws(&batch), Timestamp::now())?;
 
     if args.json {
         let report = serde_json::json!({ "undamaged": undamaged, "assessment": assessment });

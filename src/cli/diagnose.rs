@@ -295,15 +295,8 @@ fn read_rows(
     time_column: Option<&str>,
     tables: &mut Tables,
 ) -> anyhow::Result<()> {
-    let expectation = Expectation {
-        modes: simulator.modes(),
-        frequency_limits_hz: simulator.frequency_limits_hz(),
-        covariates: &tables.covariates,
-        instrumented: simulator.instrumented_points(),
-        space: simulator.space(),
-        now: Timestamp::now(),
-        max_measurements: usize::MAX,
-    };
+    let expectation =
+        Expectation { covariates: &tables.covariates, ..simulator.expectation(Timestamp::now(), usize::MAX) };
     let mut times = BTreeSet::new();
     let (mut empty, mut local, mut moved, mut earlier_rows) = (0, 0, 0, 0_i64);
     for (path, bytes) in files {

@@ -56,7 +56,7 @@ impl Reloading {
             error!("SIGHUP: the old configuration stays in force: {problem}");
             return before;
         }
-        monitor.set_retention(new.retention);
+        monitor.upkeep().retention().set(new.retention);
         monitor.store().file().set_limits(&new.store);
         info!(changed = ?now, "SIGHUP: applied {}", if now.is_empty() { "no changes".to_owned() } else { now.join(", ") });
         if !later.is_empty() {
