@@ -3,8 +3,9 @@
 
 use std::path::{Path, PathBuf};
 
-use figment::providers::{Env, Format as _, Serialized, Toml};
+use figment::providers::{Env, Format, Serialized};
 use figment::Figment;
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::access::AccessSettings;
@@ -124,6 +125,19 @@ pub enum Error {
         /// Values that are allowed.
         must: &'static str,
     },
+}
+
+/// TOML for figment. Its own feature `toml` would bring an older version of the parser into the build.
+struct Toml;
+
+impl Format for Toml {
+    type Error = toml::de::Error;
+
+    const NAME: &'static str = "TOML";
+
+    fn from_str<T: DeserializeOwned>(text: &str) -> Result<T, Self::Error> {
+        toml::from_str(text)
+    }
 }
 
 impl Config {

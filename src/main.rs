@@ -1,24 +1,24 @@
-//! The program: hands its arguments to `cli`.
+//! The program: sets up the threads and runs the command of `cli`.
 
 use std::process::ExitCode;
 
-// The C library's allocator keeps the memory of large bodies for the thread that read them, and ever more of it.
+// The allocator of the C library keeps the memory of large request bodies for the thread that read them, and does not return it.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    // candle splits even tiny products over its own thread pool, which costs more than it gains at our sizes. It reads this
-    // variable at its first product; our own pool is made before.
     let cores = core_affinity::get_core_ids().unwrap_or_default();
     let keep_to_core = move |thread: usize| {
-        // Only where all the cores are ours: with a quota of some, several programs would keep to the same.
+        // Only if the pool uses all cores: with fewer threads, several programs would be pinned to the same cores.
         if rayon::current_num_threads() == cores.len() {
             core_affinity::set_for_current(cores[thread]);
         }
     };
-    // Left to the scheduler, both threads of a computation of milliseconds are often woken on the core of the one that wakes the
-    // other, and stay there until its next tick while another core is idle.
+    // Without pinning, the scheduler often starts two threads of a short computation on the same core and leaves them there for
+    // milliseconds, while another core is idle.
     let _ = rayon::ThreadPoolBuilder::new().start_handler(keep_to_core).build_global();
+    // candle splits even small matrix products over several threads, which is slower at our sizes. It reads this variable at its
+    // first product; the pool above has been built before.
     if std::env::var_os("RAYON_NUM_THREADS").is_none() {
         std::env::set_var("RAYON_NUM_THREADS", "1");
     }
@@ -31,11 +31,11 @@ fn main() -> ExitCode {
     }
 }
 
-/// The chain of causes, without those whose text the one above them quotes already.
+/// The chain of causes in one line, without causes that the messages before them already contain.
 fn message(error: &anyhow::Error) -> String {
-    error.chain().map(ToString::to_string).fold(String::new(), |said, cause| match said.as_str() {
+    error.chain().map(ToString::to_string).fold(String::new(), |text, cause| match text.as_str() {
         "" => cause,
-        said if said.contains(&cause) => said.to_owned(),
-        said => format!("{said}: {cause}"),
+        text if text.contains(&cause) => text.to_owned(),
+        text => format!("{text}: {cause}"),
     })
 }

@@ -7,35 +7,35 @@ use anyhow::Context as _;
 use clap::Args;
 use reqwest::Method;
 
-use super::remote::PlaceArgs;
+use super::remote::LocationArgs;
 use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::monitor::Monitor;
 use crate::quantity::StructureId;
 use crate::store::{Error, Store, DATABASE_FILE};
 
-/// Write one structure into a file.
+/// Write one structure with all its data to a file.
 #[derive(Debug, Args)]
 pub struct ExportArgs {
-    /// The structure
+    /// Id of the structure
     #[arg(long, value_parser = parse_id)]
     structure: StructureId,
-    /// The file; lines of JSON
+    /// File to write; one JSON object per line
     #[arg(long)]
     out: PathBuf,
     #[command(flatten)]
-    place: PlaceArgs,
+    location: LocationArgs,
 }
 
-/// Take a file that `export` wrote. The service must be stopped.
+/// Read a file that `modalwatch export` wrote. The service must be stopped.
 #[derive(Debug, Args)]
 pub struct ImportArgs {
-    /// The file
+    /// File to read
     #[arg(long)]
     from: PathBuf,
     #[command(flatten)]
-    place: PlaceArgs,
-    /// Print what was done as JSON
+    location: LocationArgs,
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
@@ -44,13 +44,14 @@ fn parse_id(text: &str) -> Result<StructureId, String> {
     StructureId::parse(text).map_err(|e| e.to_string())
 }
 
-/// Writes the archive of a structure: asks the service that has the folder open, or else reads the folder itself.
+/// Writes the archive of a structure. If a service has the data folder open, the archive is requested from it, otherwise it is
+/// read from the folder.
 ///
 /// # Errors
-/// Whatever keeps the file from being whole; there is none then.
+/// Whatever prevents a complete archive; then no file is written.
 pub async fn export(args: &ExportArgs) -> anyhow::Result<()> {
-    let config = args.place.read()?;
-    let opened = if args.place.url.is_some() { None } else { open(&config).await? };
+    let config = args.location.read()?;
+    let opened = if args.location.url.is_some() { None } else { open(&config).await? };
     let mut file = Draft::begin(&args.out)?;
     if let Some(monitor) = opened {
         let mut lines = monitor.archive().export(&args.structure).await?;
@@ -59,11 +60,11 @@ pub async fn export(args: &ExportArgs) -> anyhow::Result<()> {
         }
         monitor.store().close().await;
     } else {
-        let service = args.place.service(&config)?;
+        let service = args.location.service(&config)?;
         let request = service.request(Method::GET, &format!("/v1/structures/{}/export", args.structure));
         let mut response = service.send(request).await?;
-        while let Some(piece) = response.chunk().await.context("the export broke off")? {
-            file.write(&piece)?;
+        while let Some(chunk) = response.chunk().await.context("the export was interrupted")? {
+            file.write(&chunk)?;
         }
     }
     let bytes = file.finish()?;
@@ -71,12 +72,12 @@ pub async fn export(args: &ExportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Takes an archive.
+/// Imports an archive.
 ///
 /// # Errors
-/// A file that is not whole or does not fit what is here, with the line.
+/// A file that is incomplete or contradicts the stored data, with the line.
 pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
-    let config = args.place.read()?;
+    let config = args.location.read()?;
     let library = Library::open(config.models_dir.as_deref())?;
     let store = Store::open_with(&config.data_dir, &config.store).await?;
     let monitor = Monitor::open(store, library, config.monitor).await?;
@@ -87,9 +88,9 @@ pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
         println!("{}", serde_json::to_string_pretty(&done)?);
         return Ok(());
     }
-    println!("{}: {} of {} batches were new and are assessed", done.structure, done.batches_new, done.batches);
+    println!("{}: {} of {} batches were new and have been assessed", done.structure, done.batches_new, done.batches);
     println!(
-        "  new: {} versions, {} trained baselines, {} undamaged states, {} maintenance windows, {} acknowledgements",
+        "  new: {} versions, {} trained models, {} undamaged references, {} maintenance windows, {} acknowledgements",
         done.versions, done.models, done.undamaged_states, done.maintenance_windows, done.acknowledgements
     );
     for warning in done.warnings {
@@ -98,7 +99,7 @@ pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The data folder, unless a service has it open.
+/// Opens the data folder; `None` if a service has it open.
 async fn open(config: &Config) -> anyhow::Result<Option<Monitor>> {
     let database = config.data_dir.join(DATABASE_FILE);
     anyhow::ensure!(database.exists(), "{} has no database: give --data-dir or --url", config.data_dir.display());
@@ -112,7 +113,7 @@ async fn open(config: &Config) -> anyhow::Result<Option<Monitor>> {
     }
 }
 
-/// A file in the making, beside its place.
+/// A temporary file in the folder of the archive, renamed to it when it is complete.
 struct Draft {
     file: std::io::BufWriter<tempfile::NamedTempFile>,
     out: PathBuf,
@@ -133,10 +134,10 @@ impl Draft {
     }
 
     fn finish(self) -> anyhow::Result<u64> {
-        let place = || format!("cannot write {}", self.out.display());
-        let file = self.file.into_inner().map_err(std::io::IntoInnerError::into_error).with_context(place)?;
-        file.as_file().sync_all().with_context(place)?;
-        file.persist(&self.out).with_context(place)?;
+        let failed = || format!("cannot write {}", self.out.display());
+        let file = self.file.into_inner().map_err(std::io::IntoInnerError::into_error).with_context(failed)?;
+        file.as_file().sync_all().with_context(failed)?;
+        file.persist(&self.out).with_context(failed)?;
         Ok(self.bytes)
     }
 }

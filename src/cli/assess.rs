@@ -1,12 +1,12 @@
-//! `modalwatch assess`: the same assessment as the service's, from files.
+//! `modalwatch assess`: the assessment of the service, from files.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use clap::Args;
 
-use super::calibrate::load;
 use super::measurements::read_measurements;
+use super::model::load;
 use crate::assessment::{self, Draws};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::measurement::MeasurementBatch;
@@ -18,22 +18,22 @@ pub struct AssessArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// The trained baseline's .safetensors, with its .json beside it; the shipped one without it
+    /// Trained model: its .safetensors file, with its .json beside it [default: the shipped model]
     #[arg(long)]
     model: Option<PathBuf>,
-    /// CSV of the undamaged state
-    #[arg(long)]
-    baseline: PathBuf,
-    /// CSV to assess
+    /// CSV file of the undamaged reference
+    #[arg(long, alias = "baseline")]
+    reference: PathBuf,
+    /// CSV file to assess
     #[arg(long)]
     data: PathBuf,
-    /// Columns that are not read, separated by commas
+    /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
-    /// Source of the measurements; part of what is digested, and so of the seed
+    /// Source of the measurements; the random seed depends on it, as in the service
     #[arg(long, default_value = "default")]
     source: String,
-    /// p of the damage threshold
+    /// Probability that defines the damage threshold: the quantile of the undamaged reference
     #[arg(long, default_value_t = 0.05)]
     threshold_probability: f64,
     /// Print the result as JSON
@@ -44,20 +44,19 @@ pub struct AssessArgs {
 /// Reads the files and prints the assessment.
 ///
 /// # Errors
-/// Any file that is refused, with line and column.
+/// A file that is refused, with line and column.
 pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
-    let baseline = load(&args.structure, args.model.as_deref())?;
-    let undamaged_batch = read_batch(args, &args.baseline, &baseline)?;
-    let batch = read_batch(args, &args.data, &baseline)?;
-    let draws =
-        |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), baseline.digest()));
+    let model = load(&args.structure, args.model.as_deref())?;
+    let undamaged_batch = read_batch(args, &args.reference, &model)?;
+    let batch = read_batch(args, &args.data, &model)?;
+    let draws = |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), model.digest()));
     let undamaged_draws = draws(&undamaged_batch);
     let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
-    let mut undamaged = assessment::undamaged_state(&baseline, &batches, args.threshold_probability)
-        .with_context(|| format!("{} makes no undamaged reference", args.baseline.display()))?;
+    let mut undamaged = assessment::undamaged_state(&model, &batches, args.threshold_probability)
+        .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
     let context = assessment::Context { undamaged: Some(&undamaged), previous: None };
-    let assessment = assessment::assess(&baseline, &batch.measurements, context, draws(&batch), Timestamp::now())?;
+    let assessment = assessment::assess(&model, &batch.measurements, context, draws(&batch), Timestamp::now())?;
 
     if args.json {
         let report = serde_json::json!({ "undamaged": undamaged, "assessment": assessment });
@@ -65,18 +64,18 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     println!(
-        "{} measurements used ({} of them beyond the prior), {} left out",
+        "{} measurements used, of which {} lie outside the prior; {} left out",
         assessment.measurements_used, assessment.measurements_outside, assessment.measurements_left_out
     );
     if !assessment.trust.accepted() {
-        println!("NOT TO BE TRUSTED: no probability of damage is given");
+        println!("THE TRUST CHECKS FAILED: no probability of damage is given");
     }
     for finding in undamaged.doubts.iter().chain(assessment.trust.findings.iter().map(|f| &f.message)) {
         println!("note: {finding}");
     }
     let percent = |misfit: &Option<f64>| misfit.map_or("-".to_owned(), |m| format!("{m:+.3}"));
     let misfit: Vec<String> = assessment.misfit_percent.iter().map(percent).collect();
-    println!("simulation misses the mean frequencies by {} %", misfit.join(", "));
+    println!("deviation of the simulated from the mean measured frequencies: {} %", misfit.join(", "));
     println!(
         "{:>16} {:>26} {:>26} {:>12} {:>24} {:>8}",
         "parameter", "mean (90 %)", "std (90 %)", "threshold", "PoD, % (90 %)", "exceeds"
@@ -103,8 +102,8 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn read_batch(args: &AssessArgs, path: &Path, baseline: &Baseline) -> anyhow::Result<MeasurementBatch> {
-    let simulator = baseline.simulator();
+fn read_batch(args: &AssessArgs, path: &Path, model: &Baseline) -> anyhow::Result<MeasurementBatch> {
+    let simulator = model.simulator();
     let measurements = read_measurements(simulator, path, &args.ignore)?;
     let structure = simulator.id().clone();
     Ok(MeasurementBatch { structure, source: args.source.clone(), idempotency_key: None, measurements })

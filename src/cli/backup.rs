@@ -7,30 +7,30 @@ use clap::Args;
 use reqwest::Method;
 use serde_json::json;
 
-use super::remote::PlaceArgs;
+use super::remote::LocationArgs;
 use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::quantity::Timestamp;
 use crate::store::backup::{self, BackupModel, Manifest, Restored};
 use crate::store::Error;
 
-/// Copy the database into a folder.
+/// Copy the database to a folder.
 #[derive(Debug, Args)]
 pub struct BackupArgs {
-    /// Folder for the backup; it must not be there yet [default: backups/<time> of the data folder]
+    /// Folder of the backup; it must not exist yet [default: backups/<time> in the data folder]
     #[arg(long)]
     out: Option<PathBuf>,
     #[command(flatten)]
-    place: PlaceArgs,
-    /// Print the record as JSON
+    location: LocationArgs,
+    /// Print the manifest of the backup as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// Put the database of a backup into a data folder.
+/// Restore the database of a backup to a data folder.
 #[derive(Debug, Args)]
 pub struct RestoreArgs {
-    /// The backup: a folder with modalwatch.sqlite and manifest.json
+    /// Folder of the backup, with modalwatch.sqlite and manifest.json
     #[arg(long)]
     from: PathBuf,
     /// Folder of the database [default: modalwatch-data]
@@ -39,24 +39,24 @@ pub struct RestoreArgs {
     /// Configuration file (TOML)
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Only check the backup
+    /// Only verify the backup
     #[arg(long)]
     verify: bool,
-    /// Put it in the place of a database that is there; that one is kept beside it
+    /// Replace an existing database, which is kept under another name
     #[arg(long)]
     replace: bool,
 }
 
-/// Makes a backup: by the service that has the folder open, or else of the folder itself.
+/// Makes a backup. If a service has the data folder open, the service makes it, otherwise it is made from the folder.
 ///
 /// # Errors
-/// Whatever keeps the backup from being made; there is none then.
+/// Whatever prevents a complete backup; then there is none.
 pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
-    let config = args.place.read()?;
+    let config = args.location.read()?;
     let now = Timestamp::now();
     let out = args.out.clone().unwrap_or_else(|| config.data_dir.join(backup::FOLDER).join(backup::name_of(now)));
-    anyhow::ensure!(!out.exists(), "{} is there already: give another --out", out.display());
-    let manifest = if args.place.url.is_some() {
+    anyhow::ensure!(!out.exists(), "{} already exists: give another folder with --out", out.display());
+    let manifest = if args.location.url.is_some() {
         by_service(args, &config, &out).await?
     } else {
         let models = models_in_use(&config)?;
@@ -73,23 +73,23 @@ pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Asks the service for a backup in its own folder, and copies that to where it was asked for.
+/// Lets the service make a backup in its data folder, and moves it to `--out` if that is given.
 async fn by_service(args: &BackupArgs, config: &Config, out: &Path) -> anyhow::Result<Manifest> {
-    let service = args.place.service(config)?;
+    let service = args.location.service(config)?;
     let request = service.request(Method::POST, "/v1/backups").json(&json!({}));
     let manifest: Manifest = service.send(request).await?.json().await?;
     let made = config.data_dir.join(backup::FOLDER).join(&manifest.name);
-    let here = || {
+    let elsewhere = || {
         format!(
-            "{} made the backup {} in its own data folder, which is not {}: fetch it from there, or give --data-dir",
+            "{} made the backup {} in its data folder, which is not {}: copy it from there, or give its data folder with --data-dir",
             service.url(),
             manifest.name,
             config.data_dir.display()
         )
     };
-    anyhow::ensure!(backup::read_manifest(&made).is_ok_and(|found| found == manifest), here());
+    anyhow::ensure!(backup::read_manifest(&made).is_ok_and(|found| found == manifest), elsewhere());
     if args.out.is_none() {
-        // It is where it would have been put anyway.
+        // The service has made it in the default folder.
         return Ok(manifest);
     }
     copy_folder(&made, out).with_context(|| format!("cannot copy {} to {}", made.display(), out.display()))?;
@@ -98,7 +98,7 @@ async fn by_service(args: &BackupArgs, config: &Config, out: &Path) -> anyhow::R
     Ok(copied)
 }
 
-/// Copies the two files of a backup into a folder that appears when it is whole.
+/// Copies the two files of a backup to a temporary folder, which is renamed to `to` when it is complete.
 fn copy_folder(from: &Path, to: &Path) -> anyhow::Result<()> {
     let parent = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(parent)?;
@@ -115,15 +115,15 @@ fn copy_folder(from: &Path, to: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The trained baselines of program and models folder: which belong to the data, though they are not in the database.
+/// The trained models of the program and the models folder. The assessments depend on them, but they are not in the database.
 fn models_in_use(config: &Config) -> anyhow::Result<Vec<BackupModel>> {
     let library = Library::open(config.models_dir.as_deref())?;
     let mut models = Vec::new();
     for (id, entry) in library.iter() {
-        if let Some(baseline) = &entry.baseline {
-            let files = library.files_of(baseline.digest())?;
+        if let Some(model) = &entry.baseline {
+            let files = library.files_of(model.digest())?;
             let kept_in = files.map_or_else(|| "program".to_owned(), |files| files.kept_in);
-            models.push(BackupModel { structure: id.to_string(), digest: baseline.digest().to_string(), kept_in });
+            models.push(BackupModel { structure: id.to_string(), digest: model.digest().to_string(), kept_in });
         }
     }
     Ok(models)
@@ -143,21 +143,21 @@ fn print_manifest(folder: &Path, manifest: &Manifest) {
         let note = match kept_in.as_str() {
             "database" => "in the backup".to_owned(),
             "program" => "shipped inside the program".to_owned(),
-            folder => format!("NOT in the backup: keep {folder} too"),
+            folder => format!("NOT in the backup: back up {folder} too"),
         };
         println!("  model of {structure} {}…: {note}", digest.get(..12).unwrap_or(digest));
     }
 }
 
-/// Checks a backup, and puts it into the data folder unless only the check was asked for.
+/// Verifies a backup and restores it to the data folder, unless only the verification is requested.
 ///
 /// # Errors
-/// A backup that is damaged or too new, a folder that is in use or has a database.
+/// A backup that is damaged or too new, a data folder that is in use or already has a database.
 pub async fn restore(args: &RestoreArgs) -> anyhow::Result<()> {
     if args.verify {
         let manifest = backup::verify(&args.from).await?;
         print_manifest(&args.from, &manifest);
-        println!("The backup is whole.");
+        println!("The backup is complete and intact.");
         return Ok(());
     }
     let flags = crate::config::Flags { data_dir: args.data_dir.clone(), ..crate::config::Flags::default() };
@@ -166,8 +166,8 @@ pub async fn restore(args: &RestoreArgs) -> anyhow::Result<()> {
         backup::restore(&args.from, &config.data_dir, args.replace, Timestamp::now()).await?;
     print_manifest(&args.from, &manifest);
     if let Some(aside) = kept_aside {
-        println!("The database that was there is kept as {}.", aside.display());
+        println!("The previous database is kept as {}.", aside.display());
     }
-    println!("Restored into {}.", config.data_dir.display());
+    println!("Restored to {}.", config.data_dir.display());
     Ok(())
 }

@@ -1,13 +1,13 @@
 //! `modalwatch calibrate`: simulation-based calibration of a trained baseline, with plots.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context as _;
 use clap::Args;
 
-use super::write_whole;
+use super::model::load;
+use super::output::write_whole;
 use crate::baseline::calibration::{calibrate as measure, cell_title, CellRanks, DRAWS};
-use crate::baseline::library::{find_structure, Library};
 use crate::baseline::manifest::CalibrationRecord;
 use crate::baseline::train::renew;
 use crate::baseline::Baseline;
@@ -60,19 +60,6 @@ pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     }
     anyhow::ensure!(record.passed(), "the calibration failed: {}", record.failures.join("; "));
     Ok(())
-}
-
-/// The shipped baseline of a structure, or the one in a file.
-pub(super) fn load(structure: &str, model: Option<&Path>) -> anyhow::Result<std::sync::Arc<Baseline>> {
-    let simulator = find_structure(structure)?;
-    let Some(weights) = model else {
-        let entry = Library::open(None)?.get(simulator.id()).and_then(|e| e.baseline.clone());
-        return entry
-            .with_context(|| format!("no baseline of {} is shipped: name a file with --model", simulator.id()));
-    };
-    let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
-    let loaded = Baseline::load(&read(&weights.with_extension("json"))?, &read(weights)?, &simulator);
-    Ok(loaded.with_context(|| format!("{} is refused", weights.display()))?.into())
 }
 
 const HEADER: [&str; 6] =

@@ -1,4 +1,4 @@
-//! `modalwatch demo`: the paper's case 1, posted to the service over its own HTTP API.
+//! `modalwatch demo`: case 1 of the paper, posted to a service over its HTTP API.
 
 use std::path::PathBuf;
 
@@ -17,10 +17,10 @@ use crate::simulator::population::Population;
 use crate::simulator::Simulator;
 use crate::telemetry::{self, LogSettings};
 
-/// Start the service and post the paper's case 1 to it.
+/// Start a service and post case 1 of the paper to it.
 #[derive(Debug, Args)]
 pub struct DemoArgs {
-    /// Address and port [default: 127.0.0.1:8080, or a free port when that is taken]
+    /// Address and port [default: 127.0.0.1:8080, or a free port if that is in use]
     #[arg(long)]
     listen: Option<String>,
     /// Folder of the database [default: a temporary one]
@@ -29,7 +29,7 @@ pub struct DemoArgs {
     /// Seed of the simulated measurements
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// End after the table instead of staying up
+    /// Stop the service after the table is printed
     #[arg(long)]
     exit: bool,
     /// Print the table as JSON
@@ -39,16 +39,17 @@ pub struct DemoArgs {
 
 const STRUCTURE: &str = "three-dof";
 const MEASUREMENTS: usize = 50;
-/// The paper's measurements have no noise; they are posted as exact as the trained baseline takes them.
+/// The paper's measurements have no noise; this is the smallest standard deviation that the trained model covers.
 const RELATIVE_STD: f64 = 1e-4;
 const HOUR_S: i64 = 3_600;
 
-/// A state of the structure: populations of Table 2, means reduced as in Table 1, and the paper's results (Table 4).
+/// A state of the structure: the populations of Table 2 with means reduced as in Table 1, and the results of Table 4 (Wang et
+/// al. 2025).
 struct Scenario {
     name: &'static str,
     /// Target mean of k1, k2, k3, N/m.
     mean: [f64; 3],
-    /// Paper's predicted probability of damage of k1, k2, k3, where Table 4 has one.
+    /// Probability of damage of k1, k2, k3 predicted in the paper, if Table 4 contains it.
     paper_pod: [Option<f64>; 3],
 }
 
@@ -56,7 +57,7 @@ struct Scenario {
 const STD: [f64; 3] = [0.3, 0.1, 0.2];
 
 const SCENARIOS: [Scenario; 5] = [
-    Scenario { name: "undamaged baseline", mean: [4.0, 5.0, 6.0], paper_pod: [None, None, None] },
+    Scenario { name: "undamaged reference", mean: [4.0, 5.0, 6.0], paper_pod: [None, None, None] },
     Scenario { name: "healthy", mean: [4.0, 5.0, 6.0], paper_pod: [None, None, None] },
     Scenario { name: "scenario 1", mean: [3.6, 5.0, 6.0], paper_pod: [Some(0.456), None, None] },
     Scenario { name: "scenario 2", mean: [4.0, 4.5, 4.8], paper_pod: [None, Some(1.0), Some(1.0)] },
@@ -98,10 +99,10 @@ struct ParameterReport {
 /// # Errors
 /// A service that does not start, or an answer that is not a success.
 pub async fn demo(args: DemoArgs) -> anyhow::Result<()> {
-    // The table is what people came for; the log speaks up only when something is wrong.
+    // The table should not be mixed with log lines, except for warnings and errors.
     telemetry::start(&LogSettings { level: "warn".to_owned(), ..LogSettings::default() })
         .map_err(anyhow::Error::msg)?;
-    let temporary = tempfile::tempdir().context("cannot make a temporary folder")?;
+    let temporary = tempfile::tempdir().context("cannot create a temporary folder")?;
     let data_dir = args.data_dir.clone().unwrap_or_else(|| temporary.path().to_owned());
     let listen = match &args.listen {
         Some(listen) => listen.clone(),
@@ -109,7 +110,7 @@ pub async fn demo(args: DemoArgs) -> anyhow::Result<()> {
     };
     let flags = Flags { data_dir: Some(data_dir), models_dir: None, http: HttpFlags { listen: Some(listen) } };
     let mut config = Config::read(None, &flags)?;
-    // The demonstration asks its own service, without a token.
+    // The demonstration sends its requests without a token.
     config.access.admin_token_file = None;
     let (stop, stopped) = oneshot::channel::<()>();
     let signal = stop_signal()?;
@@ -128,16 +129,16 @@ pub async fn demo(args: DemoArgs) -> anyhow::Result<()> {
     if args.exit {
         drop(stop);
     } else {
-        eprintln!("\nThe service stays up at {url} (Ctrl-C ends it). Try:");
+        eprintln!("\nThe service keeps running at {url} (Ctrl-C stops it). Try:");
         eprintln!("  curl {url}/v1/structures/{STRUCTURE}/history?format=csv");
         eprintln!("  curl {url}/v1/structures/{STRUCTURE}/alarms");
         let _keep = stop;
-        return running.task.await.context("the service ended by a panic");
+        return running.task.await.context("the service panicked");
     }
-    running.task.await.context("the service ended by a panic")
+    running.task.await.context("the service panicked")
 }
 
-/// The default address, or a free port when somebody else has it.
+/// The default address, or one with a free port if the default port is in use.
 async fn free_address() -> String {
     let usual = Config::default().http.listen;
     match tokio::net::TcpListener::bind(&usual).await {
@@ -159,7 +160,8 @@ async fn post_case_1(url: &str, seed: u64) -> anyhow::Result<Report> {
         if index == 0 {
             post(&client, &format!("{structure_url}/reference"), &json!({ "batches": [answer["batch"]] })).await?;
             for (k, threshold) in realised_thresholds.iter_mut().enumerate() {
-                let std = crate::stats::sample_std(&drawn.stiffness[k]).context("fifty values have a spread")?;
+                let std = crate::stats::sample_std(&drawn.stiffness[k])
+                    .context("the standard deviation of fifty values is defined")?;
                 *threshold = crate::stats::mean(&drawn.stiffness[k]) + crate::stats::normal_quantile(0.05) * std;
             }
             continue;
@@ -169,7 +171,7 @@ async fn post_case_1(url: &str, seed: u64) -> anyhow::Result<Report> {
     Ok(Report { scenarios })
 }
 
-/// Simulated measurements and the stiffnesses behind them.
+/// Simulated measurements and the stiffnesses that they were simulated from.
 struct Drawn {
     measurements: Vec<ModalMeasurement>,
     /// One list for each of k1, k2, k3, N/m.
@@ -179,7 +181,7 @@ struct Drawn {
 fn draw(simulator: &Simulator, scenario: &Scenario, seed: u64, index: usize) -> anyhow::Result<Drawn> {
     let moments: Vec<(String, f64, f64)> = (0..3).map(|k| (format!("k{}", k + 1), scenario.mean[k], STD[k])).collect();
     let population = Population::new(simulator.space(), &moments)?;
-    // Each scenario has its own draws; the digest keeps neighbouring seeds apart.
+    // Each scenario has its own seed.
     let drawn = population.draw(simulator, MEASUREMENTS, 0.0, seed_of(seed, index))?;
     let start = Timestamp::parse("2026-01-01T00:00:00Z")?.micros() + index as i64 * 24 * HOUR_S * 1_000_000;
     let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
@@ -235,7 +237,7 @@ fn report(
     Ok(ScenarioReport { name: scenario.name.to_owned(), parameters })
 }
 
-/// State of the alarm chart of a parameter after this batch.
+/// State of the alarm chart of a parameter after the batch.
 fn chart_state(answer: &Value, parameter: &str) -> Option<String> {
     let charts = answer["charts"].as_array()?;
     let own = charts.iter().find(|point| point["chart"] == parameter)?;
@@ -243,9 +245,9 @@ fn chart_state(answer: &Value, parameter: &str) -> Option<String> {
 }
 
 fn print_table(report: &Report) {
-    println!("Case 1 of Wang et al. (2025): three masses, k1..k3 to ground, {MEASUREMENTS} measurements a batch.");
-    println!("target: the population; realised: the {MEASUREMENTS} stiffnesses drawn from it; PoD in %: of the pool of samples (paper),");
-    println!("and of the population behind it with its 90 % interval\n");
+    println!("Case 1 of Wang et al. (2025): three masses, k1..k3 to ground, {MEASUREMENTS} measurements per batch.");
+    println!("target: the population; realised: the {MEASUREMENTS} stiffnesses drawn from it; updated: estimated from their frequencies.");
+    println!("PoD: probability of damage, of the pooled samples (as in the paper) and of the estimated population with its 90 % interval.\n");
     let group = "---------- mean, N/m ----------  ---------- std, N/m ---------  --------------------- PoD, % ----------------------";
     println!("{:22}{group}", "");
     println!(
@@ -293,6 +295,6 @@ fn print_table(report: &Report) {
             );
         }
     }
-    println!("\nA healthy batch of {MEASUREMENTS} exceeds 5 % about every second time: an exceedance is no alarm. Alarms have a known rate:");
-    println!("one in 1000 healthy batches. Set \"updated\" beside \"realised\": {MEASUREMENTS} draws scatter about their population.");
+    println!("\nAbout every second undamaged batch of {MEASUREMENTS} exceeds 5 %: an exceedance is not an alarm. False alarms have a fixed rate:");
+    println!("one in 1000 undamaged batches. Compare \"updated\" with \"realised\": {MEASUREMENTS} draws deviate randomly from their population.");
 }

@@ -7,7 +7,8 @@ use anyhow::Context as _;
 use clap::Args;
 use serde::Serialize;
 
-use super::{named_numbers, write_whole};
+use super::output::write_whole;
+use super::parameter::parameter_moments;
 use crate::alarm::chart::{shared, standard_error};
 use crate::alarm::detection::{detection, Detection};
 use crate::alarm::limits::{limits, Limits, Situation};
@@ -26,14 +27,14 @@ pub struct DesignAlarmArgs {
     #[arg(long)]
     structure: String,
     /// Undamaged population of one parameter, as name=mean,std in its unit; once per parameter
-    #[arg(long = "parameter", required = true, value_parser = |t: &str| named_numbers(t, 2, "name=mean,std"))]
-    parameters: Vec<(String, Vec<f64>)>,
+    #[arg(long = "parameter", required = true, value_parser = parameter_moments)]
+    parameters: Vec<(String, f64, f64)>,
     /// Number of measurements per batch
     #[arg(long, default_value_t = 20)]
     measurements: usize,
     /// Number of measurements of the undamaged reference
-    #[arg(long, default_value_t = 100)]
-    baseline: usize,
+    #[arg(long, alias = "baseline", default_value_t = 100)]
+    reference: usize,
     /// Noise as a multiple of the structure's noise
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
@@ -119,14 +120,14 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     anyhow::ensure!(!watched.is_empty(), "no parameter of {} has a direction of damage", simulator.id());
     // This share is the same for all charts, since batch and undamaged reference have the same noise.
     let first = of(watched[0].1);
-    let shared = shared(&reference(first, args.baseline), first.noise_std.powi(2), args.measurements);
-    let situation = Situation { shared, degrees_of_freedom: args.baseline - 1, charts: watched.len() };
+    let shared = shared(&reference(first, args.reference), first.noise_std.powi(2), args.measurements);
+    let situation = Situation { shared, degrees_of_freedom: args.reference - 1, charts: watched.len() };
     let limits = limits(situation, &settings);
     let found = detection(situation, &limits, &settings, args.within, args.seed);
     let shift_90 = found.shift_found(0.9);
     let parameter = |&(p, k): &(&Parameter, usize)| {
         let own = of(k);
-        let error = standard_error(&reference(own, args.baseline), own.noise_std.powi(2), args.measurements);
+        let error = standard_error(&reference(own, args.reference), own.noise_std.powi(2), args.measurements);
         let change = shift_90.map(|shift| shift * error);
         ParameterReport {
             name: p.name.clone(),
@@ -142,7 +143,7 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     let report = Report {
         structure: simulator.id().to_string(),
         measurements: args.measurements,
-        baseline_measurements: args.baseline,
+        baseline_measurements: args.reference,
         noise_multiple: args.noise,
         wanted_run_batches: args.mean_run_batches,
         shift_limit_standard_errors: limits.single,
@@ -167,7 +168,7 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
 /// The alarm settings of the arguments, which are checked.
 fn settings(args: &DesignAlarmArgs) -> anyhow::Result<AlarmSettings> {
     anyhow::ensure!(args.measurements > 0 && args.within > 0, "--measurements and --within must be at least 1");
-    anyhow::ensure!(args.baseline >= 2, "--baseline must be at least 2 measurements");
+    anyhow::ensure!(args.reference >= 2, "--reference must be at least 2 measurements");
     anyhow::ensure!(args.noise > 0.0 && args.noise.is_finite(), "--noise must be above 0");
     let settings = AlarmSettings {
         mean_run_batches: args.mean_run_batches,
@@ -208,12 +209,10 @@ fn stiffness_losses(simulator: &Simulator, column: usize, mean: f64, change: f64
 }
 
 /// Mean and standard deviation of each parameter, in the order of the space.
-fn moments(simulator: &Simulator, given: &[(String, Vec<f64>)]) -> anyhow::Result<Vec<(f64, f64)>> {
-    let triples: Vec<(String, f64, f64)> = given.iter().map(|(name, n)| (name.clone(), n[0], n[1])).collect();
-    crate::simulator::population::Population::new(simulator.space(), &triples)?;
+fn moments(simulator: &Simulator, given: &[(String, f64, f64)]) -> anyhow::Result<Vec<(f64, f64)>> {
+    crate::simulator::population::Population::new(simulator.space(), given)?;
     let one = |p: &Parameter| {
-        let (name, mean, std) =
-            triples.iter().find(|(name, ..)| *name == p.name).context("every parameter is given")?;
+        let (name, mean, std) = given.iter().find(|(name, ..)| *name == p.name).context("every parameter is given")?;
         anyhow::ensure!(
             p.prior().contains(mean),
             "the mean {mean} of {name} is outside its prior, {} to {}",
@@ -250,7 +249,7 @@ fn print(report: &Report) {
     let ewma = report.ewma_limit_standard_errors.map_or("off".to_owned(), |l| format!("{l:.2}"));
     println!("limits: one batch {:.2} standard errors, moving average {ewma}", report.shift_limit_standard_errors);
     println!(
-        "healthy operation: {:.0} ± {:.0} batches to the first false alarm (required {:.0})",
+        "without damage: {:.0} ± {:.0} batches to the first false alarm (required {:.0})",
         report.healthy_run_batches, report.healthy_run_error, report.wanted_run_batches
     );
     println!(

@@ -7,7 +7,8 @@ use anyhow::Context as _;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::write_whole;
+use super::output::write_whole;
+use super::training::{print_record, sizes, train_into};
 use crate::baseline::library::find_structure;
 use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::{Data, MOST_LEVELS};
@@ -175,11 +176,11 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     let simulator = Simulator::new(extended.definition)?;
-    let (samples, epochs) = super::train::sizes(&simulator, args.samples, args.epochs);
+    let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
     let settings = TrainSettings { epochs, seed: args.study.seed, ..TrainSettings::default() };
     let flow = FlowSettings::default();
-    let trained = super::train::train_into(&args.out, &simulator, samples, DEFAULT_NOISE_RANGE, &flow, &settings)?;
-    super::train::print_record(trained.baseline.manifest());
+    let trained = train_into(&args.out, &simulator, samples, DEFAULT_NOISE_RANGE, &flow, &settings)?;
+    print_record(trained.baseline.manifest());
     Ok(())
 }
 

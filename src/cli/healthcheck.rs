@@ -1,4 +1,4 @@
-//! `modalwatch healthcheck`: for Docker and other watchers.
+//! `modalwatch healthcheck`: readiness as exit status, for Docker and other supervisors.
 
 use std::time::Duration;
 
@@ -12,18 +12,18 @@ use crate::config::{Config, Flags};
 /// Ask a running service whether it is ready.
 #[derive(Debug, Args)]
 pub struct HealthcheckArgs {
-    /// Where it listens [default: http.listen of the configuration and the environment]
+    /// URL of the service [default: http.listen of the configuration and the environment]
     #[arg(long)]
     url: Option<String>,
-    /// Longest wait, seconds
+    /// Maximum time to wait for the answer, seconds
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=600))]
     timeout_s: u64,
 }
 
-/// Asks `/readyz`, prints what it says; an error when the service is not ready.
+/// Requests `/readyz` and prints the answer.
 ///
 /// # Errors
-/// When it is not ready, cannot be reached, or does not answer in time.
+/// A service that is not ready, cannot be reached or does not answer in time.
 pub async fn healthcheck(args: &HealthcheckArgs) -> anyhow::Result<()> {
     let url = match args.url.clone() {
         Some(url) => url,

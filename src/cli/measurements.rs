@@ -10,10 +10,10 @@ use crate::measurement::ModalMeasurement;
 use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 
-/// Reads and checks the measurements of a structure; columns in `ignore` are not read.
+/// Reads and checks the measurements of a structure, without the columns in `ignore`.
 ///
 /// # Errors
-/// A file that cannot be read, and every mistake in it with line and column.
+/// A file that cannot be read, or all errors in it, with line and column.
 pub fn read_measurements(
     simulator: &Simulator,
     path: &Path,

@@ -1,4 +1,4 @@
-//! The door for people: one function a command.
+//! The command line: the arguments, and one function per command.
 
 mod archive;
 mod assess;
@@ -10,6 +10,9 @@ mod diagnose;
 mod doctor;
 mod healthcheck;
 mod measurements;
+mod model;
+mod output;
+mod parameter;
 mod reload;
 mod remote;
 mod reproduce;
@@ -19,6 +22,7 @@ mod simulate;
 mod supervisor;
 mod token;
 mod train;
+mod training;
 mod update;
 
 use std::future::Future;
@@ -29,7 +33,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::config::{Config, Flags, HttpFlags, DEFAULT_FILE};
 use crate::telemetry;
 
-/// Watches structures through their natural frequencies.
+/// Monitors structures by their natural frequencies.
 #[derive(Debug, Parser)]
 #[command(name = "modalwatch", version, about)]
 struct Cli {
@@ -41,54 +45,54 @@ struct Cli {
 enum Command {
     /// Run the service.
     Serve(ServeArgs),
-    /// Start the service, post the paper's case 1 to it and print what it answers.
+    /// Start a service, post case 1 of the paper to it and print the results.
     Demo(demo::DemoArgs),
-    /// Train the baseline of a structure.
+    /// Train the model of a structure.
     Train(train::TrainArgs),
-    /// Measure whether a trained baseline is as sure as it should be.
+    /// Check the calibration of a trained model: whether its posteriors have the right width.
     Calibrate(calibrate::CalibrateArgs),
-    /// Simulate the alarm charts of a structure.
+    /// Simulate the alarm charts of a structure: false alarms, delay and detectable damage.
     DesignAlarm(design_alarm::DesignAlarmArgs),
     /// Simulate measurements of a structure as CSV.
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
     Assess(assess::AssessArgs),
-    /// Find mean and spread of the parameters behind measurements, by one of three methods.
+    /// Estimate mean and standard deviation of the parameters from measurements, by one of three methods.
     Update(update::UpdateArgs),
-    /// Run both cases of the paper by all methods and write a report beside its figures.
+    /// Run both cases of the paper by all methods and write a report that compares the results with its figures.
     Reproduce(reproduce::ReproduceArgs),
-    /// Find what the simulation gets wrong, name the cause and measure what naming it gains.
+    /// Find the effects that a simulation lacks, and measure how much they improve its predictions.
     Diagnose(diagnose::DiagnoseArgs),
-    /// Diagnose, write the causes into a new version of the structure, and train its baseline.
+    /// Diagnose, add the causes to a new version of the structure, and train its model.
     Extend(diagnose::ExtendArgs),
-    /// Look at the configuration.
+    /// Print the configuration.
     Config {
         #[command(subcommand)]
         what: ConfigCommand,
     },
-    /// Make, list, revoke and rotate tokens while the service is stopped.
+    /// Create, list, revoke and rotate tokens while the service is stopped.
     Token(token::TokenArgs),
-    /// Ask a running service whether it is ready; exit status 0 when it is.
+    /// Check whether a running service is ready; the exit status is 0 if it is.
     Healthcheck(healthcheck::HealthcheckArgs),
-    /// Look at everything the service needs and say what is wrong; exit status 1 when something is.
+    /// Check everything the service needs and suggest remedies; the exit status is 1 if a check fails.
     Doctor(doctor::DoctorArgs),
-    /// Copy the database into a folder, checked, while the service runs or not.
+    /// Copy the database to a folder and verify the copy, while the service is running or stopped.
     Backup(backup::BackupArgs),
-    /// Put the database of a backup into a data folder.
+    /// Restore the database of a backup to a data folder.
     Restore(backup::RestoreArgs),
-    /// Write one structure with its measurements, states and baselines into a file for another installation.
+    /// Write one structure with its measurements, references and trained models to a file for another installation.
     Export(archive::ExportArgs),
-    /// Take such a file.
+    /// Read a file that `export` wrote.
     Import(archive::ImportArgs),
-    /// Say which batches are older than asked to keep, or delete them.
+    /// List or delete the batches that are older than the retention period.
     Retention(retention::RetentionArgs),
 }
 
 #[derive(Debug, Subcommand)]
 enum ConfigCommand {
-    /// Print the configuration in force, as a file; --default prints the commented defaults.
+    /// Print the configuration in force as TOML; --default prints the commented defaults.
     Print {
-        /// The commented defaults.
+        /// Print the commented defaults
         #[arg(long)]
         default: bool,
         #[command(flatten)]
@@ -96,16 +100,16 @@ enum ConfigCommand {
     },
 }
 
-/// Where the service listens and keeps its data; each has a default.
+/// Settings of the service that have a flag.
 #[derive(Debug, Args)]
 pub struct ServeArgs {
-    /// Address and port; port 0 takes a free one [default: 127.0.0.1:8080]
+    /// Address and port; port 0 chooses a free port [default: 127.0.0.1:8080]
     #[arg(long)]
     listen: Option<String>,
     /// Folder of the database [default: modalwatch-data]
     #[arg(long)]
     data_dir: Option<PathBuf>,
-    /// Folder of your own structures and trained baselines; the shipped ones are inside the program
+    /// Folder of your own structures and trained models, in addition to those shipped with the program
     #[arg(long)]
     models: Option<PathBuf>,
     /// Configuration file (TOML)
@@ -127,10 +131,10 @@ impl ServeArgs {
     }
 }
 
-/// Runs the command of the arguments.
+/// Runs the command that the arguments of the program name.
 ///
 /// # Errors
-/// Whatever stopped the command, with its chain of causes.
+/// The error of the command, with its chain of causes.
 pub fn run() -> anyhow::Result<()> {
     match Cli::parse().command {
         Command::Serve(args) => {
@@ -172,35 +176,4 @@ pub fn run() -> anyhow::Result<()> {
 
 fn block_on(future: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
     tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(future)
-}
-
-/// Turns the settings a person gives as `name=a,b` into name and numbers.
-fn named_numbers(text: &str, count: usize, shape: &str) -> Result<(String, Vec<f64>), String> {
-    let wrong = || format!("{text:?} should read {shape}");
-    let (name, numbers) = text.split_once('=').ok_or_else(wrong)?;
-    let numbers = numbers.split(',').map(|n| n.trim().parse().map_err(|_| wrong())).collect::<Result<Vec<f64>, _>>()?;
-    if numbers.len() != count {
-        return Err(wrong());
-    }
-    Ok((name.trim().to_owned(), numbers))
-}
-
-/// Writes a file beside its place and moves it there, so that nobody ever reads half of it.
-fn write_whole(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
-    use anyhow::Context as _;
-    use std::io::Write as _;
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(std::path::Path::new("."));
-    let place = || format!("cannot write {}", path.display());
-    std::fs::create_dir_all(folder).with_context(place)?;
-    let mut file = tempfile::NamedTempFile::new_in(folder).with_context(place)?;
-    file.write_all(bytes).with_context(place)?;
-    file.as_file().sync_all().with_context(place)?;
-    // A temporary file is readable by its owner only; a result should be as readable as any other.
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt as _;
-        file.as_file().set_permissions(std::fs::Permissions::from_mode(0o644)).with_context(place)?;
-    }
-    file.persist(path).with_context(place)?;
-    Ok(())
 }

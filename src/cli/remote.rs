@@ -1,4 +1,4 @@
-//! A running service, asked by a command over its own HTTP API.
+//! Requests of a command to a running service, over its HTTP API.
 
 use std::time::Duration;
 
@@ -8,35 +8,35 @@ use reqwest::{Client, Method, RequestBuilder, Response};
 
 use crate::config::Config;
 
-/// Variable with the token of commands.
+/// Environment variable with the token.
 const TOKEN: &str = "MODALWATCH_TOKEN";
 
-/// Longest time to reach the service.
+/// Maximum time to connect to the service.
 const CONNECT: Duration = Duration::from_secs(5);
 
-/// Where data and settings are, for commands that work with a service or without.
+/// The data folder, the settings and the service, for commands that work with and without a running service.
 #[derive(Debug, Args)]
-pub struct PlaceArgs {
+pub struct LocationArgs {
     /// Folder of the database [default: modalwatch-data]
     #[arg(long)]
     pub data_dir: Option<std::path::PathBuf>,
-    /// Folder of your own structures and trained baselines
+    /// Folder of your own structures and trained models
     #[arg(long)]
     pub models: Option<std::path::PathBuf>,
     /// Configuration file (TOML)
     #[arg(long)]
     pub config: Option<std::path::PathBuf>,
-    /// Service to ask; its token is read from MODALWATCH_TOKEN [default: http.listen of the configuration, where a service has
+    /// URL of the service; the token is read from MODALWATCH_TOKEN [default: http.listen of the configuration, if a service has
     /// the data folder open]
     #[arg(long)]
     pub url: Option<String>,
 }
 
-impl PlaceArgs {
+impl LocationArgs {
     /// The configuration in force.
     ///
     /// # Errors
-    /// What is wrong with it.
+    /// An invalid configuration.
     pub fn read(&self) -> Result<Config, crate::config::Error> {
         let flags = crate::config::Flags {
             data_dir: self.data_dir.clone(),
@@ -46,16 +46,16 @@ impl PlaceArgs {
         Config::read(self.config.as_deref(), &flags)
     }
 
-    /// The service named by the flag, or the one that the configuration makes listen.
+    /// The service at `--url`, otherwise at the address in the configuration.
     ///
     /// # Errors
-    /// When no client can be made.
+    /// If the HTTP client cannot be created.
     pub fn service(&self, config: &Config) -> anyhow::Result<Service> {
         Service::at(&self.url.clone().unwrap_or_else(|| url_of(&config.http.listen)))
     }
 }
 
-/// Where a service that listens on `listen` is reached from this machine.
+/// URL of a service that listens on `listen`, as seen from this machine.
 pub fn url_of(listen: &str) -> String {
     let reached = listen.replacen("0.0.0.0", "127.0.0.1", 1).replacen("[::]", "[::1]", 1);
     format!("http://{reached}")
@@ -72,19 +72,19 @@ impl Service {
     /// The service at a URL.
     ///
     /// # Errors
-    /// When no client can be made.
+    /// If the HTTP client cannot be created.
     pub fn at(url: &str) -> anyhow::Result<Self> {
         let client = crate::notify::client_builder().connect_timeout(CONNECT).no_proxy().build()?;
         let token = std::env::var(TOKEN).ok().filter(|token| !token.is_empty());
         Ok(Self { url: url.trim_end_matches('/').to_owned(), client, token })
     }
 
-    /// Its address.
+    /// The URL of the service.
     pub fn url(&self) -> &str {
         &self.url
     }
 
-    /// A request with the token.
+    /// A request with the token, if there is one.
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let request = self.client.request(method, format!("{}{path}", self.url));
         match &self.token {
@@ -96,7 +96,7 @@ impl Service {
     /// Sends a request that must succeed.
     ///
     /// # Errors
-    /// When the service cannot be reached, or what it says against it.
+    /// A service that cannot be reached, or its error message.
     pub async fn send(&self, request: RequestBuilder) -> anyhow::Result<Response> {
         let response = request.send().await.with_context(|| format!("{} cannot be reached", self.url))?;
         let status = response.status();
@@ -107,7 +107,7 @@ impl Service {
         let problem: Option<serde_json::Value> = serde_json::from_str(&text).ok();
         let detail = problem.as_ref().and_then(|p| p["detail"].as_str()).unwrap_or(&text);
         let hint = match status.as_u16() {
-            401 | 403 => format!("; put a token with the scope admin into {TOKEN}"),
+            401 | 403 => format!("; set {TOKEN} to a token with the scope admin"),
             _ => String::new(),
         };
         anyhow::bail!("{} answers {status}: {detail}{hint}", self.url)

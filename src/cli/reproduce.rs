@@ -1,4 +1,4 @@
-//! `modalwatch reproduce`: the paper's two cases, beside its figures.
+//! `modalwatch reproduce`: the two cases of the paper, compared with its figures.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::write_whole;
+use super::output::write_whole;
 use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::find_structure;
 use crate::baseline::train::train;
@@ -18,38 +18,38 @@ use crate::reproduce::{case1, case2, report, Machine, Reproduction, Settings};
 use crate::simulator::definition::MeasurementNoise;
 use crate::simulator::Simulator;
 
-/// Measurement noise of case 2, as a share of each frequency.
+/// Relative standard deviation of the measurement noise in case 2.
 const RIG_NOISE: f64 = 0.001;
 
-/// Run the paper's cases.
+/// Run the cases of the paper by all methods.
 #[derive(Debug, Args)]
 pub struct ReproduceArgs {
     /// Folder for report.html and reproduction.json
     #[arg(long)]
     out: PathBuf,
-    /// Only this case
+    /// Run only this case
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=2))]
     case: Option<u8>,
-    /// Repetitions with fresh measurements [default: 30; 3 with --quick]
+    /// Number of repetitions with new measurements [default: 30; 3 with --quick]
     #[arg(long)]
     repetitions: Option<usize>,
-    /// A short run, to look at: three repetitions, flows trained for a shorter time
+    /// Run three repetitions with a shorter training
     #[arg(long)]
     quick: bool,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Print the numbers as JSON
+    /// Print the results as JSON
     #[arg(long)]
     json: bool,
 }
 
-/// Runs, writes the report and says where it is.
+/// Runs the cases, writes the report and prints its path.
 ///
 /// # Errors
-/// A folder that cannot be written; what a method says of its data.
+/// A folder that cannot be written, or an error of a method.
 pub fn reproduce(args: &ReproduceArgs) -> anyhow::Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let started = Instant::now();
     let repetitions = args.repetitions.unwrap_or(if args.quick { 3 } else { 30 });
     anyhow::ensure!(repetitions > 0, "--repetitions is 0: at least 1 is needed");
@@ -93,7 +93,7 @@ pub fn reproduce(args: &ReproduceArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A flow for a shipped structure with this noise, and the seconds its training took.
+/// Trains a flow for a shipped structure with the given noise. Returns it with the duration of the training, s.
 fn trained(structure: &str, noise: f64, settings: &Settings) -> anyhow::Result<(Baseline, f64)> {
     let mut definition = find_structure(structure)?.definition().clone();
     definition.measurement_noise = MeasurementNoise::Relative(noise);

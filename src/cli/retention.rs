@@ -1,36 +1,36 @@
-//! `modalwatch retention`: what is older than asked to keep.
+//! `modalwatch retention`: lists or deletes the batches that are older than the retention period.
 
 use clap::Args;
 use reqwest::Method;
 
-use super::remote::PlaceArgs;
+use super::remote::LocationArgs;
 use crate::monitor::retention::{delete_expired, plan};
 use crate::quantity::Timestamp;
 use crate::store::{Error, Store, DATABASE_FILE};
 
-/// Say which batches are older than asked to keep, or delete them.
+/// List or delete the batches that are older than the retention period.
 #[derive(Debug, Args)]
 pub struct RetentionArgs {
-    /// Days to keep [default: retention.measurements_days of the configuration]
+    /// Retention period, days [default: retention.measurements_days of the configuration]
     #[arg(long)]
     days: Option<u32>,
-    /// Only say what would go
+    /// Only list what would be deleted
     #[arg(long)]
     dry_run: bool,
     #[command(flatten)]
-    place: PlaceArgs,
+    location: LocationArgs,
 }
 
-/// Prints what would go, and deletes it unless only that was asked for.
+/// Prints the expired batches and deletes them, except with `--dry-run`.
 ///
 /// # Errors
-/// A folder that cannot be opened; a running service, where something is to be deleted.
+/// A data folder that cannot be opened, or, without `--dry-run`, one that a service has open.
 pub async fn retention(args: &RetentionArgs) -> anyhow::Result<()> {
-    let config = args.place.read()?;
+    let config = args.location.read()?;
     let mut settings = config.retention;
     settings.measurements_days = args.days.unwrap_or(settings.measurements_days);
     let database = config.data_dir.join(DATABASE_FILE);
-    let opened = if args.place.url.is_some() {
+    let opened = if args.location.url.is_some() {
         None
     } else {
         anyhow::ensure!(database.exists(), "{} has no database: give --data-dir", config.data_dir.display());
@@ -43,10 +43,10 @@ pub async fn retention(args: &RetentionArgs) -> anyhow::Result<()> {
     let Some(store) = opened else {
         anyhow::ensure!(
             args.dry_run,
-            "a service has the data folder open and deletes by its own settings: set retention.measurements_days, or stop it; \
-             --dry-run says what would go"
+            "a service has the data folder open and deletes expired batches itself: set retention.measurements_days, or stop the \
+             service; --dry-run lists what would be deleted"
         );
-        let service = args.place.service(&config)?;
+        let service = args.location.service(&config)?;
         let query = args.days.map_or_else(String::new, |days| format!("?days={days}"));
         let response = service.send(service.request(Method::GET, &format!("/v1/retention{query}"))).await?;
         let plan: serde_json::Value = response.json().await?;

@@ -1,4 +1,4 @@
-//! `modalwatch serve`: everything put together, and the way down.
+//! `modalwatch serve`: starts and stops all parts of the service.
 
 use std::future::Future;
 use std::net::SocketAddr;
@@ -21,28 +21,31 @@ use crate::mqtt::{self, MqttStatus};
 use crate::notify::Notifier;
 use crate::store::Store;
 
-/// Upper ends of the latency buckets, seconds.
+/// Upper bounds of the latency histogram buckets, s.
 const BUCKETS_SECONDS: [f64; 12] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0];
 
 /// A service that is listening.
 pub struct Running {
-    /// Where it listens.
+    /// The address it listens on.
     pub address: SocketAddr,
-    /// Ends when the service has stopped.
+    /// Completes when the service has stopped.
     pub task: tokio::task::JoinHandle<()>,
-    /// What it works with.
+    /// The monitor of the structures.
     pub monitor: Monitor,
 }
 
-/// Starts the service; it stops when `shutdown` is done.
+/// Starts the service; it stops when `shutdown` completes.
 ///
 /// # Errors
-/// A folder, database, baseline folder or address that cannot be used, with what to do.
+/// A data folder, database, models folder or address that cannot be used, with a remedy.
 pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + 'static) -> anyhow::Result<Running> {
     let library = Library::open(config.models_dir.as_deref())?;
-    // The address first: a second instance should hear that the port is taken before anything else.
+    // Listening comes first, so that a second instance reports the used port rather than the locked database.
     let listener = TcpListener::bind(&config.http.listen).await.with_context(|| {
-        format!("cannot listen on {}: is another service there? Choose another with --listen", config.http.listen)
+        format!(
+            "cannot listen on {}: if another program uses the port, choose another with --listen",
+            config.http.listen
+        )
     })?;
     let address = listener.local_addr()?;
     let store = Store::open_with(&config.data_dir, &config.store).await?;
@@ -72,21 +75,21 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let router = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
     declare_metrics(store.file().sqlite_version());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
-    info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained baseline(s)");
+    info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
     let events = monitor.events().clone();
     let task = tokio::spawn(async move {
         let shutdown = async {
             shutdown.await;
             supervisor::stopping();
-            // Event streams never end by themselves: open ones would hold the drain up to its limit.
+            // Event streams do not end by themselves and would delay the shutdown up to its time limit.
             events.close();
-            // Those who listen may have ended already.
+            // Sending fails only if all background tasks have ended already.
             let _ = stop.send(true);
         };
         server::run(listener, router, &config.http, shutdown).await;
         for task in background {
             if let Err(failure) = task.await {
-                error!(error = %failure, "A background task ended by a panic: {failure}");
+                error!(error = %failure, "A background task panicked: {failure}");
             }
         }
         store.close().await;
@@ -95,24 +98,24 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     Ok(Running { address, task, monitor })
 }
 
-/// Runs the service until SIGTERM or SIGINT; a second one ends the process at once. SIGHUP reads the configuration again.
+/// Runs the service until SIGTERM or SIGINT; a second signal ends the process immediately. SIGHUP reads the configuration again.
 ///
 /// # Errors
-/// Whatever keeps the service from starting.
+/// Whatever prevents the service from starting.
 pub async fn serve(config: Config, reloading: Reloading) -> anyhow::Result<()> {
-    // Before anything is said to listen: whoever reads that may send it at once.
+    // Before the start is reported: SIGHUP may be sent as soon as the report is read.
     let hangups = Reloading::hangups()?;
     let running = start(config.clone(), stop_signal()?).await?;
     reloading.follow(hangups, running.monitor.clone(), config);
     supervisor::ready(running.monitor);
     println!("modalwatch listens on http://{}", running.address);
-    running.task.await.context("the service ended by a panic")
+    running.task.await.context("the service panicked")
 }
 
-/// Done at the first SIGTERM or SIGINT.
+/// Completes at the first SIGTERM or SIGINT.
 ///
 /// # Errors
-/// When the process may not handle signals.
+/// If no signal handler can be installed.
 pub fn stop_signal() -> anyhow::Result<impl Future<Output = ()> + Send + 'static> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     Ok(async move {

@@ -1,32 +1,33 @@
-//! `modalwatch simulate`: measurements of a structure and a population, as CSV that the service takes.
+//! `modalwatch simulate`: simulated measurements as CSV that the service accepts.
 
 use std::path::PathBuf;
 
 use anyhow::Context as _;
 use clap::Args;
 
-use super::{named_numbers, write_whole};
+use super::output::write_whole;
+use super::parameter::parameter_moments;
 use crate::baseline::library::find_structure;
 use crate::measurement::{at_intervals, csv};
 use crate::quantity::Timestamp;
 use crate::simulator::population::Population;
 
-/// Simulate measurements of a structure.
+/// Simulate measurements of a structure as CSV.
 #[derive(Debug, Args)]
 pub struct SimulateArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// Population of one parameter, as name=mean,std in its unit; once for each parameter
-    #[arg(long = "parameter", required = true, value_parser = |t: &str| named_numbers(t, 2, "name=mean,std"))]
-    parameters: Vec<(String, Vec<f64>)>,
+    /// Population of one parameter, as name=mean,std in its unit; once per parameter
+    #[arg(long = "parameter", required = true, value_parser = parameter_moments)]
+    parameters: Vec<(String, f64, f64)>,
     /// Number of measurements
     #[arg(long, default_value_t = 50)]
     measurements: usize,
-    /// Noise as a multiple of the structure's; 0 for none
+    /// Noise as a multiple of the structure's noise; 0 = no noise
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Time of the first measurement
@@ -35,12 +36,12 @@ pub struct SimulateArgs {
     /// Seconds between measurements
     #[arg(long, default_value_t = 600)]
     interval_s: u32,
-    /// File to write; standard output without it
+    /// File to write [default: standard output]
     #[arg(long)]
     out: Option<PathBuf>,
 }
 
-/// Draws the population and writes the CSV.
+/// Draws parameters from the population, simulates the measurements and writes them as CSV.
 ///
 /// # Errors
 /// A structure or population that is refused, a file that cannot be written.
@@ -48,8 +49,7 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
     anyhow::ensure!(args.measurements > 0, "--measurements is 0: at least 1 is needed");
     anyhow::ensure!(args.noise >= 0.0 && args.noise.is_finite(), "--noise is {}: it must be 0 or above", args.noise);
-    let moments: Vec<(String, f64, f64)> = args.parameters.iter().map(|(name, n)| (name.clone(), n[0], n[1])).collect();
-    let population = Population::new(simulator.space(), &moments)?;
+    let population = Population::new(simulator.space(), &args.parameters)?;
     let drawn = population.draw(&simulator, args.measurements, args.noise, args.seed)?;
     let start = Timestamp::parse(&args.start).context("--start")?;
     let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();

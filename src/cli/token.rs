@@ -1,4 +1,4 @@
-//! `modalwatch token`: tokens without a running service.
+//! `modalwatch token`: manages tokens while the service is stopped.
 
 use std::path::PathBuf;
 
@@ -10,7 +10,7 @@ use crate::config::{Config, Flags};
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::store::{self, NewAuditEntry, Store};
 
-/// Make, list, revoke and rotate tokens while the service is stopped.
+/// Create, list, revoke and rotate tokens while the service is stopped.
 #[derive(Debug, Args)]
 pub struct TokenArgs {
     #[command(subcommand)]
@@ -25,39 +25,39 @@ pub struct TokenArgs {
 
 #[derive(Debug, Subcommand)]
 enum TokenCommand {
-    /// Make a token; it is printed once.
+    /// Create a token; it is printed once.
     Create {
-        /// What it is for, for people
+        /// Name that describes what the token is for
         #[arg(long)]
         name: String,
-        /// ingest, read or admin; may be given several times
+        /// Scope: ingest, read or admin; may be repeated
         #[arg(long = "scope", required = true)]
         scopes: Vec<Scope>,
-        /// The only structure it may be used for; may be given several times [default: all]
+        /// Restrict the token to this structure; may be repeated [default: all structures]
         #[arg(long = "structure")]
         structures: Vec<String>,
-        /// When it ends, RFC 3339 with an offset [default: never]
+        /// Time of expiry, RFC 3339 with an offset [default: never]
         #[arg(long)]
         expires_at: Option<String>,
     },
     /// List all tokens, without their secrets.
     List,
-    /// Refuse a token from now on.
+    /// Revoke a token.
     Revoke {
-        /// Its id: the part between the underscores
+        /// Id of the token: the part between its underscores
         id: String,
     },
     /// Give a token a new secret; it is printed once.
     Rotate {
-        /// Its id: the part between the underscores
+        /// Id of the token: the part between its underscores
         id: String,
-        /// Seconds that the old secret stays good
+        /// Seconds for which the old secret stays valid
         #[arg(long, default_value_t = 3_600)]
         overlap_s: u32,
     },
-    /// Make an admin token file for MODALWATCH_ADMIN_TOKEN_FILE; needs no database.
+    /// Create an admin token file for MODALWATCH_ADMIN_TOKEN_FILE; no database is needed.
     File {
-        /// The new file, readable by its owner only
+        /// File to create; only its owner can read it
         path: PathBuf,
     },
 }
@@ -65,7 +65,7 @@ enum TokenCommand {
 /// Runs the command.
 ///
 /// # Errors
-/// What is wrong with the token, or a database that cannot be opened, such as that of a running service.
+/// An invalid token, or a database that cannot be opened, for example because a service is running.
 pub async fn token(args: TokenArgs) -> anyhow::Result<()> {
     if let TokenCommand::File { path } = &args.command {
         write_admin_token(path)?;
@@ -76,7 +76,7 @@ pub async fn token(args: TokenArgs) -> anyhow::Result<()> {
     let config = Config::read(args.config.as_deref(), &flags)?;
     let store = Store::open(&config.data_dir).await.map_err(|error| match error {
         store::Error::Locked(folder) => anyhow::anyhow!(
-            "the service is running on {}: ask it (POST /v1/tokens, DELETE /v1/tokens/{{id}}, POST \
+            "the service is running on {}: use its API (POST /v1/tokens, DELETE /v1/tokens/{{id}}, POST \
              /v1/tokens/{{id}}/rotation), or stop it first",
             folder.display()
         ),
@@ -109,7 +109,7 @@ async fn run(store: &Store, command: TokenCommand) -> anyhow::Result<()> {
             Ok(())
         }
         TokenCommand::Rotate { id, overlap_s } => rotate(store, &id, overlap_s).await,
-        TokenCommand::File { .. } => unreachable!("it needs no database"),
+        TokenCommand::File { .. } => unreachable!("handled before the database is opened"),
     }
 }
 
@@ -136,7 +136,7 @@ async fn rotate(store: &Store, id: &str, overlap_s: u32) -> anyhow::Result<()> {
     let until = Timestamp::from_micros(now.micros() + i64::from(overlap_s) * 1_000_000)?;
     let rotated = record.rotated(&text, until);
     store.audit().audited(entry("rotate", &rotated.id), store.tokens().update_token(&rotated)).await?;
-    eprintln!("The old secret is good until {until}.");
+    eprintln!("The old secret is valid until {until}.");
     show_once(&text);
     Ok(())
 }
@@ -157,9 +157,9 @@ async fn list(store: &Store) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The token alone on standard output, for scripts; what it means on standard error.
+/// Prints the token to standard output, for scripts, and the explanation to standard error.
 fn show_once(text: &TokenText) {
-    eprintln!("This is shown once: the service keeps only its SHA-256.");
+    eprintln!("The token is shown only once: the service stores only its SHA-256.");
     println!("{}", text.reveal());
 }
 

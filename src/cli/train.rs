@@ -5,16 +5,15 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use clap::Args;
-use indicatif::{ProgressBar, ProgressStyle};
 
-use super::write_whole;
+use super::output::write_whole;
+use super::training::{print_record, sizes, train_into};
 use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::{find_structure, read_structure_file};
-use crate::baseline::manifest::{Manifest, ValidationRecord};
-use crate::baseline::train::{default_epochs, default_samples, diverged, train as train_baseline, Trained};
+use crate::baseline::manifest::ValidationRecord;
+use crate::baseline::train::diverged;
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
-use crate::simulator::Simulator;
 
 /// Train the baseline of a structure.
 #[derive(Debug, Args)]
@@ -116,56 +115,6 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         );
     }
     Ok(())
-}
-
-/// Number of samples and epochs of a training: those given, otherwise the defaults for the structure.
-pub(super) fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize>) -> (usize, usize) {
-    (samples.unwrap_or_else(|| default_samples(simulator)), epochs.unwrap_or_else(|| default_epochs(simulator)))
-}
-
-/// Trains with a progress bar and writes the two files of the baseline to a folder.
-pub(super) fn train_into(
-    out: &std::path::Path,
-    simulator: &Simulator,
-    samples: usize,
-    noise_range: NoiseRange,
-    flow: &FlowSettings,
-    settings: &TrainSettings,
-) -> anyhow::Result<Trained> {
-    let bar = ProgressBar::new(settings.epochs as u64);
-    let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
-    bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
-    let trained = train_baseline(simulator, samples, noise_range, flow, settings, |epoch| {
-        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
-        bar.set_position(epoch.epoch as u64);
-    })?;
-    bar.finish_and_clear();
-    write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
-    write_whole(&out.join("baseline.json"), &trained.manifest_json)?;
-    Ok(trained)
-}
-
-/// Prints the identifiability and the calibration of a baseline.
-pub(super) fn print_record(manifest: &Manifest) {
-    for p in &manifest.identifiability.parameters {
-        let (name, left) = (&p.name, 100.0 * p.variance_left);
-        println!(
-            "one measurement leaves {left:.2} % of the prior variance of {name} (standard deviation {:.4})",
-            p.posterior_std
-        );
-    }
-    for group in &manifest.identifiability.groups {
-        println!("the modes cannot distinguish these parameters: {}", group.join(", "));
-    }
-    let calibration = &manifest.calibration;
-    if calibration.passed() {
-        println!("calibration passed in {} cells of {} simulations", calibration.cells.len(), calibration.simulations);
-        return;
-    }
-    println!("CALIBRATION FAILED: the service does not use this baseline unless it is configured to");
-    for failure in &calibration.failures {
-        println!("  {failure}");
-    }
 }
 
 fn noise_range(text: &str) -> Result<NoiseRange, String> {

@@ -1,4 +1,5 @@
-//! `modalwatch update`: the population behind measurements, by sensitivity, by TMCMC or by the trained flow.
+//! `modalwatch update`: estimates the population of the parameters by sensitivity-based updating, by TMCMC or by the trained
+//! flow.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -9,8 +10,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 use nalgebra::DMatrix;
 use serde::Serialize;
 
-use super::calibrate::load;
 use super::measurements::read_measurements;
+use super::model::load;
 use crate::assessment::{draw, Draws};
 use crate::baseline::library::find_structure;
 use crate::damage::Hyperparameters;
@@ -21,34 +22,35 @@ use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all, Update};
 use crate::updating::stochastic::{settings, simulated_for, Estimate, Population};
 
-/// Update the parameters of a structure by measurements.
+/// Estimate mean and standard deviation of the parameters from measurements.
 #[derive(Debug, Args)]
 pub struct UpdateArgs {
-    /// How: a deterministic inverse of each measurement; Markov chains over mean and spread; the trained flow
+    /// sensitivity: least squares for each measurement; tmcmc: Markov chains over mean and standard deviation; cinn: the trained
+    /// flow
     #[arg(long, value_enum)]
     method: Method,
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// CSV of the measurements
+    /// CSV file of the measurements
     #[arg(long)]
     data: PathBuf,
-    /// Columns that are not read, separated by commas
+    /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
-    /// cinn: the trained baseline's .safetensors, with its .json beside it; the shipped one without it
+    /// cinn: trained model, its .safetensors file with its .json beside it [default: the shipped model]
     #[arg(long)]
     model: Option<PathBuf>,
-    /// tmcmc: samples of the chains
+    /// tmcmc: number of samples
     #[arg(long, default_value_t = 1_000)]
     samples: usize,
-    /// tmcmc: simulated measurements at each of them [default: 128; more for more than 500 measurements]
+    /// tmcmc: number of simulated measurements per sample [default: 128; more for more than 500 measurements]
     #[arg(long)]
     simulated: Option<usize>,
-    /// tmcmc: noise of the measurements as a multiple of the structure's
+    /// tmcmc: measurement noise as a multiple of the structure's noise
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Print the result as JSON
@@ -56,7 +58,7 @@ pub struct UpdateArgs {
     json: bool,
 }
 
-/// Multiple of what chance makes of a distance between distributions, beyond which something is wrong.
+/// A Bhattacharyya distance above this multiple of its expected value for a correct population is reported.
 const FAR: f64 = 5.0;
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -66,13 +68,13 @@ enum Method {
     Cinn,
 }
 
-/// What is printed; intervals are 90 %.
+/// The result; intervals are 90 %.
 #[derive(Debug, Serialize)]
 struct Answer {
     method: &'static str,
     measurements_used: usize,
     measurements_left_out: usize,
-    parameters: Vec<Line>,
+    parameters: Vec<ParameterLine>,
     #[serde(skip_serializing_if = "Option::is_none")]
     evidence: Option<Estimate>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -82,7 +84,7 @@ struct Answer {
 }
 
 #[derive(Debug, Serialize)]
-struct Line {
+struct ParameterLine {
     name: String,
     unit: String,
     mean: f64,
@@ -99,16 +101,16 @@ struct SingleUpdate {
     converged: bool,
 }
 
-/// Reads, updates and prints.
+/// Reads the measurements, estimates the population and prints it.
 ///
 /// # Errors
-/// A file that is refused, data that the method cannot use.
+/// A file that is refused, or data that the method cannot use.
 pub fn update(args: &UpdateArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
     let measurements = read_measurements(&simulator, &args.data, &args.ignore)?;
     anyhow::ensure!(
         simulator.effects().is_empty() || matches!(args.method, Method::Cinn),
-        "{} has effects that differ from measurement to measurement: only --method cinn knows of them",
+        "{} has effects that differ between measurements: only --method cinn accounts for them",
         simulator.id()
     );
     let started = Instant::now();
@@ -127,7 +129,7 @@ pub fn update(args: &UpdateArgs) -> anyhow::Result<()> {
 }
 
 fn by_sensitivity(simulator: &Simulator, measurements: &[ModalMeasurement]) -> anyhow::Result<Answer> {
-    // With fewer modes than parameters the answer would be that of the starting point.
+    // With fewer modes than parameters the result would depend on the starting point.
     let needed = simulator.space().len();
     let enough = |m: &&ModalMeasurement| m.frequencies_hz.iter().flatten().count() >= needed;
     let rows: Vec<Vec<Option<f64>>> = measurements
@@ -137,27 +139,27 @@ fn by_sensitivity(simulator: &Simulator, measurements: &[ModalMeasurement]) -> a
         .collect();
     anyhow::ensure!(
         !rows.is_empty(),
-        "no measurement has the {needed} modes that {needed} parameters need: sensitivity updating finds one point for each"
+        "no measurement has {needed} modes: sensitivity-based updating of {needed} parameters needs as many in each"
     );
     let left_out = measurements.len() - rows.len();
     let updates = update_all(simulator, &rows, &prior_lattice(simulator))?;
     let mut notes = stated_noise_ignored(measurements);
     if left_out > 0 {
-        notes.push(format!("{left_out} measurements have fewer modes than there are parameters: left out"));
+        notes.push(format!("{left_out} measurements have fewer modes than there are parameters and were left out"));
     }
     let stuck = updates.iter().filter(|u| !u.converged).count();
     if stuck > 0 {
-        notes.push(format!("{stuck} of {} searches did not come to rest", updates.len()));
+        notes.push(format!("{stuck} of {} iterations did not converge", updates.len()));
     }
     let missed = updates.iter().filter(|u| !u.is_met()).count();
     let worst = updates.iter().map(|u| 100.0 * u.residual).fold(0.0, f64::max);
     if missed > 0 {
-        let message = "measurements are not met exactly by any parameters in the prior; misfit at most";
+        let message = "measurements cannot be matched exactly by parameters within the prior; largest misfit";
         notes.push(format!("{missed} of {} {message} {worst:.3} %", updates.len()));
     }
     let line = |(k, parameter): (usize, &crate::parameter::Parameter)| {
         let values: Vec<f64> = updates.iter().map(|u| u.theta[k]).collect();
-        Line {
+        ParameterLine {
             name: parameter.name.clone(),
             unit: parameter.unit.clone(),
             mean: stats::mean(&values),
@@ -200,7 +202,7 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
         bar.set_position((100.0 * stage.exponent) as u64);
     })?;
     bar.finish_and_clear();
-    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| Line {
+    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| ParameterLine {
         name: parameter.name.clone(),
         unit: parameter.unit.clone(),
         mean: estimate.mean[k],
@@ -210,17 +212,20 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
     };
     let left_out = measurements.len() - complete.len();
     let mut notes = stated_noise_ignored(measurements);
-    // What normal samples of the fitted distribution differ by, on average: one for each moment, over 4n.
+    // Expected Bhattacharyya distance between the normal distributions fitted to two samples of size n from one population:
+    // k / (4n), with k = m + m(m+1)/2 means and covariances.
     let by_chance = (m + m * (m + 1) / 2) as f64 / (4.0 * complete.len() as f64);
     if estimate.least_distance > FAR * by_chance {
         notes.push(format!(
-            "the nearest simulated population is {:.2} away from the measured one (Bhattacharyya; chance {by_chance:.2}): \
-             it lies beyond the prior, or the simulation does not fit",
+            "the Bhattacharyya distance of the measured population from the closest simulated one is {:.2}, and {by_chance:.2} is \
+             expected by chance: the population lies beyond the prior, or the simulation does not fit",
             estimate.least_distance
         ));
     }
     if left_out > 0 {
-        notes.push(format!("{left_out} measurements lack a mode: a distance between distributions needs all of them"));
+        notes.push(format!(
+            "{left_out} measurements lack a mode and were left out: a distance between distributions needs all modes"
+        ));
     }
     Ok(Answer {
         method: "tmcmc",
@@ -234,7 +239,7 @@ fn by_tmcmc(simulator: &Simulator, measurements: &[ModalMeasurement], args: &Upd
     })
 }
 
-/// Two of the methods take every measurement as equally good.
+/// A note if the file states standard deviations, for the two methods that weight all measurements equally.
 fn stated_noise_ignored(measurements: &[ModalMeasurement]) -> Vec<String> {
     let stated = measurements.iter().any(|m| m.std_hz.is_some());
     let note = "the standard deviations stated in the file are not used by this method; --method cinn does";
@@ -242,11 +247,11 @@ fn stated_noise_ignored(measurements: &[ModalMeasurement]) -> Vec<String> {
 }
 
 fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Result<Answer> {
-    let baseline = load(&args.structure, args.model.as_deref())?;
+    let model = load(&args.structure, args.model.as_deref())?;
     let draws = Draws::with_seed(args.seed);
-    let batch = draw(&baseline, measurements, None, draws)?;
+    let batch = draw(&model, measurements, None, draws)?;
     let population = &batch.populations.parameters;
-    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| Line {
+    let line = |(k, parameter): (usize, &crate::parameter::Parameter)| ParameterLine {
         name: parameter.name.clone(),
         unit: parameter.unit.clone(),
         mean: stats::mean(&population[k].mean_draws),
@@ -256,7 +261,7 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
     };
     let mut notes: Vec<String> = batch.findings.iter().map(|f| f.message.clone()).collect();
     let pool = batch.posterior.first(draws.per_measurement);
-    for (k, parameter) in baseline.space().iter().enumerate() {
+    for (k, parameter) in model.space().iter().enumerate() {
         let pooled = Hyperparameters::from_pool(&pool.column(k), draws.per_measurement);
         let std = pooled.std.map_or("-".to_owned(), |std| format!("{std:.4}"));
         notes
@@ -266,7 +271,7 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
         method: "cinn",
         measurements_used: measurements.len() - batch.left_out,
         measurements_left_out: batch.left_out,
-        parameters: baseline.space().iter().enumerate().map(line).collect(),
+        parameters: model.space().iter().enumerate().map(line).collect(),
         evidence: None,
         updates: Vec::new(),
         notes,
@@ -274,7 +279,7 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
     })
 }
 
-/// Decimals that show a difference of this size with two digits.
+/// Number of decimals that shows a difference of this size with two significant digits.
 fn decimals(difference: f64) -> usize {
     let magnitude = difference.abs().max(1e-300).log10().floor();
     (1.0 - magnitude).clamp(0.0, 15.0) as usize
@@ -290,7 +295,7 @@ fn print(answer: &Answer) {
     }
     let with = |value: Option<f64>, interval: Option<[f64; 2]>| match (value, interval) {
         (Some(v), Some([low, high])) => {
-            // Digits that the interval makes sense of.
+            // Two significant digits of the width of the interval.
             let digits = decimals(high - low);
             format!("{v:.digits$} ({low:.digits$} … {high:.digits$})")
         }
@@ -304,6 +309,6 @@ fn print(answer: &Answer) {
     }
     if let Some(e) = &answer.evidence {
         let [log_evidence, error] = e.log_evidence;
-        println!("log-evidence {log_evidence:.2} ± {error:.2} nats; {} runs of the model", e.model_runs);
+        println!("log-evidence {log_evidence:.2} ± {error:.2} nats; {} runs of the simulation", e.model_runs);
     }
 }

@@ -10,8 +10,8 @@ use std::time::Duration;
 use axum::extract::ConnectInfo;
 use axum::http::Request;
 use axum::Router;
-use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
-use hyper_util::server::conn::auto::Builder;
+use hyper::server::conn::http1::Builder;
+use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
 use hyper_util::service::TowerToHyperService;
 use rustix::process::{getrlimit, Resource};
@@ -46,9 +46,8 @@ fn open_files_limit() -> Option<usize> {
 
 /// Serves until `shutdown` completes, then lets open requests finish within the drain time.
 pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings, shutdown: impl Future<Output = ()>) {
-    let mut builder = Builder::new(TokioExecutor::new()).http1_only();
+    let mut builder = Builder::new();
     builder
-        .http1()
         .timer(TokioTimer::new())
         .header_read_timeout(Duration::from_secs(settings.header_timeout_s))
         .keep_alive(true);
@@ -74,8 +73,7 @@ pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings,
         // Answers are small; waiting to fill a packet (Nagle) would only add latency.
         let _ = stream.set_nodelay(true);
         let service = TowerToHyperService::new(WithPeer { router: router.clone(), peer });
-        let connection = builder.serve_connection(TokioIo::new(stream), service).into_owned();
-        let connection = graceful.watch(connection);
+        let connection = graceful.watch(builder.serve_connection(TokioIo::new(stream), service));
         tokio::spawn(async move {
             if let Err(error) = connection.await {
                 debug!(%error, "A connection ended early: {error}");

@@ -299,7 +299,7 @@ fn the_command_line_assesses_what_it_simulates_like_the_service() {
     let undamaged = simulate("5.0,0.1", "1", "2026-01-01T00:00:00Z", "undamaged.csv");
     let damaged = simulate("4.5,0.1", "2", "2026-02-01T00:00:00Z", "damaged.csv");
     let offline =
-        run(&["assess", "--structure", "three-dof", "--baseline", "undamaged.csv", "--data", "damaged.csv", "--json"]);
+        run(&["assess", "--structure", "three-dof", "--reference", "undamaged.csv", "--data", "damaged.csv", "--json"]);
     let offline: serde_json::Value = serde_json::from_str(&offline).unwrap();
 
     let runtime = tokio::runtime::Runtime::new().unwrap();

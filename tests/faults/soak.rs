@@ -6,7 +6,7 @@
 //!
 //! | variable | default | meaning |
 //! |---|---|---|
-//! | `MODALWATCH_SOAK_S` | 120 | length, seconds; 1800 for the run that README tells of |
+//! | `MODALWATCH_SOAK_S` | 120 | length, seconds; 1800 for the run described in docs/accuracy.md |
 //! | `MODALWATCH_SOAK_KILL_EVERY_S` | 60, or a fifth of a shorter run | mean time between kills |
 //! | `MODALWATCH_SOAK_BATCHES_PER_S` | 50 | batches due each second |
 

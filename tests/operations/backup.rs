@@ -128,7 +128,7 @@ async fn the_command_backs_up_through_the_service_and_without_it() {
     assert!(fails(&locked).await.contains("http://127.0.0.1:1 cannot be reached"));
     run(&["backup", "--data-dir", &data_dir, "--url", &url, "--out", text(&running)]).await;
     let said = fails(&["backup", "--data-dir", &data_dir, "--url", &url, "--out", text(&running)]).await;
-    assert!(said.contains("is there already"), "{said}");
+    assert!(said.contains("already exists"), "{said}");
     service.stop("TERM");
     let stopped = elsewhere.path().join("stopped");
     let said = run(&["backup", "--data-dir", &data_dir, "--out", text(&stopped), "--json"]).await;
@@ -195,7 +195,7 @@ async fn a_backup_that_is_not_whole_is_refused_and_nothing_is_touched() {
     std::fs::remove_file(&record).unwrap();
     assert!(refused().await.contains("manifest.json"));
     std::fs::write(&record, &manifest).unwrap();
-    assert!(run(&["restore", "--verify", "--from", text(&backup)]).await.contains("The backup is whole"));
+    assert!(run(&["restore", "--verify", "--from", text(&backup)]).await.contains("The backup is complete and intact"));
 }
 
 #[tokio::test]

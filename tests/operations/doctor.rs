@@ -69,7 +69,7 @@ async fn each_defect_is_found_and_ends_with_status_1() {
     finds(&here, &[("MODALWATCH__STORE__MIN_FREE_BYTES", "9000000000000000000")], "free disk", "are free").await;
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap().to_string();
-    finds(&here, &[("MODALWATCH__HTTP__LISTEN", &address)], "port", "cannot be listened on").await;
+    finds(&here, &[("MODALWATCH__HTTP__LISTEN", &address)], "port", "cannot listen on").await;
 
     let models = tempfile::tempdir().unwrap();
     let bad = models.path().join("three-dof");

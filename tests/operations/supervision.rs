@@ -74,17 +74,17 @@ async fn a_hangup_takes_over_what_can_change_and_keeps_what_is_wrong_out() {
     };
     wait_for("Listening on");
     hangup();
-    wait_for("took over nothing new");
+    wait_for("applied no changes");
     std::fs::write(&config, "[log]\nlevel = \"info\"\n[http]\nlistn = 3\n").unwrap();
     hangup();
-    wait_for("kept the configuration in force");
+    wait_for("the old one stays in force");
     std::fs::write(&config, "[log]\nlevel = \"==\"\n").unwrap();
     hangup();
     wait_for("log.level");
     std::fs::write(&config, "[log]\nlevel = \"debug\"\n[http]\ndrain_s = 3\n[retention]\nmeasurements_days = 4000\n")
         .unwrap();
     hangup();
-    let taken = wait_for("took over");
+    let taken = wait_for("SIGHUP: applied");
     assert!(taken.contains("log.level, retention.measurements_days"), "{taken}");
     assert!(wait_for("at the next start").contains("http.drain_s"));
     child.kill().unwrap();

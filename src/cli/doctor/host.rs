@@ -1,4 +1,4 @@
-//! Configuration, clock, limits, ports, and the service that may be running.
+//! Checks of the configuration, the clock, the limits of the process, the port, and a running service.
 
 use std::time::Duration;
 
@@ -6,72 +6,72 @@ use reqwest::Method;
 use rustix::process::{getrlimit, Resource};
 use serde_json::Value;
 
-use super::super::remote::{PlaceArgs, Service};
-use super::Check;
+use super::super::remote::{LocationArgs, Service};
+use super::check::Check;
 use crate::config::Config;
 use crate::quantity::Timestamp;
 use crate::telemetry;
 
-/// This program was written after this time: a clock before it is wrong.
+/// A clock before this time is wrong, because the program is newer.
 const WRITTEN_AFTER: &str = "2026-01-01T00:00:00Z";
-/// The clock may lie this much behind the newest batch, µs.
+/// Maximum time by which the clock may be behind the newest batch, µs.
 const SKEW_MICROS: i64 = 5 * 60 * 1_000_000;
-/// Files beside those of the connections: database, log, standard streams, models while they load.
+/// Number of open files besides the connections: database, log, standard streams, models during loading.
 const OTHER_FILES: usize = 64;
-/// Longest wait for the service.
+/// Maximum time to wait for the service.
 const PATIENCE: Duration = Duration::from_secs(8);
 
-/// The configuration was read; the level of the log is a filter that only its parser knows.
+/// The configuration has been read already; only the filter of the log level is parsed here.
 pub fn configuration(config: &Config) -> Check {
     match telemetry::filter(&config.log.level) {
-        Ok(_) => Check::ok("configuration", "every key and value is known"),
+        Ok(_) => Check::ok("configuration", "all keys and values are valid"),
         Err(error) => Check::fail("configuration", error, "set log.level to info"),
     }
 }
 
-/// The clock against the program's age and the newest batch.
+/// Compares the clock with the age of the program and the newest batch.
 pub fn clock(newest: Option<Timestamp>) -> Check {
     let now = Timestamp::now();
     let written = Timestamp::parse(WRITTEN_AFTER).expect("the constant is a time");
-    let next = "set the clock and keep it by NTP: batches are judged by their time";
+    let next = "set the clock and synchronise it by NTP: the times of batches are compared with it";
     if now < written {
-        return Check::fail("clock", format!("it says {now}, before this program was written"), next);
+        return Check::fail("clock", format!("it shows {now}, a time before this program was written"), next);
     }
     match newest {
         Some(newest) if newest.micros() - now.micros() > SKEW_MICROS => {
-            Check::fail("clock", format!("it says {now}, but a batch arrived at {newest}: it went back"), next)
+            Check::fail("clock", format!("it shows {now}, but a batch was received at {newest}: it was set back"), next)
         }
         _ => Check::ok("clock", now.to_string()),
     }
 }
 
-/// Files that this process may open, against the connections that it is set to take.
+/// Compares the limit of open files with the configured number of connections.
 pub fn open_files(config: &Config) -> Check {
     let soft = getrlimit(Resource::Nofile).current.and_then(|files| usize::try_from(files).ok());
     let needed = config.http.max_connections + OTHER_FILES;
     match soft {
         Some(soft) if soft < needed => {
-            let next = format!("raise it (ulimit -n, LimitNOFILE) to {needed}, or lower http.max_connections");
+            let next = format!("raise the limit (ulimit -n, LimitNOFILE) to {needed}, or lower http.max_connections");
             Check::warn("open files", format!("{soft} are allowed, {needed} may be needed"), next)
         }
         Some(soft) => Check::ok("open files", format!("{soft} are allowed")),
-        None => Check::ok("open files", "no limit is known here"),
+        None => Check::ok("open files", "there is no limit"),
     }
 }
 
-/// The port when no service runs, else what the service says of itself.
-pub async fn service(place: &PlaceArgs, config: &Config, in_use: bool) -> Vec<Check> {
+/// Whether the port is free if no service runs, otherwise the state that the service reports.
+pub async fn service(location: &LocationArgs, config: &Config, in_use: bool) -> Vec<Check> {
     let listen = &config.http.listen;
-    if !in_use && place.url.is_none() {
+    if !in_use && location.url.is_none() {
         return vec![match tokio::net::TcpListener::bind(listen).await {
             Ok(_) => Check::ok("port", format!("{listen} is free")),
             Err(error) => {
-                let next = "stop what listens there, or choose another with --listen";
-                Check::fail("port", format!("{listen} cannot be listened on: {error}"), next)
+                let next = "stop the program that uses the port, or choose another port with --listen";
+                Check::fail("port", format!("cannot listen on {listen}: {error}"), next)
             }
         }];
     }
-    let service = match place.service(config) {
+    let service = match location.service(config) {
         Ok(service) => service,
         Err(error) => return vec![Check::fail("service", error.to_string(), "give --url")],
     };
@@ -87,9 +87,15 @@ async fn ask(service: &Service) -> Vec<Check> {
     };
     let body = match body {
         Ok(body) if body["ready"].is_boolean() => body,
-        Ok(_) => return vec![Check::fail("service", format!("{url} is another program"), "give the service's --url")],
+        Ok(_) => {
+            return vec![Check::fail(
+                "service",
+                format!("another program answers at {url}"),
+                "give the URL of the service with --url",
+            )]
+        }
         Err(error) => {
-            let next = "give the service's --url; if it is that one, its log says why it does not answer";
+            let next = "give the URL of the service with --url; if the URL is right, see the log of the service";
             return vec![Check::fail("service", format!("{url} does not answer: {error}"), next)];
         }
     };
@@ -109,11 +115,11 @@ async fn ask(service: &Service) -> Vec<Check> {
         Check::fail(
             "service",
             format!("{url} is not ready: {}", listed("reasons").join("; ")),
-            "its log has the causes",
+            "see the log of the service",
         )
     });
     for finding in listed("findings") {
-        checks.push(Check::warn("service", finding, "see README, Operations"));
+        checks.push(Check::warn("service", finding, "see docs/operations.md"));
     }
     checks
 }

@@ -1,6 +1,6 @@
-//! Trained baselines: each is loaded, runs its self-test, and says how its calibration came out.
+//! Checks of the trained models: each is loaded with its self-test, and its recorded calibration is reported.
 
-use super::Check;
+use super::check::Check;
 use crate::baseline::library::Library;
 use crate::baseline::Baseline;
 use crate::config::Config;
@@ -8,15 +8,15 @@ use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::inspect::Inspection;
 
-/// Those of program and models folder.
+/// The models shipped with the program and those in the models folder.
 pub fn library(config: &Config) -> Vec<Check> {
     let library = match Library::open(config.models_dir.as_deref()) {
         Ok(library) => library,
-        Err(error) => return vec![Check::fail("models", error.to_string(), "mend models_dir")],
+        Err(error) => return vec![Check::fail("models", error.to_string(), "correct models_dir")],
     };
     let mut checks = Vec::new();
     for refusal in library.refusals() {
-        let next = "train it again with `modalwatch train`, or put the right files there";
+        let next = "train it again with `modalwatch train`, or replace the files";
         checks.push(Check::fail("models", format!("{} is refused: {}", refusal.file, refusal.reason), next));
     }
     for (id, entry) in library.iter() {
@@ -26,14 +26,14 @@ pub fn library(config: &Config) -> Vec<Check> {
             None if library.refusals().iter().any(|refusal| refusal.structure.as_ref() == Some(id)) => {}
             None => {
                 let next = format!("modalwatch train --structure {id}");
-                checks.push(Check::warn(name, "the structure has no trained baseline", next));
+                checks.push(Check::warn(name, "the structure has no trained model", next));
             }
         }
     }
     checks
 }
 
-/// Those that the service trained itself.
+/// The models that the service trained itself, which are in the database.
 pub fn trained(inspection: &Inspection) -> Vec<Check> {
     let mut checks = Vec::new();
     for (id, definition, stored) in &inspection.structures {
@@ -41,7 +41,7 @@ pub fn trained(inspection: &Inspection) -> Vec<Check> {
         let simulator = match simulator {
             Ok(simulator) => simulator,
             Err(error) => {
-                let next = "use the modalwatch that wrote it";
+                let next = "use the version of modalwatch that stored it";
                 checks.push(Check::fail(
                     format!("structure {id}"),
                     format!("its stored definition is refused: {error}"),
@@ -58,7 +58,7 @@ pub fn trained(inspection: &Inspection) -> Vec<Check> {
                 calibrated(name, &baseline, &accepted)
             }
             Err(error) => {
-                let next = format!("go back to the version before: DELETE /v1/structures/{id}/extension");
+                let next = format!("go back to the previous version: DELETE /v1/structures/{id}/extension");
                 Check::fail(name, error.to_string(), next)
             }
         });
@@ -77,10 +77,10 @@ fn calibrated(name: String, baseline: &Baseline, accepted: &[String]) -> Check {
     if accepted.iter().any(|accepted| accepted == digest) {
         return Check::warn(
             name,
-            format!("{found}; it is used all the same"),
+            format!("{found}; it is used nevertheless, because it was accepted"),
             "train it again with more samples or epochs",
         );
     }
-    let next = format!("train it again with more samples or epochs, or put {digest} into monitor.accept_uncalibrated");
+    let next = format!("train it again with more samples or epochs, or add {digest} to monitor.accept_uncalibrated");
     Check::fail(name, found, next)
 }
