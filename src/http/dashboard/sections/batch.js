@@ -25,7 +25,7 @@ export function batch(structure) {
     "section",
     { id: "batch", class: "panel", "aria-labelledby": "batch-title" },
     h("h2", { id: "batch-title", tabindex: -1 }, "Batch"),
-    h("p", { class: "row" }, h("label", { for: "batch-picker" }, "Batch measured at"), earlier, picker, later),
+    h("p", { class: "row" }, h("label", { for: "batch-picker" }, "Batch measured until"), earlier, picker, later),
     description,
     drawn,
   );
