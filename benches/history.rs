@@ -278,12 +278,16 @@ async fn replay(threads: usize) -> f64 {
         let measurements = at_intervals(&rows, start, 1, None).expect("measurements");
         let (structure, source) = (structure.clone(), "logger".to_owned());
         let batch = MeasurementBatch { structure, source, idempotency_key: None, measurements };
-        let taken = monitor.ingest(batch).await.expect("it is taken");
+        let taken = monitor.ingest().take(batch).await.expect("it is taken");
         first.get_or_insert(taken.view.record.batch_id);
     }
     let started = Instant::now();
     // All others go back to be compared with it.
-    monitor.declare_undamaged(&structure, first.into_iter().collect(), 0.05).await.expect("an undamaged state");
+    monitor
+        .replay()
+        .declare_reference(&structure, first.into_iter().collect(), 0.05)
+        .await
+        .expect("an undamaged state");
     let waiting = async || !monitor.store().batches().pending(&structure, 1).await.expect("an answer").is_empty();
     while waiting().await {
         tokio::time::sleep(Duration::from_millis(5)).await;

@@ -64,30 +64,20 @@ const TABLE: [(&str, &[&str], bool); 34] = [
     ("discrepancy", &["physics", "plot", "simulator"], true),
     ("damage", &["hierarchy", "posterior"], true),
     ("alarm", &["damage"], true),
-    ("assessment", &["damage", "trust"], true),
+    (
+        "assessment",
+        &["alarm", "baseline", "damage", "hierarchy", "physics", "plot", "posterior", "simulator", "trust"],
+        true,
+    ),
     ("store", &["access", "alarm", "assessment", "damage", "reduction", "trust", "volume"], true),
     ("notify", &["store"], true),
     ("mqtt", &["monitor"], true),
     ("telemetry", &[], false),
-    // A study of the whole program, the assessment of a batch included.
-    ("reproduce", &["baseline", "damage", "gsa", "monitor", "physics", "plot", "simulator", "updating"], true),
+    // A study of the methods, the assessment of a batch included.
+    ("reproduce", &["assessment", "baseline", "damage", "gsa", "physics", "plot", "simulator", "updating"], true),
     (
         "monitor",
-        &[
-            "alarm",
-            "assessment",
-            "baseline",
-            "damage",
-            "discrepancy",
-            "flow",
-            "hierarchy",
-            "physics",
-            "plot",
-            "posterior",
-            "simulator",
-            "store",
-            "trust",
-        ],
+        &["alarm", "assessment", "baseline", "damage", "discrepancy", "flow", "reduction", "simulator", "store"],
         true,
     ),
     (
@@ -114,6 +104,7 @@ const TABLE: [(&str, &[&str], bool); 34] = [
         &[
             "access",
             "alarm",
+            "assessment",
             "baseline",
             "config",
             "damage",

@@ -1,4 +1,4 @@
-//! Control charts: the mean of a batch in standard errors from the undamaged state, and its moving average.
+//! Control charts: the distance of a batch mean from the undamaged reference in standard errors, and its moving average.
 
 use serde::Serialize;
 
@@ -9,23 +9,26 @@ use crate::damage::{ChartReference, UndamagedQuantity};
 use crate::parameter::DamageDirection;
 use crate::stats;
 
-/// Least share of the undamaged variance that a batch is credited with, however exact it claims to be.
+/// Least variance of a measurement in a batch, as a share of the undamaged variance, however exact its measurements claim to be.
 const LEAST_VARIANCE: f64 = 0.1;
 
-/// A batch on the chart of one series, before its neighbours are known.
+/// Series of the chart of the simulation's fit; no parameter can have a colon in its name.
+pub const FIT_SERIES: &str = "simulation:fit";
+
+/// A batch on the chart of one series, before its neighbours in time are known.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartPoint {
-    /// Shift towards damage, in standard errors; for the fit, 1 when rejected and 0 else.
+    /// Shift towards damage, in standard errors; for the fit, 1 when rejected and 0 otherwise.
     pub shift: f64,
-    /// Limit of one shift.
+    /// Limit of a single shift.
     pub limit: f64,
     /// Limit of the moving average.
     pub ewma_limit: f64,
-    /// True when the batch moves no chart.
+    /// True when the batch does not enter the chart.
     pub held: bool,
 }
 
-/// What a point means among its neighbours.
+/// The state of a series after a point.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ChartStatus {
     /// Moving average of the shifts up to this point.
@@ -42,11 +45,11 @@ pub struct ChartStatus {
 ///  z = ±(μ_ud − x̄)/se,    se² = (s² + v − v_ud)/n + τ² + s²/n_ud + τ²/B
 /// ```
 ///
-/// x̄ mean of the n posterior means of the batch; s² variance of a measurement in the undamaged state (n_ud measurements in
-/// B batches), v and v_ud mean posterior variance of a measurement now and then, τ between batches. The spread of the batch
-/// itself does not enter: of few measurements it is hardly known.
+/// x̄ is the mean of the n posterior means of the batch, s² the variance of a measurement in the undamaged reference (n_ud
+/// measurements in B batches), v and v_ud the mean posterior variance of a measurement in the batch and in the reference, τ the
+/// standard deviation between batches. The spread of the batch itself does not enter, because few measurements hardly determine it.
 ///
-/// `None` when no change of the quantity is damage or the undamaged state has no scatter.
+/// `None` when no change of the quantity indicates damage or the undamaged reference has no scatter.
 pub fn shift(
     reference: &ChartReference,
     direction: DamageDirection,
@@ -63,7 +66,7 @@ pub fn shift(
     (error > 0.0 && measurements > 0).then(|| towards * (reference.mean - mean) / error)
 }
 
-/// Standard error of the difference between a batch and the undamaged state, see [`shift`].
+/// Standard error of the difference between a batch and the undamaged reference, in the quantity's unit, see [`shift`].
 pub fn standard_error(reference: &ChartReference, within: f64, measurements: usize) -> f64 {
     let variance = reference.std.powi(2);
     let here = (variance + within - reference.within).max(LEAST_VARIANCE * variance);
@@ -71,7 +74,7 @@ pub fn standard_error(reference: &ChartReference, within: f64, measurements: usi
     (here / measurements as f64 + between + undamaged_variance(reference)).sqrt()
 }
 
-/// Share of [`standard_error`]² that comes from the undamaged state and is the same in all batches.
+/// Share ρ in [0, 1] of [`standard_error`]² that comes from the undamaged reference and is the same in all batches.
 pub fn shared(reference: &ChartReference, within: f64, measurements: usize) -> f64 {
     (undamaged_variance(reference) / standard_error(reference, within, measurements).powi(2)).clamp(0.0, 1.0)
 }
@@ -81,8 +84,8 @@ fn undamaged_variance(reference: &ChartReference) -> f64 {
     reference.std.powi(2) / reference.measurements as f64 + between / reference.batches.max(1) as f64
 }
 
-/// The probability of damage at which the mean of a batch stands on the limit, if its spread is the undamaged one: the
-/// limit of the chart in the unit of the probability of damage.
+/// The limit of the chart expressed as a probability of damage: that of a batch whose mean lies on the limit and whose spread is
+/// the undamaged one. `None` when the quantity has no damage threshold.
 pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, within: f64, measurements: usize) -> Option<f64> {
     let threshold = quantity.threshold?;
     let distance = (quantity.mean - threshold).abs() / quantity.std;
@@ -90,12 +93,12 @@ pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, within: f64, 
     Some(stats::normal_cdf(moved - distance))
 }
 
-/// A series of points, taken in the order of their measurement.
+/// A series of points in the order of their measurement.
 #[derive(Debug, Clone)]
 pub struct Series {
     settings: AlarmSettings,
     ewma: f64,
-    /// Whether the last points were above, the newest last.
+    /// Whether the last points were above a limit, the newest last.
     recent: Vec<bool>,
     state: State,
 }
@@ -106,13 +109,13 @@ impl Series {
         Self { settings, ewma: 0.0, recent: Vec::new(), state: State::Normal }
     }
 
-    /// A series that goes on behind stored points: the moving average and state of the last, and whether the last ones were
-    /// above, the newest last.
+    /// A series that continues after stored points: the moving average and state of the last, and whether the last ones were
+    /// above a limit, the newest last.
     pub fn resume(settings: AlarmSettings, ewma: f64, state: State, recent: Vec<bool>) -> Self {
         Self { settings, ewma, recent, state }
     }
 
-    /// Points before a place that [`Self::resume`] needs.
+    /// Number of previous points that [`Self::resume`] needs.
     pub fn memory(settings: &AlarmSettings) -> usize {
         settings.window.max(settings.recovery)
     }
@@ -134,12 +137,12 @@ impl Series {
         }
         let near = self.recent.iter().rev().take(self.settings.window).filter(|a| **a).count();
         let clear = self.recent.iter().rev().take_while(|a| !**a).count();
-        // The moving average has its own memory: it needs no second point.
+        // The moving average includes earlier points already, so it needs no second point above its limit.
         let event = match above {
             true if lasting || near >= self.settings.needed => Event::Confirmed,
             true => Event::Exceeds,
             false if clear >= self.settings.recovery => Event::Cleared,
-            // A single point that was not followed up is over once it leaves the window.
+            // A single point that no other confirmed ends when it leaves the window.
             false if near == 0 && !self.state.in_episode() => Event::Cleared,
             false => Event::Clears,
         };
@@ -160,7 +163,7 @@ impl ChartPoint {
     }
 }
 
-/// How misfits become an event: two of three batches, so that the 1 % of healthy batches that are rejected stay quiet.
+/// Rules of the chart of the fit: two of three batches, so that the 1 % of healthy batches that are rejected raise no alarm.
 pub fn fit_settings(settings: &AlarmSettings) -> AlarmSettings {
     AlarmSettings { needed: 2, window: 3, ewma_weight: 0.0, ..*settings }
 }

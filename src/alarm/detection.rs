@@ -1,4 +1,4 @@
-//! What the charts find: false alarms, delay, and the loss that is found with 90 % probability.
+//! Performance of the charts: false alarms, delay of detection, and the loss that is detected with 90 % probability.
 
 use rand::Rng as _;
 use rand_distr::{ChiSquared, StandardNormal};
@@ -11,26 +11,26 @@ use super::machine::State;
 use super::AlarmSettings;
 use crate::stats::{self, Stream};
 
-/// Operations simulated for the run to a false alarm.
+/// Operations simulated for the run length to a false alarm.
 const HEALTHY_OPERATIONS: usize = 400;
 /// Operations simulated for each size of damage.
 const DAMAGED_OPERATIONS: usize = 1_000;
-/// Healthy runs longer than this many times the wanted one count as that long.
+/// Healthy runs are cut at this many times the target run length.
 const LONGEST: f64 = 5.0;
-/// Healthy batches before the damage, so that the moving average has settled.
+/// Healthy batches before the damage, so that the moving average is stationary.
 const BEFORE: usize = 15;
-/// Most batches that are waited for an alarm.
+/// Runs to an alarm are cut at this many batches.
 const LONGEST_WAIT: usize = 300;
-/// Shifts that are looked at, in standard errors of a batch.
+/// Simulated shifts, in standard errors of a batch.
 const SHIFTS: [f64; 22] = [
     0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0,
 ];
 
-/// How well the charts of a structure find a shift of one parameter.
+/// How well the charts of a structure detect a shift of one parameter.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Detection {
-    /// Mean run of healthy batches to the first false alarm, each operation with an undamaged state of its own; runs are
-    /// counted up to five times the wanted one.
+    /// Mean number of healthy batches to the first false alarm, each operation with its own undamaged reference; runs are cut at
+    /// five times the target.
     pub healthy_run_batches: f64,
     /// Its standard error.
     pub healthy_run_error: f64,
@@ -41,21 +41,21 @@ pub struct Detection {
 /// Detection of one size of damage.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct DetectionPoint {
-    /// Shift of the mean, in standard errors of the comparison of a batch with the undamaged state.
+    /// Shift of the mean, in standard errors of the comparison of a batch with the undamaged reference.
     pub shift: f64,
     /// Probability of an alarm with the first damaged batch.
     pub first_batch: f64,
     /// Probability of an alarm within the given number of batches.
     pub within: f64,
-    /// Mean number of damaged batches to the alarm (ARL1), counted up to 300.
+    /// Mean number of damaged batches to the alarm (ARL1), each cut at 300.
     pub mean_run: f64,
-    /// Median of the same.
+    /// Median number of damaged batches to the alarm.
     pub median_run: f64,
 }
 
 impl Detection {
-    /// Least shift that is found within the given number of batches with a probability, interpolated; `None` when even the
-    /// largest shift is not.
+    /// Smallest shift that is detected within the given number of batches with this probability, interpolated, in standard errors;
+    /// `None` when even the largest simulated shift is not.
     pub fn shift_found(&self, probability: f64) -> Option<f64> {
         let behind = self.curve.iter().position(|p| p.within >= probability)?;
         let (Some(before), after) = (behind.checked_sub(1).map(|i| &self.curve[i]), &self.curve[behind]) else {
@@ -65,7 +65,7 @@ impl Detection {
         Some(before.shift + part * (after.shift - before.shift))
     }
 
-    /// Probability of an alarm within the given number of batches at a shift, interpolated.
+    /// Probability of an alarm within the given number of batches for a shift in standard errors, interpolated.
     pub fn probability_within(&self, shift: f64) -> f64 {
         let behind = self.curve.iter().position(|p| p.shift >= shift).unwrap_or(self.curve.len() - 1);
         let (before, after) = (&self.curve[behind.saturating_sub(1)], &self.curve[behind]);
@@ -74,7 +74,7 @@ impl Detection {
     }
 }
 
-/// Simulates healthy and damaged operation with given limits.
+/// Simulates healthy and damaged operation with given limits; `batches` is the number within which an alarm is wanted.
 pub fn detection(
     situation: Situation,
     limits: &Limits,
@@ -93,7 +93,7 @@ pub fn detection(
         let one = |operation: usize| {
             let mut stream = stats::stream(seed, &format!("damaged operation {operation}, shift {shift}"));
             let mut operation = Operation::new(situation, settings, &mut stream);
-            // An operation that alarms before the damage says nothing of finding it.
+            // An operation with an alarm before the damage does not tell whether the damage is detected.
             let quiet = (0..BEFORE).all(|_| !operation.next(0.0, limits, &mut stream));
             quiet.then(|| {
                 (1..=LONGEST_WAIT).find(|_| operation.next(shift, limits, &mut stream)).unwrap_or(LONGEST_WAIT)
@@ -116,7 +116,7 @@ pub fn detection(
     }
 }
 
-/// A structure in operation: its charts, and the errors of its undamaged state.
+/// A structure in operation: its charts, and the errors of its undamaged reference.
 struct Operation {
     charts: Vec<(f64, f64, Series)>,
     own: f64,
@@ -134,7 +134,7 @@ impl Operation {
         Self { charts: (0..situation.charts.max(1)).map(chart).collect(), own: (1.0 - situation.shared).sqrt() }
     }
 
-    /// Takes a batch in which the first parameter is shifted; true when some chart alarms.
+    /// Adds a batch in which the first parameter is shifted; true when some chart raises an alarm.
     fn next(&mut self, shift: f64, limits: &Limits, stream: &mut Stream) -> bool {
         let mut alarm = false;
         for (index, (shared, s, series)) in self.charts.iter_mut().enumerate() {

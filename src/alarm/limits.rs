@@ -1,4 +1,4 @@
-//! Limits of the charts, by simulation of healthy operation.
+//! Limits of the charts, from simulated healthy operation.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -9,28 +9,28 @@ use rayon::prelude::*;
 use super::AlarmSettings;
 use crate::stats::{self, Stream};
 
-/// Share of the wanted run within which false alarms are counted.
+/// Share of the target run length within which false alarms are counted.
 const EARLY: f64 = 0.1;
 
-/// Most operations simulated, each with an undamaged state of its own.
+/// Most operations simulated, each with its own undamaged reference.
 const MOST_OPERATIONS: usize = 10_000;
 
-/// Batches simulated in all, over operations and charts.
+/// Batches simulated in total, over operations and charts.
 const BATCHES: usize = 6_000_000;
 
-/// Largest shift that enters the moving average: one wild batch is the business of the single limit.
+/// Shifts are clipped at this value before they enter the moving average: a single extreme batch is left to the limit of one shift.
 pub const CLIP: f64 = 4.0;
 
-/// Charts of one structure that are simulated together; more are taken as several such structures.
+/// Charts of one structure that are simulated together; a structure with more is treated as several structures.
 const MOST_CHARTS: usize = 6;
 
-/// Shared parts ρ = sin²θ for which limits are simulated, at the same random numbers and at equal steps of θ from 0 to π/2.
+/// Number of shared parts ρ = sin²θ for which limits are simulated, with common random numbers and at equal steps of θ from 0 to π/2.
 const NODES: usize = 16;
 
 /// What the limits depend on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Situation {
-    /// Share ρ of the variance of a shift that comes from the undamaged state and is the same in all batches.
+    /// Share ρ of the variance of a shift that comes from the undamaged reference and is the same in all batches.
     pub shared: f64,
     /// Degrees of freedom of the undamaged standard deviation.
     pub degrees_of_freedom: usize,
@@ -41,26 +41,25 @@ pub struct Situation {
 /// The limits of a chart.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Of one shift, in standard errors.
+    /// Of a single shift, in standard errors.
     pub single: f64,
-    /// Of the moving average of shifts.
+    /// Of the moving average of the shifts, in standard errors.
     pub ewma: f64,
 }
 
-/// Limits at which healthy operation has as many early false alarms as if they came at random, one in `mean_run_batches`; for
-/// every shared part ρ of the variance, which changes with the size of a batch.
+/// Limits at which healthy operation has as many early false alarms as a random process with one alarm in `mean_run_batches`
+/// batches; for every shared part ρ of the variance, which depends on the size of a batch.
 ///
 /// ```text
 ///  shift of batch t:  z_t = (√ρ e + √(1 − ρ) ε_t)/s,    e, ε_t ~ N(0, 1) for each chart,   s² ~ χ²_ν/ν
 ///  P( first alarm within W/10 batches ) = 1 − exp(−1/10),    W the wanted mean run
 /// ```
 ///
-/// e and s are the errors of the undamaged state, drawn once for each operation. With a well-known undamaged state the mean
-/// run is W. With a small one the runs differ from operation to operation by orders of magnitude; their mean then says
-/// little (a few endless ones would pay for many that alarm at once), and comes out longer than W. An error that all batches
-/// share makes alarms come together, which alone would lower the limit: what is known less never gets a lower limit than
-/// with ρ = 0. Both charts get limits that would have twice the wanted run alone; a common factor then makes both together
-/// right.
+/// e and s are the errors of the undamaged reference, drawn once for each operation. With a well-known reference the mean run is W.
+/// With a small reference the run lengths differ by orders of magnitude between operations; their mean is then dominated by a few
+/// very long runs and larger than W. An error shared by all batches makes alarms occur in clusters, which alone would lower the
+/// limit; the limit is therefore never lower than with ρ = 0. The limits of the single shift and of the moving average would each
+/// give twice the target run alone; a common factor then adjusts both together.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LimitCurve {
     nodes: [Limits; NODES],
@@ -86,7 +85,7 @@ impl LimitCurve {
         let nodes: Vec<Limits> = (0..NODES)
             .into_par_iter()
             .map(|node| {
-                // The level that a share of the operations exceeds.
+                // The value of the statistic that this share of the operations exceeds.
                 let level = |statistic: &dyn Fn(&Records) -> f64, share: f64| {
                     let mut all: Vec<f64> = records.iter().map(statistic).collect();
                     let exceeding = (share * operations as f64) as usize;
@@ -108,8 +107,8 @@ impl LimitCurve {
         Self { nodes: nodes.try_into().expect("one for each node") }
     }
 
-    /// The limits where a share ρ of the variance comes from the undamaged state: by the cubic in θ through the four simulated
-    /// ones about it, mirrored at θ = 0, as e and −e are alike.
+    /// The limits where a share ρ of the variance comes from the undamaged reference: cubic interpolation in θ through the four
+    /// nearest simulated nodes, mirrored at θ = 0, because e and −e are equivalent.
     pub fn at(&self, shared: f64) -> Limits {
         let place = shared.clamp(0.0, 1.0).sqrt().asin() / FRAC_PI_2 * (NODES - 1) as f64;
         let first = (place as isize - 1).min(NODES as isize - 4);
@@ -124,18 +123,18 @@ impl LimitCurve {
             let found: f64 = nodes.iter().zip(&weights).map(|(node, weight)| node * weight).sum();
             found.max(of(unshared))
         };
-        // Without a moving average its limit is infinite everywhere, and differences of it are no numbers.
+        // Without a moving average its limit is infinite, and the interpolation would give NaN.
         let ewma = if unshared.ewma.is_finite() { cubic(|l| l.ewma) } else { f64::INFINITY };
         Limits { single: cubic(|l| l.single), ewma }
     }
 }
 
-/// The limits in one situation.
+/// The limits for one situation.
 pub fn limits(situation: Situation, settings: &AlarmSettings) -> Limits {
     LimitCurve::simulate(situation.degrees_of_freedom, situation.charts, settings).at(situation.shared)
 }
 
-/// Largest statistics of one operation, for each shared part.
+/// Largest statistics of one operation, for each node of ρ.
 struct Records {
     single: [f32; NODES],
     ewma: [f32; NODES],
@@ -155,11 +154,11 @@ fn records(
     for _ in 0..charts {
         let e: f64 = stream.sample(StandardNormal);
         let s = (stream.sample(chi_squared) / degrees).sqrt();
-        // z = shared + own·ε; in single precision, of which the vectors hold twice as many.
+        // z = shared + own·ε, in single precision, of which a vector register holds twice as many numbers.
         let (shared, own) = (shares.map(|(sin, _)| (sin * e / s) as f32), shares.map(|(_, cos)| (cos / s) as f32));
         let (mut average, mut largest) = ([0.0_f32; NODES], [f32::NEG_INFINITY; NODES]);
         let (weight, keep) = (settings.ewma_weight as f32, 1.0 - settings.ewma_weight as f32);
-        // k of m above a limit: the k-th largest of the window is, and the newest with it. Larger ε is larger z.
+        // k of m points are above a limit when the k-th largest of the window and the newest are. z increases with ε.
         let mut highest = f32::NEG_INFINITY;
         let mut window = vec![f32::NEG_INFINITY; settings.window];
         let mut sorted = Vec::with_capacity(settings.window);
@@ -181,7 +180,7 @@ fn records(
         }
         for node in 0..NODES {
             found.ewma[node] = found.ewma[node].max(largest[node]);
-            // A run too short for k points has none, also where ε counts nothing.
+            // A run with fewer than k points has no statistic.
             if highest > f32::NEG_INFINITY {
                 found.single[node] = found.single[node].max(shared[node] + own[node] * highest);
             }

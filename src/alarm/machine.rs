@@ -1,4 +1,4 @@
-//! The states of an alarm and what leads from one to the next.
+//! The state machine of an alarm.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,28 +6,28 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Nothing to see.
+    /// No point above the limit.
     Normal,
-    /// A point is above the limit, and not enough of them yet.
+    /// A point is above the limit, but not yet enough of them for an alarm.
     Pending,
     /// An alarm.
     Alarming,
-    /// Below the limit after an alarm, and not long enough yet.
+    /// Below the limit after an alarm, but not yet for long enough.
     Recovering,
-    /// No batch came for too long.
+    /// No batch arrived for too long.
     Silent,
 }
 
-/// What happened.
+/// What changes the state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Event {
-    /// A point above the limit that does not yet make an alarm.
+    /// A point above the limit that does not yet raise an alarm.
     Exceeds,
-    /// A point above the limit, with enough others near it to make an alarm.
+    /// A point above the limit, with enough others in the window to raise an alarm.
     Confirmed,
-    /// A point below the limit, with too few in a row to be sure.
+    /// A point below the limit, with too few consecutive ones to end an alarm.
     Clears,
-    /// Enough points below the limit in a row.
+    /// Enough consecutive points below the limit.
     Cleared,
     /// No batch for too long.
     Silence,
@@ -58,7 +58,7 @@ impl State {
     /// | recovering | alarming | alarming | recovering | normal | recovering |
     /// | silent | pending | alarming | normal | normal | silent |
     ///
-    /// An open alarm is not forgotten because the instrument fell silent.
+    /// An open alarm stays open when the instrument falls silent.
     #[must_use]
     pub const fn after(self, event: Event) -> Self {
         use Event::{Cleared, Clears, Confirmed, Exceeds, Silence};
@@ -71,7 +71,7 @@ impl State {
         }
     }
 
-    /// True in an episode: from the alarm to its end.
+    /// True during an episode, which lasts from the alarm to its end.
     pub const fn in_episode(self) -> bool {
         matches!(self, Self::Alarming | Self::Recovering)
     }

@@ -1,9 +1,9 @@
-//! From assessed batches to alarms: charts with a known rate of false alarms, and one table of states.
+//! From assessed batches to alarms: control charts with a known rate of false alarms, and a state machine.
 //!
-//! A probability of damage above its threshold is an exceedance, and of healthy batches nearly half exceed. An alarm is
-//! something else: [`chart`] sets the mean of a batch against the undamaged state in units of its standard error,
-//! [`limits`] finds the limit that healthy operation reaches once in ARL0 batches, [`machine`] turns points above the limit
-//! into states and episodes, and [`detection`] says what losses are found.
+//! A probability of damage above its threshold is an exceedance, and nearly half of the healthy batches exceed. An alarm needs
+//! more: [`chart`] compares the mean of a batch with the undamaged reference in units of its standard error, [`limits`] computes
+//! the limit that healthy operation reaches once in ARL0 batches (average run length), [`machine`] turns points above the limit
+//! into states and episodes, and [`detection`] computes which losses are detected.
 
 pub mod chart;
 pub mod detection;
@@ -12,21 +12,25 @@ pub mod machine;
 
 use serde::{Deserialize, Serialize};
 
+/// Kinds of alarms.
+pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
+
 /// How alarms are raised.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AlarmSettings {
-    /// Wanted mean run of healthy batches to a false alarm, over all parameters of a structure (ARL0).
+    /// Target mean number of healthy batches to a false alarm, over all parameters of a structure (ARL0).
     pub mean_run_batches: f64,
     /// Points above the limit that make an alarm …
     pub needed: usize,
-    /// … among this many points in a row.
+    /// … among this many consecutive points.
     pub window: usize,
-    /// Weight of the newest batch in the moving average that finds small lasting losses (EWMA); 0 switches it off.
+    /// Weight of the newest batch in the exponentially weighted moving average (EWMA), which detects small lasting losses; 0
+    /// switches it off.
     pub ewma_weight: f64,
-    /// Points in a row below the limit that end an alarm.
+    /// Consecutive points below the limit that end an alarm.
     pub recovery: usize,
-    /// Seconds without a batch after which a structure counts as silent; 0 switches it off.
+    /// Seconds without a batch after which a structure is reported as silent; 0 switches this off.
     pub silence_after_s: u64,
 }
 
@@ -37,7 +41,7 @@ impl Default for AlarmSettings {
 }
 
 impl AlarmSettings {
-    /// What must hold for the settings, as (key, value, what is right); `None` when all is well.
+    /// The first setting out of range, as (key, value, allowed range); `None` when all are in range.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let Self { mean_run_batches, needed, window, ewma_weight, recovery, .. } = *self;
         if !(10.0..=1e5).contains(&mean_run_batches) {

@@ -53,7 +53,7 @@ pub async fn export(args: &ExportArgs) -> anyhow::Result<()> {
     let opened = if args.place.url.is_some() { None } else { open(&config).await? };
     let mut file = Draft::begin(&args.out)?;
     if let Some(monitor) = opened {
-        let mut lines = monitor.export(&args.structure).await?;
+        let mut lines = monitor.archive().export(&args.structure).await?;
         while let Some(line) = lines.recv().await {
             file.write(&line?)?;
         }
@@ -80,7 +80,7 @@ pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
     let library = Library::open(config.models_dir.as_deref())?;
     let store = Store::open_with(&config.data_dir, &config.store).await?;
     let monitor = Monitor::open(store, library, config.monitor).await?;
-    let imported = monitor.import(&args.from).await;
+    let imported = monitor.archive().import(&args.from).await;
     monitor.store().close().await;
     let done = imported?;
     if args.json {

@@ -7,10 +7,10 @@ use clap::Args;
 
 use super::calibrate::load;
 use super::measurements::read_measurements;
+use crate::assessment::{self, Draws};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::measurement::MeasurementBatch;
-use crate::monitor::assess::{self, Draws};
-use crate::monitor::MonitorSettings;
+use crate::quantity::Timestamp;
 
 /// Assess measurements without a service.
 #[derive(Debug, Args)]
@@ -49,18 +49,15 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let baseline = load(&args.structure, args.model.as_deref())?;
     let undamaged_batch = read_batch(args, &args.baseline, &baseline)?;
     let batch = read_batch(args, &args.data, &baseline)?;
-    let draws = |batch: &MeasurementBatch| Draws {
-        per_measurement: MonitorSettings::default().draws_per_measurement,
-        for_population: MonitorSettings::default().draws_for_population,
-        seed: assessment_seed(&batch.content_digest(), baseline.digest()),
-    };
+    let draws =
+        |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), baseline.digest()));
     let undamaged_draws = draws(&undamaged_batch);
     let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
-    let mut undamaged = assess::undamaged_state(&baseline, &batches, args.threshold_probability)
-        .with_context(|| format!("{} makes no undamaged state", args.baseline.display()))?;
+    let mut undamaged = assessment::undamaged_state(&baseline, &batches, args.threshold_probability)
+        .with_context(|| format!("{} makes no undamaged reference", args.baseline.display()))?;
     undamaged.version = 1;
-    let context = assess::Context { undamaged: Some(&undamaged), previous: None };
-    let assessment = assess::assess(&baseline, &batch.measurements, context, draws(&batch))?;
+    let context = assessment::Context { undamaged: Some(&undamaged), previous: None };
+    let assessment = assessment::assess(&baseline, &batch.measurements, context, draws(&batch), Timestamp::now())?;
 
     if args.json {
         let report = serde_json::json!({ "undamaged": undamaged, "assessment": assessment });

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 
-use crate::measurement::check::{check_measurements, Expectation};
+use crate::measurement::check::check_measurements;
 use crate::measurement::csv::{self, CsvOptions, Times};
 use crate::measurement::ModalMeasurement;
 use crate::quantity::Timestamp;
@@ -21,15 +21,7 @@ pub fn read_measurements(
 ) -> anyhow::Result<Vec<ModalMeasurement>> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
     let options = CsvOptions { times: Times::RowNumber, ignore: ignore.to_vec(), time_column: None };
-    let expectation = Expectation {
-        modes: simulator.modes(),
-        frequency_limits_hz: simulator.frequency_limits_hz(),
-        covariates: simulator.covariates(),
-        instrumented: simulator.instrumented_points(),
-        space: simulator.space(),
-        now: Timestamp::now(),
-        max_measurements: usize::MAX,
-    };
+    let expectation = simulator.expectation(Timestamp::now(), usize::MAX);
     csv::read(&bytes, simulator.modes(), simulator.covariates(), &options)
         .and_then(|raw| check_measurements(raw, &expectation))
         .map_err(|problems| {

@@ -56,7 +56,7 @@ impl Reloading {
             error!("SIGHUP: kept the configuration in force: {problem}");
             return before;
         }
-        monitor.set_retention(new.retention);
+        monitor.upkeep().retention().set(new.retention);
         monitor.store().file().set_limits(&new.store);
         info!(changed = ?now, "SIGHUP: took over {}", if now.is_empty() { "nothing new".to_owned() } else { now.join(", ") });
         if !later.is_empty() {

@@ -5,6 +5,7 @@ use reqwest::Method;
 
 use super::remote::PlaceArgs;
 use crate::monitor::retention::{delete_expired, plan};
+use crate::quantity::Timestamp;
 use crate::store::{Error, Store, DATABASE_FILE};
 
 /// Say which batches are older than asked to keep, or delete them.
@@ -52,10 +53,10 @@ pub async fn retention(args: &RetentionArgs) -> anyhow::Result<()> {
         println!("{}", serde_json::to_string_pretty(&plan)?);
         return Ok(());
     };
-    let plan = plan(&store, settings).await?;
+    let plan = plan(&store, settings, Timestamp::now()).await?;
     println!("{}", serde_json::to_string_pretty(&plan)?);
     if !args.dry_run {
-        let deleted = delete_expired(&store, settings).await?;
+        let deleted = delete_expired(&store, settings, Timestamp::now()).await?;
         println!("Deleted {} batches with {} measurements.", deleted.batches, deleted.measurements);
     }
     store.close().await;

@@ -16,8 +16,7 @@ use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::http::access::AccessControl;
 use crate::http::{router, server, Service};
-use crate::monitor::upkeep::{declare_metrics, Reason};
-use crate::monitor::Monitor;
+use crate::monitor::{declare_metrics, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
 use crate::notify::Notifier;
 use crate::store::Store;
@@ -50,10 +49,11 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let (place, largest_batch) = ((address, config.data_dir.as_path()), config.monitor.max_measurements);
     let access = AccessControl::open(store.clone(), &config.access, &config.http, place, largest_batch).await?;
     let monitor = Monitor::open(store.clone(), library, config.monitor).await?;
-    monitor.set_retention(config.retention);
-    monitor.resume();
-    monitor.watch_for_silence();
-    monitor.watch_retention();
+    let upkeep = monitor.upkeep();
+    upkeep.retention().set(config.retention);
+    monitor.replay().resume_all();
+    upkeep.silence().watch();
+    upkeep.retention().watch();
     let metrics = PrometheusBuilder::new()
         .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
         .install_recorder()?;
@@ -63,15 +63,15 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let broker = MqttStatus::default();
     background.extend(mqtt::run(&config.mqtt, monitor.clone(), &broker, stopped)?);
     let rights = access.clone();
-    monitor.report_findings_from(move || rights.findings());
+    upkeep.report_findings_from(move || rights.findings());
     let sender = notifier.clone();
-    monitor.report_findings_from(move || {
+    upkeep.report_findings_from(move || {
         let broker = broker.finding().map(|it| Reason::new("mqtt_unavailable", it));
         broker.into_iter().chain(sender.finding().map(|it| Reason::new("webhooks_failing", it))).collect()
     });
     let router = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
     declare_metrics(store.file().sqlite_version());
-    let (data_dir, baselines) = (config.data_dir.display().to_string(), monitor.baselines_in_use());
+    let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained baseline(s)");
     let events = monitor.events().clone();
     let task = tokio::spawn(async move {

@@ -24,7 +24,7 @@ pub fn ready(monitor: Monitor) {
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
-            if monitor.writer_takes_turns().await {
+            if monitor.upkeep().writer_responds().await {
                 tell(&[NotifyState::Watchdog]);
             } else {
                 warn!("The writer does not take turns: systemd's watchdog gets no answer");

@@ -11,11 +11,10 @@ use serde::Serialize;
 
 use super::calibrate::load;
 use super::measurements::read_measurements;
+use crate::assessment::{draw, Draws};
 use crate::baseline::library::find_structure;
 use crate::damage::Hyperparameters;
 use crate::measurement::ModalMeasurement;
-use crate::monitor::assess::{self, Draws};
-use crate::monitor::MonitorSettings;
 use crate::quantity::Hertz;
 use crate::simulator::Simulator;
 use crate::stats;
@@ -244,13 +243,8 @@ fn stated_noise_ignored(measurements: &[ModalMeasurement]) -> Vec<String> {
 
 fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Result<Answer> {
     let baseline = load(&args.structure, args.model.as_deref())?;
-    let settings = MonitorSettings::default();
-    let draws = Draws {
-        per_measurement: settings.draws_per_measurement,
-        for_population: settings.draws_for_population,
-        seed: args.seed,
-    };
-    let batch = assess::draw(&baseline, measurements, None, draws)?;
+    let draws = Draws::with_seed(args.seed);
+    let batch = draw(&baseline, measurements, None, draws)?;
     let population = &batch.populations.parameters;
     let line = |(k, parameter): (usize, &crate::parameter::Parameter)| Line {
         name: parameter.name.clone(),
@@ -261,9 +255,9 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
         std_interval: population[k].std_interval(),
     };
     let mut notes: Vec<String> = batch.findings.iter().map(|f| f.message.clone()).collect();
-    let pool = batch.posterior.first(settings.draws_per_measurement);
+    let pool = batch.posterior.first(draws.per_measurement);
     for (k, parameter) in baseline.space().iter().enumerate() {
-        let pooled = Hyperparameters::from_pool(&pool.column(k), settings.draws_per_measurement);
+        let pooled = Hyperparameters::from_pool(&pool.column(k), draws.per_measurement);
         let std = pooled.std.map_or("-".to_owned(), |std| format!("{std:.4}"));
         notes
             .push(format!("pooled samples of {}: mean {:.4}, std {std} (noise included)", parameter.name, pooled.mean));

@@ -14,8 +14,8 @@ use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, U
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
 use crate::baseline::manifest::ParameterIdentifiability;
+use crate::monitor::stored::{Acknowledgement, Episode, MaintenanceWindow};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
-use crate::store::{Acknowledgement, Episode, MaintenanceWindow};
 
 /// Maximum length of a name or note, characters.
 const LONGEST_TEXT: usize = 500;
@@ -200,7 +200,7 @@ pub async fn list(
         }
     };
     let before = page_cursor(query.cursor.as_deref())?;
-    let found = shared.monitor.store().alarms().episodes(&id, before, open_only, limit).await?;
+    let found = shared.monitor.alarms().episodes(&id, before, open_only, limit).await?;
     let next = (found.len() == limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
     Ok(Json(AlarmPage { structure: id, items: found.into_iter().map(AlarmItem::from).collect(), next }).into_response())
 }
@@ -234,9 +234,7 @@ pub async fn acknowledge(
     };
     let acknowledgement = Acknowledgement { at: Timestamp::now(), by: body.by, note: body.note };
     let parsed: i64 = number.parse().map_err(|_| unknown())?;
-    let episode =
-        shared.monitor.store().alarms().acknowledge(&id, parsed, acknowledgement).await?.ok_or_else(unknown)?;
-    shared.monitor.tell_acknowledged(&id, &episode);
+    let episode = shared.monitor.alarms().acknowledge(&id, parsed, acknowledgement).await?.ok_or_else(unknown)?;
     Ok(Json(AlarmItem::from(episode)).into_response())
 }
 
@@ -257,7 +255,7 @@ pub async fn charts(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let points = shared.monitor.store().alarms().charts(&id, page_limit(query.limit.as_deref())?).await?;
+    let points = shared.monitor.alarms().charts(&id, page_limit(query.limit.as_deref())?).await?;
     let items: Vec<ChartBody> = points.into_iter().map(ChartBody::from).collect();
     Ok(Json(ChartPage { structure: id, items }).into_response())
 }
@@ -292,7 +290,7 @@ pub async fn add_maintenance(
     }
     check_text("/reason", &body.reason)?;
     let window = MaintenanceWindow { from, to, reason: body.reason.clone() };
-    shared.monitor.store().alarms().insert_maintenance(&id, window, Timestamp::now()).await?;
+    shared.monitor.alarms().add_maintenance(&id, window).await?;
     Ok((StatusCode::CREATED, Json(MaintenanceItem { from, to, reason: body.reason })).into_response())
 }
 
@@ -309,7 +307,7 @@ pub async fn add_maintenance(
 pub async fn maintenance(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let windows = shared.monitor.store().alarms().maintenance(&id).await?;
+    let windows = shared.monitor.alarms().maintenance(&id).await?;
     let item = |w: MaintenanceWindow| MaintenanceItem { from: w.from, to: w.to, reason: w.reason };
     let items: Vec<MaintenanceItem> = windows.into_iter().map(item).collect();
     Ok(Json(MaintenanceList { structure: id, items }).into_response())
@@ -328,8 +326,8 @@ pub async fn maintenance(State(shared): State<Shared>, ApiPath(id): ApiPath<Stri
 )]
 pub async fn identifiability(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
-    let baseline = watched.baseline.as_ref().map_err(|reason| {
+    let active = shared.monitor.structure(&id)?;
+    let baseline = active.baseline.as_ref().map_err(|reason| {
         ApiError::from(crate::monitor::Error::NoModel { structure: id.clone(), reason: reason.clone() })
     })?;
     let record = &baseline.manifest().identifiability;

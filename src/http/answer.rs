@@ -7,10 +7,10 @@ use super::cell::{Cell, ColumnKind};
 use crate::assessment::{Assessment, BatchState};
 use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
-use crate::monitor::BatchView;
-use crate::quantity::Timestamp;
-use crate::store::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
-use crate::trust::{Finding, Verdict};
+use crate::monitor::stored::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
+use crate::monitor::{BatchView, Missing};
+use crate::quantity::{StructureId, Timestamp};
+use crate::trust::{Finding, TrustVerdict};
 
 /// One batch.
 #[derive(Debug, Serialize, ToSchema)]
@@ -38,7 +38,8 @@ pub struct Batch {
 impl Batch {
     /// The answer for a batch, with its measurements if requested.
     pub fn new(view: BatchView, with_measurements: bool) -> Self {
-        let BatchView { record, assessment, charts, next_step } = view;
+        let BatchView { record, assessment, charts, missing } = view;
+        let next_step = missing.map(|missing| next_step(&record, &missing));
         let (measured_from, measured_to) = record.batch.time_span();
         Self {
             structure: record.batch.structure.to_string(),
@@ -57,6 +58,21 @@ impl Batch {
             measurements: with_measurements.then_some(record.batch.measurements),
         }
     }
+}
+
+/// Why a batch has no assessment or comparison, with the request that helps.
+fn next_step(record: &BatchRecord, missing: &Missing) -> String {
+    let route = declare_reference(&record.batch.structure);
+    match missing {
+        Missing::OutdatedReference(_) => format!("{missing}: {route}"),
+        Missing::Reference => format!("{missing}: {route} {{\"batches\": [\"{}\"]}}", record.batch_id),
+        Missing::Model(_) | Missing::PartOfReference(_) | Missing::NotYet => missing.to_string(),
+    }
+}
+
+/// The request that declares the undamaged reference of a structure.
+pub fn declare_reference(structure: &StructureId) -> String {
+    format!("POST /v1/structures/{structure}/reference")
 }
 
 /// Path of a batch.
@@ -82,7 +98,7 @@ pub struct AssessmentBody {
     assessed_at: Timestamp,
     exceeds: bool,
     /// `accepted` or `rejected`. A rejected assessment has no probabilities of damage.
-    trust: Verdict,
+    trust: TrustVerdict,
     extrapolated: bool,
     fit_p_value: Option<f64>,
     /// √(χ²/degrees of freedom): 1 if noise explains the whole difference between measurement and simulation.
@@ -199,7 +215,7 @@ impl From<QuantityAssessment> for ParameterBody {
             mean_interval: q.mean_interval,
             std: q.std,
             std_interval: q.std_interval,
-            edge_mass: q.edge_mass,
+            edge_mass: q.prior_bound_mass,
             threshold: damage.map(|d| d.threshold),
             probability_of_damage: damage.map(|d| d.probability_of_damage),
             probability_of_damage_interval: damage.and_then(|d| d.probability_interval),
@@ -297,7 +313,7 @@ impl HistoryItem {
             let empty = std::iter::repeat_n(Cell::Empty, HISTORY_COLUMNS.len() - batch.len());
             return vec![batch.into_iter().chain(empty).collect()];
         };
-        let trust = if assessment.trust == Verdict::Accepted { "accepted" } else { "rejected" };
+        let trust = if assessment.trust == TrustVerdict::Accepted { "accepted" } else { "rejected" };
         let low = |interval: Option<[f64; 2]>| Cell::number(interval.map(|i| i[0]));
         let high = |interval: Option<[f64; 2]>| Cell::number(interval.map(|i| i[1]));
         let row = |p: &ParameterBody| {

@@ -10,8 +10,8 @@ use super::error::ApiError;
 use super::openapi::Invalid;
 use super::request::{page_cursor, page_limit, ApiQuery, Window};
 use super::shared::Shared;
+use crate::monitor::stored::{AuditEntry, AuditQuery};
 use crate::quantity::Timestamp;
-use crate::store::{AuditEntry, AuditQuery};
 
 /// Query of the audit.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -107,7 +107,7 @@ pub async fn list(
     let Window { from, to } = Window::of(query.from.as_deref(), query.to.as_deref())?;
     let before = page_cursor(query.cursor.as_deref())?;
     let asked = AuditQuery { from, to, before, limit: page_limit(query.limit.as_deref())? };
-    let found = shared.monitor.store().audit().list(&asked).await?;
+    let found = shared.monitor.audit().list(&asked).await?;
     let next = (found.len() == asked.limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
     Ok(Json(AuditPage { items: found.into_iter().map(AuditItem::from).collect(), next }).into_response())
 }

@@ -20,8 +20,7 @@ use crate::measurement::body::{MessageBody, PostBody, RawBatch};
 use crate::measurement::check::{check_idempotency_key, check_source};
 use crate::measurement::csv::{self, CsvOptions, Times};
 use crate::measurement::MeasurementBatch;
-use crate::monitor::{Monitor, Watched};
-use crate::quantity::StructureId;
+use crate::monitor::{ActiveStructure, Monitor};
 
 /// Header that marks a batch as already stored.
 const IDEMPOTENCY_REPLAYED: HeaderName = HeaderName::from_static("idempotency-replayed");
@@ -96,7 +95,7 @@ pub async fn create(
     body: Body,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
+    let active = shared.monitor.structure(&id)?;
     if let Some(source) = &query.source {
         let in_query = |problem| ApiError::invalid_input(vec![problem]).at("query/source");
         check_source(source).map_err(in_query)?;
@@ -109,7 +108,7 @@ pub async fn create(
     let bytes = read_body(body, &headers, shared.limits).await?;
     let monitor = shared.monitor.clone();
     let small = bytes.len() <= PARSED_HERE_BYTES;
-    let parse = move || parse_batch(&monitor, &watched, id, key, kind.as_deref(), &bytes, query);
+    let parse = move || parse_batch(&monitor, &active, key, kind.as_deref(), &bytes, query);
     let batch = if small {
         // Without an await before the batch is stored, it is stored even if the client disconnects right after sending
         // it.
@@ -118,7 +117,7 @@ pub async fn create(
         tokio::task::spawn_blocking(parse).await.map_err(|e| ApiError::internal(&e))??
     };
     shared.access.take_measurements(&client, batch.measurements.len())?;
-    let ingested = shared.monitor.ingest(batch).await?;
+    let ingested = shared.monitor.ingest().take(batch).await?;
 
     let location = answer::location(&ingested.view.record);
     let body = answer::Batch::new(ingested.view, false);
@@ -143,7 +142,7 @@ pub async fn read(
     State(shared): State<Shared>,
     ApiPath((id, batch)): ApiPath<(String, String)>,
 ) -> Result<Response, ApiError> {
-    let view = shared.monitor.batch(&structure_id(&id)?, &batch).await?;
+    let view = shared.monitor.records().batch(&structure_id(&id)?, &batch).await?;
     Ok(Json(answer::Batch::new(view, true)).into_response())
 }
 
@@ -158,8 +157,7 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, ApiError> {
 
 fn parse_batch(
     monitor: &Monitor,
-    watched: &Watched,
-    structure: StructureId,
+    active: &ActiveStructure,
     idempotency_key: Option<String>,
     kind: Option<&str>,
     bytes: &Bytes,
@@ -171,12 +169,12 @@ fn parse_batch(
             let ignore = query.ignore.as_deref().unwrap_or_default().split(',').map(|c| c.trim().to_owned());
             let ignore = ignore.filter(|column| !column.is_empty()).collect();
             let options = CsvOptions { times: Times::Required, ignore, time_column: None };
-            let simulator = &watched.simulator;
+            let simulator = &active.simulator;
             let read = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
             RawBatch { source: None, idempotency_key, measurements: read.map_err(ApiError::invalid_input)? }
         }
         other => return Err(unsupported_media_type(other, "application/json, text/csv or application/x-ndjson")),
     };
     raw.source = raw.source.or(query.source);
-    monitor.check(watched, structure, raw).map_err(ApiError::invalid_input)
+    monitor.ingest().check(active, raw).map_err(ApiError::invalid_input)
 }

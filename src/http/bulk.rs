@@ -95,20 +95,20 @@ async fn take(
     text: Vec<u8>,
 ) -> Result<Ingested, ApiError> {
     let monitor = shared.monitor.clone();
-    let batch = tokio::task::spawn_blocking(move || parse(&monitor, structure, source, &text));
+    let batch = tokio::task::spawn_blocking(move || parse(&monitor, &structure, source, &text));
     let batch = batch.await.map_err(|e| ApiError::internal(&e))??;
     shared.access.take_measurements(client, batch.measurements.len())?;
-    Ok(shared.monitor.ingest_in_turn(batch, PATIENCE).await?)
+    Ok(shared.monitor.ingest().take_within(batch, PATIENCE).await?)
 }
 
 fn parse(
     monitor: &Monitor,
-    structure: StructureId,
+    structure: &StructureId,
     source: Option<String>,
     text: &[u8],
 ) -> Result<MeasurementBatch, ApiError> {
     // The structure may have been extended since the previous line.
-    let watched = monitor.structure(&structure)?;
+    let active = monitor.structure(structure)?;
     // A line has no headers: its idempotency key is a field of the JSON.
     let mut line = RawBatch::of_message(text)?;
     line.source = line.source.or(source);
@@ -116,7 +116,7 @@ fn parse(
         let at_key = |problem| ApiError::invalid_input(vec![problem]).at("/idempotency_key");
         check_idempotency_key(key).map_err(at_key)?;
     }
-    monitor.check(&watched, structure, line).map_err(ApiError::invalid_input)
+    monitor.ingest().check(&active, line).map_err(ApiError::invalid_input)
 }
 
 impl BulkAnswer {

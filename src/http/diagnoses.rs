@@ -15,9 +15,9 @@ use super::openapi::{BodyRefused, Busy, Conflict, DiagnosisPath, Invalid, Struct
 use super::request::{json_body, structure_id, whole_number, ApiPath};
 use super::shared::Shared;
 use crate::discrepancy::Diagnosis;
+use crate::monitor::stored::{DiagnosisRecord, JobState};
 use crate::monitor::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
 use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::store::{DiagnosisRecord, JobState};
 
 /// Maximum number of diagnoses in the list of a structure.
 const LISTED: usize = 100;
@@ -168,7 +168,7 @@ pub async fn create(
     let holdout = body.holdout.as_deref().unwrap_or("last:0.25").parse();
     let holdout = holdout.map_err(|message: String| ApiError::invalid_field("/holdout", message))?;
     let request = DiagnosisRequest { batches: body.batches, holdout, seed: body.seed.unwrap_or(1) };
-    let record = shared.monitor.start_diagnosis(&id, request).await?;
+    let record = shared.monitor.jobs().start_diagnosis(&id, request).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{}", record.id))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
 }
@@ -187,7 +187,7 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
     let mut items = Vec::new();
-    for record in shared.monitor.store().diagnoses().list(&id, LISTED).await? {
+    for record in shared.monitor.jobs().diagnoses(&id, LISTED).await? {
         let result: Option<serde_json::Value> = record.result.as_deref().and_then(|r| serde_json::from_str(r).ok());
         let text = |key: &str| result.as_ref().and_then(|r| r[key].as_str()).map(str::to_owned);
         items.push(Listed {
@@ -213,7 +213,7 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     responses((status = 200, description = "The diagnosis", body = DiagnosisAnswer), Unknown)
 )]
 pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    let (record, progress) = shared.monitor.diagnosis(&id).await?;
+    let (record, progress) = shared.monitor.jobs().diagnosis(&id).await?;
     Ok(Json(answer(record, progress)?).into_response())
 }
 
@@ -228,8 +228,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     responses((status = 200, description = "The report", body = String, content_type = "text/html"), Unknown, Conflict)
 )]
 pub async fn report(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    shared.monitor.diagnosis(&id).await?;
-    let Some(html) = shared.monitor.store().diagnoses().diagnosis_report(&id).await? else {
+    let Some(html) = shared.monitor.jobs().report(&id).await? else {
         return Err(ApiError::new(StatusCode::CONFLICT, "no_report", format!("diagnosis {id} has no report yet")));
     };
     let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:";
@@ -270,7 +269,7 @@ pub async fn extend(
     let ExtensionBody { samples, epochs, accept_uncalibrated } = body;
     let size = |number: Option<u64>| number.map(|n| n as usize);
     let training = ExtensionTraining { samples: size(samples), epochs: size(epochs), accept_uncalibrated };
-    let record = shared.monitor.start_extension(&id, training).await?;
+    let record = shared.monitor.jobs().start_extension(&id, training).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{id}"))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
 }
@@ -287,6 +286,6 @@ pub async fn extend(
 )]
 pub async fn step_back(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let digest = shared.monitor.step_back(&id).await?;
+    let digest = shared.monitor.versions().step_back(&id).await?;
     Ok(Json(SteppedBack { structure: id, structure_digest: digest }).into_response())
 }

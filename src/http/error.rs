@@ -118,29 +118,74 @@ impl From<monitor::Error> for ApiError {
         match error {
             E::UnknownStructure(_) => Self::new(StatusCode::NOT_FOUND, "unknown_structure", detail),
             E::UnknownBatch { .. } => Self::new(StatusCode::NOT_FOUND, "unknown_batch", detail),
-            E::UnknownDiagnosis(_) => Self::new(StatusCode::NOT_FOUND, "unknown_diagnosis", detail),
-            E::TooManyMeasurements { .. } => Self::invalid("too_many_measurements", detail, Vec::new()),
             E::NotAssessed { .. } => Self::new(StatusCode::CONFLICT, "not_assessed", detail),
-            E::NoExtension { .. } => Self::new(StatusCode::CONFLICT, "no_extension", detail),
             E::VersionChanged(_) => Self::new(StatusCode::CONFLICT, "version_changed", detail),
             E::NoStepBack(_) => Self::new(StatusCode::CONFLICT, "no_step_back", detail),
             E::NoModel { .. } => Self::new(StatusCode::CONFLICT, "no_model", detail),
             E::StructureInUse(_) => Self::new(StatusCode::CONFLICT, "structure_in_use", detail),
+            E::QueueFull(_) => Self::unavailable("queue_full", detail, RETRY_AFTER_SECONDS),
+            E::Store(error) => error.into(),
+            E::DefinitionRefused { .. } => Self::new(StatusCode::CONFLICT, "definition_refused", detail),
+            E::Definition(_) | E::Panicked => Self::internal(&detail),
+        }
+    }
+}
+
+impl From<monitor::IngestError> for ApiError {
+    fn from(error: monitor::IngestError) -> Self {
+        use monitor::IngestError as E;
+        let detail = error.to_string();
+        match error {
             E::KeyConflict { .. } => Self::invalid("idempotency_key_reused", detail, Vec::new()),
             E::MeasurementConflict { ordinal, .. } => {
                 let pointer = format!("/measurements/{ordinal}");
                 Self::invalid("measurement_exists", detail.clone(), vec![Problem { pointer, message: detail }])
             }
-            E::RepeatedBatch(_) | E::Undamaged(_) | E::Assess { .. } | E::UnfitForUndamaged { .. } => {
-                Self::invalid("unusable_baseline", detail, Vec::new())
-            }
-            E::QueueFull(_) => Self::unavailable("queue_full", detail, RETRY_AFTER_SECONDS),
-            E::ModelRefused { .. } => Self::new(StatusCode::CONFLICT, "model_refused", detail),
-            E::BackupRunning => Self::new(StatusCode::CONFLICT, "backup_running", detail),
-            E::Store(error) => error.into(),
-            E::Backup(error) => error.into(),
-            E::DefinitionRefused { .. } => Self::new(StatusCode::CONFLICT, "definition_refused", detail),
-            E::Definition(_) | E::Panicked => Self::internal(&detail),
+            E::Monitor(error) => error.into(),
+        }
+    }
+}
+
+impl From<monitor::DeclareError> for ApiError {
+    fn from(error: monitor::DeclareError) -> Self {
+        match error {
+            monitor::DeclareError::Monitor(error) => error.into(),
+            unusable => Self::invalid("unusable_baseline", unusable.to_string(), Vec::new()),
+        }
+    }
+}
+
+impl From<monitor::JobError> for ApiError {
+    fn from(error: monitor::JobError) -> Self {
+        use monitor::JobError as E;
+        let detail = error.to_string();
+        match error {
+            E::UnknownDiagnosis(_) => Self::new(StatusCode::NOT_FOUND, "unknown_diagnosis", detail),
+            E::RepeatedBatch(_) => Self::invalid("unusable_baseline", detail, Vec::new()),
+            E::TooManyMeasurements { .. } => Self::invalid("too_many_measurements", detail, Vec::new()),
+            E::NoExtension { .. } => Self::new(StatusCode::CONFLICT, "no_extension", detail),
+            E::Monitor(error) => error.into(),
+        }
+    }
+}
+
+impl From<monitor::ReloadError> for ApiError {
+    fn from(error: monitor::ReloadError) -> Self {
+        let detail = error.to_string();
+        match error {
+            monitor::ReloadError::Refused { .. } => Self::new(StatusCode::CONFLICT, "model_refused", detail),
+            monitor::ReloadError::Monitor(error) => error.into(),
+        }
+    }
+}
+
+impl From<monitor::BackupError> for ApiError {
+    fn from(error: monitor::BackupError) -> Self {
+        let detail = error.to_string();
+        match error {
+            monitor::BackupError::Running => Self::new(StatusCode::CONFLICT, "backup_running", detail),
+            monitor::BackupError::Failed(error) => error.into(),
+            monitor::BackupError::Monitor(error) => error.into(),
         }
     }
 }
@@ -154,10 +199,10 @@ impl From<JsonError> for ApiError {
     }
 }
 
-impl From<crate::store::Error> for ApiError {
+impl From<crate::monitor::stored::Error> for ApiError {
     /// A disk failure is not an error of the program: the client is asked to repeat the request, and the answer is not
     /// a 500.
-    fn from(error: crate::store::Error) -> Self {
+    fn from(error: crate::monitor::stored::Error) -> Self {
         let Some(cause) = error.disk_cause() else { return Self::internal(&error) };
         let status = match cause {
             "disk_full" => StatusCode::INSUFFICIENT_STORAGE,
@@ -180,9 +225,9 @@ impl From<crate::store::Error> for ApiError {
     }
 }
 
-impl From<crate::store::backup::Error> for ApiError {
-    fn from(error: crate::store::backup::Error) -> Self {
-        use crate::store::backup::Error as E;
+impl From<crate::monitor::stored::backup::Error> for ApiError {
+    fn from(error: crate::monitor::stored::backup::Error) -> Self {
+        use crate::monitor::stored::backup::Error as E;
         let detail = error.to_string();
         match error {
             E::Name(_) => Self::invalid_field("/name", detail),

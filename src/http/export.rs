@@ -21,9 +21,9 @@ use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
 use super::table::{Format, TableWriter};
 use crate::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
-use crate::monitor::Watched;
+use crate::monitor::stored::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
+use crate::monitor::{ActiveStructure, Records};
 use crate::quantity::{shown, Hertz, StructureId, Timestamp};
-use crate::store::{MeasurementPlace, MeasurementQuery, Store, StoredMeasurement};
 
 /// Measurements read from the store at a time.
 const PAGE: usize = 2_000;
@@ -117,22 +117,22 @@ pub async fn measurements(
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
+    let active = shared.monitor.structure(&id)?;
     let allowed = [Format::Json, Format::Csv, Format::Ndjson, Format::Parquet];
     let format = Format::of(query.format.as_deref(), &headers, &allowed)?;
     let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
     let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
     let limit = query.limit.as_deref().map(|limit| page_limit(Some(limit))).transpose()?;
-    let store = shared.monitor.store().clone();
+    let records = shared.monitor.records().clone();
     let mut page = MeasurementQuery { from: window.from, to: window.to, limit: page_limit(None)?, after };
     if format != Format::Json {
         page.limit = if format == Format::Parquet { ROW_GROUP } else { PAGE };
-        let writer = Writer::new(format, &watched)?;
-        let export = Export { store, structure: id, page, left: limit, writer };
+        let writer = Writer::new(format, &active)?;
+        let export = Export { records, structure: id, page, left: limit, writer };
         return export.answer(format).await;
     }
     page.limit = limit.unwrap_or(page.limit);
-    let found = store.batches().measurements(&id, &page).await?;
+    let found = records.measurements(&id, &page).await?;
     let next = (found.len() == page.limit).then(|| found.last().map(|m| cursor(&m.place))).flatten();
     let items = found.into_iter().map(MeasurementItem::from).collect();
     let mut response = Json(MeasurementPage { structure: id.clone(), items, next: next.clone() }).into_response();
@@ -158,7 +158,7 @@ fn parse_cursor(text: &str) -> Result<MeasurementPlace, ApiError> {
 
 /// A file that is being sent.
 struct Export {
-    store: Store,
+    records: Records,
     structure: StructureId,
     /// The next page to read.
     page: MeasurementQuery,
@@ -193,7 +193,7 @@ impl Export {
 
     async fn part(mut self) -> Result<Part, ApiError> {
         self.page.limit = self.left.map_or(self.page.limit, |left| left.min(self.page.limit));
-        let found = self.store.batches().measurements(&self.structure, &self.page).await?;
+        let found = self.records.measurements(&self.structure, &self.page).await?;
         self.left = self.left.map(|left| left - found.len());
         let last = found.len() < self.page.limit || self.left == Some(0);
         self.page.after = found.last().map(|m| m.place.clone()).or(self.page.after);
@@ -223,11 +223,11 @@ struct Columns {
 }
 
 impl Writer {
-    fn new(format: Format, watched: &Watched) -> Result<Self, ApiError> {
+    fn new(format: Format, active: &ActiveStructure) -> Result<Self, ApiError> {
         if format == Format::Ndjson {
             return Ok(Self::Ndjson);
         }
-        let simulator = &watched.simulator;
+        let simulator = &active.simulator;
         let columns = Columns {
             modes: simulator.modes(),
             covariates: simulator.covariates().to_vec(),

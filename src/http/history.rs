@@ -14,9 +14,9 @@ use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
 use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
 use super::table::{Format, TableWriter};
-use crate::monitor::Watched;
+use crate::monitor::stored::HistoryQuery;
+use crate::monitor::ActiveStructure;
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::HistoryQuery;
 
 /// Query of the history.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -134,8 +134,8 @@ pub async fn history(
     headers: HeaderMap,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
-    check_parameter(query.parameter.as_deref(), &watched)?;
+    let active = shared.monitor.structure(&id)?;
+    check_parameter(query.parameter.as_deref(), &active)?;
     let format = Format::of(query.format.as_deref(), &headers, &[Format::Json, Format::Csv, Format::Parquet])?;
     let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
     let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
@@ -148,7 +148,7 @@ pub async fn history(
         after: after.map(|(time, batch, _)| (time, batch)),
         after_quantity: None,
     };
-    let entries = shared.monitor.store().history().page(&id, &page).await?;
+    let entries = shared.monitor.records().history(&id, &page).await?;
     let next = (entries.len() == limit).then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id))).flatten();
     let items: Vec<HistoryItem> = entries.into_iter().map(HistoryItem::from).collect();
     let mut response = if format == Format::Json {
@@ -193,19 +193,19 @@ pub async fn exceedances(
     ApiQuery(query): ApiQuery<ExceedanceParams>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
-    check_parameter(query.parameter.as_deref(), &watched)?;
+    let active = shared.monitor.structure(&id)?;
+    check_parameter(query.parameter.as_deref(), &active)?;
     let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
     let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
     let (after, after_quantity) = after.map_or((None, None), |(time, batch, quantity)| (Some((time, batch)), quantity));
     let limit = page_limit(query.limit.as_deref())?;
     let parameter = query.parameter.clone();
     let page = HistoryQuery { from: window.from, to: window.to, parameter, limit, after, after_quantity };
-    let found = shared.monitor.store().history().exceedances(&id, &page).await?;
+    let found = shared.monitor.records().exceedances(&id, &page).await?;
     let next = (found.len() == limit)
         .then(|| found.last().map(|e| format!("{}~{}", cursor(e.measured_from, &e.batch_id), e.quantity)))
         .flatten();
-    let item = |e: crate::store::Exceedance| ExceedanceItem {
+    let item = |e: crate::monitor::stored::Exceedance| ExceedanceItem {
         batch: e.batch_id,
         measured_from: e.measured_from,
         measured_to: e.measured_to,
@@ -226,11 +226,11 @@ pub async fn exceedances(
 }
 
 /// 422 for a name that is not a quantity of this structure.
-fn check_parameter(name: Option<&str>, watched: &Watched) -> Result<(), ApiError> {
+fn check_parameter(name: Option<&str>, active: &ActiveStructure) -> Result<(), ApiError> {
     let Some(name) = name else { return Ok(()) };
-    let mut names: Vec<String> = watched.simulator.space().iter().map(|p| p.name.clone()).collect();
-    names.extend(watched.simulator.derived_stiffnesses().into_iter().map(|s| s.name));
-    names.extend(watched.baseline.iter().flat_map(|b| b.groups()).map(|g| g.name));
+    let mut names: Vec<String> = active.simulator.space().iter().map(|p| p.name.clone()).collect();
+    names.extend(active.simulator.derived_stiffnesses().into_iter().map(|s| s.name));
+    names.extend(active.baseline.iter().flat_map(|b| b.groups()).map(|g| g.name));
     if names.iter().any(|known| known == name) {
         return Ok(());
     }

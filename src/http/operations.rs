@@ -10,8 +10,8 @@ use utoipa::ToSchema;
 
 use super::shared::Shared;
 use crate::baseline::library::Refusal;
-use crate::monitor::upkeep::Health;
-use crate::store::schema_version;
+use crate::monitor::stored::schema_version;
+use crate::monitor::Health;
 
 /// The process is running.
 #[derive(Debug, Serialize, ToSchema)]
@@ -63,15 +63,15 @@ pub async fn health() -> Response {
     )
 )]
 pub async fn ready(State(shared): State<Shared>) -> Response {
-    let health = shared.monitor.health().await;
+    let health = shared.monitor.upkeep().health().await;
     metrics::gauge!("modalwatch_ready").set(f64::from(u8::from(health.ready)));
     metrics::gauge!("modalwatch_findings").set(health.findings.len() as f64);
     let status = if health.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     let readiness = Readiness {
         health,
-        baselines_in_use: shared.monitor.baselines_in_use(),
-        baselines_refused: shared.monitor.refusals(),
-        free_places_in_queue: shared.monitor.free_places(),
+        baselines_in_use: shared.monitor.upkeep().baselines_in_use(),
+        baselines_refused: shared.monitor.structures().library().refusals().to_vec(),
+        free_places_in_queue: shared.monitor.upkeep().free_places(),
     };
     (status, Json(readiness)).into_response()
 }
@@ -84,10 +84,10 @@ pub async fn ready(State(shared): State<Shared>) -> Response {
     responses((status = 200, description = "Prometheus text", body = String, content_type = "text/plain"))
 )]
 pub async fn metrics(State(shared): State<Shared>) -> Response {
-    let health = shared.monitor.health().await;
+    let health = shared.monitor.upkeep().health().await;
     metrics::gauge!("modalwatch_ready").set(f64::from(u8::from(health.ready)));
     metrics::gauge!("modalwatch_findings").set(health.findings.len() as f64);
-    if let Err(failure) = shared.monitor.look_at_gauges().await {
+    if let Err(failure) = shared.monitor.upkeep().set_gauges().await {
         error!(error = %failure, "Could not count what is stored: {failure}");
     }
     let text = shared.metrics.render();
@@ -104,7 +104,7 @@ pub async fn version(State(shared): State<Shared>) -> Response {
     let version = Version {
         name: env!("CARGO_PKG_NAME"),
         version: env!("CARGO_PKG_VERSION"),
-        sqlite_version: shared.monitor.store().file().sqlite_version().to_owned(),
+        sqlite_version: shared.monitor.sqlite_version().to_owned(),
         schema_version: schema_version(),
         manifest_format: crate::baseline::manifest::FORMAT,
     };

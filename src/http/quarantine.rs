@@ -11,8 +11,8 @@ use super::error::ApiError;
 use super::openapi::{Invalid, MessagePath, Unknown};
 use super::request::{page_cursor, page_limit, ApiPath, ApiQuery};
 use super::shared::Shared;
+use crate::monitor::stored::QuarantinedMessage;
 use crate::quantity::{shown, Timestamp};
-use crate::store::QuarantinedMessage;
 
 /// Number of characters of a payload in the list.
 const PREVIEW: usize = 500;
@@ -84,7 +84,7 @@ pub async fn list(
     ApiQuery(query): ApiQuery<QuarantineQuery>,
 ) -> Result<Response, ApiError> {
     let (limit, before) = (page_limit(query.limit.as_deref())?, page_cursor(query.cursor.as_deref())?);
-    let found = shared.monitor.store().quarantine().quarantined(before, limit).await?;
+    let found = shared.monitor.quarantine().quarantined(before, limit).await?;
     let next = (found.len() == limit).then(|| found.last().map(|m| m.number.to_string())).flatten();
     Ok(Json(QuarantinePage { items: found.into_iter().map(item).collect(), next }).into_response())
 }
@@ -102,7 +102,7 @@ pub async fn list(
 pub async fn read(State(shared): State<Shared>, ApiPath(message): ApiPath<String>) -> Result<Response, ApiError> {
     let number: i64 = message.parse().map_err(|_| unknown(&message))?;
     // The message is on the page of one item that begins after the next number.
-    let found = shared.monitor.store().quarantine().quarantined(number.checked_add(1), 1).await?;
+    let found = shared.monitor.quarantine().quarantined(number.checked_add(1), 1).await?;
     let found = found.into_iter().find(|m| m.number == number).ok_or_else(|| unknown(&message))?;
     let payload = String::from_utf8_lossy(&found.payload).into_owned();
     Ok(Json(QuarantineItem { payload, ..item(found) }).into_response())
@@ -120,7 +120,7 @@ pub async fn read(State(shared): State<Shared>, ApiPath(message): ApiPath<String
 )]
 pub async fn remove(State(shared): State<Shared>, ApiPath(message): ApiPath<String>) -> Result<Response, ApiError> {
     let number: i64 = message.parse().map_err(|_| unknown(&message))?;
-    if shared.monitor.store().quarantine().delete_quarantined(number).await? {
+    if shared.monitor.quarantine().delete_quarantined(number).await? {
         Ok(StatusCode::NO_CONTENT.into_response())
     } else {
         Err(unknown(&message))

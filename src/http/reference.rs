@@ -63,7 +63,7 @@ pub async fn put(
         return Err(ApiError::invalid_field("/batches", "name at least one batch"));
     }
     let probability = body.threshold_probability.unwrap_or(DEFAULT_THRESHOLD_PROBABILITY);
-    let record = shared.monitor.declare_undamaged(&id, body.batches, probability).await?;
+    let record = shared.monitor.replay().declare_reference(&id, body.batches, probability).await?;
     Ok((StatusCode::CREATED, Json(Undamaged::new(&id, &record))).into_response())
 }
 

@@ -10,14 +10,15 @@ use serde::{Deserialize, Serialize};
 use tracing::error;
 use utoipa::{IntoParams, ToSchema};
 
+use super::answer::declare_reference;
 use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{parse_json, read_body, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
 use crate::monitor::retention::RetentionPlan;
+use crate::monitor::stored::backup::Manifest;
 use crate::monitor::Reloaded;
-use crate::quantity::shown;
-use crate::store::backup::Manifest;
+use crate::quantity::{shown, Digest, StructureId};
 
 /// Maximum number of archive lines that wait to be sent.
 const BUFFERED: usize = 16;
@@ -62,6 +63,47 @@ struct BackupList {
     unreadable: Vec<String>,
 }
 
+/// The result of a reload.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Reloaded)]
+pub struct ReloadedBody {
+    /// The structure.
+    structure: StructureId,
+    /// The trained baseline in use now.
+    model_digest: Digest,
+    /// The one before.
+    #[schema(required)]
+    previous_model_digest: Option<Digest>,
+    /// False when the files are those in use.
+    changed: bool,
+    /// Version of the undamaged reference that was renewed with it.
+    #[schema(required)]
+    undamaged_version: Option<u32>,
+    /// What is left to do.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    next_step: Option<String>,
+}
+
+impl From<Reloaded> for ReloadedBody {
+    fn from(reloaded: Reloaded) -> Self {
+        let next_step = reloaded.reference_outdated.then(|| {
+            format!(
+                "the undamaged reference was made with another trained baseline, so batches are not compared with it: declare \
+                 undamaged batches again by {}",
+                declare_reference(&reloaded.structure)
+            )
+        });
+        Self {
+            structure: reloaded.structure,
+            model_digest: reloaded.model_digest,
+            previous_model_digest: reloaded.previous_model_digest,
+            changed: reloaded.changed,
+            undamaged_version: reloaded.undamaged_version,
+            next_step,
+        }
+    }
+}
+
 /// `POST /v1/backups`: makes a backup in `backups/` of the data folder while the service runs; 201 when it is verified
 /// and on disk.
 ///
@@ -76,7 +118,7 @@ struct BackupList {
 )]
 pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, ApiError> {
     let body: BackupBody = optional_json(&shared, &headers, body).await?;
-    let manifest = shared.monitor.back_up(body.name).await?;
+    let manifest = shared.monitor.upkeep().backups().make(body.name).await?;
     Ok((StatusCode::CREATED, Json(manifest)).into_response())
 }
 
@@ -90,10 +132,7 @@ pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, bod
     responses((status = 200, description = "The backups", body = BackupList))
 )]
 pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiError> {
-    let store = shared.monitor.store().clone();
-    let listed =
-        tokio::task::spawn_blocking(move || store.file().backups()).await.map_err(|e| ApiError::internal(&e))?;
-    let (items, unreadable) = listed?;
+    let (items, unreadable) = shared.monitor.upkeep().backups().list().await?;
     Ok(Json(BackupList { items, unreadable }).into_response())
 }
 
@@ -114,7 +153,7 @@ pub async fn list_backups(State(shared): State<Shared>) -> Result<Response, ApiE
 )]
 pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let mut lines = shared.monitor.export(&id).await?;
+    let mut lines = shared.monitor.archive().export(&id).await?;
     let (mut sender, body) = Channel::<Bytes, crate::monitor::Error>::new(BUFFERED);
     tokio::spawn(async move {
         while let Some(line) = lines.recv().await {
@@ -148,7 +187,7 @@ pub async fn export(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) 
     description = "Reads the models folder again and replaces the trained model. The previous model stays in use if the new one is refused.",
     params(StructurePath),
     request_body(content = Option<ReloadBody>, example = json!({"retake_undamaged": false})),
-    responses((status = 200, description = "The model that is now in use", body = Reloaded), Unknown, BodyRefused, Conflict)
+    responses((status = 200, description = "The model that is now in use", body = ReloadedBody), Unknown, BodyRefused, Conflict)
 )]
 pub async fn reload_model(
     State(shared): State<Shared>,
@@ -158,8 +197,8 @@ pub async fn reload_model(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let body: ReloadBody = optional_json(&shared, &headers, body).await?;
-    let reloaded = shared.monitor.reload_model(&id, body.retake_undamaged.unwrap_or(true)).await?;
-    Ok(Json(reloaded).into_response())
+    let reloaded = shared.monitor.models().reload(&id, body.retake_undamaged.unwrap_or(true)).await?;
+    Ok(Json(ReloadedBody::from(reloaded)).into_response())
 }
 
 /// `GET /v1/retention`: the retention setting, what would be deleted now, and the result of the last run; `days`
@@ -184,7 +223,7 @@ pub async fn retention(
             ApiError::invalid_field("query/days", message)
         })
     });
-    Ok(Json(shared.monitor.retention_plan(days.transpose()?).await?).into_response())
+    Ok(Json(shared.monitor.upkeep().retention().plan(days.transpose()?).await?).into_response())
 }
 
 /// Reads a JSON body, or returns the default if there is none.

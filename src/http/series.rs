@@ -15,12 +15,13 @@ use super::request::{structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
 use crate::damage::{QuantityKind, UndamagedState};
 use crate::measurement::CovariateKind;
-use crate::quantity::{shown, StructureId, Timestamp};
-use crate::reduction::{Reduced, Row};
-use crate::store::{
+use crate::monitor::stored::{
     ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
 };
-use crate::trust::{Code, Verdict};
+use crate::monitor::Series;
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::reduction::{Reduced, Row};
+use crate::trust::{FindingCode, TrustVerdict};
 
 /// Series that are read at a time; each uses three of the eight connections of the store.
 pub const MOST_AT_A_TIME: usize = 2;
@@ -124,8 +125,8 @@ struct Chart {
 struct TrustPoint {
     time: Timestamp,
     batch: String,
-    verdict: Verdict,
-    findings: Vec<Code>,
+    verdict: TrustVerdict,
+    findings: Vec<FindingCode>,
     #[schema(required)]
     p_value: Option<f64>,
 }
@@ -170,21 +171,15 @@ pub async fn series(
     ApiQuery(query): ApiQuery<SeriesQuery>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
+    let active = shared.monitor.structure(&id)?;
     let window = window(&query)?;
     // A long interval occupies three connections of the store; the others must stay available.
     let _turn = shared.series.acquire().await.map_err(|e| ApiError::internal(&e))?;
-    let store = shared.monitor.store();
-    let extent = store.series().extent(&id, window).await?;
-    let (from, to) = (window.from.or(extent.measured.map(|m| m.0)), window.to.or(extent.measured.map(|m| m.1)));
-
-    let (modes, declared) = (watched.simulator.modes(), watched.simulator.covariates().iter());
+    let (modes, declared) = (active.simulator.modes(), active.simulator.covariates().iter());
     let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
-    let (measured, (quantities, trust), charts) = tokio::try_join!(
-        store.series().frequency_series(&id, window, &extent, modes, &names),
-        store.series().assessed_series(&id, window, &extent),
-        store.series().chart_series(&id, window, &extent),
-    )?;
+    let Series { extent, measured, quantities, trust, charts } =
+        shared.monitor.records().series(&id, window, modes, &names).await?;
+    let (from, to) = (window.from.or(extent.measured.map(|m| m.0)), window.to.or(extent.measured.map(|m| m.1)));
     let reduced = measured.reduced
         || trust.reduced
         || extent.stride() > 1
@@ -192,13 +187,13 @@ pub async fn series(
         || charts.iter().any(|c| c.points.reduced);
 
     // The reference applies only if it was made with the trained model in use.
-    let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
-    let undamaged = store.reference().undamaged(&id).await?.filter(|u| in_use == Some(&u.model_digest));
+    let in_use = active.baseline.as_ref().ok().map(|baseline| baseline.digest());
+    let undamaged = shared.monitor.records().reference(&id).await?.filter(|u| in_use == Some(&u.model_digest));
     let within = |begin: Timestamp, end: Option<Timestamp>| {
         to.is_none_or(|to| begin <= to) && from.is_none_or(|from| end.is_none_or(|end| end >= from))
     };
-    let episodes = store.alarms().episodes(&id, None, false, MOST_ALARMS).await?;
-    let maintenance = store.alarms().maintenance(&id).await?;
+    let episodes = shared.monitor.alarms().episodes(&id, None, false, MOST_ALARMS).await?;
+    let maintenance = shared.monitor.alarms().maintenance(&id).await?;
     let body = SeriesBody {
         from,
         to,
@@ -206,7 +201,7 @@ pub async fn series(
         measurements: extent.measurements,
         reduced,
         thinned_to_every: Some(extent.stride()).filter(|stride| *stride > 1),
-        frequencies: frequencies(measured, watched.simulator.nominal_frequencies_hz(), &names)?,
+        frequencies: frequencies(measured, active.simulator.nominal_frequencies_hz(), &names)?,
         parameters: quantities
             .into_iter()
             .map(|q| track(q, undamaged.as_ref().map(|u| &u.state)))

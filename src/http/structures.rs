@@ -15,10 +15,10 @@ use super::request::{media_type, parse_json, read_body, structure_id, unsupporte
 use super::shared::Shared;
 use crate::access::Grant;
 use crate::measurement::check::Problem;
-use crate::monitor::Watched;
+use crate::monitor::stored::PutStructure;
+use crate::monitor::ActiveStructure;
 use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
-use crate::store::PutStructure;
 
 /// A structure with its trained model and its undamaged reference.
 #[derive(Debug, Serialize, ToSchema)]
@@ -92,11 +92,11 @@ struct ListedStructure {
 )]
 pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let mut items = Vec::new();
-    for summary in shared.monitor.store().structures().list().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
-        let watched = shared.monitor.structure(&summary.id);
+    for summary in shared.monitor.records().structures().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
+        let active = shared.monitor.structure(&summary.id);
         items.push(ListedStructure {
-            model_digest: watched.ok().and_then(|it| Some(it.baseline.as_ref().ok()?.digest().to_string())),
-            definition_refused: shared.monitor.refused_structures().get(&summary.id).cloned(),
+            model_digest: active.ok().and_then(|it| Some(it.baseline.as_ref().ok()?.digest().to_string())),
+            definition_refused: shared.monitor.structures().refused().get(&summary.id).cloned(),
             id: summary.id,
             digest: summary.digest.to_string(),
             created_at: summary.created_at,
@@ -119,9 +119,9 @@ pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response
 )]
 pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let watched = shared.monitor.structure(&id)?;
-    let undamaged = shared.monitor.store().reference().undamaged(&id).await?;
-    Ok(Json(body(&id, &watched, undamaged.map(|u| super::answer::Undamaged::new(&id, &u)))).into_response())
+    let active = shared.monitor.structure(&id)?;
+    let undamaged = shared.monitor.records().reference(&id).await?;
+    Ok(Json(body(&id, &active, undamaged.map(|u| super::answer::Undamaged::new(&id, &u)))).into_response())
 }
 
 /// `PUT /v1/structures/{id}`: defines a structure by JSON or TOML; 201 if it is new, 200 if it exists with this
@@ -174,13 +174,12 @@ pub async fn put(
         let message = format!("the id in the body is {}, in the path {id}", crate::quantity::shown(&definition.id));
         return Err(ApiError::invalid_field("/id", message));
     }
-    let outcome = shared.monitor.put_structure(definition).await?;
+    let outcome = shared.monitor.structures().put(definition).await?;
     let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
-    let watched = shared.monitor.structure(&id)?;
-    let undamaged =
-        shared.monitor.store().reference().undamaged(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
+    let active = shared.monitor.structure(&id)?;
+    let undamaged = shared.monitor.records().reference(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
     let location = [(header::LOCATION, format!("/v1/structures/{id}"))];
-    Ok((status, location, Json(self::body(&id, &watched, undamaged))).into_response())
+    Ok((status, location, Json(self::body(&id, &active, undamaged))).into_response())
 }
 
 /// Malformed JSON is answered 400, JSON that does not define a structure 422.
@@ -202,8 +201,8 @@ fn refused(error: DefinitionError) -> ApiError {
     ApiError::invalid("invalid_structure", error.to_string(), error.problems.iter().map(problem).collect())
 }
 
-fn body(id: &StructureId, watched: &Watched, undamaged: Option<super::answer::Undamaged>) -> StructureBody {
-    let model = watched.baseline.as_ref().ok().map(|baseline| ModelBody {
+fn body(id: &StructureId, active: &ActiveStructure, undamaged: Option<super::answer::Undamaged>) -> StructureBody {
+    let model = active.baseline.as_ref().ok().map(|baseline| ModelBody {
         digest: baseline.digest().to_string(),
         program_version: baseline.manifest().program_version.clone(),
         training_samples: baseline.manifest().training.samples,
@@ -211,24 +210,24 @@ fn body(id: &StructureId, watched: &Watched, undamaged: Option<super::answer::Un
         conditions: baseline.manifest().conditions.clone(),
         calibration: baseline.manifest().calibration.clone(),
     });
-    let emulator = watched.simulator.table().map(|table| {
-        let modes = 0..watched.simulator.modes();
+    let emulator = active.simulator.table().map(|table| {
+        let modes = 0..active.simulator.modes();
         EmulatorBody {
             runs: table.runs(),
             error_percent: modes.clone().map(|mode| 100.0 * table.emulator().relative_error(mode)).collect(),
             r_squared: modes.map(|mode| table.emulator().r_squared(mode)).collect(),
-            warnings: watched.simulator.warnings(),
+            warnings: active.simulator.warnings(),
         }
     });
-    let definition = serde_json::from_str(&watched.simulator.definition().canonical_json());
+    let definition = serde_json::from_str(&active.simulator.definition().canonical_json());
     StructureBody {
         id: id.clone(),
-        digest: watched.simulator.digest().to_string(),
+        digest: active.simulator.digest().to_string(),
         definition: definition.expect("canonical JSON is JSON"),
-        nominal_frequencies_hz: watched.simulator.nominal_frequencies_hz(),
+        nominal_frequencies_hz: active.simulator.nominal_frequencies_hz(),
         emulator,
         model,
-        model_missing: watched.baseline.as_ref().err().cloned(),
+        model_missing: active.baseline.as_ref().err().cloned(),
         undamaged,
     }
 }

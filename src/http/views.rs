@@ -14,10 +14,11 @@ use super::request::{structure_id, ApiPath};
 use super::shared::Shared;
 use crate::access::Grant;
 use crate::alarm::machine::State as AlarmState;
-use crate::monitor::{BatchDetail, ModeDetail, ParameterDetail, Watched};
+use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
+use crate::monitor::stored::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
+use crate::monitor::ActiveStructure;
 use crate::quantity::{Hertz, StructureId, Timestamp};
-use crate::store::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
-use crate::trust::Verdict;
+use crate::trust::TrustVerdict;
 
 /// Maximum number of jobs in the list.
 const LISTED_JOBS: usize = 100;
@@ -60,7 +61,7 @@ struct OverviewItem {
 #[schema(as = LatestAssessment)]
 struct Latest {
     batch: String,
-    trust: Verdict,
+    trust: TrustVerdict,
     exceeds: bool,
     #[schema(required)]
     max_probability_of_damage: Option<f64>,
@@ -147,19 +148,25 @@ struct ModeFrequencies {
     responses((status = 200, description = "The structures by id", body = Overview))
 )]
 pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
-    let store = shared.monitor.store();
     let item = |found: StructureOverview| {
-        let watched = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
-        item(found, watched)
+        let active = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
+        item(found, active)
     };
-    let items =
-        store.overview().structures().await?.into_iter().filter(|found| grant.may_see(&found.id)).map(item).collect();
-    let jobs_running = shared.monitor.jobs_running();
+    let items = shared
+        .monitor
+        .records()
+        .overview()
+        .await?
+        .into_iter()
+        .filter(|found| grant.may_see(&found.id))
+        .map(item)
+        .collect();
+    let jobs_running = shared.monitor.jobs().running();
     Ok(Json(Overview { items, jobs_running }).into_response())
 }
 
-fn item(found: StructureOverview, watched: Result<Arc<Watched>, String>) -> OverviewItem {
-    let baseline = watched.and_then(|watched| watched.baseline.clone());
+fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>) -> OverviewItem {
+    let baseline = active.and_then(|active| active.baseline.clone());
     let (baseline, model_missing) = (baseline.as_ref().ok(), baseline.as_ref().err());
     OverviewItem {
         state: state(&found, baseline.is_some()),
@@ -231,7 +238,7 @@ pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response
         verdict: job.verdict,
         summary: job.summary,
     };
-    let jobs = shared.monitor.jobs(LISTED_JOBS).await?;
+    let jobs = shared.monitor.jobs().list(LISTED_JOBS).await?;
     let items: Vec<JobItem> = jobs.into_iter().filter(|(job, _)| grant.may_see(&job.structure)).map(item).collect();
     Ok(Json(JobList { items }).into_response())
 }
@@ -253,7 +260,7 @@ pub async fn detail(
     ApiPath((id, batch)): ApiPath<(String, String)>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
-    let detail = shared.monitor.batch_detail(&id, &batch).await?;
+    let detail = shared.monitor.records().batch_detail(&id, &batch).await?;
     Ok(Json(detail_body(id, batch, detail)).into_response())
 }
 

@@ -13,10 +13,11 @@ use super::error::ApiError;
 use super::openapi::{BodyRefused, Conflict, DeliveryPath, Invalid, Unknown, WebhookPath};
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
+use crate::alarm::ALARM_KINDS;
 use crate::measurement::check::Problem;
+use crate::monitor::stored::{Delivery, DeliveryState, EventFilter, WebhookRecord};
 use crate::notify::{new_secret, EVENT_KINDS};
 use crate::quantity::{shown, StructureId, Timestamp};
-use crate::store::{Delivery, DeliveryState, EventFilter, WebhookRecord, ALARM_KINDS};
 
 /// Maximum number of webhooks: each may need a connection.
 const MOST_WEBHOOKS: usize = 100;
@@ -199,7 +200,7 @@ impl From<Delivery> for DeliveryItem {
     responses((status = 200, description = "The webhooks", body = WebhookList))
 )]
 pub async fn list(State(shared): State<Shared>) -> Result<Response, ApiError> {
-    let items: Vec<WebhookItem> = shared.monitor.store().webhooks().list().await?.into_iter().map(Into::into).collect();
+    let items: Vec<WebhookItem> = shared.monitor.webhooks().list().await?.into_iter().map(Into::into).collect();
     Ok(Json(WebhookList { items }).into_response())
 }
 
@@ -233,7 +234,7 @@ pub async fn create(State(shared): State<Shared>, headers: HeaderMap, body: Body
         created_at: now,
         updated_at: now,
     };
-    if !shared.monitor.store().webhooks().insert_webhook(record.clone(), MOST_WEBHOOKS).await? {
+    if !shared.monitor.webhooks().insert_webhook(record.clone(), MOST_WEBHOOKS).await? {
         let detail = format!("there are already {MOST_WEBHOOKS} webhooks: delete one first");
         return Err(ApiError::new(StatusCode::CONFLICT, "too_many_webhooks", detail));
     }
@@ -277,7 +278,7 @@ pub async fn put(
     let body: WebhookBody = json_body(&headers, body, shared.limits).await?;
     check(&shared, &body).await?;
     let filter = EventFilter { events: body.events, alarm_kinds: body.alarm_kinds, structures: body.structures };
-    shared.monitor.store().webhooks().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
+    shared.monitor.webhooks().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
     read(State(shared), ApiPath(id)).await
 }
 
@@ -292,7 +293,7 @@ pub async fn put(
     responses((status = 204, description = "It was deleted"), Unknown)
 )]
 pub async fn remove(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    if shared.monitor.store().webhooks().delete_webhook(&id).await? {
+    if shared.monitor.webhooks().delete_webhook(&id).await? {
         Ok(StatusCode::NO_CONTENT.into_response())
     } else {
         Err(unknown_webhook(&id))
@@ -336,7 +337,7 @@ pub async fn test(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 pub async fn rotate(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
     let (now, secret) = (Timestamp::now(), new_secret().map_err(|e| ApiError::internal(&e))?);
     let until = shared.notifier.overlap_until(now);
-    if !shared.monitor.store().webhooks().rotate_secret(&id, secret.clone(), until, now).await? {
+    if !shared.monitor.webhooks().rotate_secret(&id, secret.clone(), until, now).await? {
         return Err(unknown_webhook(&id));
     }
     let item = WebhookItem { secret: Some(secret.reveal().to_owned()), ..webhook(&shared, &id).await?.into() };
@@ -367,7 +368,7 @@ pub async fn deliveries(
     };
     let state = query.state.as_deref().map(state).transpose()?;
     let before = page_cursor(query.cursor.as_deref())?;
-    let found = shared.monitor.store().outbox().deliveries(&id, state, before, limit).await?;
+    let found = shared.monitor.outbox().deliveries(&id, state, before, limit).await?;
     let next = (found.len() == limit).then(|| found.last().map(|d| d.id.to_string())).flatten();
     Ok(Json(DeliveryPage { webhook: id, items: found.into_iter().map(Into::into).collect(), next }).into_response())
 }
@@ -393,8 +394,7 @@ pub async fn retry(
         ApiError::new(StatusCode::NOT_FOUND, "unknown_delivery", detail)
     };
     let number: i64 = delivery.parse().map_err(|_| unknown())?;
-    let found =
-        shared.monitor.store().outbox().retry_delivery(&id, number, Timestamp::now()).await?.ok_or_else(unknown)?;
+    let found = shared.monitor.outbox().retry_delivery(&id, number, Timestamp::now()).await?.ok_or_else(unknown)?;
     if found.state == DeliveryState::Delivered {
         let detail = format!("delivery {number} was accepted by the receiver: it cannot be sent again");
         return Err(ApiError::new(StatusCode::CONFLICT, "already_delivered", detail));
@@ -403,7 +403,7 @@ pub async fn retry(
 }
 
 async fn webhook(shared: &Shared, id: &str) -> Result<WebhookRecord, ApiError> {
-    shared.monitor.store().webhooks().webhook(id).await?.ok_or_else(|| unknown_webhook(id))
+    shared.monitor.webhooks().webhook(id).await?.ok_or_else(|| unknown_webhook(id))
 }
 
 fn unknown_webhook(id: &str) -> ApiError {

@@ -1,4 +1,4 @@
-//! The bounded queue in front of the processor: computing never runs on the async threads, and never piles up.
+//! The bounded queue in front of the processor: computations never run on the async threads, and their number is limited.
 
 use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::Arc;
@@ -6,13 +6,13 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{oneshot, OwnedSemaphorePermit, Semaphore};
 
-/// How much may be computed and may wait.
+/// Limits of the queue of assessments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ComputeSettings {
-    /// Assessments that run at the same time; 0 stands for the number of cores.
+    /// Assessments that run at the same time; 0 = the number of cores.
     pub threads: usize,
-    /// Assessments that may run or wait; one more is answered 503.
+    /// Assessments that may run or wait; further ones are refused with 503.
     pub queue: usize,
 }
 
@@ -32,18 +32,17 @@ pub struct QueueFull;
 #[error("the computation panicked")]
 pub struct Panicked;
 
-/// Runs computations on threads of their own, a few at a time.
+/// Runs computations on the compute threads, a limited number at a time.
 #[derive(Clone)]
 pub struct Compute {
     places: Arc<Semaphore>,
     threads: Arc<Semaphore>,
-    /// Places that work behind all other may hold together: enough to keep the threads busy, and few enough that what comes in
-    /// meanwhile soon gets a thread.
+    /// Places for low-priority work: enough to keep the threads busy, and few enough that new batches soon get a thread.
     behind: Arc<Semaphore>,
     places_behind: usize,
 }
 
-/// A place in the queue; given back when dropped.
+/// A place in the queue, released when dropped.
 pub struct Place {
     _place: OwnedSemaphorePermit,
     _behind: Option<OwnedSemaphorePermit>,
@@ -55,7 +54,7 @@ impl Compute {
     pub fn new(settings: ComputeSettings) -> Self {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = if settings.threads == 0 { cores } else { settings.threads };
-        // A batch that is computed keeps its place until it is stored: twice as many as there are threads.
+        // A computed batch keeps its place until it is stored, hence twice the number of threads.
         let places_behind = (2 * threads).min(settings.queue / 2).max(1);
         Self {
             places: Arc::new(Semaphore::new(settings.queue)),
@@ -65,7 +64,7 @@ impl Compute {
         }
     }
 
-    /// Takes a place at once.
+    /// Takes a place without waiting.
     ///
     /// # Errors
     /// [`QueueFull`] when none is free.
@@ -74,19 +73,19 @@ impl Compute {
         Ok(Place { _place: place, _behind: None, threads: Arc::clone(&self.threads) })
     }
 
-    /// Takes a place, waiting for one: for work whose sender cannot be told to come again.
+    /// Waits for a place: for work whose sender cannot be asked to send it again.
     pub async fn wait(&self) -> Place {
         let place = Arc::clone(&self.places).acquire_owned().await.expect("the semaphore is never closed");
         Place { _place: place, _behind: None, threads: Arc::clone(&self.threads) }
     }
 
-    /// Takes one of the places for work that nobody waits for, such as what a restart left over.
+    /// Waits for one of the places for low-priority work, such as what was left unassessed before a restart.
     pub async fn wait_behind(&self) -> Place {
         let behind = Arc::clone(&self.behind).acquire_owned().await.expect("the semaphore is never closed");
         Place { _behind: Some(behind), ..self.wait().await }
     }
 
-    /// How many such places there are.
+    /// Number of places for low-priority work.
     pub fn places_behind(&self) -> usize {
         self.places_behind
     }
@@ -98,16 +97,16 @@ impl Compute {
 }
 
 impl Place {
-    /// Runs `work` on a computing thread as soon as one is free.
+    /// Runs `work` on a compute thread as soon as one is free.
     ///
     /// # Errors
     /// [`Panicked`] when `work` panicked.
     pub async fn run<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Panicked> {
         let _thread = self.threads.acquire().await.expect("the semaphore is never closed");
         let (found, answer) = oneshot::channel();
-        // Among the threads that its parallel loops share: from any other, each loop would be handed over and waited for.
+        // On the thread pool that its parallel loops use: from any other thread, each loop would have to be handed over.
         rayon::spawn(move || {
-            // Whoever asked may be gone.
+            // The caller may have been dropped.
             let _ = found.send(catch_unwind(AssertUnwindSafe(work)));
         });
         answer.await.ok().and_then(Result::ok).ok_or(Panicked)

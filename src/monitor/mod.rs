@@ -1,568 +1,233 @@
-//! What happens to a batch: store it, assess it, store the result; declare undamaged states; resume after a restart.
+//! The application: batches are taken, stored and assessed; undamaged references are declared; diagnoses run as jobs.
+//!
+//! [`Monitor`] owns the parts and hands them out. Each part is a cheap handle:
+//!
+//! | part | what it does |
+//! |---|---|
+//! | [`ActiveStructures`] | the structures in use with their trained baselines |
+//! | [`Ingest`] | check, store and assess a batch |
+//! | [`Replay`] | declare an undamaged reference, assess stored batches that wait |
+//! | [`Records`] | read batches, assessments and series |
+//! | [`Alarms`] | read and acknowledge alarms, charts, maintenance |
+//! | [`Jobs`], [`Versions`] | diagnose, extend a structure, undo an extension |
+//! | [`Models`] | replace a trained baseline |
+//! | [`Upkeep`] | health, gauges, backups, retention, silence |
+//! | [`Archive`] | export and import a structure |
 
+mod alarms;
 pub mod archive;
-pub mod assess;
-pub mod charts;
+mod assessor;
+mod backups;
 pub mod compute;
-mod detail;
-mod diagnoses;
+mod error;
 pub mod events;
-mod intake;
+mod ingest;
+mod jobs;
+mod metrics;
 mod models;
+mod own_task;
 mod probe;
+mod reason;
+mod records;
+mod references;
 mod replay;
 pub mod retention;
+mod settings;
 mod silence;
-mod task;
+pub mod stored;
+mod structures;
+mod supervise;
 #[cfg(test)]
 mod tests;
-mod undamaged;
-pub mod upkeep;
-mod watched;
+mod upkeep;
+mod versions;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, RwLock};
-use std::time::Duration;
+use std::sync::Arc;
+use std::time::Instant;
 
-use serde::{Deserialize, Serialize};
-use tokio::sync::oneshot;
-use tracing::{error, warn, Instrument as _};
+pub use self::alarms::Alarms;
+use self::archive::Archive;
+use self::assessor::Assessor;
+pub use self::backups::Backups;
+use self::compute::Compute;
+pub use self::error::{BackupError, DeclareError, Error, IngestError, JobError, ReloadError};
+use self::events::Events;
+pub use self::ingest::{Ingest, Ingested};
+pub use self::jobs::{DiagnosisRequest, ExtensionResult, ExtensionTraining, Jobs};
+pub use self::metrics::declare_metrics;
+pub use self::models::{Models, Reloaded};
+use self::probe::WriterProbe;
+pub use self::reason::Reason;
+pub use self::records::{BatchView, Missing, Records, Series};
+use self::references::References;
+pub use self::replay::Replay;
+use self::retention::Retention;
+pub use self::settings::{MissingCovariate, MonitorSettings};
+pub use self::silence::Silence;
+pub use self::structures::{ActiveStructure, ActiveStructures};
+pub use self::upkeep::{Health, Upkeep};
+pub use self::versions::Versions;
+use crate::baseline::library::Library;
+use crate::quantity::StructureId;
+use crate::store::{Audit, Outbox, Quarantine, Store, Webhooks};
 
-use crate::alarm::AlarmSettings;
-use crate::assessment::{Assessment, BatchState};
-use crate::baseline::library::{Library, Refusal};
-use crate::baseline::Baseline;
-use crate::damage;
-use crate::measurement::check::Expectation;
-use crate::measurement::MeasurementBatch;
-use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::simulator::definition::{DefinitionError, StructureDefinition};
-use crate::simulator::Simulator;
-use crate::store::{self, BatchRecord, InsertBatch, PutStructure, Store, StoredChartPoint};
-use charts::KnownLimits;
-use compute::{Compute, ComputeSettings, QueueFull};
-pub use detail::{BatchDetail, ModeDetail, ParameterDetail};
-pub use diagnoses::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
-use events::{Events, KnownAlarms};
-pub use models::Reloaded;
-use task::Task;
-pub use watched::Watched;
-
-/// How batches are taken and assessed.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MonitorSettings {
-    /// Posterior samples drawn for each measurement (paper §5.2: 10).
-    pub draws_per_measurement: usize,
-    /// Posterior samples drawn for each measurement to find the population behind a batch: a quarter of them at first, all where
-    /// noise hides it or samples near it serve no better.
-    pub draws_for_population: usize,
-    /// Most measurements of one batch.
-    pub max_measurements: usize,
-    /// Digests of trained baselines that may be used although they did not pass their calibration; every answer says so.
-    pub accept_uncalibrated: Vec<String>,
-    /// What becomes of measurements that lack a covariate which the simulation depends on.
-    pub missing_covariate: MissingCovariate,
-    /// How alarms are raised.
-    pub alarm: AlarmSettings,
-    /// The queue in front of the processor.
-    pub compute: ComputeSettings,
-}
-
-/// What becomes of measurements that lack a covariate which the simulation depends on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum MissingCovariate {
-    /// They are taken at all values that the effect was learnt from, flagged, and raise no alarm.
-    Marginalise,
-    /// They are refused with 422.
-    Refuse,
-}
-
-impl Default for MonitorSettings {
-    fn default() -> Self {
-        Self {
-            draws_per_measurement: 10,
-            draws_for_population: 64,
-            max_measurements: 5_000,
-            accept_uncalibrated: Vec::new(),
-            missing_covariate: MissingCovariate::Marginalise,
-            alarm: AlarmSettings::default(),
-            compute: ComputeSettings::default(),
-        }
-    }
-}
-
-/// Why the monitor could not do what it was asked.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// No such structure.
-    #[error("there is no structure {0}")]
-    UnknownStructure(StructureId),
-    /// No such batch of that structure.
-    #[error("structure {structure} has no batch {batch}")]
-    UnknownBatch {
-        /// The structure.
-        structure: StructureId,
-        /// The batch asked for.
-        batch: String,
-    },
-    /// The structure has no trained baseline in use.
-    #[error("structure {structure} has no trained baseline in use: {reason}")]
-    NoModel {
-        /// The structure.
-        structure: StructureId,
-        /// Why, and the next step.
-        reason: String,
-    },
-    /// The queue is full; nothing was stored.
-    #[error(transparent)]
-    QueueFull(#[from] QueueFull),
-    /// The key was used for other content.
-    #[error("the idempotency key was used for batch {batch} with other content")]
-    KeyConflict {
-        /// The batch stored under that key.
-        batch: String,
-    },
-    /// A measurement of this source and time is stored already, with other content around it.
-    #[error(
-        "measurement {ordinal} at {measured_at} of this source is already in batch {batch}, which has other content"
-    )]
-    MeasurementConflict {
-        /// Index in the batch that was posted.
-        ordinal: usize,
-        /// Its time.
-        measured_at: Timestamp,
-        /// The batch that has it.
-        batch: String,
-    },
-    /// Another definition of a structure that has batches.
-    #[error("structure {0} has batches that were measured under another definition; use another id for the new one")]
-    StructureInUse(StructureId),
-    /// The same batch named twice.
-    #[error("batch {0} is named twice")]
-    RepeatedBatch(String),
-    /// The batches make no undamaged state.
-    #[error(transparent)]
-    Undamaged(#[from] damage::Error),
-    /// An inference failed.
-    #[error("batch {batch} could not be used: {source}")]
-    Assess {
-        /// The batch.
-        batch: String,
-        /// The cause.
-        source: assess::Error,
-    },
-    /// A batch that is not to be trusted cannot be part of an undamaged state.
-    #[error("batch {batch} cannot be part of an undamaged state: {reason}")]
-    UnfitForUndamaged {
-        /// The batch.
-        batch: String,
-        /// What was found in it.
-        reason: String,
-    },
-    /// More measurements than a diagnosis takes.
-    #[error("{found} measurements are more than the {most} that one diagnosis takes: name fewer batches")]
-    TooManyMeasurements {
-        /// Measurements asked for.
-        found: usize,
-        /// Most.
-        most: usize,
-    },
-    /// A batch without a current assessment.
-    #[error("batch {batch} is not assessed: {reason}")]
-    NotAssessed {
-        /// The batch.
-        batch: String,
-        /// Why.
-        reason: String,
-    },
-    /// No such diagnosis.
-    #[error("there is no diagnosis {0}")]
-    UnknownDiagnosis(String),
-    /// A diagnosis that no extension can be made of.
-    #[error("diagnosis {diagnosis} cannot be extended: {reason}")]
-    NoExtension {
-        /// The diagnosis.
-        diagnosis: String,
-        /// Why.
-        reason: String,
-    },
-    /// Another version came in between.
-    #[error("structure {0} became another version in the meantime: nothing was changed")]
-    VersionChanged(StructureId),
-    /// A structure whose present version extends none.
-    #[error("structure {0} extends no earlier version: there is no step back")]
-    NoStepBack(StructureId),
-    /// A baseline that may not take the place of the one in use.
-    #[error("the trained baseline for {structure} is refused, {}: {reason}", match kept {
-        Some(digest) => format!("{digest} stays in use"),
-        None => "there is none in use".to_owned(),
-    })]
-    ModelRefused {
-        /// The structure.
-        structure: StructureId,
-        /// Why.
-        reason: String,
-        /// Digest of the one that stays in use.
-        kept: Option<String>,
-    },
-    /// A backup is being made.
-    #[error("a backup is being made: ask again when it is done")]
-    BackupRunning,
-    /// No backup was made.
-    #[error(transparent)]
-    Backup(#[from] store::backup::Error),
-    /// A definition that does not pass.
-    #[error("the definition of a structure is refused: {0}")]
-    Definition(#[from] DefinitionError),
-    /// A stored definition does not pass any more: the database was written by another version of the program.
-    #[error(
-        "the stored definition of structure {structure} is refused by this version of the program: {reason}; its batches are \
-         kept: run the version that wrote it, or define the structure under another id"
-    )]
-    DefinitionRefused {
-        /// The structure.
-        structure: StructureId,
-        /// Why.
-        reason: String,
-    },
-    /// The database failed.
-    #[error(transparent)]
-    Store(#[from] store::Error),
-    /// A computation or an owned task panicked: a bug.
-    #[error("a task panicked")]
-    Panicked,
-}
-
-/// A batch with all that is known of it.
-pub struct BatchView {
-    /// The batch as stored.
-    pub record: BatchRecord,
-    /// Its current assessment.
-    pub assessment: Option<Assessment>,
-    /// Its points on the alarm charts.
-    pub charts: Vec<StoredChartPoint>,
-    /// Why there is no assessment, or no comparison with an undamaged state; and what to do next.
-    pub next_step: Option<String>,
-}
-
-/// What was done for a batch while it was being stored.
-enum Begun {
-    Computed(Box<task::Computed>),
-    Not(compute::Place),
-}
-
-/// A batch taken in.
-pub struct Ingested {
-    /// The batch.
-    pub view: BatchView,
-    /// True when it had been posted before.
-    pub replayed: bool,
-}
-
-/// The office: a cheap handle on store, baselines and queue.
+/// The application: a cheap handle on its parts.
 #[derive(Clone)]
 pub struct Monitor {
     store: Store,
-    library: Arc<RwLock<Arc<Library>>>,
-    watched: Arc<RwLock<BTreeMap<StructureId, Arc<Watched>>>>,
-    /// Stored structures that this version of the program does not take, with the reason.
-    refused: Arc<BTreeMap<StructureId, String>>,
-    known_limits: Arc<KnownLimits>,
-    /// Alarms that this process has logged.
-    reported: Arc<Mutex<BTreeSet<(StructureId, i64)>>>,
-    compute: Compute,
     events: Events,
-    known_alarms: KnownAlarms,
-    jobs: diagnoses::Jobs,
-    /// Held while unassessed batches of a structure are worked off.
-    resuming: Arc<Mutex<BTreeMap<StructureId, Arc<tokio::sync::Mutex<()>>>>>,
-    /// Structures whose unassessed batches are tried again and again.
-    recovering: Arc<Mutex<BTreeSet<StructureId>>>,
-    settings: MonitorSettings,
-    upkeep: Arc<upkeep::Upkeep>,
-    probe: probe::WriterProbe,
+    structures: Arc<ActiveStructures>,
+    alarms: Arc<Alarms>,
+    records: Records,
+    ingest: Ingest,
+    replay: Replay,
+    versions: Versions,
+    jobs: Jobs,
+    models: Models,
+    upkeep: Upkeep,
+    archive: Archive,
 }
 
 impl Monitor {
-    /// Puts the structures of the library into the store, where they are not yet, and takes up those stored.
+    /// Stores the structures of the library that are not stored yet, and activates all stored structures.
     ///
     /// # Errors
     /// [`Error::Store`].
     pub async fn open(store: Store, library: Library, settings: MonitorSettings) -> Result<Self, Error> {
-        for refusal in library.refusals() {
-            error!(file = %refusal.file, "Refused {}: {}", refusal.file, refusal.reason);
-        }
         let events = Events::default();
-        let mut monitor = Self {
-            probe: probe::WriterProbe::new(store.clone()),
-            store,
-            library: Arc::new(RwLock::new(Arc::new(library))),
-            watched: Arc::default(),
-            refused: Arc::default(),
+        let accept_uncalibrated = settings.accept_uncalibrated.clone();
+        let structures = ActiveStructures::open(store.clone(), library, events.clone(), accept_uncalibrated).await?;
+        let structures = Arc::new(structures);
+        let alarms = Arc::new(Alarms::new(store.clone(), events.clone()));
+        for structure in structures.ids() {
+            // Alarms of an earlier run are not published again.
+            alarms.changes(&structure).await;
+        }
+        let compute = Compute::new(settings.compute);
+        let silence_after_s = settings.alarm.silence_after_s;
+        let assessor = Arc::new(Assessor {
+            store: store.clone(),
+            structures: Arc::clone(&structures),
+            compute: compute.clone(),
             known_limits: Arc::default(),
-            reported: Arc::default(),
-            compute: Compute::new(settings.compute),
-            jobs: diagnoses::Jobs::new(events.clone()),
-            events,
-            known_alarms: KnownAlarms::default(),
-            resuming: Arc::default(),
-            recovering: Arc::default(),
+            alarms: Arc::clone(&alarms),
+            events: events.clone(),
             settings,
-            upkeep: Arc::default(),
+        });
+        let references = Arc::new(References::new(Arc::clone(&assessor)));
+        let replay = Replay::new(Arc::clone(&assessor), Arc::clone(&references));
+        let records = Records::new(Arc::clone(&assessor));
+        let versions = Versions::new(store.clone(), Arc::clone(&structures), Arc::clone(&references), replay.clone());
+        let jobs = Jobs::new(store.clone(), Arc::clone(&structures), versions.clone(), events.clone());
+        jobs.end_interrupted().await?;
+        let models = Models::new(store.clone(), Arc::clone(&structures), references, replay.clone());
+        let upkeep = Upkeep {
+            store: store.clone(),
+            structures: Arc::clone(&structures),
+            models: models.clone(),
+            compute,
+            probe: WriterProbe::new(store.clone()),
+            backups: Backups::new(store.clone(), Arc::clone(&structures)),
+            retention: Retention::new(store.clone()),
+            silence: Silence::new(store.clone(), Arc::clone(&structures), Arc::clone(&alarms), silence_after_s),
+            sources: Arc::default(),
+            started: Instant::now(),
         };
-        for (id, entry) in monitor.library().iter() {
-            let json = entry.simulator.definition().canonical_json();
-            let outcome =
-                monitor.store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
-            if outcome == PutStructure::Refused {
-                warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches and the library's differs");
-            }
-        }
-        let interrupted = monitor.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
-        if interrupted > 0 {
-            warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
-        }
-        let mut refused = BTreeMap::new();
-        for summary in monitor.store.structures().list().await? {
-            if let Some(record) = monitor.store.structures().structure(&summary.id).await? {
-                let built = StructureDefinition::parse_json(&record.definition_json).and_then(Simulator::new);
-                let simulator = match built {
-                    Ok(simulator) => simulator,
-                    // One structure must not keep the others from being watched.
-                    Err(reason) => {
-                        error!(structure.id = %summary.id, "Refused the stored definition of {}: {reason}", summary.id);
-                        refused.insert(summary.id, reason.to_string());
-                        continue;
-                    }
-                };
-                let baseline = monitor.baseline_for(&simulator).await?;
-                monitor.watch(simulator, baseline);
-                // Alarms of an earlier run are no news.
-                monitor.look_at_alarms(&summary.id).await;
-            }
-        }
-        monitor.refused = Arc::new(refused);
-        Ok(monitor)
+        let ingest = Ingest::new(Arc::clone(&assessor), replay.clone(), records.clone());
+        let archive = Archive::new(assessor, replay.clone());
+        Ok(Self { store, events, structures, alarms, records, ingest, replay, versions, jobs, models, upkeep, archive })
     }
 
-    /// The store, for what is only read.
+    /// A structure in use.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::DefinitionRefused`].
+    pub fn structure(&self, id: &StructureId) -> Result<Arc<ActiveStructure>, Error> {
+        self.structures.get(id)
+    }
+
+    /// The structures in use.
+    pub fn structures(&self) -> &ActiveStructures {
+        &self.structures
+    }
+
+    /// Takes batches.
+    pub fn ingest(&self) -> &Ingest {
+        &self.ingest
+    }
+
+    /// Declares references and assesses stored batches.
+    pub fn replay(&self) -> &Replay {
+        &self.replay
+    }
+
+    /// Reads batches and results.
+    pub fn records(&self) -> &Records {
+        &self.records
+    }
+
+    /// The alarms of the structures.
+    pub fn alarms(&self) -> &Alarms {
+        &self.alarms
+    }
+
+    /// Diagnoses and extensions.
+    pub fn jobs(&self) -> &Jobs {
+        &self.jobs
+    }
+
+    /// The versions of the structures.
+    pub fn versions(&self) -> &Versions {
+        &self.versions
+    }
+
+    /// The trained baselines.
+    pub fn models(&self) -> &Models {
+        &self.models
+    }
+
+    /// Health and background tasks.
+    pub fn upkeep(&self) -> &Upkeep {
+        &self.upkeep
+    }
+
+    /// Export and import.
+    pub fn archive(&self) -> &Archive {
+        &self.archive
+    }
+
+    /// The live events.
+    pub fn events(&self) -> &Events {
+        &self.events
+    }
+
+    /// The registered webhooks.
+    pub fn webhooks(&self) -> Webhooks<'_> {
+        self.store.webhooks()
+    }
+
+    /// The deliveries to webhooks.
+    pub fn outbox(&self) -> Outbox<'_> {
+        self.store.outbox()
+    }
+
+    /// Messages that were refused and kept.
+    pub fn quarantine(&self) -> Quarantine<'_> {
+        self.store.quarantine()
+    }
+
+    /// The audit log.
+    pub fn audit(&self) -> Audit<'_> {
+        self.store.audit()
+    }
+
+    /// Version of SQLite.
+    pub fn sqlite_version(&self) -> &str {
+        self.store.file().sqlite_version()
+    }
+
+    /// The store, for the command line and tests, which open and close it.
     pub fn store(&self) -> &Store {
         &self.store
     }
-
-    /// How batches are taken.
-    pub fn settings(&self) -> &MonitorSettings {
-        &self.settings
-    }
-
-    /// Files of the library that were refused.
-    pub fn refusals(&self) -> Vec<Refusal> {
-        self.library().refusals().to_vec()
-    }
-
-    /// Places left in the queue.
-    pub fn free_places(&self) -> usize {
-        self.compute.free()
-    }
-
-    /// What a batch of this structure must look like.
-    pub fn expectation<'a>(&self, watched: &'a Watched) -> Expectation<'a> {
-        Expectation {
-            modes: watched.simulator.modes(),
-            frequency_limits_hz: watched.simulator.frequency_limits_hz(),
-            covariates: watched.simulator.covariates(),
-            instrumented: watched.simulator.instrumented_points(),
-            space: watched.simulator.space(),
-            now: Timestamp::now(),
-            max_measurements: self.settings.max_measurements,
-        }
-    }
-
-    /// Stores a batch, assesses it and stores the result.
-    ///
-    /// It runs in a task of its own: a client that goes away does not stop it half-way.
-    ///
-    /// # Errors
-    /// [`Error::QueueFull`] with nothing stored; the conflicts of [`InsertBatch`]; [`Error::Store`].
-    pub async fn ingest(&self, batch: MeasurementBatch) -> Result<Ingested, Error> {
-        let place = self.compute.reserve()?;
-        self.ingest_with(batch, place).await
-    }
-
-    /// As [`Self::ingest`], but waits at most `patience` for a place: for many batches in a row, each of which should neither
-    /// crowd others out nor be sent back.
-    ///
-    /// # Errors
-    /// As [`Self::ingest`].
-    pub async fn ingest_in_turn(&self, batch: MeasurementBatch, patience: Duration) -> Result<Ingested, Error> {
-        let place = tokio::time::timeout(patience, self.compute.wait()).await.map_err(|_| QueueFull)?;
-        self.ingest_with(batch, place).await
-    }
-
-    async fn ingest_with(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {
-        let (monitor, structure) = (self.clone(), batch.structure.clone());
-        let task = tokio::spawn(async move { monitor.ingest_here(batch, place).await }.in_current_span());
-        task.await.unwrap_or_else(|_| {
-            // It may have been stored before.
-            self.resume_until_done(structure);
-            Err(Error::Panicked)
-        })
-    }
-
-    async fn ingest_here(&self, batch: MeasurementBatch, place: compute::Place) -> Result<Ingested, Error> {
-        let structure = batch.structure.clone();
-        let watched = self.structure(&structure)?;
-        let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
-        let (foreseen, outcome) = oneshot::channel();
-        let insert = self.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, foreseen);
-        let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
-            batch_id: batch_id.clone(),
-            batch,
-            content_digest,
-            received_at,
-            state: BatchState::Received,
-            failure: None,
-        };
-        // While it is on its way to the disk. Nothing of it is stored or told before the batch is there.
-        let compute = async {
-            match outcome.await {
-                Ok(InsertBatch::Inserted { content_digest, previous }) if watched.baseline.is_ok() => {
-                    let task = Task::new(Arc::clone(&watched), record(batch.clone(), content_digest), previous, place)?;
-                    Ok(Begun::Computed(Box::new(self.compute(task).await?)))
-                }
-                _ => Ok(Begun::Not(place)),
-            }
-        };
-        let (inserted, begun) = tokio::join!(insert, compute);
-        match inserted? {
-            InsertBatch::Inserted { content_digest, .. } => {
-                metrics::counter!("modalwatch_batches_received_total").increment(1);
-                metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
-                // What was stored, without reading all of it back.
-                let record = record(batch, content_digest);
-                let stands = match begun {
-                    Ok(Begun::Computed(computed)) => self.finish_computed(*computed).await,
-                    Ok(Begun::Not(_)) => {
-                        self.tell_batch(&structure, &batch_id, record.state);
-                        return Ok(Ingested { view: self.view(record).await?, replayed: false });
-                    }
-                    Err(failure) => Err(failure),
-                };
-                let view = match self.or_resumed(&structure, stands)? {
-                    Some((assessment, charts)) => {
-                        let record = BatchRecord { state: BatchState::Assessed, ..record };
-                        self.view_of(record, Some(assessment), charts).await?
-                    }
-                    None => self.batch(&structure, &batch_id).await?,
-                };
-                Ok(Ingested { view, replayed: false })
-            }
-            InsertBatch::Replayed(id) => {
-                let record = self.stored(&structure, &id).await?;
-                if let (BatchState::Received, true, Ok(Begun::Not(place))) =
-                    (record.state, watched.baseline.is_ok(), begun)
-                {
-                    let stands = async { self.finish(self.task(watched, record, place).await?).await }.await;
-                    self.or_resumed(&structure, stands)?;
-                    return Ok(Ingested { view: self.batch(&structure, &id).await?, replayed: true });
-                }
-                Ok(Ingested { view: self.view(record).await?, replayed: true })
-            }
-            InsertBatch::KeyConflict { batch_id } => Err(Error::KeyConflict { batch: batch_id }),
-            InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
-                Err(Error::MeasurementConflict { ordinal, measured_at, batch: batch_id })
-            }
-        }
-    }
-
-    /// The result of a stored batch. Where there is none, the batch is tried again later: whoever sent it may not send it again.
-    fn or_resumed<T>(&self, structure: &StructureId, result: Result<T, Error>) -> Result<T, Error> {
-        result.inspect_err(|_| self.resume_until_done(structure.clone()))
-    }
-
-    /// One batch with its current assessment.
-    ///
-    /// # Errors
-    /// [`Error::UnknownBatch`], [`Error::UnknownStructure`].
-    pub async fn batch(&self, structure: &StructureId, batch_id: &str) -> Result<BatchView, Error> {
-        self.view(self.stored(structure, batch_id).await?).await
-    }
-
-    /// A batch with what was made of it.
-    async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
-        let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
-        let assessment = self.store.assessments().assessment(structure, batch_id).await?;
-        let charts = self.store.alarms().chart_points(structure, batch_id).await?;
-        self.view_of(record, assessment, charts).await
-    }
-
-    /// A batch with this made of it.
-    async fn view_of(
-        &self,
-        record: BatchRecord,
-        assessment: Option<Assessment>,
-        charts: Vec<StoredChartPoint>,
-    ) -> Result<BatchView, Error> {
-        let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
-        let watched = self.structure(structure)?;
-        let in_use = watched.baseline.as_ref().ok().map(|baseline| baseline.digest());
-        let next_step = match (&assessment, &watched.baseline) {
-            (None, Err(reason)) => Some(reason.clone()),
-            (Some(a), _) if a.undamaged_version.is_none() => {
-                Some(self.why_not_compared(structure, batch_id, in_use).await?)
-            }
-            _ => None,
-        };
-        Ok(BatchView { record, assessment, charts, next_step })
-    }
-
-    async fn why_not_compared(
-        &self,
-        structure: &StructureId,
-        batch_id: &str,
-        model_digest: Option<&Digest>,
-    ) -> Result<String, Error> {
-        Ok(match self.store.reference().undamaged(structure).await? {
-            Some(undamaged) if undamaged.batches.iter().any(|id| id == batch_id) => {
-                format!("part of the undamaged state, version {}: not compared with itself", undamaged.state.version)
-            }
-            Some(undamaged) if model_digest.is_some_and(|digest| *digest != undamaged.model_digest) => format!(
-                "the undamaged state, version {}, was taken with another trained baseline: name undamaged batches again \
-                 by POST /v1/structures/{structure}/reference",
-                undamaged.state.version
-            ),
-            Some(_) => "not compared with the undamaged state yet".to_owned(),
-            None => format!(
-                "no undamaged state: name undamaged batches by POST /v1/structures/{structure}/reference \
-                 {{\"batches\": [\"{batch_id}\"]}}"
-            ),
-        })
-    }
-
-    /// Logs alarms that were raised since the last look, each once, and tells of all that changed.
-    async fn report_episodes(&self, structure: &StructureId) {
-        for episode in self.tell_alarms(structure).await {
-            let key = (structure.clone(), episode.number);
-            if !self.reported.lock().expect("no holder of this lock panics").insert(key) {
-                continue;
-            }
-            metrics::counter!("modalwatch_alarms_total", "kind" => episode.kind.clone()).increment(1);
-            warn!(
-                structure.id = %structure, episode = episode.number, kind = %episode.kind, series = %episode.series,
-                "Alarm {} of {structure}: {} ({}), since {}", episode.number, episode.kind, episode.series, episode.opened_at
-            );
-        }
-    }
-
-    async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
-        let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: crate::quantity::shown(batch_id) };
-        self.store.batches().batch(structure, batch_id).await?.ok_or_else(unknown)
-    }
-}
-
-fn baseline_of(structure: &StructureId, watched: &Watched) -> Result<Arc<Baseline>, Error> {
-    let missing = |reason: &String| Error::NoModel { structure: structure.clone(), reason: reason.clone() };
-    watched.baseline.as_ref().map(Arc::clone).map_err(missing)
 }

@@ -1,110 +1,133 @@
-//! Putting another trained baseline in the place of the one in use, while batches come in.
+//! Replacing the trained baseline in use by another, while batches arrive.
 //!
-//! The new one is loaded beside the old one, runs its self-test, and must have passed its calibration. Only then the pointer
-//! is swapped. A batch that was begun with the old one ends with it, or is assessed again: a result names one digest.
+//! The new one is loaded beside the old one, runs its self-test, and must have passed its calibration. Only then is it swapped in. A
+//! batch that was started with the old one either keeps its result or is assessed again: a result names one digest.
 
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
 
-use serde::Serialize;
 use tracing::{info, warn};
 
-use super::{Error, Monitor, Watched};
+use super::error::{Error, ReloadError};
+use super::own_task::in_own_task;
+use super::references::References;
+use super::replay::Replay;
+use super::structures::{ActiveStructure, ActiveStructures};
 use crate::baseline::library::{Entry, Library};
 use crate::baseline::Baseline;
 use crate::quantity::{Digest, StructureId};
+use crate::store::Store;
 
-/// What a reload did.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+/// The result of a reload.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Reloaded {
     /// The structure.
     pub structure: StructureId,
-    /// The baseline in use now.
+    /// The trained baseline in use now.
     pub model_digest: Digest,
     /// The one before.
-    #[schema(required)]
     pub previous_model_digest: Option<Digest>,
     /// False when the files are those in use.
     pub changed: bool,
-    /// The undamaged state taken anew with it.
-    #[schema(required)]
+    /// Version of the undamaged reference that was renewed with it.
     pub undamaged_version: Option<u32>,
-    /// What is left to do.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub next_step: Option<String>,
+    /// True when the undamaged reference was made with another trained baseline and has to be declared again.
+    pub reference_outdated: bool,
 }
 
-impl Monitor {
-    /// Reads the models folder again and puts the baseline that it has for a structure in the place of the one in use, which
-    /// stays when the new one is refused. With `retake`, the undamaged batches are taken as that under the new one too.
+/// Replaces trained baselines.
+#[derive(Clone)]
+pub struct Models {
+    store: Store,
+    structures: Arc<ActiveStructures>,
+    references: Arc<References>,
+    replay: Replay,
+    /// Held during a reload.
+    reloading: Arc<tokio::sync::Mutex<()>>,
+    /// Why the last reload of a structure was refused, until one succeeds.
+    refused: Arc<Mutex<BTreeMap<StructureId, String>>>,
+}
+
+impl Models {
+    pub(super) fn new(
+        store: Store,
+        structures: Arc<ActiveStructures>,
+        references: Arc<References>,
+        replay: Replay,
+    ) -> Self {
+        Self { store, structures, references, replay, reloading: Arc::default(), refused: Arc::default() }
+    }
+
+    /// Reads the models folder again and puts its trained baseline for a structure into use; the one before stays in use when the
+    /// new one is refused. With `renew`, the undamaged reference is renewed with the new one.
     ///
     /// # Errors
-    /// [`Error::UnknownStructure`]; [`Error::ModelRefused`] with the reason; [`Error::VersionChanged`].
-    pub async fn reload_model(&self, structure: &StructureId, retake: bool) -> Result<Reloaded, Error> {
-        let (monitor, id) = (self.clone(), structure.clone());
-        let task = tokio::spawn(async move { monitor.reload_model_here(&id, retake).await });
-        let reloaded = task.await.map_err(|_| Error::Panicked)?;
+    /// [`Error::UnknownStructure`]; [`ReloadError::Refused`] with the reason; [`Error::VersionChanged`].
+    pub async fn reload(&self, structure: &StructureId, renew: bool) -> Result<Reloaded, ReloadError> {
+        let (models, id) = (self.clone(), structure.clone());
+        let reloaded = in_own_task(async move { models.reload_here(&id, renew).await }).await;
         let outcome = match &reloaded {
             Ok(reloaded) if reloaded.changed => "swapped",
             Ok(_) => "unchanged",
             Err(_) => "refused",
         };
         metrics::counter!("modalwatch_model_reloads_total", "outcome" => outcome).increment(1);
-        let mut refused = self.upkeep.refused_reloads.lock().expect("no holder of this lock panics");
+        let mut refused = self.refused.lock().expect("no holder of this lock panics");
         match &reloaded {
             Ok(_) => {
                 refused.remove(structure);
             }
-            Err(Error::ModelRefused { reason, .. }) => {
+            Err(ReloadError::Refused { reason, .. }) => {
                 warn!(structure.id = %structure, "Kept the trained baseline of {structure}: {reason}");
                 refused.insert(structure.clone(), reason.clone());
             }
-            Err(_) => {}
+            Err(ReloadError::Monitor(_)) => {}
         }
         drop(refused);
         reloaded
     }
 
-    async fn reload_model_here(&self, structure: &StructureId, retake: bool) -> Result<Reloaded, Error> {
-        let _turn = self.upkeep.reloading.lock().await;
-        let watched = self.structure(structure)?;
-        let before = watched.baseline.as_ref().ok().map(|baseline| baseline.digest().clone());
-        let refused = |reason: String| Error::ModelRefused {
+    /// Structures whose last reload was refused, with the reason.
+    pub fn refused(&self) -> BTreeMap<StructureId, String> {
+        self.refused.lock().expect("no holder of this lock panics").clone()
+    }
+
+    async fn reload_here(&self, structure: &StructureId, renew: bool) -> Result<Reloaded, ReloadError> {
+        let _turn = self.reloading.lock().await;
+        let active = self.structures.get(structure)?;
+        let before = active.model_digest().cloned();
+        let refused = |reason: String| ReloadError::Refused {
             structure: structure.clone(),
             reason,
             kept: before.as_ref().map(Digest::to_string),
         };
-        if self.store.structures().trained_baseline(structure, watched.simulator.digest()).await?.is_some() {
+        if self.store.structures().trained_baseline(structure, active.simulator.digest()).await?.is_some() {
             let reason =
-                "its present version was trained by the service itself, which no file replaces: go back by DELETE \
-                          …/extension first";
+                "the service itself trained the present version, an extension, which no file replaces: undo the \
+                          extension first";
             return Err(refused(reason.to_owned()));
         }
-        let library = self.library();
+        let library = self.structures.library();
         let read = tokio::task::spawn_blocking(move || library.read_again()).await.map_err(|_| Error::Panicked)?;
         let library = read.map_err(|e| refused(e.to_string()))?;
-        let baseline = candidate(&library, structure, &watched).map_err(refused)?;
-        self.usable(&baseline).map_err(refused)?;
+        let baseline = candidate(&library, structure, &active).map_err(refused)?;
+        self.structures.usable(&baseline).map_err(refused)?;
         let model_digest = baseline.digest().clone();
         let changed = before.as_ref() != Some(&model_digest);
         if changed {
-            self.swap(structure, &watched, baseline)?;
+            self.structures.swap_baseline(&active, baseline)?;
             info!(structure.id = %structure, model.digest = %model_digest, "Swapped the trained baseline of {structure}");
         }
-        *self.library.write().expect("no holder of this lock panics") = Arc::new(library);
-        let (mut undamaged_version, mut next_step) = (None, None);
+        self.structures.set_library(library);
+        let (mut undamaged_version, mut reference_outdated) = (None, false);
         if changed && self.store.reference().undamaged(structure).await?.is_some() {
-            if retake {
-                undamaged_version = self.take_again(structure).await;
+            if renew {
+                undamaged_version = self.references.renew(structure).await;
             }
-            next_step = undamaged_version.is_none().then(|| {
-                format!(
-                    "the undamaged state was taken with another baseline, so batches are compared with none: name undamaged \
-                     batches again by POST /v1/structures/{structure}/reference"
-                )
-            });
+            reference_outdated = undamaged_version.is_none();
         }
         if changed {
-            self.resume_later(structure.clone());
+            self.replay.resume_later(structure.clone());
         }
         Ok(Reloaded {
             structure: structure.clone(),
@@ -112,32 +135,15 @@ impl Monitor {
             previous_model_digest: before,
             changed,
             undamaged_version,
-            next_step,
+            reference_outdated,
         })
-    }
-
-    /// Swaps the pointer, unless the structure became another version while the new baseline was loaded.
-    fn swap(&self, structure: &StructureId, expected: &Watched, baseline: Arc<Baseline>) -> Result<(), Error> {
-        let mut all = self.watched.write().expect("no holder of this lock panics");
-        let present = all.get(structure).ok_or_else(|| Error::UnknownStructure(structure.clone()))?;
-        if present.simulator.digest() != expected.simulator.digest() {
-            return Err(Error::VersionChanged(structure.clone()));
-        }
-        let watched = Watched { simulator: present.simulator.clone(), baseline: Ok(baseline) };
-        all.insert(structure.clone(), Arc::new(watched));
-        Ok(())
-    }
-
-    /// What is known of structures and trained baselines on disk.
-    pub fn library(&self) -> Arc<Library> {
-        Arc::clone(&self.library.read().expect("no holder of this lock panics"))
     }
 }
 
-/// The baseline of a library for the present version of a structure, or why it has none. Stricter than at the start: who asks
-/// for a reload has put a file there and means that one.
-fn candidate(library: &Library, structure: &StructureId, watched: &Watched) -> Result<Arc<Baseline>, String> {
-    // A definition that cannot be read might be that of this structure; what is shipped must not slip in its place.
+/// The trained baseline of a library for the present version of a structure, or why there is none. Stricter than at the start:
+/// whoever asks for a reload has just written a file and means that one.
+fn candidate(library: &Library, structure: &StructureId, active: &ActiveStructure) -> Result<Arc<Baseline>, String> {
+    // A definition that cannot be read might be that of this structure; a shipped baseline must not silently be used instead.
     let blocking = |of: Option<&StructureId>| of.is_none() || of == Some(structure);
     if let Some(refusal) = library.refusals().iter().find(|refusal| blocking(refusal.structure.as_ref())) {
         return Err(format!("{}: {}", refusal.file, refusal.reason));
@@ -145,11 +151,11 @@ fn candidate(library: &Library, structure: &StructureId, watched: &Watched) -> R
     let Some(Entry { simulator, baseline }) = library.get(structure) else {
         return Err("the models folder has none for it".to_owned());
     };
-    if simulator.digest() != watched.simulator.digest() {
-        let (found, present) = (simulator.digest(), watched.simulator.digest());
+    if simulator.digest() != active.simulator.digest() {
+        let (found, present) = (simulator.digest(), active.simulator.digest());
         return Err(format!(
             "it is for another definition of the structure (digest {found}, the present one is {present})"
         ));
     }
-    baseline.clone().ok_or_else(|| "the models folder has the structure, but no trained baseline of it".to_owned())
+    baseline.clone().ok_or_else(|| "the models folder has the structure, but no trained baseline for it".to_owned())
 }

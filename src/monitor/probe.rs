@@ -1,6 +1,6 @@
-//! Whether the writer writes, asked of it at most once a second.
+//! Whether the database can be written, tested at most once a second.
 //!
-//! `/readyz` needs no token: whoever reaches the service can ask as often as they like, and each look is a transaction.
+//! Reading the health needs no token, so anyone can ask as often as they like, and each test is a transaction.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -8,24 +8,24 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::Mutex;
 
-use super::upkeep::Reason;
+use super::reason::Reason;
 use crate::store::Store;
 
-/// An answer is good for so long.
+/// How long a result is used.
 const FRESH_FOR: Duration = Duration::from_secs(1);
 
-/// Longest time the writer gets to answer.
+/// Longest time that the writer gets to respond.
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// What the writer answered, and when.
+/// The result of a test, and its time.
 struct Answer {
     at: Instant,
     finding: Option<Reason>,
-    /// Of the store, afterwards: when another write was refused, the answer is old.
+    /// Refused writes of the store after the test: when another write was refused since, the result is outdated.
     refused_writes: u64,
 }
 
-/// The last answer of the writer of a store.
+/// The last test of the writer of a store.
 #[derive(Clone)]
 pub(super) struct WriterProbe {
     store: Store,
@@ -37,15 +37,14 @@ impl WriterProbe {
         Self { store, last: Arc::default() }
     }
 
-    /// Why nothing can be written, or `None`, as it was a second ago at most. Those who come meanwhile wait for the same
-    /// answer.
+    /// Why nothing can be written, or `None`; at most one second old. Callers that arrive during a test wait for its result.
     pub(super) async fn finding(&self) -> Option<Reason> {
         self.finding_of(ask(self.store.clone())).await
     }
 
     async fn finding_of(&self, question: impl Future<Output = Option<Reason>> + Send + 'static) -> Option<Reason> {
         let probe = self.clone();
-        // In a task of its own: a client that goes away before the answer would else make the next one ask again.
+        // In a task of its own: otherwise a client that goes away before the result would make the next one test again.
         let task = tokio::spawn(async move {
             let mut last = probe.last.lock().await;
             let refused_writes = probe.store.file().refused_writes();
@@ -58,11 +57,11 @@ impl WriterProbe {
             *last = Some(Answer { at: Instant::now(), finding: finding.clone(), refused_writes });
             finding
         });
-        task.await.unwrap_or_else(|_| Some(Reason::new("internal", "the look at the writer ended by a panic: a bug")))
+        task.await.unwrap_or_else(|_| Some(Reason::new("internal", "the test of the writer panicked: a bug")))
     }
 
-    /// True when the writer takes turns at all: a full disk is no reason to restart, a writer that hangs is.
-    pub(super) async fn takes_turns(&self) -> bool {
+    /// True unless the writer hangs, which is a reason to restart the service; a full disk is none.
+    pub(super) async fn responds(&self) -> bool {
         self.finding().await.is_none_or(|reason| reason.code != STUCK)
     }
 }
@@ -76,7 +75,7 @@ async fn ask(store: Store) -> Option<Reason> {
             let code = error.disk_cause().unwrap_or("database_failed");
             Some(Reason::new(code, format!("nothing can be stored: {error}")))
         }
-        Err(_) => Some(Reason::new(STUCK, format!("the writer has not answered for {} s", PATIENCE.as_secs()))),
+        Err(_) => Some(Reason::new(STUCK, format!("the writer has not responded for {} s", PATIENCE.as_secs()))),
     }
 }
 
@@ -122,6 +121,6 @@ mod tests {
         store.file().set_limits(&StoreSettings { min_free_bytes: u64::MAX, ..StoreSettings::default() });
         assert!(store.file().is_writable().await.is_err());
         assert_eq!(probe.finding().await.unwrap().code, "disk_full");
-        assert!(probe.takes_turns().await);
+        assert!(probe.responds().await);
     }
 }

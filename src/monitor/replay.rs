@@ -1,104 +1,144 @@
-//! Going on with stored batches that wait for their assessment: after a restart, a new baseline, an extension, a new undamaged
-//! state.
+//! Assessment of stored batches that wait for it: after a restart, with a new trained baseline, an extension or a new undamaged
+//! reference.
 //!
-//! They are computed on all cores and stored in the order of their arrival. What comes out does not depend on the number of
-//! threads: each batch has a seed of its own.
+//! They are computed on all cores and stored in the order of their arrival. The results do not depend on the number of threads,
+//! because each batch has its own seed.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures_util::{stream, StreamExt as _, TryStreamExt as _};
 use tracing::{error, warn};
 
-use super::task::{Computed, Settled};
-use super::{Error, Monitor};
+use super::assessor::{Assessor, Computed, Finished, Settled};
+use super::error::{DeclareError, Error};
+use super::own_task::in_own_task;
+use super::references::References;
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
-use crate::store;
+use crate::store::{self, UndamagedRecord};
 
-/// Pause between two tries to store what could not be stored, such as on a full disk.
-const BETWEEN_TRIES: Duration = Duration::from_secs(2);
+/// Pause between two attempts to store results that could not be stored, for example on a full disk.
+const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
 
 /// Batches that are looked up at a time.
 const PAGE: usize = 500;
 
-/// What became of a batch that waits.
-enum Taken {
+/// The state of a waiting batch after an attempt to assess it.
+enum Waiting {
     Computed(Box<Computed>),
-    /// Somebody else has done it, or it cannot be read.
+    /// It does not wait any more, or it cannot be read.
     Done,
-    /// There is no baseline to assess it with.
+    /// There is no trained baseline to assess it with.
     NoBaseline,
 }
 
-impl Monitor {
+/// Assesses waiting batches.
+#[derive(Clone)]
+pub struct Replay {
+    assessor: Arc<Assessor>,
+    references: Arc<References>,
+    /// For each structure, held while its waiting batches are assessed.
+    turns: Arc<Mutex<BTreeMap<StructureId, Arc<tokio::sync::Mutex<()>>>>>,
+    /// Structures whose waiting batches are attempted repeatedly.
+    recovering: Arc<Mutex<BTreeSet<StructureId>>>,
+}
+
+impl Replay {
+    pub(super) fn new(assessor: Arc<Assessor>, references: Arc<References>) -> Self {
+        Self { assessor, references, turns: Arc::default(), recovering: Arc::default() }
+    }
+
     /// Assesses what an earlier run left unassessed, in the background.
-    pub fn resume(&self) {
-        let structures: Vec<StructureId> = self.lock_read().keys().cloned().collect();
-        for structure in structures {
+    pub fn resume_all(&self) {
+        for structure in self.assessor.structures.ids() {
             self.resume_later(structure);
         }
     }
 
+    /// Makes an undamaged reference from stored batches. Other batches without a comparison are compared with it afterwards, in the
+    /// background.
+    ///
+    /// # Errors
+    /// [`Error::NoModel`], [`Error::UnknownBatch`], [`DeclareError`].
+    pub async fn declare_reference(
+        &self,
+        structure: &StructureId,
+        batch_ids: Vec<String>,
+        threshold_probability: f64,
+    ) -> Result<Arc<UndamagedRecord>, DeclareError> {
+        let (replay, structure) = (self.clone(), structure.clone());
+        let place = self.assessor.compute.reserve().map_err(Error::from)?;
+        in_own_task(async move {
+            let declared = replay.references.declare(&structure, batch_ids, threshold_probability, place).await?;
+            replay.resume_later(structure);
+            Ok(declared)
+        })
+        .await
+    }
+
+    /// Renews an outdated reference and assesses the waiting batches of a structure, in the background.
     pub(super) fn resume_later(&self, structure: StructureId) {
-        let monitor = self.clone();
+        let replay = self.clone();
         tokio::spawn(async move {
-            monitor.retake_undamaged(&structure).await;
-            if let Err(error) = monitor.resume_structure(&structure).await {
-                error!(structure.id = %structure, %error, "Could not go on with unassessed batches of {structure}: {error}");
-                monitor.resume_until_done(structure);
+            replay.references.renew_if_outdated(&structure).await;
+            if let Err(error) = replay.resume(&structure).await {
+                error!(structure.id = %structure, %error, "Could not assess the waiting batches of {structure}: {error}");
+                replay.resume_until_done(structure);
             }
         });
     }
 
-    /// Goes on with unassessed batches until none is left: after a full disk nobody may post them again.
+    /// Attempts to assess the waiting batches of a structure until none is left, in the background: after a full disk, for example,
+    /// their senders may not send them again.
     pub(super) fn resume_until_done(&self, structure: StructureId) {
         if !self.recovering.lock().expect("no holder of this lock panics").insert(structure.clone()) {
             return;
         }
-        let monitor = self.clone();
+        let replay = self.clone();
         tokio::spawn(async move {
             loop {
-                tokio::time::sleep(BETWEEN_TRIES).await;
-                match monitor.resume_structure(&structure).await {
+                tokio::time::sleep(BETWEEN_ATTEMPTS).await;
+                match replay.resume(&structure).await {
                     Ok(()) => break,
-                    Err(_) if monitor.store.file().is_closed() => break,
+                    Err(_) if replay.assessor.store.file().is_closed() => break,
                     Err(error) => {
                         warn!(structure.id = %structure, %error, "Unassessed batches of {structure} still wait: {error}");
                     }
                 }
             }
-            monitor.recovering.lock().expect("no holder of this lock panics").remove(&structure);
+            replay.recovering.lock().expect("no holder of this lock panics").remove(&structure);
         });
     }
 
-    pub(super) async fn resume_structure(&self, structure: &StructureId) -> Result<(), Error> {
+    /// Assesses the waiting batches of a structure.
+    pub(super) async fn resume(&self, structure: &StructureId) -> Result<(), Error> {
         // One at a time for each structure: two would assess the same batches.
-        let turn = Arc::clone(
-            self.resuming.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default(),
-        );
+        let turn =
+            Arc::clone(self.turns.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default());
         let _turn = turn.lock().await;
         loop {
-            let pending = self.store.batches().pending(structure, PAGE).await?;
-            if pending.is_empty() || !self.replay(structure, pending).await? {
+            let pending = self.assessor.store.batches().pending(structure, PAGE).await?;
+            if pending.is_empty() || !self.assess_all(structure, pending).await? {
                 return Ok(());
             }
         }
     }
 
-    /// Assesses some batches; false when there is no baseline to assess them with.
-    async fn replay(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
-        let together = self.compute.places_behind();
+    /// Assesses some batches; false when there is no trained baseline to assess them with.
+    async fn assess_all(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
+        let at_a_time = self.assessor.compute.places_behind();
         let has_baseline = AtomicBool::new(true);
-        let computed = stream::iter(batches).map(|id| self.compute_waiting(structure, id)).buffered(together);
-        let stored = computed.map_ok(|taken| {
-            // Queued here, and so in the order of the stream, however long each takes from here on.
-            let queued = match taken {
-                Taken::Computed(computed) => Some(self.store_computed(*computed)),
-                Taken::Done => None,
-                Taken::NoBaseline => {
+        let computed = stream::iter(batches).map(|id| self.compute_waiting(structure, id)).buffered(at_a_time);
+        let stored = computed.map_ok(|waiting| {
+            // The write is queued here, in the order of the stream, however long its completion takes.
+            let queued = match waiting {
+                Waiting::Computed(computed) => Some(self.assessor.store_computed(*computed)),
+                Waiting::Done => None,
+                Waiting::NoBaseline => {
                     has_baseline.store(false, Ordering::Relaxed);
                     None
                 }
@@ -110,38 +150,47 @@ impl Monitor {
                 }
             }
         });
-        let mut stored = pin!(stored.try_buffered(together));
+        let mut stored = pin!(stored.try_buffered(at_a_time));
         while let Some(stored) = stored.try_next().await? {
             let Some(stored) = stored else { continue };
-            if let Settled::GoOn(task) = self.settle(stored).await? {
-                self.finish(task).await?;
-            }
+            let finished = match self.assessor.settle(stored).await? {
+                Settled::Again(task) => self.assessor.finish(task).await?,
+                Settled::Finished(finished) => finished,
+            };
+            self.resume_if_superseded(structure, &finished);
         }
         Ok(has_baseline.load(Ordering::Relaxed))
     }
 
-    /// Computes the assessment of a batch that waits.
-    async fn compute_waiting(&self, structure: &StructureId, batch_id: String) -> Result<Taken, Error> {
-        let place = self.compute.wait_behind().await;
-        // The version may change at any time: each batch is taken under the present one.
-        let watched = self.structure(structure)?;
-        if watched.baseline.is_err() {
-            return Ok(Taken::NoBaseline);
+    /// Resumes a structure whose version changed while one of its batches was assessed.
+    pub(super) fn resume_if_superseded(&self, structure: &StructureId, finished: &Finished) {
+        if matches!(finished, Finished::OfAnotherVersion) {
+            self.resume_later(structure.clone());
         }
-        let record = match self.stored(structure, &batch_id).await {
-            // One damaged row must not keep the batches behind it waiting.
+    }
+
+    /// Computes the assessment of a waiting batch.
+    async fn compute_waiting(&self, structure: &StructureId, batch_id: String) -> Result<Waiting, Error> {
+        let place = self.assessor.compute.wait_behind().await;
+        // The version may change at any time: each batch is assessed under the present one.
+        let active = self.assessor.structures.get(structure)?;
+        if active.baseline.is_err() {
+            return Ok(Waiting::NoBaseline);
+        }
+        let record = match self.assessor.stored(structure, &batch_id).await {
+            // One damaged row must not block the batches after it.
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
                 error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
-                let version = watched.simulator.digest();
-                self.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
-                return Ok(Taken::Done);
+                let version = active.simulator.digest();
+                self.assessor.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
+                return Ok(Waiting::Done);
             }
             record => record?,
         };
         if record.state != BatchState::Received {
-            return Ok(Taken::Done);
+            return Ok(Waiting::Done);
         }
-        let task = self.task(watched, record, place).await?;
-        Ok(Taken::Computed(Box::new(self.compute(task).await?)))
+        let task = self.assessor.task(active, record, place).await?;
+        Ok(Waiting::Computed(Box::new(self.assessor.compute(task).await?)))
     }
 }

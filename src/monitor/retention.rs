@@ -1,22 +1,23 @@
-//! Deleting old batches, where somebody asked for it.
+//! Deletion of old batches, where the configuration asks for it.
 
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use tracing::{error, info};
 
-use super::upkeep::supervise;
-use super::{Error, Monitor};
+use super::error::Error;
+use super::supervise::supervise;
 use crate::quantity::Timestamp;
 use crate::store::{Deleted, Expired, Store};
 
-/// Batches deleted in one transaction: others get their turn in between.
+/// Batches deleted in one transaction; other writes take place between two transactions.
 const AT_A_TIME: usize = 20;
 
 /// Pause between two transactions.
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// Wait after the start: a service that was down for long has better things to do first.
+/// Delay after the start, when assessments that wait are more urgent.
 const FIRST_AFTER: Duration = Duration::from_secs(30);
 
 const MICROS_A_DAY: i64 = 86_400_000_000;
@@ -27,7 +28,7 @@ const MICROS_A_DAY: i64 = 86_400_000_000;
 pub struct RetentionSettings {
     /// Days after which a batch is deleted; 0 = never.
     pub measurements_days: u32,
-    /// Seconds between two looks.
+    /// Seconds between two runs.
     pub every_s: u64,
 }
 
@@ -38,46 +39,50 @@ impl Default for RetentionSettings {
 }
 
 impl RetentionSettings {
-    /// The time before which measurements are not kept; `None` when all are.
+    /// The time before which measurements are deleted; `None` when all are kept.
     pub fn before(&self, now: Timestamp) -> Option<Timestamp> {
         let span = i64::from(self.measurements_days) * MICROS_A_DAY;
         (span > 0).then(|| Timestamp::from_micros(now.micros() - span).ok()).flatten()
     }
 }
 
-/// What became of the last look.
+/// The result of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct RetentionRun {
     /// When it ended.
     pub at: Timestamp,
-    /// What went.
+    /// What was deleted.
     pub deleted: Deleted,
     /// Why it ended early.
     #[schema(required)]
     pub failure: Option<String>,
 }
 
-/// What is kept, and what would go.
+/// What is kept, and what would be deleted.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct RetentionPlan {
-    /// Days; 0 = everything is kept for ever.
+    /// Days for which batches are kept; 0 = for ever.
     pub measurements_days: u32,
-    /// The time before which measurements would go.
+    /// The time before which measurements would be deleted.
     #[schema(required)]
     pub before: Option<Timestamp>,
-    /// What would go, by structure.
+    /// What would be deleted, by structure.
     pub would_delete: Vec<Expired>,
-    /// What became of the last look of this process.
+    /// The result of the last run of this process.
     #[schema(required)]
     pub last_run: Option<RetentionRun>,
 }
 
-/// What a number of days, or without it the settings, would delete now; nothing is deleted.
+/// What these settings would delete at the time `now`; nothing is deleted.
 ///
 /// # Errors
 /// [`crate::store::Error`].
-pub async fn plan(store: &Store, settings: RetentionSettings) -> Result<RetentionPlan, crate::store::Error> {
-    let before = settings.before(Timestamp::now());
+pub async fn plan(
+    store: &Store,
+    settings: RetentionSettings,
+    now: Timestamp,
+) -> Result<RetentionPlan, crate::store::Error> {
+    let before = settings.before(now);
     let would_delete = match before {
         Some(before) => store.retention().expired(before).await?,
         None => Vec::new(),
@@ -85,13 +90,17 @@ pub async fn plan(store: &Store, settings: RetentionSettings) -> Result<Retentio
     Ok(RetentionPlan { measurements_days: settings.measurements_days, before, would_delete, last_run: None })
 }
 
-/// Deletes everything older than the settings say, a few batches at a time.
+/// Deletes what is too old by the settings at the time `now`, a few batches at a time.
 ///
 /// # Errors
 /// [`crate::store::Error`]; what was deleted before stays deleted.
-pub async fn delete_expired(store: &Store, settings: RetentionSettings) -> Result<Deleted, crate::store::Error> {
+pub async fn delete_expired(
+    store: &Store,
+    settings: RetentionSettings,
+    now: Timestamp,
+) -> Result<Deleted, crate::store::Error> {
     let mut all = Deleted::default();
-    let Some(before) = settings.before(Timestamp::now()) else { return Ok(all) };
+    let Some(before) = settings.before(now) else { return Ok(all) };
     loop {
         let deleted = store.retention().delete_expired(before, AT_A_TIME).await?;
         if deleted.batches == 0 {
@@ -104,40 +113,50 @@ pub async fn delete_expired(store: &Store, settings: RetentionSettings) -> Resul
     }
 }
 
-impl Monitor {
+/// Deletes old batches while the service runs.
+#[derive(Clone)]
+pub struct Retention {
+    store: Store,
+    settings: Arc<Mutex<RetentionSettings>>,
+    last_run: Arc<Mutex<Option<RetentionRun>>>,
+}
+
+impl Retention {
+    pub(super) fn new(store: Store) -> Self {
+        Self { store, settings: Arc::default(), last_run: Arc::default() }
+    }
+
     /// Sets how long batches are kept.
-    pub fn set_retention(&self, settings: RetentionSettings) {
-        *self.upkeep.retention.lock().expect("no holder of this lock panics") = settings;
+    pub fn set(&self, settings: RetentionSettings) {
+        *self.settings.lock().expect("no holder of this lock panics") = settings;
     }
 
-    /// What became of the last look.
-    pub fn last_retention(&self) -> Option<RetentionRun> {
-        self.upkeep.last_retention.lock().expect("no holder of this lock panics").clone()
+    /// The result of the last run of this process.
+    pub fn last_run(&self) -> Option<RetentionRun> {
+        self.last_run.lock().expect("no holder of this lock panics").clone()
     }
 
-    /// What a number of days, or without it the settings, would delete now.
+    /// What would be deleted now when batches are kept for this number of days, by default that of the settings.
     ///
     /// # Errors
     /// [`Error::Store`].
-    pub async fn retention_plan(&self, days: Option<u32>) -> Result<RetentionPlan, Error> {
-        let mut settings = *self.upkeep.retention.lock().expect("no holder of this lock panics");
+    pub async fn plan(&self, days: Option<u32>) -> Result<RetentionPlan, Error> {
+        let mut settings = self.settings();
         settings.measurements_days = days.unwrap_or(settings.measurements_days);
-        Ok(RetentionPlan { last_run: self.last_retention(), ..plan(&self.store, settings).await? })
+        Ok(RetentionPlan { last_run: self.last_run(), ..plan(&self.store, settings, Timestamp::now()).await? })
     }
 
-    /// Deletes what is older than the settings say, again and again, for as long as the service runs. While they say that
-    /// everything is kept, it only looks at them.
-    pub fn watch_retention(&self) {
-        let monitor = self.clone();
+    /// Deletes old batches regularly for as long as the service runs, in the background.
+    pub fn watch(&self) {
+        let retention = self.clone();
         supervise("retention", move || {
-            let monitor = monitor.clone();
+            let retention = retention.clone();
             async move {
-                let settings = || *monitor.upkeep.retention.lock().expect("no holder of this lock panics");
-                tokio::time::sleep(FIRST_AFTER.min(Duration::from_secs(settings().every_s))).await;
+                tokio::time::sleep(FIRST_AFTER.min(Duration::from_secs(retention.settings().every_s))).await;
                 loop {
-                    let settings = settings();
+                    let settings = retention.settings();
                     if settings.measurements_days > 0 {
-                        monitor.apply_retention(settings).await;
+                        retention.apply(settings).await;
                     }
                     tokio::time::sleep(Duration::from_secs(settings.every_s)).await;
                 }
@@ -145,9 +164,13 @@ impl Monitor {
         });
     }
 
-    async fn apply_retention(&self, settings: RetentionSettings) {
+    fn settings(&self) -> RetentionSettings {
+        *self.settings.lock().expect("no holder of this lock panics")
+    }
+
+    async fn apply(&self, settings: RetentionSettings) {
         let days = settings.measurements_days;
-        let (deleted, failure) = match delete_expired(&self.store, settings).await {
+        let (deleted, failure) = match delete_expired(&self.store, settings, Timestamp::now()).await {
             Ok(deleted) => {
                 if deleted.batches > 0 {
                     let Deleted { batches, measurements } = deleted;
@@ -155,7 +178,7 @@ impl Monitor {
                         batches,
                         measurements,
                         days,
-                        "Deleted {batches} batches older than {days} days, as retention.measurements_days says"
+                        "Deleted {batches} batches older than {days} days, according to retention.measurements_days"
                     );
                 }
                 (deleted, None)
@@ -166,7 +189,7 @@ impl Monitor {
             }
         };
         let run = RetentionRun { at: Timestamp::now(), deleted, failure };
-        *self.upkeep.last_retention.lock().expect("no holder of this lock panics") = Some(run);
+        *self.last_run.lock().expect("no holder of this lock panics") = Some(run);
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use super::compute::ComputeSettings;
 use super::events::News;
-use super::{Error, Ingested, Monitor, MonitorSettings};
+use super::{Error, IngestError, Ingested, Monitor, MonitorSettings};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
@@ -84,7 +84,7 @@ async fn stored(monitor: &Monitor) -> Vec<String> {
 /// Posts a batch again until it is taken, as a client does that was answered with an error.
 async fn retried(monitor: &Monitor, number: usize, tries: usize) -> Ingested {
     for _ in 0..tries {
-        if let Ok(taken) = monitor.ingest(batch(number)).await {
+        if let Ok(taken) = monitor.ingest().take(batch(number)).await {
             return taken;
         }
     }
@@ -103,7 +103,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
             let (mut call, mut elsewhere) = (0, 0);
             loop {
                 faults.set(point, &format!("{call}*off->{action}"));
-                let outcome = monitor.ingest(batch(number)).await;
+                let outcome = monitor.ingest().take(batch(number)).await;
                 let Err(error) = outcome else {
                     faults.clear(point);
                     number += 1;
@@ -116,14 +116,17 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
                     // No call was left to fail.
                     break;
                 };
-                assert!(matches!(error, Error::Store(_) | Error::Panicked), "{point} {action}: {error}");
+                assert!(
+                    matches!(error, IngestError::Monitor(Error::Store(_) | Error::Panicked)),
+                    "{point} {action}: {error}"
+                );
                 if stays {
-                    assert!(monitor.ingest(batch(number)).await.is_err(), "{point} fails still");
+                    assert!(monitor.ingest().take(batch(number)).await.is_err(), "{point} fails still");
                     faults.clear(point);
                 }
                 let taken = retried(&monitor, number, 3).await;
                 assert_eq!(taken.view.record.state, BatchState::Assessed, "{point} {action}, call {call}");
-                assert!(monitor.ingest(batch(number)).await.unwrap().replayed);
+                assert!(monitor.ingest().take(batch(number)).await.unwrap().replayed);
                 (number, failures) = (number + 1, failures + 1);
                 call += 1;
                 assert!(call < 50, "{point} never runs out");
@@ -148,7 +151,7 @@ async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent
     let monitor = open(folder.path()).await;
     // The first commit stores the batch, the second would store its assessment.
     faults.set("store::commit", "1*off->return");
-    assert!(monitor.ingest(batch(0)).await.is_err());
+    assert!(monitor.ingest().take(batch(0)).await.is_err());
     faults.clear("store::commit");
     for _ in 0..100 {
         tokio::time::sleep(std::time::Duration::from_millis(100)).await;
@@ -172,7 +175,7 @@ async fn a_model_that_cannot_be_loaded_is_named_and_the_others_serve() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).await.unwrap();
         let monitor = Monitor::open(store, library, MonitorSettings::default()).await.unwrap();
-        assert_eq!(monitor.baselines_in_use(), 2);
+        assert_eq!(monitor.upkeep().baselines_in_use(), 2);
     }
 }
 
@@ -183,13 +186,13 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
     let monitor = open(folder.path()).await;
     let mut ids = Vec::new();
     for number in 0..6 {
-        ids.push(monitor.ingest(batch(number)).await.unwrap().view.record.batch_id);
+        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
     }
     // A year back.
     faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
-    monitor.declare_undamaged(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
+    monitor.replay().declare_reference(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
     for _ in 0..100 {
-        let view = monitor.batch(&structure(), &ids[5]).await.unwrap();
+        let view = monitor.records().batch(&structure(), &ids[5]).await.unwrap();
         if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
             return;
         }
@@ -208,10 +211,10 @@ async fn replayed(threads: usize) -> Vec<String> {
     let monitor = open_with(folder.path(), MonitorSettings { compute, ..MonitorSettings::default() }).await;
     let mut ids = Vec::new();
     for number in 0..REPLAYED {
-        ids.push(monitor.ingest(batch(number)).await.unwrap().view.record.batch_id);
+        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
     }
     let mut news = monitor.events().watch().unwrap();
-    monitor.declare_undamaged(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
+    monitor.replay().declare_reference(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
     let mut told = Vec::new();
     while told.len() < REPLAYED - 5 {
         if let News::Batch { batch, state, .. } = news.recv().await.unwrap() {
@@ -223,7 +226,7 @@ async fn replayed(threads: usize) -> Vec<String> {
     let mut left = Vec::new();
     let mut times = BTreeSet::new();
     for id in &ids {
-        let view = monitor.batch(&structure(), id).await.unwrap();
+        let view = monitor.records().batch(&structure(), id).await.unwrap();
         let (mut assessment, mut charts) = (view.assessment.unwrap(), view.charts);
         times.insert(assessment.assessed_at);
         assessment.assessed_at = Timestamp::from_micros(0).unwrap();

@@ -9,7 +9,7 @@ use crate::measurement::body::RawBatch;
 use crate::measurement::check::Problem;
 use crate::measurement::json::JsonError;
 use crate::measurement::MeasurementBatch;
-use crate::monitor::{Error, Monitor};
+use crate::monitor::{Error, IngestError, Monitor};
 use crate::quantity::{shown, StructureId, Timestamp};
 
 /// Maximum number of attempts for a message whose storage fails for reasons outside the message.
@@ -43,7 +43,7 @@ impl Intake {
         let payload = payload.as_ref();
         loop {
             let Some((reason, tries)) = self.store(topic, payload).await else { return };
-            match self.monitor.store().quarantine().insert(topic, payload, &reason, tries, Timestamp::now()).await {
+            match self.monitor.quarantine().insert(topic, payload, &reason, tries, Timestamp::now()).await {
                 Ok(()) => {
                     count("quarantined");
                     warn!(topic = %shown(topic), reason, "Put an MQTT message into quarantine: {reason}");
@@ -83,9 +83,9 @@ impl Intake {
     /// Returns whether the batch was already stored.
     async fn store_once(&self, topic: &str, payload: &[u8]) -> Result<bool, Refused> {
         let batch = self.batch(topic, payload).await?;
-        match self.monitor.ingest_when_free(batch).await {
+        match self.monitor.ingest().take_when_free(batch).await {
             Ok(ingested) => Ok(ingested.replayed),
-            Err(error @ (Error::Store(_) | Error::QueueFull(_) | Error::Panicked)) => {
+            Err(IngestError::Monitor(error @ (Error::Store(_) | Error::QueueFull(_) | Error::Panicked))) => {
                 Err(Refused::Temporary(error.to_string()))
             }
             Err(error) => Err(Refused::Permanent(error.to_string())),
@@ -99,7 +99,7 @@ impl Intake {
             .structure(topic)
             .ok_or_else(|| permanent(format!("the topic {} has another form than mqtt.topic", shown(topic))))?;
         let id = StructureId::parse(id).map_err(|e| permanent(e.to_string()))?;
-        let watched = self.monitor.structure(&id).map_err(|e| permanent(e.to_string()))?;
+        let active = self.monitor.structure(&id).map_err(|e| permanent(e.to_string()))?;
         if payload.len() > self.max_payload_bytes {
             let (bytes, most) = (payload.len(), self.max_payload_bytes);
             return Err(permanent(format!(
@@ -113,7 +113,7 @@ impl Intake {
                 JsonError::Malformed(reason) => reason,
                 JsonError::Shape(problem) => sentence(&[problem]),
             })?;
-            monitor.check(&watched, id, raw).map_err(|problems| sentence(&problems))
+            monitor.ingest().check(&active, raw).map_err(|problems| sentence(&problems))
         };
         tokio::task::spawn_blocking(parse)
             .await

@@ -35,6 +35,7 @@ mod beam;
 mod check;
 pub mod definition;
 pub mod effect;
+mod expectation;
 mod instrumented;
 pub mod law;
 mod layout;

@@ -6,15 +6,11 @@ use super::column::{elements, list, timestamp};
 use super::database::Database;
 use super::error::Error;
 use super::transaction::Transaction;
+use crate::alarm::chart::FIT_SERIES;
 use crate::quantity::{StructureId, Timestamp};
 
-/// Series name of the chart of the fit of the simulation. Parameter names cannot contain a colon.
-pub const FIT_SERIES: &str = "simulation:fit";
 /// Series name of alarms about missing data.
 pub const SILENCE_SERIES: &str = "structure:silence";
-
-/// Kinds of alarms.
-pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
 
 /// An alarm from its beginning to its end.
 #[derive(Debug, Clone, PartialEq)]

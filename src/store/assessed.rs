@@ -15,19 +15,19 @@ use super::series::{bounds, Extent, QuantityMark, QuantitySeries, Series, Series
 use crate::damage::QuantityKind;
 use crate::quantity::StructureId;
 use crate::reduction::{Reduced, Reducer, Row};
-use crate::trust::{Code, Verdict};
+use crate::trust::{FindingCode, TrustVerdict};
 
 /// The part of a stored trust that a series contains.
 #[derive(Deserialize)]
 struct SeriesTrust {
-    verdict: Verdict,
+    verdict: TrustVerdict,
     p_value: Option<f64>,
     findings: Vec<FindingColumn>,
 }
 
 #[derive(Deserialize)]
 struct FindingColumn {
-    code: Code,
+    code: FindingCode,
 }
 
 impl SeriesTrust {
@@ -35,7 +35,7 @@ impl SeriesTrust {
         match text {
             Some(text) => serde_json::from_str(text).map_err(|e| bad_row("assessment")(&e)),
             // Assessments of early versions have no trust.
-            None => Ok(Self { verdict: Verdict::Accepted, p_value: None, findings: Vec::new() }),
+            None => Ok(Self { verdict: TrustVerdict::Accepted, p_value: None, findings: Vec::new() }),
         }
     }
 }
@@ -252,7 +252,7 @@ impl Series<'_> {
         let found: BTreeMap<String, Option<String>> = found.into_iter().collect();
         let row = |Row { time_us, values, tag: batch }| {
             let trust = SeriesTrust::of(found.get(&batch).and_then(Option::as_deref))?;
-            let mut findings: Vec<Code> = Vec::new();
+            let mut findings: Vec<FindingCode> = Vec::new();
             for finding in trust.findings {
                 if !findings.contains(&finding.code) {
                     findings.push(finding.code);

@@ -7,14 +7,14 @@ use sqlx::FromRow;
 
 use super::chart::{chart, ChartOutcome};
 use super::chart_episode::Charted;
-use super::chart_point::{NewChartPoint, StoredChartPoint};
+use super::chart_point::StoredChartPoint;
 use super::column::{bad_row, elements, from_blob, list, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
-use crate::assessment::Assessment;
+use crate::assessment::{Assessment, NewChartPoint};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::Trust;
@@ -337,7 +337,7 @@ async fn insert(
                 .bind(q.std)
                 .bind(q.pooled.within)
                 .bind(q.pooled.between)
-                .bind(q.edge_mass)
+                .bind(q.prior_bound_mass)
                 .bind(damage.map(|d| d.threshold))
                 .bind(damage.map(|d| d.probability_of_damage))
                 .bind(damage.map(|d| d.exceeds))
@@ -409,7 +409,7 @@ fn quantity_assessment(row: QuantityAssessmentRow) -> Result<QuantityAssessment,
             within: row.variance_within,
             between: row.variance_between,
         },
-        edge_mass: row.edge_mass,
+        prior_bound_mass: row.edge_mass,
         group: row.group_name,
         damage,
     })

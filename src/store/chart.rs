@@ -6,12 +6,13 @@
 use std::sync::LazyLock;
 
 use super::chart_episode::{Charted, Episodes};
-use super::chart_point::{state_of, stored_point, NewChartPoint, PointRow, StoredChartPoint, POINT_COLUMNS};
+use super::chart_point::{state_of, stored_point, PointRow, StoredChartPoint, POINT_COLUMNS};
 use super::error::Error;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
 use crate::alarm::chart::Series;
 use crate::alarm::machine::State;
+use crate::assessment::NewChartPoint;
 
 /// Points read at a time.
 const PAGE: usize = 500;

@@ -1,9 +1,10 @@
 //! The alarm episodes that the points of a chart open and end.
 
 use super::alarm::{insert_episode, kind_of};
-use super::chart_point::{state_of, ChartPosition, NewChartPoint, PointRow};
+use super::chart_point::{state_of, ChartPosition, PointRow};
 use super::error::Error;
 use super::transaction::Transaction;
+use crate::assessment::NewChartPoint;
 use crate::quantity::Timestamp;
 
 /// A batch whose points on the charts are to be stored.

@@ -7,26 +7,10 @@ use super::column::{bad_row, timestamp};
 use super::error::Error;
 use crate::alarm::chart::{ChartPoint, Series};
 use crate::alarm::machine::State;
-use crate::alarm::AlarmSettings;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Moving averages that differ by less are equal up to rounding.
 const SAME: f64 = 1e-9;
-
-/// A point of a batch on an alarm chart, to be stored.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NewChartPoint {
-    /// The parameter of a damage chart, or `simulation:fit`.
-    pub series: String,
-    /// Version of the undamaged reference; 0 for the chart of the fit.
-    pub undamaged_version: u32,
-    /// Shift and limits of the point.
-    pub point: ChartPoint,
-    /// Probability of damage that corresponds to the limit.
-    pub probability_limit: Option<f64>,
-    /// Settings of the chart.
-    pub settings: AlarmSettings,
-}
 
 /// A stored point of a chart.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,7 +19,7 @@ pub struct StoredChartPoint {
     pub batch_id: String,
     /// Time of the last measurement of the batch.
     pub measured_to: Timestamp,
-    /// The parameter, or `simulation:fit`.
+    /// The parameter, or [`crate::alarm::chart::FIT_SERIES`].
     pub series: String,
     /// Shift towards damage, in standard errors.
     pub shift: f64,

@@ -53,12 +53,12 @@ use database::Database;
 use undamaged::Newest;
 use writer::Writer;
 
-pub use alarm::{Acknowledgement, Alarms, Episode, MaintenanceWindow, ALARM_KINDS, FIT_SERIES};
+pub use alarm::{Acknowledgement, Alarms, Episode, MaintenanceWindow};
 pub use archive::Archive;
 pub use assessment::{Assessments, StoredAssessment};
 pub use audit::{Audit, AuditEntry, AuditQuery, NewAuditEntry};
 pub use batch::{BatchRecord, Batches, InsertBatch};
-pub use chart_point::{NewChartPoint, StoredChartPoint};
+pub use chart_point::StoredChartPoint;
 pub use database_file::DatabaseFile;
 pub use diagnosis::{Diagnoses, DiagnosisRecord, JobState};
 pub use error::Error;

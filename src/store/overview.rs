@@ -13,7 +13,7 @@ use super::database::Database;
 use super::error::Error;
 use crate::alarm::machine::State;
 use crate::quantity::{StructureId, Timestamp};
-use crate::trust::Verdict;
+use crate::trust::TrustVerdict;
 
 /// Summary of a structure.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,7 +46,7 @@ pub struct LatestAssessment {
     /// The batch.
     pub batch_id: String,
     /// Verdict of the trust.
-    pub verdict: Verdict,
+    pub verdict: TrustVerdict,
     /// Number of findings.
     pub findings: usize,
     /// Whether a probability of damage exceeds that of the undamaged reference.
@@ -80,7 +80,7 @@ struct LatestRow {
 /// The part of a stored trust that the overview contains.
 #[derive(Deserialize)]
 struct OverviewTrust {
-    verdict: Verdict,
+    verdict: TrustVerdict,
     findings: Vec<IgnoredAny>,
 }
 
@@ -162,7 +162,7 @@ impl Overview<'_> {
             let trust = match &row.trust {
                 Some(trust) => serde_json::from_str(trust).map_err(|e| bad_row("assessment")(&e))?,
                 // Assessments of early versions have no trust.
-                None => OverviewTrust { verdict: Verdict::Accepted, findings: Vec::new() },
+                None => OverviewTrust { verdict: TrustVerdict::Accepted, findings: Vec::new() },
             };
             let latest = LatestAssessment {
                 batch_id: row.batch_id,

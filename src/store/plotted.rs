@@ -2,7 +2,7 @@
 //! batches is plotted without reading the rows of their quantities.
 
 use crate::assessment::Assessment;
-use crate::trust::Verdict;
+use crate::trust::TrustVerdict;
 
 use super::column::{bad_row, to_blob};
 use super::error::Error;
@@ -13,8 +13,8 @@ const OF_TRUST: usize = 3;
 const OF_A_QUANTITY: usize = 6;
 
 /// P-value, 1 if rejected, number of findings. A missing p-value is NaN.
-pub(super) fn trust_values(p_value: Option<f64>, verdict: Verdict, findings: usize) -> [f64; OF_TRUST] {
-    let rejected = if verdict == Verdict::Rejected { 1.0 } else { 0.0 };
+pub(super) fn trust_values(p_value: Option<f64>, verdict: TrustVerdict, findings: usize) -> [f64; OF_TRUST] {
+    let rejected = if verdict == TrustVerdict::Rejected { 1.0 } else { 0.0 };
     [p_value.unwrap_or(f64::NAN), rejected, findings as f64]
 }
 

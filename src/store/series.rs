@@ -16,7 +16,7 @@ use super::error::Error;
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
 use crate::reduction::{Reduced, Reducer};
-use crate::trust::{Code, Verdict};
+use crate::trust::{FindingCode, TrustVerdict};
 
 /// Largest number of measurements that is read for one series. Of longer series, every second, third … measurement is read.
 const MOST_MEASUREMENTS: u64 = 500_000;
@@ -81,7 +81,7 @@ pub struct QuantityMark {
 /// An alarm chart over a window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartSeries {
-    /// The parameter, or `simulation:fit`.
+    /// The parameter, or [`crate::alarm::chart::FIT_SERIES`].
     pub chart: String,
     /// Points by the time of the last measurement of their batch. The values are the shift and the moving average.
     pub points: Reduced<ChartMark>,
@@ -108,9 +108,9 @@ pub struct TrustMark {
     /// The batch.
     pub batch: String,
     /// The verdict.
-    pub verdict: Verdict,
+    pub verdict: TrustVerdict,
     /// Codes of the findings, each once.
-    pub findings: Vec<Code>,
+    pub findings: Vec<FindingCode>,
 }
 
 /// Time series for plots.

@@ -63,7 +63,7 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
         std_interval: None,
         pooled: Hyperparameters { mean: 3.61, std: None, within: 0.01, between: None },
         group: None,
-        edge_mass: 0.0,
+        prior_bound_mass: 0.0,
         damage: undamaged_version.map(|_| damage.clone()),
     };
     Assessment {

@@ -1,21 +1,21 @@
-//! The slip behind a batch that does not fit: a unit, a shift of modes.
+//! Common mistakes behind a batch that does not fit: another unit, modes numbered wrongly.
 
+use super::finding::{Finding, FindingCode, FindingEffect};
 use super::fit::fit;
-use super::{Code, Effect, Finding};
 use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
 use crate::physics;
 
-/// Measurements that a suspicion is tried on.
+/// Measurements that a suspected mistake is tested on.
 const TRIED: usize = 8;
 
-/// Draws that a search begins from the mean of.
+/// Posterior draws whose mean is the starting point of a search.
 const DRAWS: usize = 16;
 
-/// Units that frequencies come in by mistake, and the factor that turns them into Hz.
+/// Units used by mistake, and the factor that converts them into Hz.
 const UNITS: [(&str, f64); 3] = [("rad/s", 0.5 * std::f64::consts::FRAC_1_PI), ("kHz", 1e3), ("rpm", 1.0 / 60.0)];
 
-/// Why no suspicion could be tried.
+/// Why no suspected mistake could be tested.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The flow failed.
@@ -26,10 +26,10 @@ pub enum Error {
     Simulation(#[from] physics::Error),
 }
 
-/// Tries the common slips on a rejected batch and names the first that makes it fit.
+/// Tests common mistakes on a rejected batch and reports the first whose correction makes it fit.
 ///
 /// # Errors
-/// [`Error`], which a loaded baseline rules out.
+/// [`Error`], which does not occur with a loaded baseline.
 pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> Result<Option<Finding>, Error> {
     let step = observations.len().div_ceil(TRIED).max(1);
     let some: Vec<&Observation> = observations.iter().step_by(step).collect();
@@ -49,11 +49,12 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
             ..o.clone()
         };
         if tried(&in_hz, false)? {
-            let message = format!("taken as {unit} instead of Hz, the measurements fit: send Hz");
-            return Ok(Some(Finding::new(Code::UnitSuspected, Effect::Reject, message)));
+            let message = format!("the measurements fit when they are read as {unit} instead of Hz: send Hz");
+            return Ok(Some(Finding::new(FindingCode::UnitSuspected, FindingEffect::Reject, message)));
         }
     }
-    // Mode j was missed and all above moved down: what came as mode i is mode i + 1 from j on, and the last is unknown.
+    // Mode j was missed and those above it were numbered one too low: what was sent as mode i is mode i + 1 from j on, and the
+    // last mode is unknown.
     let modes = baseline.simulator().modes();
     for missed in 0..modes.saturating_sub(1) {
         let shifted = |o: &Observation| {
@@ -64,13 +65,14 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
                 ..o.clone()
             }
         };
-        // With too few modes left to test anything, any shift would fit.
+        // With too few modes left for a test, any shift would fit.
         if tried(&shifted, true)? {
             let message = format!(
-                "with mode {} missed and those above it taken one too low, the measurements fit: send null for the missed mode",
+                "the measurements fit when mode {} is taken as missed and those above it as numbered one too low: send null for \
+                 the missed mode",
                 missed + 1
             );
-            return Ok(Some(Finding::new(Code::ModesShifted, Effect::Reject, message)));
+            return Ok(Some(Finding::new(FindingCode::ModesShifted, FindingEffect::Reject, message)));
         }
     }
     Ok(None)

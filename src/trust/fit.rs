@@ -1,22 +1,22 @@
-//! What the simulation leaves unexplained of a batch, set against what noise alone would leave.
+//! Test of fit: the residuals of the simulation for a batch, against those that noise alone would leave.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 
-use super::{too_many, Code, Effect, Finding};
+use super::finding::{too_many, Finding, FindingCode, FindingEffect};
 use crate::baseline::nearest::{nearest, Nearest};
 use crate::baseline::observation::Observation;
 use crate::physics;
 use crate::simulator::Simulator;
 
-/// Share of healthy batches that are rejected.
+/// Significance level: share of healthy batches that are rejected.
 pub const LEVEL: f64 = 0.01;
 
-/// Share of healthy batches in which some measurement counts as not reached.
+/// Share of healthy batches in which some measurement is reported as beyond the prior.
 const SINGLE_LEVEL: f64 = 0.001;
 
-/// Relative misfit beyond which a measurement that no parameters give is an outlier and no neighbour of the prior.
+/// Relative misfit above which a measurement that no parameters reproduce is an outlier, rather than close to the prior.
 const GROSS: f64 = 0.05;
 
 /// How well the simulation reproduces the measurements of a batch.
@@ -24,37 +24,36 @@ const GROSS: f64 = 0.05;
 pub struct Fit {
     /// Nearest point of the prior box for each measurement.
     pub nearest: Vec<Nearest>,
-    /// Measurements that no parameters of the prior give within the noise, but nearly.
+    /// Rows of measurements slightly beyond the prior: no parameters reproduce them within the noise, but nearly.
     pub outside: Vec<usize>,
-    /// Measurements far from anything the simulation gives.
+    /// Rows of measurements far from anything the simulation gives.
     pub gross: Vec<usize>,
     /// Probability of a misfit at least this large; `None` without degrees of freedom.
     pub p_value: Option<f64>,
-    /// √(χ²/degrees of freedom).
+    /// √(χ²/degrees of freedom); `None` without degrees of freedom.
     pub distance: Option<f64>,
-    /// Degrees of freedom over the measurements that are reached.
+    /// Degrees of freedom, summed over the measurements within the prior.
     pub degrees_of_freedom: usize,
 }
 
-/// Looks for each measurement in the prior box, beginning at `starts`.
+/// Finds the nearest point of the prior box for each measurement, starting at `starts`, `[n][d]`, and tests the residuals.
 ///
 /// ```text
 ///  T = Σ_j min_x Σ_i r_ij²,   r_ij = (ln f_ij − ln f_i(x))/s_ij,   p_T = P(χ²_ν ≥ T),   ν = Σ_j (modes − free parameters)
 ///  M = Rᵀ P⁺ R,   R = Σ_j r_j,   P = Σ_j P_j,   p_M = P(χ²_rank ≥ M),      p = 2·min(p_T, p_M)
 /// ```
 ///
-/// T sees measurements that do not fit, each in its own way; M, with the projectors P_j on what the parameters cannot absorb,
-/// sees a mode that is off by the same little in all of them.
+/// T detects measurements that misfit each in its own way. M detects a small misfit of a mode that is the same in all
+/// measurements; P_j is the projector on the residuals that the parameters cannot absorb.
 ///
-/// A measurement whose own p falls below 0.001/n does not enter T: it is named instead, so that one bad record does not
-/// take the others with it. Nor do measurements with no more modes than parameters, which leave something over only at an
-/// edge of the prior.
+/// A measurement with a p-value below 0.001/n does not enter T but is reported, so that one bad record does not reject the others.
+/// Measurements with no more modes than parameters do not enter T either: they have residuals only at a bound of the prior.
 ///
 /// # Errors
-/// [`physics::Error`], which a checked prior rules out.
+/// [`physics::Error`], which does not occur inside a checked prior.
 pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f64>]) -> Result<Fit, physics::Error> {
-    let look = |(observation, start): (&Observation, &Vec<f64>)| nearest(simulator, observation, start);
-    let nearest = observations.par_iter().zip(starts).map(look).collect::<Result<Vec<_>, _>>()?;
+    let search = |(observation, start): (&Observation, &Vec<f64>)| nearest(simulator, observation, start);
+    let nearest = observations.par_iter().zip(starts).map(search).collect::<Result<Vec<_>, _>>()?;
     let (mut outside, mut gross) = (Vec::new(), Vec::new());
     let (mut chi_squared, mut degrees_of_freedom) = (0.0, 0);
     let modes = simulator.modes();
@@ -87,13 +86,13 @@ pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f6
 }
 
 impl Fit {
-    /// Whether the batch as a whole is something the simulation produces.
+    /// True when the simulation cannot have produced the batch as a whole.
     pub fn rejected(&self) -> bool {
         let bad = self.outside.len() + self.gross.len();
         self.p_value.is_some_and(|p| p < LEVEL) || too_many(bad, self.nearest.len())
     }
 
-    /// What the fit says, in findings; `indices` are those of the measurements in their batch.
+    /// The findings of the test; `indices` are those of the measurements in their batch.
     pub fn findings(&self, simulator: &Simulator, indices: &[usize]) -> Vec<Finding> {
         let mut findings = Vec::new();
         let count = self.nearest.len();
@@ -101,46 +100,50 @@ impl Fit {
         if self.rejected() {
             let bad = self.outside.len() + self.gross.len();
             let message = if too_many(bad, count) {
-                format!("{bad} of {count} measurements cannot come from this simulation with any parameters of the prior: units, modes or the simulation are wrong")
+                format!(
+                    "{bad} of {count} measurements cannot be reproduced by the simulation with any parameters of the prior: the \
+                     units, the order of the modes or the simulation may be wrong"
+                )
             } else {
                 format!(
-                    "what the simulation leaves unexplained is {:.2} times the noise (p = {:.1e}): it does not fit these measurements{}",
+                    "the simulation does not fit these measurements: its residuals are {:.2} times the noise (p = {:.1e}){}",
                     self.distance.unwrap_or_default(),
                     self.p_value.unwrap_or_default(),
                     self.worst_mode()
                 )
             };
-            findings.push(Finding::new(Code::SimulationDoesNotFit, Effect::Reject, message));
+            findings.push(Finding::new(FindingCode::SimulationDoesNotFit, FindingEffect::Reject, message));
         }
         if !self.gross.is_empty() {
             let message = format!(
-                "{} of {count} measurements are outliers and left out: no parameters of the prior come within {:.0} % of them",
+                "{} of {count} measurements are outliers and are left out: no parameters of the prior come within {:.0} % of them",
                 self.gross.len(),
                 100.0 * GROSS
             );
-            findings.push(Finding::new(Code::Outlier, Effect::Note, message).of(named(&self.gross)));
+            findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Note, message).of(named(&self.gross)));
         }
         if !self.outside.is_empty() {
             let message = format!(
-                "{} of {count} measurements lie beyond the prior; they count as its nearest point. Widen the prior if the \
-                 structure can be there",
+                "{} of {count} measurements lie beyond the prior, and its nearest point is used for them: widen the prior if the \
+                 structure can have such parameters",
                 self.outside.len()
             );
-            findings.push(Finding::new(Code::OutsidePrior, Effect::Note, message).of(named(&self.outside)));
+            findings
+                .push(Finding::new(FindingCode::OutsidePrior, FindingEffect::Note, message).of(named(&self.outside)));
         }
         if self.p_value.is_none() && !self.rejected() {
             let message = format!(
-                "{} modes against {} parameters: the parameters can absorb nearly any measurement, so that only what \
-                 leaves the prior shows as a misfit",
+                "with {} modes and {} parameters, the parameters can absorb nearly any measurement, so that only \
+                 measurements beyond the prior show a misfit",
                 simulator.modes(),
                 simulator.space().len()
             );
-            findings.push(Finding::new(Code::FitNotTestable, Effect::Note, message));
+            findings.push(Finding::new(FindingCode::FitNotTestable, FindingEffect::Note, message));
         }
         findings
     }
 
-    /// The mode that is off the same way in most measurements, in words.
+    /// The mode with the largest misfit common to the measurements, in words; empty when none is significant.
     fn worst_mode(&self) -> String {
         let modes = self.nearest.first().map_or(0, |n| n.standardised_residuals.len());
         let mean = |mode: usize| {
@@ -150,18 +153,19 @@ impl Fit {
         };
         let worst = (0..modes).map(mean).max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()));
         worst.filter(|(_, z)| z.abs() > 3.0).map_or_else(String::new, |(mode, z)| {
-            format!("; mode {} is {} the simulation's", mode + 1, if z > 0.0 { "above" } else { "below" })
+            let side = if z > 0.0 { "above" } else { "below" };
+            format!("; mode {} lies {side} the simulated one", mode + 1)
         })
     }
 }
 
-/// p-value of a misfit that is the same in all measurements: residuals summed, against the sum of their covariances.
+/// p-value of a misfit common to all measurements: the sum of the residuals against the sum of their covariances.
 fn common_misfit(sum: &DVector<f64>, covariance: DMatrix<f64>) -> f64 {
     let largest = covariance.diagonal().max();
     let eigen = covariance.symmetric_eigen();
     let (mut statistic, mut rank) = (0.0, 0);
     for (value, direction) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
-        // Directions in which only some measurements have anything left over are no common ones.
+        // Directions in which only some measurements have residuals are not common to all.
         if *value > 0.3 * largest {
             statistic += direction.dot(sum).powi(2) / value;
             rank += 1;

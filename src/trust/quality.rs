@@ -1,35 +1,35 @@
-//! What can be seen in the measurements without any simulation: order, repeats, resolution, outliers.
+//! Plausibility of the measurements without any simulation: order, repeats, resolution, outliers.
 
-use super::{too_many, Code, Effect, Finding};
+use super::finding::{too_many, Finding, FindingCode, FindingEffect};
 use crate::measurement::ModalMeasurement;
 use crate::quantity::Hertz;
 use crate::stats;
 
-/// Fewest values of a mode for a judgement on their scatter.
+/// Fewest values of a mode from which their scatter is judged.
 const FEWEST: usize = 8;
 
-/// Distance from the median, in robust standard deviations, that no healthy scatter reaches.
+/// Distance from the median, in robust standard deviations, beyond which a value is an outlier.
 const FAR: f64 = 8.0;
 
-/// Share of distinct values below which a mode counts as quantised.
+/// Share of distinct values below which a mode is reported as quantised.
 const FEW_DISTINCT: f64 = 0.34;
 
-/// What was seen, and what is left to assess.
+/// The findings, and the measurements left to assess.
 #[derive(Debug, Clone)]
 pub struct Inspection {
-    /// The measurements to go on with, modes in ascending order, and their index in the batch; never empty.
+    /// The measurements to assess, modes in ascending order, with their index in the batch; never empty.
     pub kept: Vec<(usize, ModalMeasurement)>,
-    /// What was seen.
+    /// The findings.
     pub findings: Vec<Finding>,
 }
 
-/// Looks at the measurements of a batch; `previous` are the frequencies of the measurement before them of the same source.
+/// Inspects the measurements of a batch; `previous` are the frequencies of the last measurement of the same source before it.
 pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hertz>]>) -> Inspection {
     let mut findings = Vec::new();
     let mut kept: Vec<(usize, ModalMeasurement)> = measurements.iter().cloned().enumerate().collect();
     sort_modes(&mut kept, &mut findings);
     let coarse = quantised(&kept, &mut findings);
-    // On a coarse grid equal values are no sign of anything.
+    // Values rounded to coarse steps coincide by chance.
     if !coarse {
         drop_repeats(&mut kept, previous, &mut findings);
     }
@@ -37,8 +37,8 @@ pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hert
     Inspection { kept, findings }
 }
 
-/// Names measurements whose modes are out of order. A few are left out; of a batch full of them the modes are put in order,
-/// for the figures, and the batch is rejected.
+/// Reports measurements whose modes are out of order. A few are left out. When there are many, the batch is rejected, and the modes
+/// are sorted so that its figures can still be computed.
 fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
     let mut swapped = Vec::new();
     let mut places = String::new();
@@ -71,20 +71,20 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
     if !swapped.is_empty() {
         let many = too_many(swapped.len(), kept.len());
         let message = format!(
-            "modes are out of order in {} of {} measurements (in the first, {places}): they seem swapped; {}",
+            "modes are out of order in {} of {} measurements (in the first, {places}) and seem to be swapped; {}",
             swapped.len(),
             kept.len(),
-            if many { "the figures are for ascending frequencies" } else { "these are left out" }
+            if many { "the figures are computed with ascending frequencies" } else { "these are left out" }
         );
-        let effect = if many { Effect::Reject } else { Effect::Note };
-        findings.push(Finding::new(Code::ModesSwapped, effect, message).of(swapped.clone()));
+        let effect = if many { FindingEffect::Reject } else { FindingEffect::Note };
+        findings.push(Finding::new(FindingCode::ModesSwapped, effect, message).of(swapped.clone()));
         if !many {
             kept.retain(|(index, _)| !swapped.contains(index));
         }
     }
 }
 
-/// True when every mode that varies lies on a coarse grid; each mode that does is named.
+/// True when every mode that varies is rounded to coarse steps; each such mode is reported.
 fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) -> bool {
     let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
     let (mut coarse, mut scattered) = (0, 0);
@@ -110,8 +110,9 @@ fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) ->
         ));
     }
     if !parts.is_empty() {
-        let message = format!("{}: record more digits, the scatter is finer than that", parts.join("; "));
-        findings.push(Finding::new(Code::Quantised, Effect::HoldAlarm, message));
+        let message =
+            format!("{}: record more digits, because the scatter is smaller than these steps", parts.join("; "));
+        findings.push(Finding::new(FindingCode::Quantised, FindingEffect::HoldAlarm, message));
     }
     coarse > 0 && coarse == scattered
 }
@@ -135,29 +136,29 @@ fn drop_repeats(
         return;
     }
     let indices: Vec<usize> = repeats.iter().map(|&row| kept[row].0).collect();
-    // All repeat the measurement before the batch, or all the first of it.
+    // All repeat the measurement before the batch, or all repeat the first of the batch.
     if repeats.len() == count || (count >= 3 && repeats.len() + 1 == count) {
         let message = match count {
             1 => {
-                "the same frequencies as in the measurement before, to the last digit: the sensor or its gateway hangs"
+                "the frequencies equal those of the measurement before to the last digit: the sensor or its gateway hangs"
                     .to_owned()
             }
             _ => format!(
                 "all {count} measurements have the same frequencies to the last digit: the sensor or its gateway hangs"
             ),
         };
-        findings.push(Finding::new(Code::NoScatter, Effect::Reject, message));
+        findings.push(Finding::new(FindingCode::NoScatter, FindingEffect::Reject, message));
         kept.truncate(1);
         return;
     }
-    let effect = if too_many(repeats.len(), count) { Effect::HoldAlarm } else { Effect::Note };
+    let effect = if too_many(repeats.len(), count) { FindingEffect::HoldAlarm } else { FindingEffect::Note };
     let message =
         format!("{} of {count} measurements repeat an earlier one to the last digit and are left out", repeats.len());
-    findings.push(Finding::new(Code::StaleRepeat, effect, message).of(indices.clone()));
+    findings.push(Finding::new(FindingCode::StaleRepeat, effect, message).of(indices.clone()));
     kept.retain(|(index, _)| !indices.contains(index));
 }
 
-/// Leaves out measurements with a mode far from what the others of the batch show.
+/// Leaves out measurements with a mode far from those of the other measurements of the batch.
 fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
     let count = kept.len();
     let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
@@ -171,7 +172,7 @@ fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<F
         let values: Vec<f64> = logs.iter().map(|(_, x)| *x).collect();
         let median = stats::quantile(&values, 0.5);
         let deviations: Vec<f64> = values.iter().map(|x| (x - median).abs()).collect();
-        // 1.4826 makes the median deviation of a normal distribution its standard deviation.
+        // 1.4826 times the median absolute deviation of a normal distribution is its standard deviation.
         let spread = 1.4826 * stats::quantile(&deviations, 0.5);
         if spread <= 0.0 {
             continue;
@@ -197,13 +198,13 @@ fn drop_outliers(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<F
     let examples = examples.join("; ");
     if too_many(indices.len(), count) {
         let message = format!(
-            "{} of {count} measurements lie far from the others ({examples}): the batch mixes two states, or two instruments",
+            "{} of {count} measurements lie far from the others ({examples}): the batch mixes two states or two instruments",
             indices.len()
         );
-        findings.push(Finding::new(Code::Outlier, Effect::Reject, message).of(indices));
+        findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Reject, message).of(indices));
         return;
     }
-    let message = format!("{} of {count} measurements are outliers and left out: {examples}", indices.len());
-    findings.push(Finding::new(Code::Outlier, Effect::Note, message).of(indices.clone()));
+    let message = format!("{} of {count} measurements are outliers and are left out: {examples}", indices.len());
+    findings.push(Finding::new(FindingCode::Outlier, FindingEffect::Note, message).of(indices.clone()));
     kept.retain(|(index, _)| !indices.contains(index));
 }

@@ -10,7 +10,7 @@ use serde_json::{json, Value};
 use crate::helpers::{command, created, eventually, spawn, within, Service};
 
 #[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
-#[path = "../discrepancy/world.rs"]
+#[path = "../discrepancy/world/mod.rs"]
 mod world;
 
 /// Two springs of a chain are unknown; the simulation does not depend on temperature.

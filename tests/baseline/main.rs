@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::LazyLock;
 
+use modalwatch::assessment::{self, BatchSamples, Context, Draws};
 use modalwatch::baseline::observation::{Observation, DEFAULT_NOISE_RANGE};
 use modalwatch::baseline::train::{train, validate};
 use modalwatch::baseline::{library::Library, Baseline, LoadError};
@@ -13,7 +14,6 @@ use modalwatch::damage::{self, Hyperparameters};
 use modalwatch::flow::train::TrainSettings;
 use modalwatch::flow::FlowSettings;
 use modalwatch::measurement::ModalMeasurement;
-use modalwatch::monitor::assess::{self, BatchSamples, Context, Draws};
 use modalwatch::parameter::DamageDirection;
 use modalwatch::quantity::{Hertz, Probability, StructureId, Timestamp};
 use modalwatch::simulator::definition::StructureDefinition;
@@ -56,7 +56,7 @@ fn draws(seed: u64) -> Draws {
 }
 
 fn samples(baseline: &Baseline, drawn: &SimulatedMeasurements, seed: u64) -> BatchSamples {
-    assess::draw(baseline, &measurements(drawn), None, draws(seed)).unwrap()
+    assessment::draw(baseline, &measurements(drawn), None, draws(seed)).unwrap()
 }
 
 /// Pool of ten samples for each of the fifty measurements, one list a parameter.
@@ -249,7 +249,9 @@ fn the_same_seed_gives_the_same_files_on_one_and_on_two_threads() {
 fn a_batch_is_assessed_the_same_every_time() {
     let drawn = draw(&THREE_DOF, [(4.0, 0.3), (5.0, 0.1), (6.0, 0.2)], 1);
     let batch = measurements(&drawn);
-    let assess = |seed| assess::assess(&THREE_DOF, &batch, Context::default(), draws(seed)).unwrap().quantities;
+    let now = Timestamp::from_micros(0).unwrap();
+    let assess =
+        |seed| assessment::assess(&THREE_DOF, &batch, Context::default(), draws(seed), now).unwrap().quantities;
     assert_eq!(assess(1), assess(1));
     assert_ne!(assess(1), assess(2));
 }

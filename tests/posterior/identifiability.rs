@@ -1,14 +1,14 @@
 //! Two stiffnesses that the modes cannot distinguish: damage is reported for both together, and for neither alone.
 
+use modalwatch::assessment::{self, Context};
 use modalwatch::baseline::observation::DEFAULT_NOISE_RANGE;
 use modalwatch::baseline::train::train;
 use modalwatch::damage::QuantityKind;
 use modalwatch::flow::train::TrainSettings;
 use modalwatch::flow::FlowSettings;
-use modalwatch::monitor::assess::{self, Context};
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
-use modalwatch::trust::Code;
+use modalwatch::trust::FindingCode;
 
 use super::population::{batch, undamaged, DRAWS};
 use super::shipped;
@@ -46,8 +46,8 @@ fn damage_of_one_of_two_is_reported_for_the_group_and_for_neither_alone() {
     let state = undamaged(baseline, &batch(baseline, &[(100.0, 1.5), (100.0, 1.5)], 40, 1.0, 1));
     let damaged = batch(baseline, &[(85.0, 1.5), (100.0, 1.5)], 20, 1.0, 2);
     let context = Context { undamaged: Some(&state), previous: None };
-    let assessment = assess::assess(baseline, &damaged, context, DRAWS).unwrap();
-    assert!(assessment.trust.findings.iter().any(|f| f.code == Code::NotIdentifiable), "{:?}", assessment.trust);
+    let assessment = assessment::assess(baseline, &damaged, context, DRAWS, damaged[0].measured_at).unwrap();
+    assert!(assessment.trust.findings.iter().any(|f| f.code == FindingCode::NotIdentifiable), "{:?}", assessment.trust);
     for q in &assessment.quantities {
         match q.kind {
             QuantityKind::Group => {

@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use modalwatch::assessment::{self, Context, Draws};
 use modalwatch::baseline::Baseline;
 use modalwatch::damage::{self, Hyperparameters, UndamagedState};
 use modalwatch::measurement::ModalMeasurement;
-use modalwatch::monitor::assess::{self, Context, Draws};
 use modalwatch::quantity::{Hertz, Timestamp};
 use modalwatch::simulator::population::Population;
 use modalwatch::stats;
@@ -46,7 +46,7 @@ pub fn batch(
 
 pub fn undamaged(baseline: &Baseline, measurements: &[ModalMeasurement]) -> UndamagedState {
     // Another seed than that of the batches, as in the service: draws of two populations must be independent.
-    assess::undamaged_state(baseline, &[(measurements, Draws { seed: 6, ..DRAWS })], 0.05).unwrap()
+    assessment::undamaged_state(baseline, &[(measurements, Draws { seed: 6, ..DRAWS })], 0.05).unwrap()
 }
 
 /// Shares and means over repetitions, for each parameter.
@@ -68,7 +68,7 @@ fn repeat(multiple: f64, repetitions: u64) -> [Found; 3] {
         let state = undamaged(&baseline, &batch(&baseline, &TABLE_2, 50, multiple, 10_000 + seed));
         let measured = batch(&baseline, &TABLE_2, 50, multiple, seed);
         let context = Context { undamaged: Some(&state), previous: None };
-        let assessment = assess::assess(&baseline, &measured, context, DRAWS).unwrap();
+        let assessment = assessment::assess(&baseline, &measured, context, DRAWS, measured[0].measured_at).unwrap();
         for (k, q) in assessment.quantities.iter().enumerate() {
             let (mean, std) = TABLE_2[k];
             let inside = |interval: Option<[f64; 2]>, x: f64| interval.is_some_and(|i| (i[0]..=i[1]).contains(&x));
@@ -128,7 +128,7 @@ fn without_noise_pool_and_population_agree() {
     let baseline = shipped("three-dof");
     for seed in 0..20 {
         let measured = batch(&baseline, &TABLE_2, 50, 0.0, seed);
-        let samples = assess::draw(&baseline, &measured, None, DRAWS).unwrap();
+        let samples = assessment::draw(&baseline, &measured, None, DRAWS).unwrap();
         for (k, (_, std)) in TABLE_2.iter().enumerate() {
             let pooled = Hyperparameters::from_pool(&samples.posterior.first(10).column(k), 10);
             let population = &samples.populations.parameters[k];
@@ -148,7 +148,7 @@ fn tiny_batches_and_equal_measurements_stay_finite() {
             let moments = TABLE_2.map(|(mean, std)| (mean, spread * std));
             let measured = batch(&baseline, &moments, count, 0.0, 3);
             let context = Context { undamaged: Some(&state), previous: None };
-            let assessment = assess::assess(&baseline, &measured, context, DRAWS).unwrap();
+            let assessment = assessment::assess(&baseline, &measured, context, DRAWS, measured[0].measured_at).unwrap();
             for q in &assessment.quantities {
                 assert!(q.mean.is_finite() && q.mean_interval.unwrap().iter().all(|x| x.is_finite()), "{q:?}");
                 assert_eq!(q.std.is_some(), assessment.measurements_used > 1, "{q:?}");
@@ -167,12 +167,12 @@ fn an_undamaged_state_with_damage_in_it_is_doubted_and_one_too_small_refused() {
     let later = batch(&baseline, &TABLE_2, 30, 1.0, 2);
     let damaged = batch(&baseline, &[(4.0, 0.3), (4.6, 0.1), (6.0, 0.2)], 30, 1.0, 3);
     let state = |parts: [&[ModalMeasurement]; 2]| {
-        assess::undamaged_state(&baseline, &parts.map(|part| (part, DRAWS)), 0.05).unwrap()
+        assessment::undamaged_state(&baseline, &parts.map(|part| (part, DRAWS)), 0.05).unwrap()
     };
     assert_eq!(state([&healthy, &later]).doubts, Vec::<String>::new());
     let doubts = state([&healthy, &damaged]).doubts;
     assert!(doubts.iter().any(|d| d.starts_with("k2: its batches differ")), "{doubts:?}");
-    let small = assess::undamaged_state(&baseline, &[(&healthy[..9], DRAWS)], 0.05).unwrap_err();
+    let small = assessment::undamaged_state(&baseline, &[(&healthy[..9], DRAWS)], 0.05).unwrap_err();
     assert!(small.to_string().contains("at least 10"), "{small}");
     // More measurements determine the threshold more accurately.
     let width = |count: usize| {

@@ -1,9 +1,9 @@
 //! Batches that the simulation can produce, and batches that it cannot.
 
+use modalwatch::assessment::{self, BatchSamples, Draws};
 use modalwatch::measurement::ModalMeasurement;
-use modalwatch::monitor::assess::{self, BatchSamples, Draws};
 use modalwatch::quantity::Hertz;
-use modalwatch::trust::{Code, Trust};
+use modalwatch::trust::{FindingCode, Trust};
 
 use super::population::{batch, TABLE_2};
 use super::shipped;
@@ -15,7 +15,7 @@ const RIG: [(f64, f64); 2] = [(0.0475, 0.004), (0.0475, 0.004)];
 const DRAWS: Draws = Draws { per_measurement: 10, for_population: 10, seed: 5 };
 
 fn draw(id: &str, measured: &[ModalMeasurement]) -> BatchSamples {
-    assess::draw(&shipped(id), measured, None, DRAWS).unwrap()
+    assessment::draw(&shipped(id), measured, None, DRAWS).unwrap()
 }
 
 fn moments(id: &str) -> &'static [(f64, f64)] {
@@ -45,7 +45,7 @@ fn healthy_batches_are_rejected_at_the_nominal_rate() {
 }
 
 fn draw_with(baseline: &modalwatch::baseline::Baseline, measured: &[ModalMeasurement]) -> BatchSamples {
-    assess::draw(baseline, measured, None, DRAWS).unwrap()
+    assessment::draw(baseline, measured, None, DRAWS).unwrap()
 }
 
 fn changed(measured: &[ModalMeasurement], change: impl Fn(usize, f64) -> f64) -> Vec<ModalMeasurement> {
@@ -65,19 +65,20 @@ fn units_and_swapped_modes_are_rejected_and_rightly_named() {
         let (mut radians, mut kilohertz, mut swapped) = (0, 0, 0);
         for seed in 0..repetitions {
             let measured = batch(&baseline, moments(id), 10, 1.0, seed);
-            let named = |measured: Vec<ModalMeasurement>, code: Code, word: &str| {
+            let named = |measured: Vec<ModalMeasurement>, code: FindingCode, word: &str| {
                 let samples = draw(id, &measured);
                 let trust = Trust::new(&samples.fit, samples.findings.clone());
                 let found = trust.findings.iter().any(|f| f.code == code && f.message.contains(word));
                 usize::from(found && !trust.accepted())
             };
-            radians += named(changed(&measured, |_, f| f * 2.0 * std::f64::consts::PI), Code::UnitSuspected, "rad/s");
-            kilohertz += named(changed(&measured, |_, f| f / 1_000.0), Code::UnitSuspected, "kHz");
+            radians +=
+                named(changed(&measured, |_, f| f * 2.0 * std::f64::consts::PI), FindingCode::UnitSuspected, "rad/s");
+            kilohertz += named(changed(&measured, |_, f| f / 1_000.0), FindingCode::UnitSuspected, "kHz");
             let mut other = measured.clone();
             for m in &mut other {
                 m.frequencies_hz.swap(1, 2);
             }
-            swapped += named(other, Code::ModesSwapped, "swapped");
+            swapped += named(other, FindingCode::ModesSwapped, "swapped");
         }
         println!("{id}, of {repetitions}: rad/s named {radians}, kHz {kilohertz}, swapped modes {swapped}");
         for found in [radians, kilohertz, swapped] {
@@ -112,7 +113,7 @@ fn three_per_cent_in_one_mode_of_the_rig_are_noticed_where_the_links_cannot_abso
 fn three_dof_says_that_it_cannot_test_and_rejects_what_leaves_the_prior() {
     let baseline = shipped("three-dof");
     let healthy = draw("three-dof", &batch(&baseline, &TABLE_2, 10, 1.0, 1));
-    assert!(healthy.findings.iter().any(|f| f.code == Code::FitNotTestable), "{:?}", healthy.findings);
+    assert!(healthy.findings.iter().any(|f| f.code == FindingCode::FitNotTestable), "{:?}", healthy.findings);
     assert_eq!(healthy.fit.p_value, None);
     let beyond = draw("three-dof", &batch(&baseline, &[(2.4, 0.1), (5.0, 0.1), (6.0, 0.2)], 10, 1.0, 1));
     assert!(beyond.fit.rejected(), "{:?}", beyond.findings);

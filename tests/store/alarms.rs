@@ -2,9 +2,8 @@
 
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
-use modalwatch::store::{
-    Acknowledgement, Episode, EventFilter, MaintenanceWindow, NewChartPoint, Secret, Store, WebhookRecord,
-};
+use modalwatch::assessment::NewChartPoint;
+use modalwatch::store::{Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
 

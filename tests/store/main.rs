@@ -14,7 +14,7 @@ use modalwatch::damage::{ChartReference, Damage, Hyperparameters, QuantityAssess
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
 use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
-use modalwatch::trust::{Code, Effect, Finding, Trust};
+use modalwatch::trust::{Finding, FindingCode, FindingEffect, Trust};
 
 fn bridge() -> StructureId {
     StructureId::parse("bridge").unwrap()
@@ -59,7 +59,7 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
         relative_change: -0.1,
         relative_change_interval: Some([-0.12, -0.08]),
     };
-    let finding = Finding::new(Code::Outlier, Effect::Note, "one of them").of(vec![2]);
+    let finding = Finding::new(FindingCode::Outlier, FindingEffect::Note, "one of them").of(vec![2]);
     let quantity = |name: &str| QuantityAssessment {
         name: name.to_owned(),
         unit: "N/m".to_owned(),
@@ -69,7 +69,7 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
         std: Some(0.3),
         std_interval: Some([0.2, 0.5]),
         pooled: Hyperparameters { mean: 3.61, std: Some(0.31), within: 0.01, between: Some(0.08) },
-        edge_mass: 0.02,
+        prior_bound_mass: 0.02,
         group: Some("group:k1+k2".to_owned()),
         damage: undamaged_version.map(|_| damage.clone()),
     };

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use modalwatch::damage::QuantityKind;
 use modalwatch::store::{Extent, SeriesWindow};
-use modalwatch::trust::{Code, Verdict};
+use modalwatch::trust::{FindingCode, TrustVerdict};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, Connection as _};
 
@@ -137,11 +137,11 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
         assert_eq!(alarming, ["b077777"], "{}", chart.chart);
     }
 
-    let rejected: Vec<_> = trust.rows.iter().filter(|row| row.tag.verdict == Verdict::Rejected).collect();
+    let rejected: Vec<_> = trust.rows.iter().filter(|row| row.tag.verdict == TrustVerdict::Rejected).collect();
     assert_eq!(rejected.len(), 1);
     assert_eq!(
         (rejected[0].tag.batch.as_str(), rejected[0].tag.findings.as_slice()),
-        ("b012345", &[Code::Outlier][..])
+        ("b012345", &[FindingCode::Outlier][..])
     );
 
     let started = Instant::now();
@@ -199,7 +199,7 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
         assert!(row.values[1].is_nan(), "compared with nothing under the new model: {row:?}");
     }
     assert_eq!(trust.rows.len(), 1);
-    assert_eq!(trust.rows[0].tag.findings, [Code::Outlier]);
+    assert_eq!(trust.rows[0].tag.findings, [FindingCode::Outlier]);
 }
 
 #[tokio::test]
@@ -210,7 +210,7 @@ async fn the_column_for_plots_says_what_the_rows_say() {
         store.batches().insert_batch(&batch(&id, 1_000 * i, 2), &id, at(0)).await.unwrap();
         let mut given = assessment(["m1", "m2"][i as usize % 2], (i % 3 > 0).then_some(1), at(i));
         if i % 7 == 0 {
-            given.trust.verdict = Verdict::Rejected;
+            given.trust.verdict = TrustVerdict::Rejected;
             given.trust.p_value = None;
         }
         for (position, quantity) in given.quantities.iter_mut().enumerate() {

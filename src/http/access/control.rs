@@ -14,7 +14,7 @@ use crate::access::{
 };
 use crate::http::error::ApiError;
 use crate::http::settings::HttpSettings;
-use crate::monitor::upkeep::Reason;
+use crate::monitor::Reason;
 use crate::quantity::Timestamp;
 use crate::store::{self, Store};
 

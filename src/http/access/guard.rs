@@ -12,7 +12,7 @@ use super::control::AccessControl;
 use super::{journal, route};
 use crate::access::{allow, token_like, About, Denied, Grant, Need};
 use crate::http::error::ApiError;
-use crate::store::NewAuditEntry;
+use crate::monitor::stored::NewAuditEntry;
 
 /// Middleware around every handler.
 pub async fn guard(State(access): State<AccessControl>, mut request: Request, next: Next) -> Response {

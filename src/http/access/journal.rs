@@ -12,8 +12,8 @@ use super::control::AccessControl;
 use crate::access::Grant;
 use crate::http::error::ApiError;
 use crate::http::request_id::{current_id, with_current_id};
+use crate::monitor::stored::NewAuditEntry;
 use crate::quantity::Timestamp;
-use crate::store::NewAuditEntry;
 
 /// Maximum length of a stored path, characters.
 const LONGEST_SUBJECT: usize = 300;

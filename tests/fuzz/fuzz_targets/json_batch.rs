@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 use libfuzzer_sys::fuzz_target;
 use modalwatch::baseline::library::find_structure;
 use modalwatch::measurement::body::RawBatch;
-use modalwatch::measurement::check::{check_idempotency_key, check_measurements, check_source, Expectation};
+use modalwatch::measurement::check::{check_idempotency_key, check_measurements, check_source};
 use modalwatch::measurement::MeasurementBatch;
 use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::Simulator;
@@ -24,15 +24,7 @@ fn checked(raw: RawBatch) -> Option<MeasurementBatch> {
     if let Some(key) = &raw.idempotency_key {
         check_idempotency_key(key).ok()?;
     }
-    let expectation = Expectation {
-        modes: s.modes(),
-        frequency_limits_hz: s.frequency_limits_hz(),
-        covariates: s.covariates(),
-        instrumented: s.instrumented_points(),
-        space: s.space(),
-        now: Timestamp::from_micros(1_800_000_000_000_000).unwrap(),
-        max_measurements: 5_000,
-    };
+    let expectation = s.expectation(Timestamp::from_micros(1_800_000_000_000_000).unwrap(), 5_000);
     let measurements = match check_measurements(raw.measurements, &expectation) {
         Ok(measurements) => measurements,
         Err(problems) => {

@@ -1,121 +1,87 @@
-//! What a batch says, drawn again: the densities of its parameters, and what they predict for each mode.
+//! The densities of the parameters of a batch, and the frequencies that they predict for each mode.
 
-use std::sync::Arc;
-
-use super::assess::{self, BatchSamples};
-use super::{baseline_of, Error, Monitor};
-use crate::assessment::BatchState;
+use super::samples::{BatchSamples, Error};
 use crate::baseline::Baseline;
 use crate::damage::UndamagedState;
 use crate::measurement::ModalMeasurement;
 use crate::parameter::Parameter;
 use crate::plot::density;
-use crate::quantity::{Digest, Hertz, StructureId};
+use crate::quantity::{Digest, Hertz};
 use crate::stats;
-use crate::store::BatchRecord;
 
-/// Measured values shown of each mode, evenly chosen from the batch.
+/// Measured values shown for each mode, evenly spaced in the batch.
 const SHOWN_MEASUREMENTS: usize = 200;
 
-/// Simulations behind a prediction.
+/// Posterior samples that are simulated for a prediction.
 const SIMULATIONS: usize = 1_000;
 
-/// Places over the whole prior, and over the part of it where the densities are.
-const PLACES: [usize; 2] = [60, 140];
+/// Grid points over the whole prior, and over the part of it where the densities are concentrated.
+const GRID_POINTS: [usize; 2] = [60, 140];
 
-/// Margin about the prior, as a share of its width.
+/// Margin on each side of the prior, as a share of its width.
 const MARGIN: f64 = 0.05;
 
-/// Standard deviations about a mean beyond which a density is not drawn finely.
+/// Standard deviations about a mean within which the grid is fine.
 const REACH: f64 = 4.5;
 
-/// The densities of the parameters of a batch and what they predict.
+/// The densities of the parameters of a batch, and the frequencies that they predict.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BatchDetail {
-    /// The trained baseline in use, which drew it.
+    /// Digest of the trained baseline that drew the samples.
     pub model_digest: Digest,
     /// Measurements of the batch.
     pub measurements: usize,
     /// Those whose values are shown.
     pub shown: usize,
-    /// Posterior samples that were sent through the simulation.
+    /// Posterior samples that were simulated.
     pub simulations: usize,
-    /// One entry a parameter.
+    /// One entry for each parameter.
     pub parameters: Vec<ParameterDetail>,
-    /// One entry a mode.
+    /// One entry for each mode.
     pub modes: Vec<ModeDetail>,
 }
 
-/// Densities of one parameter, all on the same places.
+/// Densities of one parameter, all on the same grid, in 1/unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterDetail {
     /// Its name.
     pub name: String,
     /// Its unit.
     pub unit: String,
-    /// Places, ascending; closer where the densities are.
+    /// Grid points in the unit of the parameter, ascending; closer together where the densities are concentrated.
     pub grid: Vec<f64>,
-    /// The uniform prior.
+    /// Density of the uniform prior.
     pub prior: Vec<f64>,
-    /// The pooled samples of the batch.
+    /// Density of the pooled posterior samples of the batch.
     pub posterior: Vec<f64>,
-    /// The population behind the undamaged state.
+    /// Normal density of the population behind the undamaged reference.
     pub undamaged: Option<Vec<f64>>,
-    /// δ.
+    /// Damage threshold δ, in the unit of the parameter.
     pub threshold: Option<f64>,
 }
 
-/// A mode: measured, and predicted by the posterior samples, without noise.
+/// Frequencies of one mode: measured, and predicted by the posterior samples without noise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModeDetail {
-    /// Values of the measurements shown, Hz.
+    /// Frequencies of the measurements shown, Hz.
     pub measured_hz: Vec<Option<Hertz>>,
     /// Mean of the predicted frequencies, Hz.
     pub predicted_mean_hz: f64,
-    /// 5 % and 95 % of the predicted frequencies lie below, Hz.
+    /// 5 % and 95 % quantiles of the predicted frequencies, Hz.
     pub predicted_interval_hz: [f64; 2],
 }
 
-impl Monitor {
-    /// The detail of an assessed batch, by the samples of its assessment.
-    ///
-    /// # Errors
-    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::NoModel`], [`Error::NotAssessed`],
-    /// [`Error::QueueFull`].
-    pub async fn batch_detail(&self, structure: &StructureId, batch_id: &str) -> Result<BatchDetail, Error> {
-        let watched = self.structure(structure)?;
-        let record = self.stored(structure, batch_id).await?;
-        let baseline = baseline_of(structure, &watched)?;
-        let not_assessed = |reason: String| Error::NotAssessed { batch: batch_id.to_owned(), reason };
-        match record.state {
-            BatchState::Assessed => {}
-            BatchState::Received => return Err(not_assessed("it waits for its turn".to_owned())),
-            BatchState::Failed => return Err(not_assessed(record.failure.unwrap_or_default())),
-        }
-        let place = self.compute.reserve()?;
-        let draws = self.draws(&baseline, &record);
-        let (source, from) = (&record.batch.source, record.batch.time_span().0);
-        let previous = self.store.batches().frequencies_before(structure, source, from).await?;
-        let undamaged = self.store.reference().undamaged(structure).await?;
-        let undamaged = undamaged.filter(|u| u.model_digest == *baseline.digest());
-        let drawn = Arc::clone(&baseline);
-        let work = move || {
-            let BatchRecord { batch, .. } = record;
-            let samples = assess::draw(&drawn, &batch.measurements, previous.as_deref(), draws)?;
-            detail(&drawn, &batch.measurements, &samples, draws.per_measurement, undamaged.as_ref().map(|u| &u.state))
-        };
-        let done = place.run(work).await.map_err(|_| Error::Panicked)?;
-        done.map_err(|error| not_assessed(error.to_string()))
-    }
-}
-
-fn detail(
+/// The detail of a batch by the samples of its assessment; the pool has `per_measurement` samples of each measurement.
+///
+/// # Errors
+/// [`Error::Simulation`] when the simulation fails inside the prior.
+pub fn detail(
     baseline: &Baseline,
     measurements: &[ModalMeasurement],
     samples: &BatchSamples,
     per_measurement: usize,
     undamaged: Option<&UndamagedState>,
-) -> Result<BatchDetail, assess::Error> {
+) -> Result<BatchDetail, Error> {
     let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
     let parameter = |(column, parameter): (usize, &Parameter)| {
         let state = undamaged.and_then(|state| state.quantities.iter().find(|q| q.name == parameter.name));
@@ -128,7 +94,7 @@ fn detail(
             name: parameter.name.clone(),
             unit: parameter.unit.clone(),
             prior: grid.iter().map(inside).collect(),
-            // Samples without a spread have no density that could be drawn.
+            // Samples that are all equal have no density.
             posterior: density::kernel_at(&pool, &grid).unwrap_or_else(|| vec![0.0; grid.len()]),
             undamaged: population.map(|(mean, std)| grid.iter().map(|x| density::normal(*x, mean, std)).collect()),
             threshold: state.and_then(|q| q.threshold),
@@ -160,7 +126,7 @@ fn detail(
     })
 }
 
-/// Places over the prior with its edges, closer together where the samples and the undamaged population are.
+/// Grid points over the prior and at its bounds, closer together where the samples and the undamaged population are.
 fn grid(parameter: &Parameter, pool: &[f64], population: Option<(f64, f64)>) -> Vec<f64> {
     let width = parameter.upper - parameter.lower;
     let (low, high) = (parameter.lower - MARGIN * width, parameter.upper + MARGIN * width);
@@ -170,16 +136,16 @@ fn grid(parameter: &Parameter, pool: &[f64], population: Option<(f64, f64)>) -> 
     let to = reach().map(|(mean, std)| mean + REACH * std).fold(low, f64::max).min(high);
     let spread =
         |from: f64, to: f64, count: usize| (0..count).map(move |i| from + (to - from) * i as f64 / (count - 1) as f64);
-    let mut places: Vec<f64> = spread(low, high, PLACES[0]).chain([parameter.lower, parameter.upper]).collect();
+    let mut points: Vec<f64> = spread(low, high, GRID_POINTS[0]).chain([parameter.lower, parameter.upper]).collect();
     if from < to {
-        places.extend(spread(from, to, PLACES[1]));
+        points.extend(spread(from, to, GRID_POINTS[1]));
     }
-    places.sort_by(f64::total_cmp);
-    places.dedup();
-    places
+    points.sort_by(f64::total_cmp);
+    points.dedup();
+    points
 }
 
-/// At most `most` of `count` indices, evenly.
+/// At most `most` of `count` indices, evenly spaced.
 fn evenly(count: usize, most: usize) -> Vec<usize> {
     let taken = count.min(most);
     (0..taken).map(|i| i * count / taken).collect()

@@ -6,15 +6,15 @@ use crate::damage::QuantityAssessment;
 use crate::quantity::{Digest, Timestamp};
 use crate::trust::Trust;
 
-/// How far a stored batch has come.
+/// How far the processing of a stored batch has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum BatchState {
-    /// On disk, not assessed yet: it waits for its turn or for a trained baseline.
+    /// Stored but not yet assessed: it waits in the queue or for a trained baseline.
     Received,
-    /// Assessed; see its newest assessment for the undamaged state it was compared with.
+    /// Assessed; its newest assessment says which undamaged reference it was compared with.
     Assessed,
-    /// The assessment failed; the reason is stored and the batch kept.
+    /// The assessment failed; the reason is stored and the batch is kept.
     Failed,
 }
 
@@ -29,31 +29,32 @@ impl BatchState {
     }
 }
 
-/// What one batch says of the structure: a pure function of data, trained baseline, undamaged state and seed.
+/// What one batch says about the structure: a pure function of data, trained baseline, undamaged reference and seed.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Assessment {
-    /// Digest of the trained baseline that gave it.
+    /// Digest of the trained baseline that was used.
     pub model_digest: Digest,
-    /// Digest of the structure it was trained for.
+    /// Digest of the structure that this baseline was trained for.
     pub structure_digest: Digest,
-    /// Version of the undamaged state compared with; `None` when there was none or the batch is part of it.
+    /// Version of the undamaged reference that the batch was compared with; `None` when there was none or when the batch is part
+    /// of it.
     pub undamaged_version: Option<u32>,
-    /// Seed of the draws.
+    /// Seed of the random draws.
     pub seed: u64,
     /// Posterior samples drawn for each measurement.
     pub draws_per_measurement: usize,
-    /// Measurements that the estimate rests on.
+    /// Measurements that the estimate is based on.
     pub measurements_used: usize,
     /// Measurements left out; the findings say which and why.
     pub measurements_left_out: usize,
-    /// Of those used, measurements that no point of the prior box gives; they count as the nearest point of the box.
+    /// Number of used measurements that no point of the prior box reproduces; each is replaced by the nearest point of the box.
     pub measurements_outside: usize,
     /// Mean number of effective samples that a measurement contributes to the hyperparameters.
     pub effective_sample_size: f64,
-    /// For each mode, 100·(mean measured − simulated)/mean measured, simulated at the mean of all posterior samples: what
-    /// the simulation cannot reproduce, in per cent; `None` for a mode that no measurement has.
+    /// For each mode, 100·(mean measured − simulated)/mean measured, per cent, simulated at the mean of all posterior samples: the
+    /// part that the simulation cannot reproduce. `None` for a mode that no measurement has.
     pub misfit_percent: Vec<Option<f64>>,
-    /// How far it can be believed.
+    /// How far the assessment can be trusted.
     pub trust: Trust,
     /// When it was computed.
     pub assessed_at: Timestamp,

@@ -1,5 +1,5 @@
-//! The way of one stored batch: computed off the async threads, stored, told; and again where its baseline or undamaged state
-//! became another meanwhile.
+//! The processing of one stored batch: its assessment is computed away from the async threads and stored; and again where its
+//! trained baseline or undamaged reference changed meanwhile.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -7,18 +7,21 @@ use std::time::Instant;
 
 use tracing::{info, info_span, warn, Instrument as _};
 
-use super::assess::{self, Context, Draws};
-use super::compute::Place;
-use super::{baseline_of, charts, Error, Monitor, Watched};
-use crate::assessment::{Assessment, BatchState};
+use super::alarms::Alarms;
+use super::compute::{Compute, Place};
+use super::error::Error;
+use super::events::Events;
+use super::settings::MonitorSettings;
+use super::structures::{ActiveStructure, ActiveStructures};
+use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, KnownLimits, NewChartPoint};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedState;
-use crate::quantity::{Hertz, StructureId};
-use crate::store::{BatchRecord, NewChartPoint, StoredAssessment, StoredChartPoint, UndamagedRecord};
+use crate::quantity::{shown, Hertz, StructureId, Timestamp};
+use crate::store::{BatchRecord, Store, StoredAssessment, StoredChartPoint, UndamagedRecord};
 
-/// A batch on its way, and what it is assessed with.
+/// A batch to assess, and what it is assessed with.
 pub(super) struct Task {
-    watched: Arc<Watched>,
+    active: Arc<ActiveStructure>,
     baseline: Arc<Baseline>,
     record: Arc<BatchRecord>,
     /// Frequencies of the measurement before it, of the same source.
@@ -26,10 +29,10 @@ pub(super) struct Task {
     place: Place,
 }
 
-/// A batch that was computed, and under which undamaged state.
+/// A batch whose assessment was computed.
 pub(super) struct Computed {
     task: Task,
-    /// Newest version of the undamaged state then, 0 where there was none.
+    /// Newest version of the undamaged reference at that time, 0 where there was none.
     newest_undamaged: u32,
     seconds: f64,
     /// The assessment with its points on the charts, or why there is none.
@@ -51,68 +54,92 @@ enum Outcome {
     OfAnotherVersion,
 }
 
+/// The final result of a batch.
+pub(super) enum Finished {
+    /// The assessment as it was stored, with the points of the batch on the charts.
+    Assessed(Box<Assessment>, Vec<StoredChartPoint>),
+    /// The assessment failed, and the reason was stored.
+    Failed,
+    /// Nothing was stored: the batch waits for an assessment under the present version of its structure.
+    OfAnotherVersion,
+}
+
 /// A stored result.
 pub(super) enum Settled {
-    /// It stands: the assessment as it was stored, with the points of the batch on the charts.
-    Stands(Box<Assessment>, Vec<StoredChartPoint>),
-    /// There is none, or not yet.
-    Without,
-    /// Its baseline or undamaged state became another meanwhile.
-    GoOn(Task),
+    /// It is final.
+    Finished(Finished),
+    /// The trained baseline or the undamaged reference changed meanwhile: the batch has to be assessed again.
+    Again(Task),
 }
 
 impl Task {
     /// The task of a stored batch; `previous` are the frequencies of the measurement before it, of the same source.
     pub(super) fn new(
-        watched: Arc<Watched>,
+        active: Arc<ActiveStructure>,
         record: BatchRecord,
         previous: Option<Vec<Option<Hertz>>>,
         place: Place,
     ) -> Result<Self, Error> {
-        let baseline = baseline_of(&record.batch.structure, &watched)?;
-        Ok(Self { watched, baseline, record: Arc::new(record), previous: Arc::new(previous), place })
+        let baseline = active.trained_baseline()?;
+        Ok(Self { active, baseline, record: Arc::new(record), previous: Arc::new(previous), place })
     }
 
-    /// Whether the batch is compared with an undamaged state: one that was taken with its baseline and without the batch.
+    /// Whether the batch is compared with an undamaged reference: one made with the same trained baseline and without the batch.
     fn is_comparable(&self, undamaged: &UndamagedRecord) -> bool {
         undamaged.model_digest == *self.baseline.digest() && !undamaged.batches.contains(&self.record.batch_id)
     }
 }
 
-impl Monitor {
-    /// Goes on with a task until its result stands: the assessment with the points of the batch on the charts, as they were
-    /// stored; `None` where the reason why there is none was.
-    pub(super) async fn finish(&self, task: Task) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
+/// Assesses stored batches.
+pub(super) struct Assessor {
+    pub(super) store: Store,
+    pub(super) structures: Arc<ActiveStructures>,
+    pub(super) compute: Compute,
+    pub(super) known_limits: Arc<KnownLimits>,
+    pub(super) alarms: Arc<Alarms>,
+    pub(super) events: Events,
+    pub(super) settings: MonitorSettings,
+}
+
+impl Assessor {
+    /// A stored batch.
+    pub(super) async fn stored(&self, structure: &StructureId, batch_id: &str) -> Result<BatchRecord, Error> {
+        let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: shown(batch_id) };
+        self.store.batches().batch(structure, batch_id).await?.ok_or_else(unknown)
+    }
+
+    /// The task of a stored batch.
+    pub(super) async fn task(
+        &self,
+        active: Arc<ActiveStructure>,
+        record: BatchRecord,
+        place: Place,
+    ) -> Result<Task, Error> {
+        let (batch, (from, _)) = (&record.batch, record.batch.time_span());
+        let previous = self.store.batches().frequencies_before(&batch.structure, &batch.source, from).await?;
+        Task::new(active, record, previous, place)
+    }
+
+    /// Processes a task until its result is final.
+    pub(super) async fn finish(&self, task: Task) -> Result<Finished, Error> {
         let computed = self.compute(task).await?;
         self.finish_computed(computed).await
     }
 
     /// The rest of [`Self::finish`].
-    pub(super) async fn finish_computed(
-        &self,
-        computed: Computed,
-    ) -> Result<Option<(Assessment, Vec<StoredChartPoint>)>, Error> {
-        let mut computed = computed;
+    pub(super) async fn finish_computed(&self, mut computed: Computed) -> Result<Finished, Error> {
         loop {
             let stored = self.store_computed(computed).await?;
             computed = match self.settle(stored).await? {
-                Settled::GoOn(task) => self.compute(task).await?,
-                Settled::Stands(assessment, charts) => return Ok(Some((*assessment, charts))),
-                Settled::Without => return Ok(None),
+                Settled::Again(task) => self.compute(task).await?,
+                Settled::Finished(finished) => return Ok(finished),
             };
         }
     }
 
-    /// The task of a stored batch.
-    pub(super) async fn task(&self, watched: Arc<Watched>, record: BatchRecord, place: Place) -> Result<Task, Error> {
-        let (batch, (from, _)) = (&record.batch, record.batch.time_span());
-        let previous = self.store.batches().frequencies_before(&batch.structure, &batch.source, from).await?;
-        Task::new(watched, record, previous, place)
-    }
-
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
-        // Where it is not the newest any more, the batch is computed again (`settle`).
+        // If a newer reference is stored meanwhile, the batch is assessed again (`settle`).
         let undamaged = self.store.reference().undamaged_as_read(&task.record.batch.structure).await?;
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
@@ -124,9 +151,10 @@ impl Monitor {
         let work = move || {
             let undamaged: Option<&UndamagedState> = undamaged.as_deref().map(|record| &record.state);
             let context = Context { undamaged, previous: previous.as_deref() };
-            let assessment = assess::assess(&baseline, &record.batch.measurements, context, draws)?;
-            let points = charts::points(&baseline, &assessment, undamaged, &settings, &known);
-            Ok::<_, assess::Error>((assessment, points))
+            let measurements = &record.batch.measurements;
+            let assessment = assessment::assess(&baseline, measurements, context, draws, Timestamp::now())?;
+            let points = chart_points(&baseline, &assessment, undamaged, &settings, &known);
+            Ok::<_, assessment::Error>((assessment, points))
         };
         let (structure, batch) = (task.record.batch.structure.as_str(), &task.record.batch_id);
         let trace = info_span!(target: "modalwatch::spans", "assess", structure.id = structure, batch.id = batch);
@@ -138,22 +166,22 @@ impl Monitor {
         Ok(Computed { task, newest_undamaged, seconds: started.elapsed().as_secs_f64(), outcome })
     }
 
-    /// Stores what was computed. It is queued at once: results are stored in the order of the calls, also where the ends are
-    /// waited for later.
+    /// Stores what was computed. The write is queued at once, so that results are stored in the order of the calls even when their
+    /// futures are awaited later.
     pub(super) fn store_computed(&self, computed: Computed) -> impl Future<Output = Result<Stored, Error>> + Send {
         let Computed { task, newest_undamaged, seconds, outcome } = computed;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let stored = match outcome {
             Ok((assessment, points)) => {
                 metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
-                report(structure, id, &assessment, seconds);
+                log_assessment(structure, id, &assessment, seconds);
                 let insert = self.store.assessments().insert_assessment(structure, id, &assessment, points);
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {
                 metrics::counter!("modalwatch_assessments_failed_total").increment(1);
                 warn!(structure.id = %structure, batch.id = %id, "Could not assess batch {id} of {structure}: {reason}");
-                let version = task.watched.simulator.digest();
+                let version = task.active.simulator.digest();
                 Err(self.store.batches().mark_failed(structure, id, version, &reason))
             }
         };
@@ -178,50 +206,47 @@ impl Monitor {
         }
     }
 
-    /// Tells of a stored result; whether it stands.
+    /// Publishes a stored result, and decides whether it is final.
     pub(super) async fn settle(&self, stored: Stored) -> Result<Settled, Error> {
         let Stored { mut task, newest_undamaged, outcome } = stored;
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let (assessment, stored) = match outcome {
             Outcome::Assessed(assessment, stored) => (assessment, stored),
             Outcome::Failed => {
-                self.tell_batch(structure, id, BatchState::Failed);
-                return Ok(Settled::Without);
+                self.events.batch_changed(structure, id, BatchState::Failed);
+                return Ok(Settled::Finished(Finished::Failed));
             }
-            Outcome::OfAnotherVersion => {
-                // The batch waits for an assessment under the present version.
-                self.resume_later(structure.clone());
-                return Ok(Settled::Without);
-            }
+            Outcome::OfAnotherVersion => return Ok(Settled::Finished(Finished::OfAnotherVersion)),
         };
-        self.tell_batch(structure, id, BatchState::Assessed);
+        self.events.batch_changed(structure, id, BatchState::Assessed);
         if stored.alarms_changed {
-            self.report_episodes(structure).await;
+            self.alarms.report(structure).await;
         }
-        if let Some(newer) = self.swapped_since(&task.watched, &task.baseline) {
+        if let Some(newer) = self.swapped_since(&task.active, &task.baseline) {
             task.baseline = newer;
-            return Ok(Settled::GoOn(task));
+            return Ok(Settled::Again(task));
         }
-        // A state declared while this was computed did not find the batch assessed, and so did not send it back: it is
-        // compared now.
+        // A reference declared while this was computed did not find the batch assessed and so did not reset it: it is compared
+        // with that reference now.
         if stored.newest_undamaged != newest_undamaged {
             let present =
                 self.store.reference().undamaged(structure).await?.filter(|record| task.is_comparable(record));
             if present.map(|record| record.state.version) != assessment.undamaged_version {
-                return Ok(Settled::GoOn(task));
+                return Ok(Settled::Again(task));
             }
         }
-        Ok(Settled::Stands(assessment, stored.charts))
+        Ok(Settled::Finished(Finished::Assessed(assessment, stored.charts)))
     }
 
-    /// The baseline that took the place of another for the same version of the structure: a batch that was begun with the old
-    /// one would be compared with nothing.
-    fn swapped_since(&self, watched: &Watched, used: &Baseline) -> Option<Arc<Baseline>> {
-        let present = self.structure(watched.simulator.id()).ok()?;
+    /// The trained baseline that replaced `used` for the same version of the structure: a batch assessed with the old one could not
+    /// be compared with the reference.
+    fn swapped_since(&self, active: &ActiveStructure, used: &Baseline) -> Option<Arc<Baseline>> {
+        let present = self.structures.get(active.simulator.id()).ok()?;
         let newer = present.baseline.as_ref().ok().filter(|baseline| baseline.digest() != used.digest())?;
-        (present.simulator.digest() == watched.simulator.digest()).then(|| Arc::clone(newer))
+        (present.simulator.digest() == active.simulator.digest()).then(|| Arc::clone(newer))
     }
 
+    /// Numbers of samples and seed for a batch.
     pub(super) fn draws(&self, baseline: &Baseline, record: &BatchRecord) -> Draws {
         Draws {
             per_measurement: self.settings.draws_per_measurement,
@@ -231,7 +256,7 @@ impl Monitor {
     }
 }
 
-fn report(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
+fn log_assessment(structure: &StructureId, batch_id: &str, assessment: &Assessment, seconds: f64) {
     metrics::counter!("modalwatch_assessments_total").increment(1);
     let exceeding = assessment.quantities.iter().filter(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
     let exceeding: Vec<&str> = exceeding.map(|q| q.name.as_str()).collect();

@@ -1,0 +1,79 @@
+//! Environmental and operational conditions: the covariates of a batch against those of the undamaged reference.
+
+use std::collections::BTreeMap;
+
+use crate::damage::SeenCovariate;
+use crate::measurement::{CovariateValue, ModalMeasurement};
+use crate::trust::{Finding, FindingCode, FindingEffect};
+
+/// The range or the categories of each covariate over some measurements.
+pub(super) fn conditions<'a>(
+    measurements: impl Iterator<Item = &'a ModalMeasurement>,
+) -> BTreeMap<String, SeenCovariate> {
+    let mut seen = BTreeMap::<String, SeenCovariate>::new();
+    for (name, value) in measurements.flat_map(|m| &m.covariates) {
+        match value {
+            CovariateValue::Number(x) => {
+                let entry = seen.entry(name.clone()).or_insert(SeenCovariate::Range([*x, *x]));
+                if let SeenCovariate::Range([low, high]) = entry {
+                    (*low, *high) = (low.min(*x), high.max(*x));
+                }
+            }
+            CovariateValue::Category(c) => {
+                let entry = seen.entry(name.clone()).or_insert_with(|| SeenCovariate::Categories([c.clone()].into()));
+                if let SeenCovariate::Categories(all) = entry {
+                    all.insert(c.clone());
+                }
+            }
+        }
+    }
+    seen
+}
+
+/// Findings about covariates of a batch that lie outside those of the undamaged reference, and then about missing ones.
+pub(super) fn compare_conditions(
+    measurements: &[ModalMeasurement],
+    seen: &BTreeMap<String, SeenCovariate>,
+) -> impl Iterator<Item = Finding> {
+    let (mut outside, mut missing) = (Vec::new(), Vec::new());
+    for (name, seen) in seen {
+        let mut example: Option<String> = None;
+        let (mut rows, mut lacking) = (Vec::new(), 0);
+        for (index, measurement) in measurements.iter().enumerate() {
+            let Some(value) = measurement.covariates.get(name) else {
+                lacking += 1;
+                continue;
+            };
+            if let Some(difference) = difference(name, value, seen) {
+                rows.push(index);
+                example.get_or_insert(difference);
+            }
+        }
+        if let Some(example) = example {
+            let message = format!(
+                "conditions outside those of the undamaged reference ({example}): they alone may explain a change, so this batch \
+                 raises no alarm"
+            );
+            outside.push(Finding::new(FindingCode::Extrapolated, FindingEffect::HoldAlarm, message).of(rows));
+        }
+        if lacking > 0 {
+            let message = format!(
+                "{lacking} measurements lack {name}, which the undamaged reference has: this batch raises no alarm"
+            );
+            missing.push(Finding::new(FindingCode::CovariateMissing, FindingEffect::HoldAlarm, message));
+        }
+    }
+    outside.into_iter().chain(missing)
+}
+
+/// A value outside what the reference has, in words.
+fn difference(name: &str, value: &CovariateValue, seen: &SeenCovariate) -> Option<String> {
+    match (value, seen) {
+        (CovariateValue::Number(x), SeenCovariate::Range([low, high])) => {
+            (!(low..=high).contains(&x)).then(|| format!("{name} = {x}, reference {low} to {high}"))
+        }
+        (CovariateValue::Category(c), SeenCovariate::Categories(all)) => (!all.contains(c))
+            .then(|| format!("{name} = {c}, reference {}", all.iter().cloned().collect::<Vec<_>>().join(", "))),
+        _ => None,
+    }
+}

@@ -1,0 +1,67 @@
+//! The monitored quantities of a structure: parameters, spring stiffnesses and groups of parameters.
+
+use super::samples::BatchSamples;
+use crate::baseline::Baseline;
+use crate::damage::{QuantityKind, QuantitySamples};
+use crate::hierarchy::PopulationEstimate;
+use crate::parameter::DamageDirection;
+
+/// Samples of everything that is monitored: each parameter, the stiffness of each spring that a parameter sets through a law, and
+/// the mean of each group of parameters that the modes cannot distinguish. The pool has `per_measurement` samples of each
+/// measurement.
+pub fn monitored_quantities(
+    baseline: &Baseline,
+    samples: &BatchSamples,
+    per_measurement: usize,
+) -> Vec<QuantitySamples> {
+    let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
+    let prior_bound_mass = samples.posterior.prior_bound_mass(baseline.space());
+    let population = |column: usize| &samples.populations.parameters[column];
+    let groups = baseline.groups();
+    let group_of = |column: usize| groups.iter().find(|g| g.columns.contains(&column)).map(|g| g.name.clone());
+    let parameters = baseline.space().iter().enumerate().map(|(column, parameter)| QuantitySamples {
+        name: parameter.name.clone(),
+        unit: parameter.unit.clone(),
+        kind: QuantityKind::Parameter,
+        damage: parameter.damage,
+        pool: pooled.column(column),
+        draws: pooled.draws(),
+        population: population(column).clone(),
+        prior_bound_mass: prior_bound_mass[column],
+        group: group_of(column),
+    });
+    let springs = baseline.simulator().derived_stiffnesses().into_iter().map(|spring| {
+        let parameter = &baseline.space().as_slice()[spring.parameter];
+        let monitored = parameter.damage != DamageDirection::None;
+        QuantitySamples {
+            pool: pooled.column(spring.parameter).into_iter().map(|p| spring.value(p)).collect(),
+            population: population(spring.parameter).through(|p| spring.value(p)),
+            unit: "N/m".to_owned(),
+            kind: QuantityKind::SpringStiffness,
+            damage: if monitored { DamageDirection::Decrease } else { DamageDirection::None },
+            draws: pooled.draws(),
+            prior_bound_mass: prior_bound_mass[spring.parameter],
+            group: group_of(spring.parameter),
+            name: spring.name,
+        }
+    });
+    let of_groups = groups.iter().map(|group| {
+        let members: Vec<Vec<f64>> = group.columns.iter().map(|&column| pooled.column(column)).collect();
+        let parts: Vec<&PopulationEstimate> = group.columns.iter().map(|&column| population(column)).collect();
+        let parameter = &baseline.space().as_slice()[group.columns[0]];
+        QuantitySamples {
+            name: group.name.clone(),
+            unit: parameter.unit.clone(),
+            kind: QuantityKind::Group,
+            damage: parameter.damage,
+            pool: (0..members[0].len())
+                .map(|i| members.iter().map(|m| m[i]).sum::<f64>() / members.len() as f64)
+                .collect(),
+            draws: pooled.draws(),
+            population: PopulationEstimate::average(&parts),
+            prior_bound_mass: group.columns.iter().map(|&column| prior_bound_mass[column]).fold(0.0, f64::max),
+            group: None,
+        }
+    });
+    parameters.chain(springs).chain(of_groups).collect()
+}

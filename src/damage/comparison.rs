@@ -1,0 +1,134 @@
+//! Comparison of the quantities of a batch with the undamaged reference.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::pool::{Hyperparameters, QuantityKind, QuantitySamples};
+use super::reference::{UndamagedQuantity, UndamagedState};
+use super::threshold::{probability_of_damage, threshold};
+use crate::hierarchy::{interval, PopulationEstimate};
+use crate::parameter::DamageDirection;
+use crate::quantity::Probability;
+use crate::stats;
+
+/// Comparison of one quantity of a batch with the undamaged reference.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Damage {
+    /// Damage threshold δ, in the quantity's unit.
+    pub threshold: f64,
+    /// Probability of damage P(x beyond δ) of the population behind the batch: its posterior median.
+    pub probability_of_damage: f64,
+    /// Its 90 % credible interval, with the uncertainty of the population and of δ; `None` for one measurement.
+    pub probability_interval: Option<[f64; 2]>,
+    /// Share of the pool beyond the pool's δ (paper).
+    pub pooled_probability: f64,
+    /// True when the probability of damage exceeds p of the reference's threshold.
+    pub exceeds: bool,
+    /// (μ − μ_ud)/μ_ud.
+    pub relative_change: f64,
+    /// Its 90 % credible interval.
+    pub relative_change_interval: Option<[f64; 2]>,
+}
+
+/// The estimate of one quantity from a batch.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct QuantityAssessment {
+    /// Name of the parameter, `spring:` with the name of the spring, or `group:` with the parameters of a group.
+    pub name: String,
+    /// Unit of mean and standard deviation.
+    pub unit: String,
+    /// Its kind.
+    pub kind: QuantityKind,
+    /// Mean of the population behind the batch.
+    pub mean: f64,
+    /// Its 90 % credible interval; `None` in assessments stored by versions that did not compute it.
+    pub mean_interval: Option<[f64; 2]>,
+    /// Standard deviation of the population; `None` for one measurement, which does not determine it.
+    pub std: Option<f64>,
+    /// Its 90 % credible interval.
+    pub std_interval: Option<[f64; 2]>,
+    /// Mean and spread of the pool (paper).
+    pub pooled: Hyperparameters,
+    /// Posterior mass at the prior bounds: share of the samples within 1 % of the prior's width from a bound. Above a few per
+    /// cent the prior is too narrow or the simulation does not fit.
+    #[serde(rename = "edge_mass")]
+    pub prior_bound_mass: f64,
+    /// Group of parameters that this one cannot be distinguished from: damage is assessed for the group.
+    pub group: Option<String>,
+    /// Comparison with the undamaged reference; `None` without one, when no change of this quantity indicates damage, when the
+    /// batch is rejected, or for a parameter of a group.
+    pub damage: Option<Damage>,
+}
+
+/// Assesses each quantity, and compares it with the undamaged reference if there is one.
+pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedState>) -> Vec<QuantityAssessment> {
+    let one = |sample: &QuantitySamples| {
+        let population = &sample.population;
+        let damage = undamaged.filter(|_| sample.group.is_none()).and_then(|state| compare(sample, state));
+        QuantityAssessment {
+            name: sample.name.clone(),
+            unit: sample.unit.clone(),
+            kind: sample.kind,
+            mean: population.mean,
+            mean_interval: Some(population.mean_interval()),
+            std: population.std,
+            std_interval: population.std_interval(),
+            pooled: Hyperparameters::from_pool(&sample.pool, sample.draws),
+            prior_bound_mass: sample.prior_bound_mass,
+            group: sample.group.clone(),
+            damage,
+        }
+    };
+    samples.par_iter().map(one).collect()
+}
+
+fn compare(sample: &QuantitySamples, state: &UndamagedState) -> Option<Damage> {
+    let reference = state.quantities.iter().find(|q| q.name == sample.name)?;
+    let threshold_here = reference.threshold?;
+    let pooled_probability = probability_of_damage(&sample.pool, reference.pooled_threshold?, sample.damage)?;
+    let draws = population_probabilities(&sample.population, reference, sample.damage, state.threshold_probability);
+    let (probability, probability_interval) = match draws {
+        Some(draws) => (stats::quantile(&draws, 0.5), Some(interval(&draws))),
+        // One measurement: its posterior includes the noise, and so must δ.
+        None => (pooled_probability, None),
+    };
+    let changes: Vec<f64> = sample
+        .population
+        .mean_draws
+        .iter()
+        .zip(reference.mean_draws.iter().cycle())
+        .map(|(mean, undamaged)| (mean - undamaged) / undamaged)
+        .collect();
+    Some(Damage {
+        threshold: threshold_here,
+        probability_of_damage: probability,
+        probability_interval,
+        pooled_probability,
+        exceeds: probability > state.threshold_probability,
+        relative_change: (sample.population.mean - reference.mean) / reference.mean,
+        relative_change_interval: Some(interval(&changes)),
+    })
+}
+
+/// Draws of the probability of damage of a normal population, each with its own δ; `None` without a spread.
+///
+/// ```text
+///  PoD = Φ((δ − μ)/σ) for a loss,    δ = μ_ud + Φ⁻¹(p) σ_ud,    (μ, σ) and (μ_ud, σ_ud) drawn from their posteriors
+/// ```
+fn population_probabilities(
+    population: &PopulationEstimate,
+    reference: &UndamagedQuantity,
+    direction: DamageDirection,
+    probability: f64,
+) -> Option<Vec<f64>> {
+    let level = Probability::new(probability).ok()?;
+    if population.std_draws.is_empty() || reference.std_draws.is_empty() {
+        return None;
+    }
+    let undamaged = reference.mean_draws.iter().zip(&reference.std_draws).cycle();
+    let one = |((mean, std), (mean_ud, std_ud)): ((&f64, &f64), (&f64, &f64))| {
+        let distance = (threshold(*mean_ud, *std_ud, direction, level)? - mean) / std;
+        Some(stats::normal_cdf(if direction == DamageDirection::Increase { -distance } else { distance }))
+    };
+    population.mean_draws.iter().zip(&population.std_draws).zip(undamaged).map(one).collect()
+}

@@ -1,0 +1,263 @@
+//! The undamaged reference: threshold, chart reference and conditions of each quantity.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::{Deserialize, Serialize};
+use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
+
+use super::pool::{Hyperparameters, QuantitySamples};
+use super::threshold::threshold;
+use crate::hierarchy::interval;
+use crate::quantity::{OutOfRange, Probability};
+use crate::stats;
+
+/// The undamaged reference of one quantity.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct UndamagedQuantity {
+    /// Name of the quantity.
+    pub name: String,
+    /// Mean μ_ud of the population.
+    pub mean: f64,
+    /// Standard deviation σ_ud of the population.
+    pub std: f64,
+    /// Damage threshold δ; `None` when no change of this quantity indicates damage.
+    pub threshold: Option<f64>,
+    /// 90 % credible interval of δ.
+    pub threshold_interval: Option<[f64; 2]>,
+    /// δ of the pool (paper), for the pooled probability of damage.
+    pub pooled_threshold: Option<f64>,
+    /// Reference of the alarm charts.
+    pub reference: ChartReference,
+    /// Posterior draws of μ_ud.
+    #[serde(skip)]
+    pub mean_draws: Vec<f64>,
+    /// Posterior draws of σ_ud.
+    #[serde(skip)]
+    pub std_draws: Vec<f64>,
+}
+
+/// Mean and spread of single measurements in the undamaged reference, noise included.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct ChartReference {
+    /// Mean of the posterior means of the measurements, in the quantity's unit.
+    pub mean: f64,
+    /// Their standard deviation about the mean of their batch, in the quantity's unit.
+    pub std: f64,
+    /// Mean posterior variance of one measurement, unit².
+    pub within: f64,
+    /// Number of measurements.
+    pub measurements: usize,
+    /// Number of batches.
+    pub batches: usize,
+    /// Degrees of freedom of the standard deviation.
+    pub degrees_of_freedom: usize,
+    /// Standard deviation τ of the batch means beyond what the scatter within batches explains; 0 unless it is significant.
+    pub between_batches_std: f64,
+}
+
+/// The undamaged reference of a structure, which batches are compared with; a version never changes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct UndamagedState {
+    /// Version, from 1.
+    pub version: u32,
+    /// p of the threshold; a batch whose probability of damage is larger exceeds it.
+    pub threshold_probability: f64,
+    /// Number of measurements in it.
+    pub measurements: usize,
+    /// The quantities, in the order of the trained baseline's.
+    pub quantities: Vec<UndamagedQuantity>,
+    /// Range or categories of each covariate of its measurements.
+    pub conditions: BTreeMap<String, SeenCovariate>,
+    /// Doubts about its data, in sentences.
+    pub doubts: Vec<String>,
+}
+
+/// The values of a covariate in the undamaged reference.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SeenCovariate {
+    /// Smallest and largest number.
+    Range([f64; 2]),
+    /// Categories.
+    Categories(BTreeSet<String>),
+}
+
+/// Why samples make no undamaged reference.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// Too few measurements to estimate a spread.
+    #[error(
+        "{measurements} measurements: an undamaged reference needs at least {least}, so that its standard deviation, and with it \
+         the damage threshold, is known to about 25 %"
+    )]
+    TooFewMeasurements {
+        /// Measurements given.
+        measurements: usize,
+        /// Fewest allowed.
+        least: usize,
+    },
+    /// A threshold probability outside (0, 0.5].
+    #[error("threshold probability {0} must be above 0 and at most 0.5")]
+    ThresholdProbability(f64),
+    /// Not a probability at all.
+    #[error(transparent)]
+    OutOfRange(#[from] OutOfRange),
+}
+
+/// Fewest measurements of an undamaged reference: 10 give the standard deviation to ±24 %.
+pub const MINIMUM_MEASUREMENTS: usize = 10;
+
+/// Significance level at which the data of an undamaged reference raise a doubt.
+const CONTAMINATION_LEVEL: f64 = 0.001;
+
+/// Significance level at which the scatter between batches enters the charts.
+const BETWEEN_LEVEL: f64 = 0.01;
+
+impl UndamagedState {
+    /// The undamaged reference from the samples of several batches, pooled batch after batch; `sizes` are the numbers of
+    /// measurements of the batches, `probability` is p of the threshold. The version is 0 until it is stored.
+    ///
+    /// # Errors
+    /// [`Error`] for too few measurements or a threshold probability outside (0, 0.5].
+    pub fn from_samples(samples: &[QuantitySamples], sizes: &[usize], probability: f64) -> Result<Self, Error> {
+        if !(probability > 0.0 && probability <= 0.5) {
+            return Err(Error::ThresholdProbability(probability));
+        }
+        let level = Probability::new(probability)?;
+        let measurements = samples.first().map_or(0, |s| s.pool.len() / s.draws);
+        let too_few = Error::TooFewMeasurements { measurements, least: MINIMUM_MEASUREMENTS };
+        if measurements < MINIMUM_MEASUREMENTS {
+            return Err(too_few);
+        }
+        let mut doubts = Vec::new();
+        let mut quantity = |sample: &QuantitySamples| {
+            let pooled = Hyperparameters::from_pool(&sample.pool, sample.draws);
+            let population = &sample.population;
+            let (std, pooled_std) = (population.std?, pooled.std?);
+            let thresholds: Vec<f64> = population
+                .mean_draws
+                .iter()
+                .zip(&population.std_draws)
+                .filter_map(|(m, s)| threshold(*m, *s, sample.damage, level))
+                .collect();
+            let (reference, doubt) = ChartReference::new(sample, sizes);
+            doubts.extend(doubt.map(|doubt| format!("{}: {doubt}", sample.name)));
+            Some(UndamagedQuantity {
+                name: sample.name.clone(),
+                mean: population.mean,
+                std,
+                threshold: threshold(population.mean, std, sample.damage, level),
+                threshold_interval: (!thresholds.is_empty()).then(|| interval(&thresholds)),
+                pooled_threshold: threshold(pooled.mean, pooled_std, sample.damage, level),
+                reference,
+                mean_draws: population.mean_draws.clone(),
+                std_draws: population.std_draws.clone(),
+            })
+        };
+        let quantities = samples.iter().map(&mut quantity).collect::<Option<Vec<_>>>().ok_or(too_few)?;
+        Ok(Self {
+            version: 0,
+            threshold_probability: probability,
+            measurements,
+            quantities,
+            conditions: BTreeMap::new(),
+            doubts,
+        })
+    }
+}
+
+impl ChartReference {
+    /// The reference of the alarm charts, and a doubt about its data if there is one.
+    ///
+    /// Where batches differ (p < 0.01), the scatter between them enters the charts. Where they differ beyond doubt (p < 0.001), or
+    /// one measurement lies far from the others, the reader is warned that the reference may contain more than random scatter.
+    fn new(sample: &QuantitySamples, sizes: &[usize]) -> (Self, Option<String>) {
+        let means: Vec<f64> = sample.pool.chunks(sample.draws).map(stats::mean).collect();
+        let analysis = Scatter::of(&means, sizes);
+        let doubt = analysis.contamination.clone().or_else(|| outlier(&means));
+        let within = Hyperparameters::from_pool(&sample.pool, sample.draws).within;
+        let (count, batches) = (means.len(), analysis.batches);
+        let degrees_of_freedom = match (analysis.between_batches_std > 0.0, count > batches) {
+            (true, _) => batches - 1,
+            (false, true) => count - batches,
+            (false, false) => count - 1,
+        };
+        let reference = Self {
+            mean: stats::mean(&means),
+            std: analysis.within_batches.sqrt(),
+            within,
+            measurements: count,
+            batches,
+            degrees_of_freedom,
+            between_batches_std: analysis.between_batches_std,
+        };
+        (reference, doubt)
+    }
+}
+
+/// One-way analysis of variance of the means of single measurements over their batches.
+struct Scatter {
+    batches: usize,
+    /// Variance within batches, unit².
+    within_batches: f64,
+    /// Standard deviation between batches, 0 unless significant.
+    between_batches_std: f64,
+    contamination: Option<String>,
+}
+
+impl Scatter {
+    /// ```text
+    ///  F = variance of the batch means · n̄ / variance within batches ~ F(B − 1, N − B)   for batches of one population
+    /// ```
+    fn of(means: &[f64], sizes: &[usize]) -> Self {
+        let mut start = 0;
+        let mut batches = Vec::new();
+        for &size in sizes.iter().filter(|size| **size > 0) {
+            batches.push(&means[start..start + size]);
+            start += size;
+        }
+        let mean = stats::mean(means);
+        let (b, n) = (batches.len() as f64, means.len() as f64);
+        // Batches with one measurement each have no spread within.
+        let within_batches =
+            if n > b { batches.iter().map(|x| squares(x)).sum::<f64>() / (n - b) } else { squares(means) / (n - 1.0) };
+        // Equivalent size of unequal batches in the variance between them.
+        let size = (n - batches.iter().map(|x| (x.len() as f64).powi(2)).sum::<f64>() / n) / (b - 1.0);
+        let mut found = Self { batches: batches.len(), within_batches, between_batches_std: 0.0, contamination: None };
+        if batches.len() >= 2 && n > b && within_batches > 0.0 {
+            let between: f64 = batches.iter().map(|x| x.len() as f64 * (stats::mean(x) - mean).powi(2)).sum();
+            let f = between / (b - 1.0) / within_batches;
+            let p = FisherSnedecor::new(b - 1.0, n - b).map_or(1.0, |distribution| distribution.sf(f));
+            if p < BETWEEN_LEVEL {
+                found.between_batches_std = ((between / (b - 1.0) - within_batches) / size).max(0.0).sqrt();
+            }
+            if p < CONTAMINATION_LEVEL {
+                found.contamination = Some(format!(
+                    "its batches differ by more than their scatter (p = {p:.0e}): damage, weather or a changed set-up may be the \
+                     cause"
+                ));
+            }
+        }
+        found
+    }
+}
+
+/// A doubt when one value lies far from the others, by Grubbs' test in its t approximation, two-sided.
+fn outlier(means: &[f64]) -> Option<String> {
+    let n = means.len() as f64;
+    let (mean, total) = (stats::mean(means), squares(means) / (n - 1.0));
+    if total <= 0.0 {
+        return None;
+    }
+    let largest = means.iter().map(|x| (x - mean).abs()).fold(0.0, f64::max) / total.sqrt();
+    let t2 = n * (n - 2.0) * largest.powi(2) / ((n - 1.0).powi(2) - n * largest.powi(2));
+    let p = if t2 > 0.0 { StudentsT::new(0.0, 1.0, n - 2.0).map_or(1.0, |t| 2.0 * n * t.sf(t2.sqrt())) } else { 0.0 };
+    (p < CONTAMINATION_LEVEL)
+        .then(|| format!("one measurement lies {largest:.1} standard deviations from the others (p = {p:.0e})"))
+}
+
+/// Sum of the squared deviations from the mean.
+fn squares(values: &[f64]) -> f64 {
+    let centre = stats::mean(values);
+    values.iter().map(|x| (x - centre).powi(2)).sum::<f64>()
+}

@@ -1,0 +1,156 @@
+//! The alarms of the structures: read, acknowledged, published as events and logged.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Mutex;
+
+use tracing::{error, warn};
+
+use super::error::Error;
+use super::events::{Events, News};
+use crate::quantity::{StructureId, Timestamp};
+use crate::store::{Acknowledgement, Episode, MaintenanceWindow, Store, StoredChartPoint};
+
+/// The alarms of the structures, and which of them subscribers and the log know already.
+pub struct Alarms {
+    store: Store,
+    events: Events,
+    published: Mutex<BTreeMap<StructureId, Published>>,
+    /// Alarms that this process has logged.
+    logged: Mutex<BTreeSet<(StructureId, i64)>>,
+}
+
+/// The alarms of a structure that were published.
+#[derive(Debug, Clone, Default)]
+struct Published {
+    /// Number of the newest.
+    newest: i64,
+    open: BTreeSet<i64>,
+}
+
+impl Alarms {
+    pub(super) fn new(store: Store, events: Events) -> Self {
+        Self { store, events, published: Mutex::default(), logged: Mutex::default() }
+    }
+
+    /// Alarms of a structure, newest first, at most `limit`, with numbers below `before`.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn episodes(
+        &self,
+        structure: &StructureId,
+        before: Option<i64>,
+        open_only: bool,
+        limit: usize,
+    ) -> Result<Vec<Episode>, Error> {
+        Ok(self.store.alarms().episodes(structure, before, open_only, limit).await?)
+    }
+
+    /// Acknowledges an alarm; the first acknowledgement stays. `None` when there is no such alarm.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn acknowledge(
+        &self,
+        structure: &StructureId,
+        number: i64,
+        acknowledgement: Acknowledgement,
+    ) -> Result<Option<Episode>, Error> {
+        let episode = self.store.alarms().acknowledge(structure, number, acknowledgement).await?;
+        if let Some(episode) = &episode {
+            self.events.publish(event(structure, episode, "acknowledged"));
+        }
+        Ok(episode)
+    }
+
+    /// The newest `limit` points of each chart of a structure, oldest first.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn charts(&self, structure: &StructureId, limit: usize) -> Result<Vec<StoredChartPoint>, Error> {
+        Ok(self.store.alarms().charts(structure, limit).await?)
+    }
+
+    /// Adds a maintenance window: batches measured in it do not enter the charts.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn add_maintenance(&self, structure: &StructureId, window: MaintenanceWindow) -> Result<(), Error> {
+        Ok(self.store.alarms().insert_maintenance(structure, window, Timestamp::now()).await?)
+    }
+
+    /// Maintenance windows of a structure, newest first.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn maintenance(&self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
+        Ok(self.store.alarms().maintenance(structure).await?)
+    }
+
+    /// Publishes the alarms that changed since the last call, and logs those opened, each once.
+    pub(super) async fn report(&self, structure: &StructureId) {
+        for episode in self.publish_changes(structure).await {
+            let key = (structure.clone(), episode.number);
+            if !self.logged.lock().expect("no holder of this lock panics").insert(key) {
+                continue;
+            }
+            metrics::counter!("modalwatch_alarms_total", "kind" => episode.kind.clone()).increment(1);
+            warn!(
+                structure.id = %structure, episode = episode.number, kind = %episode.kind, series = %episode.series,
+                "Alarm {} of {structure}: {} ({}), since {}", episode.number, episode.kind, episode.series, episode.opened_at
+            );
+        }
+    }
+
+    /// Publishes the alarms that were opened, ended or withdrawn since the last call. The open ones.
+    pub(super) async fn publish_changes(&self, structure: &StructureId) -> Vec<Episode> {
+        let (changes, open) = self.changes(structure).await;
+        for news in changes {
+            self.events.publish(news);
+        }
+        open
+    }
+
+    /// The events for the alarms of a structure that changed since the last call, which are known from now on; and the open ones.
+    pub(super) async fn changes(&self, structure: &StructureId) -> (Vec<News>, Vec<Episode>) {
+        let published = || self.published.lock().expect("no holder of this lock panics");
+        let Published { newest, open } = published().get(structure).cloned().unwrap_or_default();
+        let open: Vec<i64> = open.into_iter().collect();
+        match self.store.alarms().episodes_since(structure, newest, &open).await {
+            Ok(mut episodes) => {
+                let changes = published().entry(structure.clone()).or_default().learn(structure, &episodes);
+                episodes.retain(|episode| episode.state() == "open");
+                (changes, episodes)
+            }
+            Err(failure) => {
+                error!(structure.id = %structure, error = %failure, "Could not read the changed alarms of {structure}: {failure}");
+                Default::default()
+            }
+        }
+    }
+}
+
+impl Published {
+    /// Updates what is known from stored alarms; the events for what is new.
+    fn learn(&mut self, structure: &StructureId, episodes: &[Episode]) -> Vec<News> {
+        let mut changes = Vec::new();
+        for episode in episodes {
+            let open = episode.state() == "open";
+            let was_open = self.open.contains(&episode.number);
+            if open != was_open || episode.number > self.newest {
+                changes.push(event(structure, episode, episode.state()));
+            }
+            if open {
+                self.open.insert(episode.number);
+            } else {
+                self.open.remove(&episode.number);
+            }
+        }
+        self.newest = episodes.iter().map(|e| e.number).max().unwrap_or(0).max(self.newest);
+        changes
+    }
+}
+
+fn event(structure: &StructureId, episode: &Episode, state: &'static str) -> News {
+    News::Alarm { structure: structure.clone(), alarm: episode.number, kind: episode.kind.clone(), state }
+}

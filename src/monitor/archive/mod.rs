@@ -1,0 +1,53 @@
+//! Moving a structure from one installation to another.
+//!
+//! An import stores what was measured and declared; the assessments are computed again. They are functions of measurements, trained
+//! baseline, undamaged reference and seed, all of which are in the archive, so they are the same to the last bit.
+
+#![expect(clippy::result_large_err, reason = "an import fails once, on a command line")]
+
+mod error;
+mod export;
+mod import;
+mod lines;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use tokio::sync::mpsc::Receiver;
+
+pub use self::error::ImportError;
+pub use self::import::Imported;
+use super::assessor::Assessor;
+use super::error::Error;
+use super::replay::Replay;
+use crate::quantity::StructureId;
+
+/// Exports and imports structures.
+#[derive(Clone)]
+pub struct Archive {
+    assessor: Arc<Assessor>,
+    replay: Replay,
+}
+
+impl Archive {
+    pub(super) fn new(assessor: Arc<Assessor>, replay: Replay) -> Self {
+        Self { assessor, replay }
+    }
+
+    /// The archive of a structure, line by line, each with its line end; when it is interrupted, the last of them is an error.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::Store`].
+    pub async fn export(&self, structure: &StructureId) -> Result<Receiver<Result<Vec<u8>, Error>>, Error> {
+        export::export(&self.assessor, structure).await
+    }
+
+    /// Imports an archive: stores what is new, assesses the batches that wait, and stores the acknowledgements. Repeating an import
+    /// changes nothing, so an interrupted import is completed by repeating it.
+    ///
+    /// # Errors
+    /// [`ImportError`]; a file that is not whole is refused before anything is stored.
+    pub async fn import(&self, path: &Path) -> Result<Imported, ImportError> {
+        import::import(&self.assessor, &self.replay, path).await
+    }
+}

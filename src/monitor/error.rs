@@ -1,0 +1,205 @@
+//! Why the monitor could not do what it was asked to do.
+
+use super::compute::QueueFull;
+use crate::assessment;
+use crate::damage;
+use crate::quantity::{StructureId, Timestamp};
+use crate::simulator::definition::DefinitionError;
+use crate::store;
+
+/// A failure that several operations share.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No such structure.
+    #[error("there is no structure {0}")]
+    UnknownStructure(StructureId),
+    /// No such batch of that structure.
+    #[error("structure {structure} has no batch {batch}")]
+    UnknownBatch {
+        /// The structure.
+        structure: StructureId,
+        /// The batch asked for.
+        batch: String,
+    },
+    /// The structure has no trained baseline in use.
+    #[error("structure {structure} has no trained baseline in use: {reason}")]
+    NoModel {
+        /// The structure.
+        structure: StructureId,
+        /// Why, and the next step.
+        reason: String,
+    },
+    /// A batch without a current assessment.
+    #[error("batch {batch} is not assessed: {reason}")]
+    NotAssessed {
+        /// The batch.
+        batch: String,
+        /// Why.
+        reason: String,
+    },
+    /// The queue is full; nothing was stored.
+    #[error(transparent)]
+    QueueFull(#[from] QueueFull),
+    /// The structure has batches under another definition.
+    #[error("structure {0} has batches that were measured under another definition; use another id for the new one")]
+    StructureInUse(StructureId),
+    /// The version of the structure changed during the operation.
+    #[error("structure {0} changed to another version in the meantime: nothing was changed")]
+    VersionChanged(StructureId),
+    /// The present version of the structure is not an extension.
+    #[error("structure {0} is not an extension of an earlier version: there is nothing to undo")]
+    NoStepBack(StructureId),
+    /// An invalid definition.
+    #[error("the definition of a structure is refused: {0}")]
+    Definition(#[from] DefinitionError),
+    /// A stored definition is not valid any more: the database was written by another version of the program.
+    #[error(
+        "the stored definition of structure {structure} is refused by this version of the program: {reason}; its batches are \
+         kept: run the version that wrote it, or define the structure under another id"
+    )]
+    DefinitionRefused {
+        /// The structure.
+        structure: StructureId,
+        /// Why.
+        reason: String,
+    },
+    /// The database failed.
+    #[error(transparent)]
+    Store(#[from] store::Error),
+    /// A computation or a background task panicked: a bug.
+    #[error("a task panicked")]
+    Panicked,
+}
+
+/// Why a batch was not taken.
+#[derive(Debug, thiserror::Error)]
+pub enum IngestError {
+    /// The key was used for other content.
+    #[error("the idempotency key was used for batch {batch} with other content")]
+    KeyConflict {
+        /// The batch stored under that key.
+        batch: String,
+    },
+    /// A measurement of this source and time is already stored in a batch with other content.
+    #[error(
+        "measurement {ordinal} at {measured_at} of this source is already in batch {batch}, which has other content"
+    )]
+    MeasurementConflict {
+        /// Index in the batch that was sent.
+        ordinal: usize,
+        /// Its time.
+        measured_at: Timestamp,
+        /// The batch that contains it.
+        batch: String,
+    },
+    /// Anything else.
+    #[error(transparent)]
+    Monitor(#[from] Error),
+}
+
+/// Why batches were not declared as the undamaged reference.
+#[derive(Debug, thiserror::Error)]
+pub enum DeclareError {
+    /// A batch is listed twice.
+    #[error("batch {0} is listed twice")]
+    RepeatedBatch(String),
+    /// The batches together make no undamaged reference.
+    #[error(transparent)]
+    Reference(#[from] damage::Error),
+    /// An inference failed.
+    #[error("batch {batch} could not be used: {source}")]
+    Assess {
+        /// The batch.
+        batch: String,
+        /// The cause.
+        source: assessment::Error,
+    },
+    /// A batch that cannot be trusted cannot be part of the undamaged reference.
+    #[error("batch {batch} cannot be part of the undamaged reference: {reason}")]
+    Untrusted {
+        /// The batch.
+        batch: String,
+        /// What was found in it.
+        reason: String,
+    },
+    /// Anything else.
+    #[error(transparent)]
+    Monitor(#[from] Error),
+}
+
+/// Why a diagnosis or an extension was not started.
+#[derive(Debug, thiserror::Error)]
+pub enum JobError {
+    /// No such diagnosis.
+    #[error("there is no diagnosis {0}")]
+    UnknownDiagnosis(String),
+    /// A batch is listed twice.
+    #[error("batch {0} is listed twice")]
+    RepeatedBatch(String),
+    /// More measurements than a diagnosis takes.
+    #[error("{found} measurements are more than the {most} that one diagnosis takes: name fewer batches")]
+    TooManyMeasurements {
+        /// Measurements asked for.
+        found: usize,
+        /// Most.
+        most: usize,
+    },
+    /// The structure cannot be extended by this diagnosis.
+    #[error("diagnosis {diagnosis} cannot be extended: {reason}")]
+    NoExtension {
+        /// The diagnosis.
+        diagnosis: String,
+        /// Why.
+        reason: String,
+    },
+    /// Anything else.
+    #[error(transparent)]
+    Monitor(#[from] Error),
+}
+
+/// Why another trained baseline was not put into use.
+#[derive(Debug, thiserror::Error)]
+pub enum ReloadError {
+    /// The new baseline may not replace the one in use.
+    #[error("the trained baseline for {structure} is refused, {}: {reason}", match kept {
+        Some(digest) => format!("{digest} stays in use"),
+        None => "there is none in use".to_owned(),
+    })]
+    Refused {
+        /// The structure.
+        structure: StructureId,
+        /// Why.
+        reason: String,
+        /// Digest of the one that stays in use.
+        kept: Option<String>,
+    },
+    /// Anything else.
+    #[error(transparent)]
+    Monitor(#[from] Error),
+}
+
+/// Why no backup was made.
+#[derive(Debug, thiserror::Error)]
+pub enum BackupError {
+    /// Another backup is running.
+    #[error("another backup is running: ask again when it is done")]
+    Running,
+    /// The backup failed.
+    #[error(transparent)]
+    Failed(#[from] store::backup::Error),
+    /// Anything else.
+    #[error(transparent)]
+    Monitor(#[from] Error),
+}
+
+macro_rules! from_store {
+    ($($error:ident),+) => {$(
+        impl From<store::Error> for $error {
+            fn from(error: store::Error) -> Self {
+                Self::Monitor(error.into())
+            }
+        }
+    )+};
+}
+
+from_store!(IngestError, DeclareError, JobError, ReloadError);

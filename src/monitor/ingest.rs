@@ -1,0 +1,208 @@
+//! From raw values to a stored and assessed batch: the rules are the same for every way in.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::oneshot;
+use tracing::Instrument as _;
+
+use super::assessor::{Assessor, Computed, Finished, Task};
+use super::compute::{Place as QueuePlace, QueueFull};
+use super::error::{Error, IngestError};
+use super::records::{BatchView, Records};
+use super::replay::Replay;
+use super::settings::MissingCovariate;
+use super::structures::ActiveStructure;
+use crate::assessment::BatchState;
+use crate::measurement::body::RawBatch;
+use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, FieldPath, Problem};
+use crate::measurement::{MeasurementBatch, ModalMeasurement};
+use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::store::{BatchRecord, InsertBatch};
+
+/// Source of a batch that names none.
+const DEFAULT_SOURCE: &str = "default";
+
+/// Most missing covariates reported.
+const MOST_MISSING: usize = 20;
+
+/// A batch that was taken.
+pub struct Ingested {
+    /// The batch.
+    pub view: BatchView,
+    /// True when it was already stored before.
+    pub replayed: bool,
+}
+
+/// The computation for a batch while it was being stored.
+enum Begun {
+    Computed(Box<Computed>),
+    Not(QueuePlace),
+}
+
+/// Takes batches: checks, stores and assesses them.
+#[derive(Clone)]
+pub struct Ingest {
+    assessor: Arc<Assessor>,
+    replay: Replay,
+    records: Records,
+}
+
+impl Ingest {
+    pub(super) fn new(assessor: Arc<Assessor>, replay: Replay, records: Records) -> Self {
+        Self { assessor, replay, records }
+    }
+
+    /// Checks a batch against its structure. It computes: not for an async thread when the batch is large.
+    ///
+    /// # Errors
+    /// Every mistake with its place, at most about 20.
+    pub fn check(&self, active: &ActiveStructure, raw: RawBatch) -> Result<MeasurementBatch, Vec<Problem>> {
+        let RawBatch { source, idempotency_key, measurements: raw } = raw;
+        let source = source.unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
+        check_source(&source).map_err(|problem| vec![problem])?;
+        idempotency_key.as_deref().map_or(Ok(()), check_idempotency_key).map_err(|problem| vec![problem])?;
+        let paths: Vec<FieldPath> = raw.iter().map(|r| r.path).collect();
+        let settings = &self.assessor.settings;
+        let expectation = active.simulator.expectation(Timestamp::now(), settings.max_measurements);
+        let measurements = check_measurements(raw, &expectation)?;
+        if settings.missing_covariate == MissingCovariate::Refuse {
+            let missing = measurements.iter().zip(&paths).flat_map(|(m, path)| missing_covariates(active, m, *path));
+            let problems: Vec<Problem> = missing.take(MOST_MISSING).collect();
+            if !problems.is_empty() {
+                return Err(problems);
+            }
+        }
+        let structure = active.simulator.id().clone();
+        Ok(MeasurementBatch { structure, source, idempotency_key, measurements })
+    }
+
+    /// Stores a batch, assesses it and stores the result; refuses it at once when the queue is full.
+    ///
+    /// # Errors
+    /// [`Error::QueueFull`] with nothing stored; [`IngestError`].
+    pub async fn take(&self, batch: MeasurementBatch) -> Result<Ingested, IngestError> {
+        let place = self.assessor.compute.reserve().map_err(Error::from)?;
+        self.take_with(batch, place).await
+    }
+
+    /// As [`Self::take`], but waits at most `patience` for a place in the queue: for many batches in a row, none of which should
+    /// displace those of other senders or be refused.
+    ///
+    /// # Errors
+    /// As [`Self::take`].
+    pub async fn take_within(&self, batch: MeasurementBatch, patience: Duration) -> Result<Ingested, IngestError> {
+        let waited = tokio::time::timeout(patience, self.assessor.compute.wait()).await;
+        self.take_with(batch, waited.map_err(|_| Error::from(QueueFull))?).await
+    }
+
+    /// As [`Self::take`], but waits for a place in the queue: for senders that cannot be asked to send again.
+    ///
+    /// # Errors
+    /// As [`Self::take`], without [`Error::QueueFull`].
+    pub async fn take_when_free(&self, batch: MeasurementBatch) -> Result<Ingested, IngestError> {
+        let place = self.assessor.compute.wait().await;
+        self.take_with(batch, place).await
+    }
+
+    /// Runs in a task of its own, so that a client that goes away does not interrupt it.
+    async fn take_with(&self, batch: MeasurementBatch, place: QueuePlace) -> Result<Ingested, IngestError> {
+        let (ingest, structure) = (self.clone(), batch.structure.clone());
+        let task = tokio::spawn(async move { ingest.take_here(batch, place).await }.in_current_span());
+        task.await.unwrap_or_else(|_| {
+            // The batch may have been stored before the panic.
+            self.replay.resume_until_done(structure);
+            Err(Error::Panicked.into())
+        })
+    }
+
+    async fn take_here(&self, batch: MeasurementBatch, place: QueuePlace) -> Result<Ingested, IngestError> {
+        let structure = batch.structure.clone();
+        let active = self.assessor.structures.get(&structure)?;
+        let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
+        let (foreseen, outcome) = oneshot::channel();
+        let insert = self.assessor.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, foreseen);
+        let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
+            batch_id: batch_id.clone(),
+            batch,
+            content_digest,
+            received_at,
+            state: BatchState::Received,
+            failure: None,
+        };
+        // While the batch is written to disk. No result is stored or published before the batch itself is stored.
+        let compute = async {
+            match outcome.await {
+                Ok(InsertBatch::Inserted { content_digest, previous }) if active.baseline.is_ok() => {
+                    let task = Task::new(Arc::clone(&active), record(batch.clone(), content_digest), previous, place)?;
+                    Ok(Begun::Computed(Box::new(self.assessor.compute(task).await?)))
+                }
+                _ => Ok(Begun::Not(place)),
+            }
+        };
+        let (inserted, begun) = tokio::join!(insert, compute);
+        match inserted? {
+            InsertBatch::Inserted { content_digest, .. } => {
+                metrics::counter!("modalwatch_batches_received_total").increment(1);
+                metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
+                // The record as it was stored, without reading it back.
+                Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await?, replayed: false })
+            }
+            InsertBatch::Replayed(id) => {
+                let record = self.assessor.stored(&structure, &id).await?;
+                if let (BatchState::Received, true, Ok(Begun::Not(place))) =
+                    (record.state, active.baseline.is_ok(), begun)
+                {
+                    let finished =
+                        async { self.assessor.finish(self.assessor.task(active, record, place).await?).await }.await;
+                    self.or_resumed(&structure, finished)?;
+                    return Ok(Ingested { view: self.records.batch(&structure, &id).await?, replayed: true });
+                }
+                Ok(Ingested { view: self.records.view(record).await?, replayed: true })
+            }
+            InsertBatch::KeyConflict { batch_id } => Err(IngestError::KeyConflict { batch: batch_id }),
+            InsertBatch::MeasurementConflict { ordinal, measured_at, batch_id } => {
+                Err(IngestError::MeasurementConflict { ordinal, measured_at, batch: batch_id })
+            }
+        }
+    }
+
+    /// Stores the assessment of a batch that was just stored.
+    async fn inserted(&self, record: BatchRecord, begun: Result<Begun, Error>) -> Result<BatchView, Error> {
+        let structure = record.batch.structure.clone();
+        let finished = match begun {
+            Ok(Begun::Computed(computed)) => self.assessor.finish_computed(*computed).await,
+            Ok(Begun::Not(_)) => {
+                self.assessor.events.batch_changed(&structure, &record.batch_id, record.state);
+                return self.records.view(record).await;
+            }
+            Err(failure) => Err(failure),
+        };
+        match self.or_resumed(&structure, finished)? {
+            Finished::Assessed(assessment, charts) => {
+                let record = BatchRecord { state: BatchState::Assessed, ..record };
+                self.records.view_of(record, Some(*assessment), charts).await
+            }
+            Finished::Failed | Finished::OfAnotherVersion => self.records.batch(&structure, &record.batch_id).await,
+        }
+    }
+
+    /// The result of a stored batch. Where there is none, the batch is attempted again later, because its sender may not send it
+    /// again.
+    fn or_resumed(&self, structure: &StructureId, result: Result<Finished, Error>) -> Result<Finished, Error> {
+        match &result {
+            Ok(finished) => self.replay.resume_if_superseded(structure, finished),
+            Err(_) => self.replay.resume_until_done(structure.clone()),
+        }
+        result
+    }
+}
+
+fn missing_covariates(active: &ActiveStructure, measurement: &ModalMeasurement, path: FieldPath) -> Vec<Problem> {
+    let missing = active.simulator.effect_sizes(&measurement.covariates).missing;
+    let problem = |name: String| {
+        let message = format!("{name} is missing: the simulation of this structure depends on it");
+        Problem::new(path.of_covariate(&name), message)
+    };
+    missing.into_iter().map(problem).collect()
+}

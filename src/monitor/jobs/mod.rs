@@ -1,0 +1,333 @@
+//! Diagnoses and extensions as jobs: one at a time, outside the queue of assessments.
+
+mod progress;
+mod study;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::future::Future;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use tokio::sync::Semaphore;
+use tracing::{error, info, warn};
+
+use self::progress::Progress;
+use self::study::Study;
+pub use self::study::{DiagnosisRequest, ExtensionTraining};
+use super::compute::QueueFull;
+use super::error::{Error, JobError};
+use super::events::Events;
+use super::own_task::in_own_task;
+use super::structures::{ActiveStructure, ActiveStructures};
+use super::versions::Versions;
+use crate::baseline::train::Trained;
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::simulator::Simulator;
+use crate::store::{DiagnosisRecord, JobKind, JobRecord, JobState, NewVersion, Store, StoredBaseline};
+
+/// Most measurements of one diagnosis.
+const MOST_MEASUREMENTS: usize = 200_000;
+
+/// Most jobs that run or wait.
+const MOST_JOBS: usize = 16;
+
+/// The result of an extension.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct ExtensionResult {
+    /// Effects that were added, by name.
+    pub added: Vec<String>,
+    /// Causes that were left out, and why.
+    pub left_out: Vec<String>,
+    /// The new version.
+    pub structure_digest: String,
+    /// The version that it extends.
+    pub parent_digest: String,
+    /// Its trained baseline.
+    pub model_digest: String,
+    /// Version of the undamaged reference that was renewed with it.
+    pub undamaged_version: Option<u32>,
+}
+
+/// Result of a job as JSON, with the report of a diagnosis as HTML; or why it failed.
+type JobOutput = Result<(String, Option<String>), String>;
+
+/// Starts jobs and reads their results.
+#[derive(Clone)]
+pub struct Jobs {
+    store: Store,
+    structures: Arc<ActiveStructures>,
+    versions: Versions,
+    one_at_a_time: Arc<Semaphore>,
+    progress: Progress,
+}
+
+impl Jobs {
+    pub(super) fn new(store: Store, structures: Arc<ActiveStructures>, versions: Versions, events: Events) -> Self {
+        let one_at_a_time = Arc::new(Semaphore::new(1));
+        Self { store, structures, versions, one_at_a_time, progress: Progress::new(events) }
+    }
+
+    /// Marks the jobs that the end of an earlier run interrupted as failed.
+    pub(super) async fn end_interrupted(&self) -> Result<(), Error> {
+        let interrupted = self.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
+        if interrupted > 0 {
+            warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
+        }
+        Ok(())
+    }
+
+    /// Starts a diagnosis; without batches in the request, of all batches.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::QueueFull`], [`JobError`].
+    pub async fn start_diagnosis(
+        &self,
+        structure: &StructureId,
+        request: DiagnosisRequest,
+    ) -> Result<DiagnosisRecord, JobError> {
+        let (jobs, structure) = (self.clone(), structure.clone());
+        in_own_task(async move { jobs.start_diagnosis_here(structure, request).await }).await
+    }
+
+    async fn start_diagnosis_here(
+        self,
+        structure: StructureId,
+        mut request: DiagnosisRequest,
+    ) -> Result<DiagnosisRecord, JobError> {
+        let active = self.structures.get(&structure)?;
+        let stored = self.store.batches().batch_sizes(&structure).await?;
+        if request.batches.is_empty() {
+            request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
+        }
+        check_batches(&structure, &stored, &request.batches)?;
+        if self.running() >= MOST_JOBS {
+            return Err(Error::QueueFull(QueueFull).into());
+        }
+        let id = uuid::Uuid::now_v7().to_string();
+        let json = serde_json::to_string(&request).expect("a request is plain data");
+        let simulator = active.simulator.clone();
+        self.store.diagnoses().insert_diagnosis(&id, &structure, simulator.digest(), &json, Timestamp::now()).await?;
+        let (jobs, job) = (self.clone(), id.clone());
+        let diagnose = async move {
+            let _turn = jobs.turn().await;
+            let study = jobs.study(job, &structure, simulator, request).await?;
+            let diagnosed = tokio::task::spawn_blocking(move || study.diagnose()).await;
+            diagnosed.map_err(|_| "the diagnosis panicked".to_owned())?
+        };
+        self.run(&id, active.simulator.id(), JobKind::Diagnosis, diagnose);
+        Ok(self.diagnosis(&id).await?.0)
+    }
+
+    /// Starts to extend a structure by the causes of a diagnosis: a new version of the structure and a trained baseline for it. All
+    /// batches are assessed again.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownDiagnosis`]; [`JobError::NoExtension`] when the diagnosis is not done, when the structure has changed since,
+    /// or when an extension by it is running.
+    pub async fn start_extension(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, JobError> {
+        let (jobs, id) = (self.clone(), id.to_owned());
+        in_own_task(async move { jobs.start_extension_here(&id, training).await }).await
+    }
+
+    async fn start_extension_here(&self, id: &str, training: ExtensionTraining) -> Result<DiagnosisRecord, JobError> {
+        let (record, _) = self.diagnosis(id).await?;
+        let active = self.structures.get(&record.structure)?;
+        let refuse = |why: &str| JobError::NoExtension { diagnosis: id.to_owned(), reason: why.to_owned() };
+        if record.state != JobState::Done {
+            return Err(refuse("it is not done"));
+        }
+        if record.structure_digest != *active.simulator.digest() {
+            return Err(refuse("the structure has another version now: diagnose that one"));
+        }
+        if !self.store.diagnoses().begin_extension(id, Timestamp::now()).await? {
+            return Err(refuse("an extension by it is running"));
+        }
+        let begun = self.diagnosis(id).await?.0;
+        let (jobs, structure) = (self.clone(), record.structure.clone());
+        let extend = async move { jobs.extend(&record, active, training).await.map(|result| (result, None)) };
+        self.run(id, &structure, JobKind::Extension, extend);
+        Ok(begun)
+    }
+
+    /// Runs a job in the background and stores its result.
+    fn run(
+        &self,
+        id: &str,
+        structure: &StructureId,
+        kind: JobKind,
+        work: impl Future<Output = JobOutput> + Send + 'static,
+    ) {
+        self.progress.begin(id, structure, kind);
+        let (jobs, id, name) = (self.clone(), id.to_owned(), kind_name(kind));
+        tokio::spawn(async move {
+            let output = work.await;
+            if let Err(failure) = &output {
+                warn!(diagnosis = %id, "The {name} {id} failed: {failure}");
+            }
+            let state = if output.is_ok() { JobState::Done } else { JobState::Failed };
+            let stored = match kind {
+                JobKind::Diagnosis => jobs.store.diagnoses().finish_diagnosis(&id, output, Timestamp::now()).await,
+                JobKind::Extension => {
+                    jobs.store
+                        .diagnoses()
+                        .finish_extension(&id, output.map(|(result, _)| result), Timestamp::now())
+                        .await
+                }
+            };
+            if let Err(failure) = stored {
+                error!(diagnosis = %id, "Could not store the result of the {name} {id}: {failure}");
+            }
+            jobs.progress.end(&id, state);
+        });
+    }
+
+    /// Waits until no other job runs.
+    async fn turn(&self) -> tokio::sync::SemaphorePermit<'_> {
+        self.one_at_a_time.acquire().await.expect("the semaphore is never closed")
+    }
+
+    /// The data of a job.
+    async fn study(
+        &self,
+        id: String,
+        structure: &StructureId,
+        simulator: Simulator,
+        request: DiagnosisRequest,
+    ) -> Result<Study, String> {
+        let measurements =
+            self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
+        Ok(Study { id, simulator, measurements, request, progress: self.progress.clone() })
+    }
+
+    /// Extends a structure and puts the extension into use; the result as JSON.
+    async fn extend(
+        &self,
+        record: &DiagnosisRecord,
+        active: Arc<ActiveStructure>,
+        training: ExtensionTraining,
+    ) -> Result<String, String> {
+        let text = |e: &dyn std::fmt::Display| e.to_string();
+        let (structure, parent) = (&record.structure, active.simulator.digest().clone());
+        let _turn = self.turn().await;
+        if *self.structures.get(structure).map_err(|e| text(&e))?.simulator.digest() != parent {
+            return Err("the structure changed to another version while this waited: diagnose that one".to_owned());
+        }
+        let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| text(&e))?;
+        let study = self.study(record.id.clone(), structure, active.simulator.clone(), request).await?;
+        let work = move || study.extend(active.baseline.as_ref().ok().map(Arc::as_ref), training);
+        let extended = tokio::task::spawn_blocking(work).await.map_err(|_| "the extension panicked".to_owned())??;
+        let accepted = self.accepted(&extended.trained, training)?;
+        let Trained { baseline, manifest_json, weights } = extended.trained;
+        let (structure_digest, model_digest) = (extended.simulator.digest().clone(), baseline.digest().to_string());
+        let version = NewVersion {
+            digest: structure_digest.clone(),
+            definition_json: extended.simulator.definition().canonical_json(),
+            parent: Some(parent.clone()),
+            diagnosis: Some(record.id.clone()),
+            baseline: Some(StoredBaseline {
+                model_digest: model_digest.clone(),
+                manifest: manifest_json,
+                weights,
+                accepted,
+            }),
+        };
+        let switched = self.versions.switch(&parent, version, extended.simulator, Arc::new(baseline)).await;
+        let result = ExtensionResult {
+            added: extended.added,
+            left_out: extended.left_out,
+            structure_digest: structure_digest.to_string(),
+            parent_digest: parent.to_string(),
+            model_digest,
+            undamaged_version: switched.map_err(|e| text(&e))?,
+        };
+        info!(structure.id = %structure, diagnosis = %record.id, "Extended {structure}: {}", result.added.join("; "));
+        Ok(serde_json::to_string(&result).expect("a result is plain data"))
+    }
+
+    /// Whether a flow that failed its calibration is accepted by the request; an error when it may not be used.
+    fn accepted(&self, trained: &Trained, training: ExtensionTraining) -> Result<bool, String> {
+        match self.structures.usable(&trained.baseline) {
+            Ok(()) => Ok(false),
+            Err(_) if training.accept_uncalibrated => Ok(true),
+            Err(_) => {
+                let failures = &trained.baseline.manifest().calibration.failures;
+                Err(format!(
+                    "the new flow failed its calibration ({}): ask again with more samples or epochs, or with \
+                     \"accept_uncalibrated\": true to use it nevertheless, which every answer will say",
+                    failures.join("; ")
+                ))
+            }
+        }
+    }
+
+    /// A diagnosis, and what its job is doing now.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownDiagnosis`], [`Error::Store`].
+    pub async fn diagnosis(&self, id: &str) -> Result<(DiagnosisRecord, Option<String>), JobError> {
+        let record = self.store.diagnoses().diagnosis(id).await?;
+        let record = record.ok_or_else(|| JobError::UnknownDiagnosis(shown(id)))?;
+        Ok((record, self.progress.of(id)))
+    }
+
+    /// Diagnoses of a structure, newest first, at most `limit`.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn diagnoses(&self, structure: &StructureId, limit: usize) -> Result<Vec<DiagnosisRecord>, Error> {
+        Ok(self.store.diagnoses().list(structure, limit).await?)
+    }
+
+    /// The report of a diagnosis as HTML; `None` where there is none yet.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownDiagnosis`], [`Error::Store`].
+    pub async fn report(&self, id: &str) -> Result<Option<String>, JobError> {
+        self.diagnosis(id).await?;
+        Ok(self.store.diagnoses().diagnosis_report(id).await?)
+    }
+
+    /// Diagnoses and extensions, newest first, at most `limit`, each with what it is doing now if it runs.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn list(&self, limit: usize) -> Result<Vec<(JobRecord, Option<String>)>, Error> {
+        let records = self.store.diagnoses().jobs(limit).await?;
+        let with_progress = |record: JobRecord| {
+            let running = record.state == JobState::Running;
+            let progress = running.then(|| self.progress.of(&record.id)).flatten();
+            (record, progress)
+        };
+        Ok(records.into_iter().map(with_progress).collect())
+    }
+
+    /// Number of jobs that run or wait.
+    pub fn running(&self) -> usize {
+        self.progress.count()
+    }
+}
+
+/// Checks the batches of a request against those stored, with their sizes.
+fn check_batches(structure: &StructureId, stored: &[(String, usize)], batches: &[String]) -> Result<(), JobError> {
+    let sizes: BTreeMap<&String, usize> = stored.iter().map(|(id, count)| (id, *count)).collect();
+    let mut seen = BTreeSet::new();
+    let mut found = 0;
+    for id in batches {
+        if !seen.insert(id) {
+            return Err(JobError::RepeatedBatch(id.clone()));
+        }
+        let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: shown(id) };
+        found += sizes.get(id).ok_or_else(unknown)?;
+    }
+    if found > MOST_MEASUREMENTS {
+        return Err(JobError::TooManyMeasurements { found, most: MOST_MEASUREMENTS });
+    }
+    Ok(())
+}
+
+const fn kind_name(kind: JobKind) -> &'static str {
+    match kind {
+        JobKind::Diagnosis => "diagnosis",
+        JobKind::Extension => "extension by diagnosis",
+    }
+}

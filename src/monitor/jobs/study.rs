@@ -1,0 +1,101 @@
+//! The computations behind the jobs: the diagnosis of measurements, and the training of an extension.
+
+use serde::{Deserialize, Serialize};
+
+use super::progress::Progress;
+use crate::baseline::observation::DEFAULT_NOISE_RANGE;
+use crate::baseline::train::{train, Trained};
+use crate::baseline::Baseline;
+use crate::discrepancy::data::Data;
+use crate::discrepancy::extend::extend;
+use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
+use crate::flow::train::TrainSettings;
+use crate::flow::FlowSettings;
+use crate::measurement::ModalMeasurement;
+use crate::simulator::Simulator;
+
+/// Simulated pairs for the extension of a structure that had no trained baseline.
+const SAMPLES: usize = 200_000;
+
+/// Epochs for the extension of a structure that had no trained baseline.
+const EPOCHS: usize = 80;
+
+/// What is diagnosed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DiagnosisRequest {
+    /// Batches, by id.
+    pub batches: Vec<String>,
+    /// Measurements held out to measure the gain.
+    pub holdout: Holdout,
+    /// Seed of the bootstrap and, in an extension, of the training.
+    pub seed: u64,
+}
+
+/// How an extension is trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ExtensionTraining {
+    /// Simulated pairs; `None` for as many as the trained baseline before.
+    pub samples: Option<usize>,
+    /// Epochs; `None` for as many as the trained baseline before.
+    pub epochs: Option<usize>,
+    /// Use the flow even if it fails its calibration; every answer says so then.
+    pub accept_uncalibrated: bool,
+}
+
+/// A job that computes on measurements of a structure.
+pub(super) struct Study {
+    pub(super) id: String,
+    pub(super) simulator: Simulator,
+    pub(super) measurements: Vec<ModalMeasurement>,
+    pub(super) request: DiagnosisRequest,
+    pub(super) progress: Progress,
+}
+
+/// A trained extension of a structure.
+pub(super) struct TrainedExtension {
+    pub(super) added: Vec<String>,
+    pub(super) left_out: Vec<String>,
+    pub(super) simulator: Simulator,
+    pub(super) trained: Trained,
+}
+
+impl Study {
+    /// The diagnosis as JSON, and its report as HTML.
+    pub(super) fn diagnose(&self) -> Result<(String, Option<String>), String> {
+        let (data, outcome) = self.outcome()?;
+        let html = report::html(&self.simulator, &data, &outcome);
+        Ok((serde_json::to_string(&outcome.diagnosis).expect("a diagnosis is plain data"), html))
+    }
+
+    /// Extends the structure by the causes of the diagnosis, and trains a flow for it like the one before, for the same noise.
+    pub(super) fn extend(
+        &self,
+        before: Option<&Baseline>,
+        training: ExtensionTraining,
+    ) -> Result<TrainedExtension, String> {
+        let before = before.map(Baseline::manifest);
+        let noise_range = before.and_then(|m| m.conditions.noise_range).unwrap_or(DEFAULT_NOISE_RANGE);
+        let samples = training.samples.or(before.map(|m| m.training.samples)).unwrap_or(SAMPLES);
+        let epochs = training.epochs.or(before.map(|m| m.training.settings.epochs)).unwrap_or(EPOCHS);
+        let mut flow = FlowSettings::default();
+        flow.units = before.map_or(flow.units, |m| m.architecture.units);
+        // The fits are not stored: the same data and seed give them again.
+        let (data, outcome) = self.outcome()?;
+        let extended = extend(&self.simulator, &data, &outcome).map_err(|e| e.to_string())?;
+        let simulator = Simulator::new(extended.definition.clone()).map_err(|e| e.to_string())?;
+        let settings = TrainSettings { epochs, seed: self.request.seed, ..TrainSettings::default() };
+        let trained = train(&simulator, samples, noise_range, &flow, &settings, |epoch| {
+            self.progress.report(&self.id, format!("training: epoch {} of {epochs}", epoch.epoch));
+        });
+        self.progress.report(&self.id, "switching");
+        let (added, left_out) = (extended.added, extended.left_out);
+        Ok(TrainedExtension { added, left_out, simulator, trained: trained.map_err(|e| e.to_string())? })
+    }
+
+    fn outcome(&self) -> Result<(Data, Outcome), String> {
+        let data = Data::new(&self.simulator, &self.measurements);
+        let progress = |step: Step| self.progress.report(&self.id, step.to_string());
+        let outcome = diagnose(&self.simulator, &data, &self.request.holdout, self.request.seed, &progress);
+        Ok((data, outcome.map_err(|e| e.to_string())?))
+    }
+}

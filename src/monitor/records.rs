@@ -1,0 +1,234 @@
+//! What is read of the stored batches and their assessments.
+
+use std::fmt;
+use std::sync::Arc;
+
+use super::assessor::Assessor;
+use super::error::Error;
+use crate::assessment::{detail, draw, Assessment, BatchDetail, BatchState};
+use crate::quantity::{Digest, StructureId};
+use crate::reduction::Reduced;
+use crate::store::{
+    BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, MeasurementQuery, QuantitySeries,
+    SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark, UndamagedRecord,
+};
+
+/// A batch with its results.
+pub struct BatchView {
+    /// The batch as stored.
+    pub record: BatchRecord,
+    /// Its current assessment.
+    pub assessment: Option<Assessment>,
+    /// Its points on the alarm charts.
+    pub charts: Vec<StoredChartPoint>,
+    /// Why there is no assessment, or no comparison with an undamaged reference.
+    pub missing: Option<Missing>,
+}
+
+/// Why a batch has no assessment, or no comparison with an undamaged reference.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Missing {
+    /// The structure has no trained baseline in use; why, and what to do.
+    Model(String),
+    /// The batch is part of the reference of this version.
+    PartOfReference(u32),
+    /// The reference of this version was made with another trained baseline: it has to be declared again.
+    OutdatedReference(u32),
+    /// The comparison is still to come.
+    NotYet,
+    /// The structure has no reference: it has to be declared.
+    Reference,
+}
+
+impl fmt::Display for Missing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Model(reason) => f.write_str(reason),
+            Self::PartOfReference(version) => {
+                write!(f, "part of the undamaged reference, version {version}: not compared with itself")
+            }
+            Self::OutdatedReference(version) => write!(
+                f,
+                "the undamaged reference, version {version}, was made with another trained baseline: declare undamaged batches again"
+            ),
+            Self::NotYet => f.write_str("not compared with the undamaged reference yet"),
+            Self::Reference => f.write_str("there is no undamaged reference: declare undamaged batches"),
+        }
+    }
+}
+
+/// Measured and computed series of a structure over a window of time.
+pub struct Series {
+    /// Number and times of the batches in the window.
+    pub extent: Extent,
+    /// Frequencies and covariates.
+    pub measured: Reduced<()>,
+    /// Estimates of each quantity.
+    pub quantities: Vec<QuantitySeries>,
+    /// Trust of each batch.
+    pub trust: Reduced<TrustMark>,
+    /// Alarm charts.
+    pub charts: Vec<ChartSeries>,
+}
+
+/// Reads stored batches and what was computed from them.
+#[derive(Clone)]
+pub struct Records {
+    assessor: Arc<Assessor>,
+}
+
+impl Records {
+    pub(super) fn new(assessor: Arc<Assessor>) -> Self {
+        Self { assessor }
+    }
+
+    /// All stored structures.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn structures(&self) -> Result<Vec<StructureSummary>, Error> {
+        Ok(self.assessor.store.structures().list().await?)
+    }
+
+    /// All structures with their alarms and newest assessments.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn overview(&self) -> Result<Vec<StructureOverview>, Error> {
+        Ok(self.assessor.store.overview().structures().await?)
+    }
+
+    /// The newest undamaged reference of a structure.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn reference(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+        Ok(self.assessor.store.reference().undamaged(structure).await?)
+    }
+
+    /// A page of the batches of a structure with their current assessments.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn history(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<HistoryEntry>, Error> {
+        Ok(self.assessor.store.history().page(structure, query).await?)
+    }
+
+    /// A page of the exceedances of a structure.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn exceedances(&self, structure: &StructureId, query: &HistoryQuery) -> Result<Vec<Exceedance>, Error> {
+        Ok(self.assessor.store.history().exceedances(structure, query).await?)
+    }
+
+    /// A page of the measurements of a structure.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn measurements(
+        &self,
+        structure: &StructureId,
+        query: &MeasurementQuery,
+    ) -> Result<Vec<StoredMeasurement>, Error> {
+        Ok(self.assessor.store.batches().measurements(structure, query).await?)
+    }
+
+    /// The series of a structure; `modes` is its number of modes, `covariates` are the names of its numeric covariates.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn series(
+        &self,
+        structure: &StructureId,
+        window: SeriesWindow,
+        modes: usize,
+        covariates: &[String],
+    ) -> Result<Series, Error> {
+        let store = &self.assessor.store;
+        let extent = store.series().extent(structure, window).await?;
+        let (measured, (quantities, trust), charts) = tokio::try_join!(
+            store.series().frequency_series(structure, window, &extent, modes, covariates),
+            store.series().assessed_series(structure, window, &extent),
+            store.series().chart_series(structure, window, &extent),
+        )?;
+        Ok(Series { extent, measured, quantities, trust, charts })
+    }
+
+    /// One batch with its current assessment.
+    ///
+    /// # Errors
+    /// [`Error::UnknownBatch`], [`Error::UnknownStructure`].
+    pub async fn batch(&self, structure: &StructureId, batch_id: &str) -> Result<BatchView, Error> {
+        self.view(self.assessor.stored(structure, batch_id).await?).await
+    }
+
+    /// A stored batch with its current assessment.
+    pub(super) async fn view(&self, record: BatchRecord) -> Result<BatchView, Error> {
+        let (structure, batch_id) = (&record.batch.structure, record.batch_id.as_str());
+        let assessment = self.assessor.store.assessments().assessment(structure, batch_id).await?;
+        let charts = self.assessor.store.alarms().chart_points(structure, batch_id).await?;
+        self.view_of(record, assessment, charts).await
+    }
+
+    /// A stored batch with these results.
+    pub(super) async fn view_of(
+        &self,
+        record: BatchRecord,
+        assessment: Option<Assessment>,
+        charts: Vec<StoredChartPoint>,
+    ) -> Result<BatchView, Error> {
+        let active = self.assessor.structures.get(&record.batch.structure)?;
+        let missing = match (&assessment, &active.baseline) {
+            (None, Err(reason)) => Some(Missing::Model(reason.clone())),
+            (Some(a), _) if a.undamaged_version.is_none() => {
+                Some(self.why_not_compared(&record, active.model_digest()).await?)
+            }
+            _ => None,
+        };
+        Ok(BatchView { record, assessment, charts, missing })
+    }
+
+    async fn why_not_compared(&self, record: &BatchRecord, model_digest: Option<&Digest>) -> Result<Missing, Error> {
+        let Some(reference) = self.reference(&record.batch.structure).await? else { return Ok(Missing::Reference) };
+        let version = reference.state.version;
+        Ok(if reference.batches.contains(&record.batch_id) {
+            Missing::PartOfReference(version)
+        } else if model_digest.is_some_and(|digest| *digest != reference.model_digest) {
+            Missing::OutdatedReference(version)
+        } else {
+            Missing::NotYet
+        })
+    }
+
+    /// The densities and predictions of an assessed batch, by the samples of its assessment, which are drawn again.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::NoModel`], [`Error::NotAssessed`],
+    /// [`Error::QueueFull`].
+    pub async fn batch_detail(&self, structure: &StructureId, batch_id: &str) -> Result<BatchDetail, Error> {
+        let Assessor { store, structures, compute, .. } = &*self.assessor;
+        let active = structures.get(structure)?;
+        let record = self.assessor.stored(structure, batch_id).await?;
+        let baseline = active.trained_baseline()?;
+        let not_assessed = |reason: String| Error::NotAssessed { batch: batch_id.to_owned(), reason };
+        match record.state {
+            BatchState::Assessed => {}
+            BatchState::Received => return Err(not_assessed("it waits for its assessment".to_owned())),
+            BatchState::Failed => return Err(not_assessed(record.failure.unwrap_or_default())),
+        }
+        let place = compute.reserve()?;
+        let draws = self.assessor.draws(&baseline, &record);
+        let (source, from) = (&record.batch.source, record.batch.time_span().0);
+        let previous = store.batches().frequencies_before(structure, source, from).await?;
+        let reference = store.reference().undamaged(structure).await?.filter(|u| u.model_digest == *baseline.digest());
+        let work = move || {
+            let measurements = &record.batch.measurements;
+            let samples = draw(&baseline, measurements, previous.as_deref(), draws)?;
+            let reference = reference.as_ref().map(|record| &record.state);
+            detail(&baseline, measurements, &samples, draws.per_measurement, reference)
+        };
+        let done = place.run(work).await.map_err(|_| Error::Panicked)?;
+        done.map_err(|error| not_assessed(error.to_string()))
+    }
+}

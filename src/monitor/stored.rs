@@ -1,0 +1,9 @@
+//! The records and errors of the store that the application passes on.
+
+pub use crate::store::{
+    backup, schema_version, Acknowledgement, AuditEntry, AuditQuery, BatchRecord, ChartMark, ChartSeries, Delivery,
+    DeliveryState, DiagnosisRecord, Episode, Error, EventFilter, Exceedance, HistoryEntry, HistoryQuery, JobKind,
+    JobRecord, JobState, LatestAssessment, MaintenanceWindow, MeasurementPlace, MeasurementQuery, NewAuditEntry,
+    PutStructure, QuantityMark, QuantitySeries, QuarantinedMessage, SeriesWindow, StoredChartPoint, StoredMeasurement,
+    StructureOverview, TrustMark, UndamagedRecord, WebhookRecord,
+};

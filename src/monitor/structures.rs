@@ -1,0 +1,235 @@
+//! The active structures, each with its trained baseline or the reason why it has none.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, RwLock, RwLockReadGuard};
+
+use tracing::{error, warn};
+
+use super::error::Error;
+use super::events::Events;
+use crate::baseline::library::Library;
+use crate::baseline::Baseline;
+use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::simulator::definition::StructureDefinition;
+use crate::simulator::Simulator;
+use crate::store::{NewVersion, PutStructure, Store};
+
+/// What to do where a structure has no trained baseline.
+const TRAIN: &str =
+    "train one with `modalwatch train` into the models folder (--models), then reload it or start the service again";
+
+/// A structure in use.
+pub struct ActiveStructure {
+    /// The structure.
+    pub simulator: Simulator,
+    /// The trained baseline in use, or why there is none.
+    pub baseline: Result<Arc<Baseline>, String>,
+}
+
+impl ActiveStructure {
+    /// The trained baseline in use.
+    ///
+    /// # Errors
+    /// [`Error::NoModel`].
+    pub fn trained_baseline(&self) -> Result<Arc<Baseline>, Error> {
+        let missing =
+            |reason: &String| Error::NoModel { structure: self.simulator.id().clone(), reason: reason.clone() };
+        self.baseline.as_ref().map(Arc::clone).map_err(missing)
+    }
+
+    /// Digest of the trained baseline in use.
+    pub(super) fn model_digest(&self) -> Option<&Digest> {
+        self.baseline.as_ref().ok().map(|baseline| baseline.digest())
+    }
+}
+
+/// The structures in use and the library of trained baselines on disk.
+pub struct ActiveStructures {
+    store: Store,
+    events: Events,
+    accept_uncalibrated: Vec<String>,
+    library: RwLock<Arc<Library>>,
+    active: RwLock<BTreeMap<StructureId, Arc<ActiveStructure>>>,
+    refused: BTreeMap<StructureId, String>,
+}
+
+impl ActiveStructures {
+    /// Stores the structures of the library that are not stored yet, and activates all stored structures.
+    pub(super) async fn open(
+        store: Store,
+        library: Library,
+        events: Events,
+        accept_uncalibrated: Vec<String>,
+    ) -> Result<Self, Error> {
+        for refusal in library.refusals() {
+            error!(file = %refusal.file, "Refused {}: {}", refusal.file, refusal.reason);
+        }
+        for (id, entry) in library.iter() {
+            let json = entry.simulator.definition().canonical_json();
+            let outcome =
+                store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            if outcome == PutStructure::Refused {
+                warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches, and the library's definition differs");
+            }
+        }
+        let library = RwLock::new(Arc::new(library));
+        let (active, refused) = (RwLock::default(), BTreeMap::new());
+        let mut structures = Self { store, events, accept_uncalibrated, library, active, refused };
+        for summary in structures.store.structures().list().await? {
+            let id = summary.id;
+            let Some(record) = structures.store.structures().structure(&id).await? else { continue };
+            match StructureDefinition::parse_json(&record.definition_json).and_then(Simulator::new) {
+                Ok(simulator) => {
+                    let baseline = structures.baseline_for(&simulator).await?;
+                    structures.activate(simulator, baseline);
+                }
+                // One invalid definition must not keep the other structures from being monitored.
+                Err(reason) => {
+                    error!(structure.id = %id, "Refused the stored definition of {id}: {reason}");
+                    structures.refused.insert(id, reason.to_string());
+                }
+            }
+        }
+        Ok(structures)
+    }
+
+    /// A structure in use.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`]; [`Error::DefinitionRefused`] for one whose stored definition is not valid any more.
+    pub fn get(&self, id: &StructureId) -> Result<Arc<ActiveStructure>, Error> {
+        self.read().get(id).cloned().ok_or_else(|| match self.refused.get(id) {
+            Some(reason) => Error::DefinitionRefused { structure: id.clone(), reason: reason.clone() },
+            None => Error::UnknownStructure(id.clone()),
+        })
+    }
+
+    /// Ids of the structures in use.
+    pub fn ids(&self) -> Vec<StructureId> {
+        self.read().keys().cloned().collect()
+    }
+
+    /// Digests of the trained baselines in use, by structure.
+    pub fn models_in_use(&self) -> Vec<(StructureId, Digest)> {
+        self.read().iter().filter_map(|(id, active)| Some((id.clone(), active.model_digest()?.clone()))).collect()
+    }
+
+    /// Stored structures that this version of the program refuses, with the reason.
+    pub fn refused(&self) -> &BTreeMap<StructureId, String> {
+        &self.refused
+    }
+
+    /// Structures and trained baselines on disk, as last read.
+    pub fn library(&self) -> Arc<Library> {
+        Arc::clone(&self.library.read().expect("no holder of this lock panics"))
+    }
+
+    /// Replaces what was read from disk.
+    pub(super) fn set_library(&self, library: Library) {
+        *self.library.write().expect("no holder of this lock panics") = Arc::new(library);
+    }
+
+    /// Defines a structure.
+    ///
+    /// # Errors
+    /// [`Error::StructureInUse`] when it has batches under another definition.
+    pub async fn put(&self, definition: StructureDefinition) -> Result<PutStructure, Error> {
+        let built = tokio::task::spawn_blocking(move || Simulator::new(definition)).await;
+        let simulator = built.unwrap_or_else(|e| std::panic::resume_unwind(e.into_panic()))?;
+        let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
+        let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
+        match outcome {
+            PutStructure::Refused => return Err(Error::StructureInUse(id)),
+            PutStructure::Created | PutStructure::Replaced => {
+                let baseline = self.baseline_for(&simulator).await?;
+                self.activate(simulator, baseline);
+                self.events.structure_changed(&id);
+            }
+            PutStructure::Unchanged => {}
+        }
+        Ok(outcome)
+    }
+
+    /// Puts a structure into use, in place of its present version if there is one.
+    pub(super) fn activate(&self, simulator: Simulator, baseline: Result<Arc<Baseline>, String>) {
+        let id = simulator.id().clone();
+        let active = Arc::new(ActiveStructure { simulator, baseline });
+        self.active.write().expect("no holder of this lock panics").insert(id, active);
+    }
+
+    /// Puts another trained baseline into use, unless the structure changed to another version since `expected` was read.
+    pub(super) fn swap_baseline(&self, expected: &ActiveStructure, baseline: Arc<Baseline>) -> Result<(), Error> {
+        let structure = expected.simulator.id();
+        let mut all = self.active.write().expect("no holder of this lock panics");
+        let present = all.get(structure).ok_or_else(|| Error::UnknownStructure(structure.clone()))?;
+        if present.simulator.digest() != expected.simulator.digest() {
+            return Err(Error::VersionChanged(structure.clone()));
+        }
+        let swapped = ActiveStructure { simulator: present.simulator.clone(), baseline: Ok(baseline) };
+        all.insert(structure.clone(), Arc::new(swapped));
+        Ok(())
+    }
+
+    /// Puts another version of a structure into use, unless it changed since the version `expected`.
+    pub(super) async fn switch_version(
+        &self,
+        expected: &Digest,
+        version: NewVersion,
+        simulator: Simulator,
+        baseline: Arc<Baseline>,
+    ) -> Result<(), Error> {
+        let structure = simulator.id().clone();
+        if !self.store.structures().switch_version(&structure, expected, version, Timestamp::now()).await? {
+            return Err(Error::VersionChanged(structure));
+        }
+        self.activate(simulator, Ok(baseline));
+        self.events.structure_changed(&structure);
+        Ok(())
+    }
+
+    /// The trained baseline for a version of a structure: one that the service trained for it, or that of the library.
+    pub(super) async fn baseline_for(&self, simulator: &Simulator) -> Result<Result<Arc<Baseline>, String>, Error> {
+        let Some(stored) = self.store.structures().trained_baseline(simulator.id(), simulator.digest()).await? else {
+            return Ok(self.library_baseline(simulator));
+        };
+        let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);
+        let refused = |e: crate::baseline::LoadError| format!("the baseline that the service trained is refused: {e}");
+        let usable = |baseline: &Baseline| if stored.accepted { Ok(()) } else { self.usable(baseline) };
+        Ok(loaded.map_err(refused).and_then(|baseline| usable(&baseline).map(|()| Arc::new(baseline))))
+    }
+
+    fn library_baseline(&self, simulator: &Simulator) -> Result<Arc<Baseline>, String> {
+        let id = simulator.id();
+        let library = self.library();
+        let Some(entry) = library.get(id) else {
+            return Err(format!("no trained baseline: {TRAIN}"));
+        };
+        if entry.simulator.digest() != simulator.digest() {
+            return Err(format!("the trained baseline is for another definition of {id}: {TRAIN}"));
+        }
+        let refused = || library.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
+        let baseline = entry.baseline.clone().ok_or_else(|| match refused() {
+            Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
+            None => format!("no trained baseline: {TRAIN}"),
+        })?;
+        self.usable(&baseline).map(|()| baseline)
+    }
+
+    /// Whether a trained baseline passed its calibration or is accepted by configuration; otherwise why it may not be used.
+    pub(super) fn usable(&self, baseline: &Baseline) -> Result<(), String> {
+        let failures = &baseline.manifest().calibration.failures;
+        let digest = baseline.digest().as_str();
+        if failures.is_empty() || self.accept_uncalibrated.iter().any(|accepted| accepted == digest) {
+            return Ok(());
+        }
+        Err(format!(
+            "the trained baseline failed its calibration ({}): train again with more samples or epochs; to use it nevertheless, \
+             and have every answer say so, add its digest {digest} to monitor.accept_uncalibrated",
+            failures.join("; ")
+        ))
+    }
+
+    fn read(&self) -> RwLockReadGuard<'_, BTreeMap<StructureId, Arc<ActiveStructure>>> {
+        self.active.read().expect("no holder of this lock panics")
+    }
+}

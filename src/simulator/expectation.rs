@@ -1,0 +1,20 @@
+//! What the measurements of a structure must look like.
+
+use super::Simulator;
+use crate::measurement::check::Expectation;
+use crate::quantity::Timestamp;
+
+impl Simulator {
+    /// The rules for measurements of this structure that arrive at the time `now`, at most `max_measurements` in a batch.
+    pub fn expectation(&self, now: Timestamp, max_measurements: usize) -> Expectation<'_> {
+        Expectation {
+            modes: self.modes(),
+            frequency_limits_hz: self.frequency_limits_hz(),
+            covariates: self.covariates(),
+            instrumented: self.instrumented_points(),
+            space: self.space(),
+            now,
+            max_measurements,
+        }
+    }
+}

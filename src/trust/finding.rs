@@ -1,0 +1,99 @@
+//! Findings about a batch: what the reader must know before relying on the figures.
+
+use serde::{Deserialize, Serialize};
+
+/// The effect of a finding on the assessment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FindingEffect {
+    /// The reader is informed; nothing else follows.
+    Note,
+    /// The batch does not enter the alarm charts.
+    HoldAlarm,
+    /// The batch is rejected.
+    Reject,
+}
+
+/// Kind of a finding; the names are part of the API.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FindingCode {
+    /// No parameters of the prior give these frequencies within their noise.
+    SimulationDoesNotFit,
+    /// As many parameters as modes: a misfit inside the prior box cannot be detected.
+    FitNotTestable,
+    /// The values are in another unit than Hz.
+    UnitSuspected,
+    /// Modes are in the wrong order.
+    ModesSwapped,
+    /// A mode was missed, and those above it were numbered one too low.
+    ModesShifted,
+    /// All measurements are the same: the sensor hangs.
+    NoScatter,
+    /// A measurement repeats an earlier one to the last digit.
+    StaleRepeat,
+    /// Frequencies are rounded to steps larger than their scatter.
+    Quantised,
+    /// Single measurements far from the others or from anything the simulation gives; left out.
+    Outlier,
+    /// Measurements slightly beyond the prior; the nearest point of the prior is used for them.
+    OutsidePrior,
+    /// Many samples lie at a bound of a prior.
+    PriorEdge,
+    /// Less noise stated than the baseline was trained for; the least trained noise is used.
+    NoiseBelowRange,
+    /// Measurements that lack modes which the baseline needs; left out.
+    NotUsable,
+    /// More noise stated than the baseline was trained for; those modes are left out.
+    NoiseAboveRange,
+    /// Covariates outside those of the undamaged reference.
+    Extrapolated,
+    /// Parameters where the table behind an emulator has no runs.
+    BeyondRuns,
+    /// The undamaged reference or the simulation has a covariate that measurements lack.
+    CovariateMissing,
+    /// Too few effective samples for the hyperparameters.
+    FewEffectiveSamples,
+    /// The baseline in use did not pass its calibration and was accepted by configuration.
+    Uncalibrated,
+    /// Parameters that these modes cannot distinguish.
+    NotIdentifiable,
+    /// Modes that the emulator of a table reproduces badly.
+    EmulatorDoubtful,
+}
+
+/// One finding about a batch.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Finding {
+    /// Its kind.
+    pub code: FindingCode,
+    /// Its effect on the assessment.
+    pub effect: FindingEffect,
+    /// A sentence for people.
+    pub message: String,
+    /// Index of the measurements concerned; empty for the whole batch.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub measurements: Vec<usize>,
+}
+
+impl Finding {
+    /// A finding about the whole batch.
+    pub fn new(code: FindingCode, effect: FindingEffect, message: impl Into<String>) -> Self {
+        Self { code, effect, message: message.into(), measurements: Vec::new() }
+    }
+
+    /// The same about some of its measurements.
+    #[must_use]
+    pub fn of(mut self, measurements: Vec<usize>) -> Self {
+        self.measurements = measurements;
+        self
+    }
+}
+
+/// A batch is rejected as a whole when more than this share of its measurements, and more than one, are bad.
+const MOST_BAD: f64 = 0.1;
+
+/// True when `bad` of `all` measurements are so many that the others cannot be trusted either.
+pub(super) fn too_many(bad: usize, all: usize) -> bool {
+    bad > 0 && (bad == all || bad as f64 > (MOST_BAD * all as f64).max(1.0))
+}

@@ -1,0 +1,42 @@
+//! Findings that hold for every batch of a trained baseline.
+
+use super::finding::{Finding, FindingCode, FindingEffect};
+use crate::baseline::Baseline;
+
+/// Failures of a calibration that a finding quotes.
+const SHOWN_FAILURES: usize = 3;
+
+/// Findings about the trained baseline itself: that it did not pass its calibration, that it cannot distinguish parameters, that
+/// its emulator is doubtful.
+pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
+    let record = &baseline.manifest().calibration;
+    let uncalibrated = (!record.passed()).then(|| {
+        // A flow that was trained far too short fails in dozens of places; a few of them are enough to read.
+        let some = record.failures.iter().take(SHOWN_FAILURES).cloned().collect::<Vec<_>>().join("; ");
+        let more = record.failures.len().saturating_sub(SHOWN_FAILURES);
+        let more = if more > 0 { format!("; and {more} more, see its manifest") } else { String::new() };
+        let message = format!("the trained baseline in use failed its calibration: {some}{more}");
+        Finding::new(FindingCode::Uncalibrated, FindingEffect::Note, message)
+    });
+    let grouped = baseline.groups().into_iter().map(|group| {
+        let names: Vec<&str> = group.columns.iter().map(|&k| baseline.space().as_slice()[k].name.as_str()).collect();
+        let message = format!(
+            "these modes cannot distinguish {}: damage is assessed for their mean, {}, and not for each of them",
+            names.join(" and "),
+            group.name
+        );
+        Finding::new(FindingCode::NotIdentifiable, FindingEffect::Note, message)
+    });
+    // Parameters of different kinds cannot be averaged: the pair is reported, and each keeps its own figures.
+    let parameters = &baseline.manifest().identifiability.parameters;
+    let grouped_names: Vec<&String> = baseline.manifest().identifiability.groups.iter().flatten().collect();
+    let confused = parameters.iter().filter(|p| !grouped_names.contains(&&p.name) && p.is_confused()).map(|p| {
+        let other = p.confused_with.as_ref().map_or("another parameter", |(name, _)| name.as_str());
+        let message =
+            format!("these modes hardly distinguish {} from {other}: damage of one may appear in the other", p.name);
+        Finding::new(FindingCode::NotIdentifiable, FindingEffect::Note, message)
+    });
+    let simulation = baseline.simulator().warnings().into_iter();
+    let doubtful = simulation.map(|message| Finding::new(FindingCode::EmulatorDoubtful, FindingEffect::Note, message));
+    uncalibrated.into_iter().chain(grouped).chain(confused).chain(doubtful).collect()
+}
