@@ -4,34 +4,36 @@
 //! each the probability that it has fallen below what the undamaged structure showed. Between them stands a conditional
 //! invertible neural network, trained once on simulations of the structure.
 //!
-//! # The house
+//! # Modules
 //!
-//! Numbers with units enter at the bottom, JSON leaves at the top. Each room uses only rooms below it;
-//! `tests/architecture.rs` holds them to it.
+//! Data flows in one direction: numbers with units enter at the bottom of this list, and JSON leaves at the top. Each module uses
+//! only modules below it, and no two files of a module use each other in a circle; `tests/architecture.rs` checks both.
 //!
 //! ```text
-//!  cli · http                            the doors      words for people and programs
-//!  config · telemetry                    what the doors are set to, and what they log
-//!  reproduce                             the exam       the paper's cases by all methods, beside its figures
-//!  mqtt                                  the letter box batches from a broker
-//!  monitor                               the office     what happens to a batch
-//!  notify                                the messenger  who is told of alarms: webhooks
-//!  store                                 the archive    the only room that speaks SQL
-//!  access                                who may do what: tokens and scopes
-//!  assessment                            the result of one batch
-//!  alarm                                 charts, limits, states: when to wake somebody
-//!  discrepancy                           the study: what the simulation gets wrong, and what would mend it
-//!  damage                                judgement on the population behind a batch
-//!  trust                                 whether an answer may be believed
+//!  cli · http                            commands for people · the HTTP API and the dashboard
+//!  config · telemetry                    settings · logs and traces
+//!  reproduce                             both cases of the paper by all methods, beside its figures
+//!  mqtt                                  batches from a message broker
+//!  monitor                               the application: ingest, replay, jobs, upkeep
+//!  notify                                webhooks
+//!  store                                 the database; the only module with SQL
+//!  access                                tokens and scopes
+//!  assessment                            from the measurements of a batch to its assessment and its chart points
+//!  alarm                                 control charts, their limits, and the states of alarms
+//!  discrepancy                           diagnosis: what the simulation gets wrong, and the extension that corrects it
+//!  damage                                undamaged reference, damage thresholds, probability of damage
+//!  trust                                 whether an answer can be trusted
 //!  hierarchy                             the population behind posterior samples
-//!  baseline                              a trained flow, its record, and where it is found
-//!  posterior                             samples of the parameters, whoever drew them
-//!  updating                              the same question without a flow: sensitivity, TMCMC, laws
-//!  simulator                             the bench      parameters in, natural frequencies out
-//!  physics | emulator | gsa | flow       workshops      structures | tables of runs | global sensitivity | networks
-//!  parameter · measurement               what is unknown · what arrives
-//!  quantity · stats · simd · plot · reduction · volume   the foundation
+//!  baseline                              trained models: training, calibration, inference, files
+//!  posterior                             posterior samples of the parameters, by whichever method
+//!  updating                              model updating without a network: sensitivity method, TMCMC, laws of springs
+//!  simulator                             from parameters to natural frequencies; the structure file
+//!  physics | emulator | gsa | flow       eigenproblems | emulators of finite-element runs | Sobol' indices | the invertible network
+//!  parameter · measurement               unknowns and their priors · measurements and their checks
+//!  quantity · stats · simd · plot · reduction · volume   units, statistics, vector arithmetic, SVG, data reduction, file systems
 //! ```
+//!
+//! `docs/architecture.md` follows one batch through these modules.
 //!
 //! # Reading order
 //!
@@ -45,19 +47,19 @@
 //! | parameter | an unknown of the structure, mostly a stiffness; θ is a vector of them |
 //! | batch | measurements of one structure taken in one state |
 //! | hyperparameters | mean and standard deviation of a parameter over a batch |
-//! | baseline | a trained flow with its manifest: `models/<structure>/baseline.safetensors` and `.json` |
-//! | model digest | SHA-256 of the manifest; names the baseline in every result |
-//! | undamaged state | the batches later ones are compared with; made by `POST …/baseline` |
-//! | threshold δ | μ_ud − 1.645 σ_ud: below it a value counts as damaged |
-//! | population | normal distribution of a parameter over the measurements of a batch, free of their noise |
-//! | pool | all posterior samples of a batch together: the paper's estimate, noise included |
+//! | trained model, trained baseline | a trained flow with its manifest: `models/<structure>/baseline.safetensors` and `.json` |
+//! | model digest | SHA-256 of the manifest; identifies the trained model in every result |
+//! | undamaged reference | the batches that later ones are compared with; declared by `PUT` or `POST …/reference` |
+//! | threshold δ | μ_ud − 1.645 σ_ud, the 5 % quantile of the undamaged reference; lower values are considered damaged |
+//! | population | normal distribution of a parameter over the measurements of a batch, without their noise |
+//! | pool | all posterior samples of a batch together: the paper's estimate, which includes the noise |
 //! | probability of damage | P(x < δ) of the population behind a batch; of the pool, its share below δ |
-//! | exceedance | a probability of damage above that of the undamaged state, 5 % |
-//! | chart, episode | shift of a batch from the undamaged state in standard errors; an alarm from its first batch to its end |
+//! | exceedance | a probability of damage above that of the undamaged reference, 5 % |
+//! | chart, episode | shift of a batch from the undamaged reference in standard errors; an alarm from its first batch to its end |
 //! | effect | target × law × covariate: what acts on a structure beside its parameters |
-//! | cause, verdict | an effect that the simulation lacks; what a diagnosis says of the causes |
-//! | extension | a new version of a structure with the causes as effects, and its own baseline |
-//! | outside | a measurement that no parameters of the prior give |
+//! | cause, verdict | an effect that the simulation lacks; the conclusion of a diagnosis about the causes |
+//! | extension | a new version of a structure with the causes as effects, and its trained model |
+//! | outside | a measurement that no parameters inside the prior can produce |
 //!
 //! # References
 //!
@@ -72,7 +74,7 @@
 //! - D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
 //!   2166–2175. Populations from posterior samples. A. Gelman (2006), Prior distributions for variance parameters in
 //!   hierarchical models, Bayesian Analysis 1, 515–533. The prior of their spread. T. A. Louis (1982), Finding the observed
-//!   information matrix when using the EM algorithm, J. R. Stat. Soc. B 44, 226–233. Where their draws are looked for.
+//!   information matrix when using the EM algorithm, J. R. Stat. Soc. B 44, 226–233. Their importance proposal.
 //! - S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
 //!   arXiv:1804.06788; P. Lemos et al. (2023), Sampling-based accuracy testing of posterior estimators for general
 //!   inference, ICML. Ranks and TARP.
