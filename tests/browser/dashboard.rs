@@ -257,7 +257,7 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     page.evaluate("document.querySelector('input[name=by]').focus()");
     page.type_text("Ines Vogel");
     page.press("Enter");
-    page.wait_for("document.getElementById('alarms').textContent.includes('seen by Ines Vogel')");
+    page.wait_for("document.getElementById('alarms').textContent.includes('acknowledged by Ines Vogel')");
     let alarms = service.read("/v1/structures/three-dof/alarms").await;
     assert_eq!(alarms["items"][0]["acknowledgement"]["by"], "Ines Vogel", "{alarms}");
 

@@ -110,7 +110,7 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undo
 
     // The bar of the job grows while one looks at it.
     page.evaluate("location.hash = '#/jobs'");
-    let job = "[...document.querySelectorAll('[data-job]')].find((row) => row.textContent.includes('Extension of the model'))";
+    let job = "[...document.querySelectorAll('[data-job]')].find((row) => row.textContent.includes('Model extension'))";
     let bar = format!("{job}?.querySelector('progress')?.value");
     let first = page.wait_for(&format!("{job}?.textContent.includes('epoch') && {bar}")).as_f64().unwrap();
     page.wait_for(&format!("({bar} ?? 1) > {first}"));
@@ -119,13 +119,13 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undo
     page.wait_for(&format!("{job}.textContent.includes('Done')"));
 
     page.evaluate("location.hash = '#/structures/tiny'");
-    page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('The model was extended by it')");
+    page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('The model has been extended')");
     let after = service.read("/v1/structures/tiny").await;
     assert_eq!(after["digest"], extended["extension"]["result"]["structure_digest"]);
     assert_ne!(after["digest"], before["digest"]);
 
-    press_and_confirm(&mut page, "Step back");
-    page.wait_for("document.getElementById('notices').textContent.includes('Went back to the version before')");
+    press_and_confirm(&mut page, "Undo last extension");
+    page.wait_for("document.getElementById('notices').textContent.includes('The previous version has been restored')");
     let back = service.read("/v1/structures/tiny").await;
     assert_eq!((&back["digest"], &back["model"]["digest"]), (&before["digest"], &before["model"]["digest"]));
     assert_eq!(page.evaluate("window.sameLoad"), json!(true), "the page was loaded again");

@@ -42,13 +42,13 @@ async fn a_wrong_token_is_refused_with_a_message_and_the_right_one_shows_the_fle
     page.call("Page.navigate", &json!({ "url": at(&service, "") }));
     page.wait_for("document.querySelector('dialog[open]') !== null");
     let told = |page: &mut Page| {
-        page.evaluate("document.querySelector('dialog').textContent.includes('did not take the token')")
+        page.evaluate("document.querySelector('dialog').textContent.includes('did not accept the token')")
     };
     assert_eq!(told(&mut page), json!(false));
     // One of the right form that the service does not know.
     let wrong = format!("mw_{}_{}", "0".repeat(16), "0".repeat(52));
     sign_in(&mut page, &wrong);
-    page.wait_for("document.querySelector('dialog[open]')?.textContent.includes('did not take the token')");
+    page.wait_for("document.querySelector('dialog[open]')?.textContent.includes('did not accept the token')");
     assert_eq!(page.evaluate("document.querySelectorAll('table.fleet tbody tr').length"), json!(0));
     only_told_of(&mut page, 401);
 

@@ -1,4 +1,4 @@
-// The page: header, routes, the sign-in, and events that bring views up to date.
+// Entry point of the page: header, routing, sign-in, and the server events that update the view.
 
 import { ApiError, keepToken, onUnauthorized, token } from "./api.js";
 import { endCharts } from "./charts/base.js";
@@ -13,8 +13,8 @@ import { structure } from "./structure.js";
 
 const main = document.getElementById("main");
 
-/** The view on the page: `{element, title, load(), event(name, data), missed()}`, and
- * `end()` where work may be under way. */
+/** The view that is shown: `{element, title, load(), event(name, data), missed()}`, and `end()` if it must be told that the
+ * user has left it. */
 let view = null;
 
 const ROUTES = [
@@ -36,8 +36,13 @@ async function route() {
     view = null;
     fill(
       main,
-      h("h1", null, "Nothing here"),
-      h("p", null, "This address names no view. ", h("a", { href: "#/" }, "To the fleet")),
+      h("h1", null, "Page not found"),
+      h(
+        "p",
+        null,
+        "This address does not belong to any page of the dashboard. ",
+        h("a", { href: "#/" }, "Go to the fleet"),
+      ),
     );
     return;
   }
@@ -50,14 +55,14 @@ async function route() {
     await opened.load();
     if (view === opened) fill(main, opened.element);
   } catch (error) {
-    // A mistake of the page itself belongs into the console too.
+    // An error in this code, not in an answer of the service, is also written to the console.
     if (!(error instanceof ApiError)) console.error(error);
     if (view === opened) fill(main, h("h1", null, opened.title), problem(error, route));
   }
 }
 
 window.addEventListener("hashchange", () => {
-  // A new view begins at its top, for keyboards and screen readers too.
+  // Keyboard and screen reader users start at the top of a new view as well.
   route().then(() => main.focus({ preventScroll: true }));
 });
 
@@ -66,9 +71,9 @@ document.getElementById("skip").addEventListener("click", (event) => {
   main.focus();
 });
 
-// Colours: as the system, or as chosen.
+// Colour theme: the setting of the operating system, or the choice of the user.
 const THEMES = [
-  ["auto", "auto", "as the system"],
+  ["auto", "auto", "system setting"],
   ["light", "sun", "light"],
   ["dark", "moon", "dark"],
 ];
@@ -91,25 +96,25 @@ themeButton.addEventListener("click", () => {
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", themeChanged);
 showTheme(localStorage.getItem("modalwatch.theme"));
 
-// The token: asked for once, when the service wants one.
+// Sign-in: the user is asked for a token once, if the service requires one.
 let asking = null;
 const signButton = document.getElementById("sign");
-/** An open service has nothing to sign in to. */
-let wantsToken = false;
+/** Whether the service has asked for a token; without that, the sign-in button stays hidden. */
+let needsToken = false;
 function showSign() {
-  signButton.hidden = !wantsToken && !token();
+  signButton.hidden = !needsToken && !token();
   fill(signButton, token() ? "Sign out" : "Sign in");
 }
 function askForToken(error) {
-  wantsToken = true;
+  needsToken = true;
   showSign();
   asking ??= ask({
     title: "Sign in",
     body: h(
       "p",
       null,
-      error && token() ? "The service did not take the token kept in this tab. " : "",
-      "Enter an API token (mw_…) of this service. It stays in this tab and is forgotten when the tab closes.",
+      error && token() ? "The service did not accept the token stored in this tab. " : "",
+      "Enter an API token (mw_…) of this service. It is stored in this tab only and deleted when the tab is closed.",
     ),
     fields: [{ name: "token", label: "Token", type: "password", required: true, autocomplete: "current-password" }],
     confirm: "Sign in",
@@ -121,14 +126,14 @@ onUnauthorized(askForToken);
 signButton.addEventListener("click", async () => {
   if (token()) {
     keepToken(null);
-    notify("Signed out: the token is forgotten.");
+    notify("Signed out. The token has been deleted from this tab.");
     route();
   } else if (await askForToken(null)) route();
 });
 window.addEventListener("token", showSign);
 showSign();
 
-// What happens, as it happens.
+// Live updates from the service.
 const live = document.getElementById("live");
 const LIVE = { connecting: "Connecting", live: "Live", reconnecting: "Reconnecting", "signed-out": "Signed out" };
 follow("v1/events", {
@@ -139,7 +144,7 @@ follow("v1/events", {
   },
   event: (name, data) => {
     if (name === "job") showRunning();
-    // The service tells a client that was too slow for some events.
+    // The service sends `resync` to a client that has missed events because it read them too slowly.
     if (name === "resync") view?.missed?.();
     else view?.event?.(name, data);
   },

@@ -1,8 +1,8 @@
-// Elements without a framework: `h` makes one, the rest is what several views share.
+// Construction of DOM elements without a framework, and elements that several views share.
 
 const SVG = "http://www.w3.org/2000/svg";
 
-/** An element: `h("a", { class: "x", href: "#/", onclick: go }, "text", child, [more])`. */
+/** Creates an element: `h("a", { class: "x", href: "#/", onclick: go }, "text", child, [more])`. */
 export function h(tag, attributes, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes ?? {})) {
@@ -18,7 +18,7 @@ export function h(tag, attributes, ...children) {
 
 const PROPERTIES = { value: 1, checked: 1, selected: 1, disabled: 1, hidden: 1, open: 1 };
 
-/** A cell of a table that becomes cards on a narrow page: it knows its column. */
+/** A table cell that carries the name of its column. On narrow screens, tables are shown as cards with these names. */
 export function cell(column, ...content) {
   return h("td", { "data-label": column }, h("span", { class: "cell" }, content));
 }
@@ -29,7 +29,7 @@ export function fill(element, ...children) {
   return element;
 }
 
-/** Paths of icons on a grid of 16. */
+/** SVG paths of the icons, on a 16 × 16 grid. */
 const ICONS = {
   check: "M3 8.5l3.2 3.2L13 4.8",
   alarm: "M8 2L15 14H1zM8 6.5v3.5M8 11.8v.4",
@@ -49,7 +49,7 @@ const ICONS = {
   wrench: "M10 6.5a3.5 3.5 0 0 0 4.3-4.3l-2.2 2.2-1.8-.4-.4-1.8L12 .2A3.5 3.5 0 0 0 7.6 4.6L2 10.2a2 2 0 0 0 2.8 2.8z",
 };
 
-/** An icon; the words beside it carry the meaning. */
+/** A decorative icon, hidden from screen readers: the text beside it carries the meaning. */
 export function icon(name) {
   const svg = document.createElementNS(SVG, "svg");
   svg.setAttribute("viewBox", "0 0 16 16");
@@ -61,7 +61,7 @@ export function icon(name) {
   return svg;
 }
 
-/** The same for a list whose entries carry `data-key`: a button that had the focus gets it back. */
+/** Replaces the content of a list whose entries carry `data-key`, and restores the focus to the button or link that had it. */
 export function refill(element, ...children) {
   const focused = element.contains(document.activeElement) ? document.activeElement : null;
   const entry = focused?.closest("[data-key]")?.dataset.key;
@@ -74,7 +74,7 @@ export function refill(element, ...children) {
   same?.focus();
 }
 
-/** A sentence at the top of the page that goes away by itself. */
+/** Shows a message at the top of the page; it disappears after some seconds. */
 export function notify(message, kind = "note") {
   const notice = h("p", { class: `notice ${kind}` }, icon(kind === "error" ? "alarm" : "note"), message);
   const close = h("button", { type: "button", class: "quiet", "aria-label": "Dismiss" }, icon("cross"));
@@ -84,7 +84,7 @@ export function notify(message, kind = "note") {
   setTimeout(() => notice.remove(), kind === "error" ? 20000 : 6000);
 }
 
-/** An error as people need it: what, why, and the id under which the log has it. */
+/** An error for the user: title, reason, rejected fields, and the request ID under which the service has logged it. */
 export function problem(error, retry) {
   const details = (error.errors ?? []).map((e) => h("li", null, h("code", null, e.pointer), ` ${e.message}`));
   return h(
@@ -93,19 +93,19 @@ export function problem(error, retry) {
     h("p", null, icon("alarm"), h("strong", null, error.title ?? "Something went wrong")),
     h("p", null, error.message),
     details.length > 0 && h("ul", null, details),
-    error.requestId && h("p", { class: "fine" }, "Request id for the log: ", h("code", null, error.requestId)),
+    error.requestId && h("p", { class: "fine" }, "Request ID in the log: ", h("code", null, error.requestId)),
     retry && h("p", null, h("button", { type: "button", onclick: retry }, "Try again")),
   );
 }
 
 /**
- * A dialog with a form. `submit(values)` may throw: the error is shown and the dialog stays. Escape and "Cancel" close it;
- * the focus goes back to where it was. Resolves to what `submit` gave, or to `undefined`.
+ * Opens a dialog with a form. If `submit(values)` throws, the error is shown and the dialog stays open. Escape and "Cancel"
+ * close it; the focus then returns to where it was. Resolves to the result of `submit`, or to `undefined` if cancelled.
  */
 export function ask({ title, body, fields = [], confirm, danger = false, cancel = "Cancel", submit }) {
   return new Promise((resolve) => {
     let outcome;
-    const complaint = h("div", null);
+    const errorBox = h("div", null);
     const inputs = fields.map((field) => {
       const id = `field-${field.name}`;
       const kind = field.type === "textarea" ? "textarea" : "input";
@@ -130,7 +130,7 @@ export function ask({ title, body, fields = [], confirm, danger = false, cancel 
       h("h2", { id: "dialog-title" }, title),
       body,
       inputs,
-      complaint,
+      errorBox,
       h("p", { class: "buttons" }, stop, send),
     );
     const dialog = h("dialog", { "aria-labelledby": "dialog-title" }, form);
@@ -141,7 +141,7 @@ export function ask({ title, body, fields = [], confirm, danger = false, cancel 
         outcome = (await submit(Object.fromEntries(new FormData(form)))) ?? true;
         dialog.close();
       } catch (error) {
-        fill(complaint, problem(error));
+        fill(errorBox, problem(error));
       } finally {
         send.disabled = false;
       }
@@ -157,7 +157,7 @@ export function ask({ title, body, fields = [], confirm, danger = false, cancel 
   });
 }
 
-/** Runs `work` at most once every `wait_ms`, the last call always. */
+/** Wraps `work` so that it runs at most once every `wait_ms`; calls in between are merged into one that runs afterwards. */
 export function throttled(work, wait_ms) {
   let timer = null;
   let last = -Infinity;

@@ -1,12 +1,13 @@
-// Server-sent events, read by fetch so that the token goes along in a header; connects again by itself.
+// Server-sent events with automatic reconnection. They are read with `fetch`, because `EventSource` cannot send the token
+// in a header.
 
 import { request } from "./api.js";
 
-/** No byte for this long means a dead connection: the service sends a heartbeat every 15 s. */
+/** A connection without any byte for this long is considered dead: the service sends a heartbeat every 15 s. */
 const SILENCE_MS = 40000;
 const LONGEST_WAIT_MS = 30000;
 
-/** Parser of an event stream: feed it text, it hands out `{event, data}`. */
+/** Parser of an event stream: takes chunks of text and passes each complete `{event, data}` to `deliver`. */
 export function parser(deliver) {
   let rest = "";
   let event = "message";
@@ -30,14 +31,16 @@ export function parser(deliver) {
 }
 
 /**
- * Follows `path` for as long as the page lives. `on.event(name, data)` for each event, `on.state(state)` with `connecting`,
- * `live`, `reconnecting` or `signed-out`, `on.missed()` after a connection was lost: what happened meanwhile has to be read again.
+ * Follows the event stream at `path` until the page is closed. Calls `on.event(name, data)` for each event, `on.state(state)`
+ * with `live`, `reconnecting` or `signed-out`, and `on.missed()` after a lost connection has been restored: the data
+ * must then be read again, because events may have been missed.
  */
 export function follow(path, on) {
   let failures = 0;
   let wake = null;
   let controller = null;
-  /** True while the page is left but kept by the browser, which would keep its connection too: there are six for a host. */
+  /** True while the browser keeps the page in its back/forward cache. The connection is closed then, because browsers allow
+   * only six connections per host. */
   let away = false;
 
   const attempt = async () => {
@@ -80,7 +83,7 @@ export function follow(path, on) {
     }
   };
 
-  // A laptop that wakes up, a network that comes back, a token just given: no need to wait.
+  // Reconnect without delay when the page is shown again, the network returns, or the token changes.
   window.addEventListener("pagehide", () => {
     away = true;
     controller?.abort();

@@ -1,4 +1,4 @@
-// Numbers with units and times in the viewer's zone.
+// Formatting of numbers, units and times.
 
 import { h } from "./dom.js";
 
@@ -14,7 +14,7 @@ const full = new Intl.DateTimeFormat(undefined, {
 });
 const withZone = new Intl.DateTimeFormat(undefined, { timeZoneName: "short" });
 
-/** Name of the viewer's time zone now, for axes. */
+/** Short name of the viewer's current time zone. */
 export function zone() {
   return withZone.formatToParts(new Date()).find((part) => part.type === "timeZoneName")?.value ?? "local time";
 }
@@ -30,13 +30,13 @@ export function utc(time) {
   return `${new Date(time).toISOString().slice(0, 19).replace("T", " ")} UTC`;
 }
 
-/** An element with the local time; UTC in its title. */
+/** A `<time>` element with the local time; its tooltip shows UTC. */
 export function timeElement(time) {
   if (!time) return h("span", null, MISSING);
   return h("time", { datetime: new Date(time).toISOString(), title: utc(time) }, local(time));
 }
 
-/** The same, told from now; kept fresh by `refreshAges`. */
+/** A `<time>` element with the time relative to now, such as "5 minutes ago"; `refreshAges` keeps it up to date. */
 export function age(time) {
   if (!time) return h("span", null, "never");
   const iso = new Date(time).toISOString();
@@ -67,7 +67,7 @@ function ago(time) {
   return seconds < 0 ? `in ${words}` : `${words} ago`;
 }
 
-/** A number with so many significant digits. */
+/** A number rounded to `digits` significant digits. */
 export function number(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return MISSING;
   const size = Math.abs(value);
@@ -85,7 +85,7 @@ export function quantity(value, unit, digits) {
   return unit && unit !== "1" ? `${number(value, digits)} ${unit}` : number(value, digits);
 }
 
-/** A probability in per cent; small ones are not rounded to nothing. */
+/** A probability in per cent; values close to 0 or 1 are not rounded to 0 % or 100 %. */
 export function percent(probability) {
   if (probability === null || probability === undefined || !Number.isFinite(probability)) return MISSING;
   const value = 100 * probability;
@@ -106,7 +106,7 @@ export function words(code) {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
-/** First digits of a digest, the whole of it in the title. */
+/** The first digits of a digest; the tooltip shows all of them. */
 export function digest(value) {
   return value ? h("code", { title: value }, value.slice(0, 12)) : h("span", null, MISSING);
 }

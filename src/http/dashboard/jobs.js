@@ -1,17 +1,17 @@
-// Jobs: diagnoses and extensions, with their progress as it comes.
+// Background jobs (diagnoses and model extensions) with live progress.
 
 import { read } from "./api.js";
 import { cell, fill, h, throttled } from "./dom.js";
 import { age, timeElement, words } from "./format.js";
 import { jobChip } from "./states.js";
 
-const KINDS = { diagnosis: "Diagnosis", extension: "Extension of the model" };
+const KINDS = { diagnosis: "Diagnosis", extension: "Model extension" };
 
-/** Progress as a bar when it can be counted ("epoch 3 of 80" or a share), and always in words. */
-export function progress(told, label) {
-  if (told === null || told === undefined || told === "") return "";
-  const share = typeof told === "number" ? told : shareOf(told);
-  const text = typeof told === "number" ? `${Math.round(100 * told)} %` : words(told);
+/** Progress as text, with a bar if it can be expressed as a fraction (a number, or text such as "epoch 3 of 80"). */
+export function progress(reported, label) {
+  if (reported === null || reported === undefined || reported === "") return "";
+  const share = typeof reported === "number" ? reported : shareOf(reported);
+  const text = typeof reported === "number" ? `${Math.round(100 * reported)} %` : words(reported);
   const bar = share !== null && h("progress", { max: "1", value: share, "aria-label": `Progress of ${label}` });
   return h("span", { class: "progress" }, bar, h("span", null, text));
 }
@@ -31,9 +31,9 @@ function rows(items) {
       "tr",
       { dataset: { job: job.job } },
       cell("State", jobChip(job.state)),
-      cell("What", page ? h("a", { href: `#/diagnoses/${encodeURIComponent(job.job)}` }, `${name}: report`) : name),
+      cell("Job", page ? h("a", { href: `#/diagnoses/${encodeURIComponent(job.job)}` }, `${name}: report`) : name),
       cell("Structure", h("a", { href: `#/structures/${encodeURIComponent(job.structure)}` }, job.structure)),
-      cell("Begun", age(job.created_at)),
+      cell("Started", age(job.created_at)),
       cell(
         isOpen(job) ? "Progress" : "Ended",
         isOpen(job) ? progress(job.progress, `${name} of ${job.structure}`) : timeElement(job.finished_at),
@@ -53,16 +53,14 @@ export function jobs() {
   const table = h(
     "table",
     { class: "cards" },
-    h("caption", { class: "hidden-text" }, "Jobs, the newest first"),
+    h("caption", { class: "hidden-text" }, "Jobs, newest first"),
     h(
       "thead",
       null,
       h(
         "tr",
         null,
-        ["State", "What", "Structure", "Begun", "Ended or progress", "Outcome"].map((c) =>
-          h("th", { scope: "col" }, c),
-        ),
+        ["State", "Job", "Structure", "Started", "Progress or end", "Outcome"].map((c) => h("th", { scope: "col" }, c)),
       ),
     ),
     body,
@@ -71,7 +69,11 @@ export function jobs() {
     "div",
     { class: "blank" },
     h("h2", null, "No jobs yet"),
-    h("p", null, "A diagnosis looks for what a simulation gets wrong. Open a structure and choose “Diagnose”."),
+    h(
+      "p",
+      null,
+      "A diagnosis finds where the simulation disagrees with the measurements. To start one, open a structure and choose “Diagnose”.",
+    ),
   );
   const element = h("div", { class: "view", dataset: { page: "jobs" } }, h("h1", null, "Jobs"), none, table);
   const load = async () => {
@@ -90,7 +92,7 @@ export function jobs() {
   };
 }
 
-/** Number of running jobs in the header. */
+/** Updates the number of unfinished jobs in the header. */
 export const showRunning = throttled(async () => {
   const mark = document.getElementById("jobs-running");
   const { items } = await read("v1/jobs", false).catch(() => ({ items: [] }));

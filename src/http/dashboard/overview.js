@@ -1,4 +1,4 @@
-// The fleet: every structure at a glance, what needs somebody first.
+// The fleet: all structures with their states, the most urgent first.
 
 import { at, read } from "./api.js";
 import { acknowledgeDialog, alarmWords } from "./sections/alarms.js";
@@ -6,7 +6,7 @@ import { cell, fill, h, icon, refill, throttled } from "./dom.js";
 import { age, count, percent } from "./format.js";
 import { EVERY_STATE, stateChip, stateText, stateWord, trustChip, urgency } from "./states.js";
 
-/** Structures whose open alarms are read for the list at the top. */
+/** Maximum number of structures whose open alarms are listed at the top. */
 const MOST_ALARMING = 20;
 
 export function overview() {
@@ -16,7 +16,7 @@ export function overview() {
   const table = h(
     "table",
     { class: "cards fleet" },
-    h("caption", { class: "hidden-text" }, "Structures, those that need somebody first"),
+    h("caption", { class: "hidden-text" }, "Structures, most urgent first"),
     h(
       "thead",
       null,
@@ -62,7 +62,7 @@ export function overview() {
     tiles.hidden = items.length === 0;
     fill(blank, items.length === 0 ? firstSteps() : "");
     const open = items.reduce((sum, item) => sum + item.open_alarms, 0);
-    // A tab in the background tells of alarms too.
+    // The title shows the number of alarms even if the tab is in the background.
     document.title = `${open > 0 ? `(${open}) ` : ""}Fleet – modalwatch`;
     await loadAlarms(sorted);
   };
@@ -98,7 +98,7 @@ export function overview() {
               h("a", { href: `#/structures/${encodeURIComponent(alarm.structure)}` }, alarm.structure),
               `: ${alarmWords(alarm)}, `,
               age(alarm.opened_at),
-              alarm.acknowledgement && h("span", { class: "fine" }, `seen by ${alarm.acknowledgement.by}`),
+              alarm.acknowledgement && h("span", { class: "fine" }, `acknowledged by ${alarm.acknowledgement.by}`),
             ),
             !alarm.acknowledgement &&
               h(
@@ -146,7 +146,7 @@ function row(item) {
         : h(
             "span",
             { class: "soft" },
-            latest?.trust === "rejected" ? "withheld" : item.undamaged_version ? "–" : "no undamaged state",
+            latest?.trust === "rejected" ? "withheld" : item.undamaged_version ? "–" : "no reference",
           ),
     ),
     cell("Latest batch", latest ? trustChip(latest.trust, latest.findings) : h("span", { class: "soft" }, "none yet")),
@@ -189,13 +189,13 @@ function modelMark(item) {
   return h("span", { class: "soft" }, "calibrated");
 }
 
-/** What helps somebody whose service knows no structure. */
+/** Instructions for a service without any structure. */
 function firstSteps() {
   return h(
     "div",
     { class: "blank" },
     h("h2", null, "No structures yet"),
-    h("p", null, "Describe a structure and send it; its page appears here by itself."),
+    h("p", null, "Write a structure file and send it; the structure appears here automatically."),
     h(
       "pre",
       { tabindex: 0 },
@@ -205,6 +205,6 @@ function firstSteps() {
         `curl -X PUT ${location.origin}/v1/structures/my-bridge \\\n  -H 'content-type: application/toml' --data-binary @my-bridge.toml`,
       ),
     ),
-    h("p", { class: "fine" }, 'A service with tokens also wants -H "authorization: Bearer $TOKEN".'),
+    h("p", { class: "fine" }, 'If the service requires tokens, add -H "authorization: Bearer $TOKEN".'),
   );
 }

@@ -1,4 +1,4 @@
-// The report of a diagnosis, shown inside the page so that it needs no second sign-in.
+// The report of a diagnosis. It is shown inside this page, so that it is requested with the token of this tab.
 
 import { read, request } from "./api.js";
 import { h } from "./dom.js";
@@ -6,18 +6,18 @@ import { h } from "./dom.js";
 const path = (id, rest = "") => `v1/diagnoses/${encodeURIComponent(id)}${rest}`;
 
 /**
- * The report as a document without inline styles, which our policy forbids even to a parser: its sheet waits in a template,
- * its style attributes under another name, until the CSSOM sets them.
+ * Parses the report. The content security policy forbids inline styles even in parsed documents. The style sheet is therefore
+ * moved to a template and `style` attributes are renamed to `data-style`; both are applied later through the CSSOM.
  */
 function parsed(html) {
-  const harmless = html
+  const withoutStyles = html
     .replace(/<style([^>]*)>/g, "<template data-sheet>")
     .replaceAll("</style>", "</template>")
     .replace(/(<[a-z][^<>]*?)\sstyle=/g, "$1 data-style=");
-  return new DOMParser().parseFromString(harmless, "text/html");
+  return new DOMParser().parseFromString(withoutStyles, "text/html");
 }
 
-/** The report's own style; it is written for a page of its own, whose root is our shadow root's host. */
+/** The style sheet of the report. Rules for the root of its page apply to the host of the shadow root instead. */
 function sheetOf(page) {
   const sheet = new CSSStyleSheet();
   const text = [...page.querySelectorAll("template[data-sheet]")].map((style) => style.content.textContent).join("\n");
@@ -44,13 +44,13 @@ export function report(id) {
         h("a", { href: "#/" }, "Fleet"),
         " / ",
         h("a", { href: `#/structures/${encodeURIComponent(diagnosis.structure)}` }, diagnosis.structure),
-        " / diagnosis",
+        " / Diagnosis",
       ),
       h("h1", null, `Diagnosis of ${diagnosis.structure}`),
       h(
         "p",
         null,
-        h("a", { href: file, download: `diagnosis-${diagnosis.structure}-${id}.html` }, "Download as one HTML file"),
+        h("a", { href: file, download: `diagnosis-${diagnosis.structure}-${id}.html` }, "Download as an HTML file"),
       ),
       host,
     );

@@ -1,21 +1,28 @@
-// States as icon, word and colour, in one order: what needs somebody comes first.
+// States of structures, batches and jobs as chips with icon, word and colour.
 
 import { h, icon } from "./dom.js";
+import { count } from "./format.js";
 
+/** States of a structure, the most urgent first. */
 const STATES = {
-  alarming: { word: "Alarm", icon: "alarm", kind: "bad", text: "the charts are beyond their limits" },
-  silent: { word: "Silent", icon: "silent", kind: "bad", text: "no measurement has come for longer than agreed" },
-  pending: { word: "Pending", icon: "pending", kind: "warn", text: "one batch beyond the limit, waiting for the next" },
-  recovering: { word: "Recovering", icon: "recovering", kind: "warn", text: "back inside, the alarm is not over yet" },
-  no_model: { word: "No model", icon: "unassessed", kind: "idle", text: "no trained baseline serves this structure" },
-  unassessed: { word: "No judgement yet", icon: "unassessed", kind: "idle", text: "nothing to compare with yet" },
-  normal: { word: "Normal", icon: "check", kind: "good", text: "inside all limits" },
+  alarming: { word: "Alarm", icon: "alarm", kind: "bad", text: "a control chart is above its limit" },
+  silent: { word: "Silent", icon: "silent", kind: "bad", text: "no measurement within the configured time" },
+  pending: { word: "Pending", icon: "pending", kind: "warn", text: "above the limit; the next batches decide" },
+  recovering: {
+    word: "Recovering",
+    icon: "recovering",
+    kind: "warn",
+    text: "below the limit again; the alarm has not ended yet",
+  },
+  no_model: { word: "No model", icon: "unassessed", kind: "idle", text: "no trained model for this structure" },
+  unassessed: { word: "Not assessed", icon: "unassessed", kind: "idle", text: "no assessed batch yet" },
+  normal: { word: "Normal", icon: "check", kind: "good", text: "within all limits" },
 };
 
-/** Place in the order; unknown states are shown last. */
+/** Rank of a state, 0 for the most urgent; unknown states come last. */
 export function urgency(state) {
-  const place = Object.keys(STATES).indexOf(state);
-  return place < 0 ? Object.keys(STATES).length : place;
+  const rank = Object.keys(STATES).indexOf(state);
+  return rank < 0 ? Object.keys(STATES).length : rank;
 }
 
 export function stateText(state) {
@@ -26,7 +33,7 @@ export function stateWord(state) {
   return STATES[state]?.word ?? state;
 }
 
-/** A state as a chip. */
+/** The state of a structure as a chip. */
 export function stateChip(state) {
   const known = STATES[state] ?? { word: state, icon: "unassessed", kind: "idle" };
   return h("span", { class: `chip ${known.kind}`, title: known.text }, icon(known.icon), known.word);
@@ -34,10 +41,10 @@ export function stateChip(state) {
 
 export const EVERY_STATE = Object.keys(STATES);
 
-/** A verdict of trust as a chip. */
+/** The trust verdict of a batch as a chip, with the number of its findings. */
 export function trustChip(verdict, findings = 0) {
   if (verdict === "rejected") return h("span", { class: "chip bad" }, icon("cross"), "Rejected");
-  if (findings > 0) return h("span", { class: "chip warn" }, icon("note"), `Accepted, ${findings} to note`);
+  if (findings > 0) return h("span", { class: "chip warn" }, icon("note"), `Accepted, ${count(findings, "finding")}`);
   return h("span", { class: "chip good" }, icon("check"), "Accepted");
 }
 

@@ -1,4 +1,4 @@
-// One structure: what is the matter, its charts over one span of time, a batch in detail, and what can be done.
+// The page of one structure: its state, charts over a common time span, one batch in detail, model, diagnoses, maintenance.
 
 import { at, read } from "./api.js";
 import { TimeGroup, seconds } from "./charts/base.js";
@@ -24,10 +24,10 @@ const SPANS = [
   ["1 year", 365 * DAY_S],
   ["All", null],
 ];
-/** Points a chart asks for: as many as a wide screen has pixels. */
+/** Maximum number of points requested per series; more could not be distinguished on a screen. */
 const POINTS = 1000;
-/** Limit of the probability of damage before an undamaged state gives its own. */
-const USUAL_LIMIT = 0.05;
+/** Limit of the probability of damage as long as no undamaged reference specifies one. */
+const DEFAULT_LIMIT = 0.05;
 
 const JUMPS = [
   ["alarms", "Alarms"],
@@ -40,7 +40,7 @@ const JUMPS = [
 ];
 
 export function structure(id) {
-  const state = { told: null, item: null, series: null };
+  const state = { info: null, item: null, series: null };
   const headline = h("div", { class: "headline" });
   const group = new TimeGroup(zoom);
   const select = (chosen) => detail.select(chosen);
@@ -56,7 +56,7 @@ export function structure(id) {
   const windows = maintenance(id, () => refresh.series());
   const diagnoses = diagnosis(id, () => refresh.all());
   const used = model(id, () => refresh.all());
-  const spans = h("div", { class: "picker", role: "group", "aria-label": "Span of time" });
+  const spans = h("div", { class: "picker", role: "group", "aria-label": "Time span" });
   const spanText = h("span", { class: "fine" });
   const first = h("div", null);
   const charts = h(
@@ -102,7 +102,7 @@ export function structure(id) {
     );
   }
 
-  /** Jumps within the page; the address stays that of the structure. */
+  /** Scrolls to a section and moves the focus there, without changing the address of the page. */
   function jump(event, name) {
     event.preventDefault();
     const target = document.getElementById(name);
@@ -112,11 +112,12 @@ export function structure(id) {
     heading.focus({ preventScroll: true });
   }
 
-  /** True when another view is on the page. */
+  /** True once another view has replaced this one. */
   let left = false;
-  /** The whole record, seconds; known from the first read. */
+  /** First and last time of the record in seconds; set by the first request. */
   let whole = null;
-  /** Length of the span chosen, seconds; it follows the newest batch. */
+  /** Length in seconds of the chosen time span, which ends at the newest batch; `null` shows the whole record, `undefined` a
+   * span chosen by zooming. */
   let length = null;
 
   function zoom(range) {
@@ -150,34 +151,34 @@ export function structure(id) {
       group.range && `&from=${encodeURIComponent(iso(group.range[0]))}&to=${encodeURIComponent(iso(group.range[1]))}`;
     const asked = group.range;
     const series = await read(at(id, `/series?points=${POINTS}${range ?? ""}`));
-    // Somebody has zoomed on meanwhile, or has left.
+    // The answer is outdated if the user has zoomed or left the page in the meantime.
     if (asked !== group.range || left) return;
     state.series = series;
     const ends = [series.from, series.to].map((time) => (time ? seconds(time) : null));
     if (!group.range && ends[0] !== null) {
       whole = ends;
-      const air = Math.max((ends[1] - ends[0]) * 0.01, 60);
-      group.all = [ends[0] - air, ends[1] + air];
+      const padding = Math.max((ends[1] - ends[0]) * 0.01, 60);
+      group.all = [ends[0] - padding, ends[1] + padding];
     }
     draw();
     await detail.update(series);
   }
 
   function draw() {
-    const { series, told, item } = state;
-    const limit = told.undamaged?.threshold_probability ?? USUAL_LIMIT;
+    const { series, info, item } = state;
+    const limit = info.undamaged?.threshold_probability ?? DEFAULT_LIMIT;
     const empty = (item?.batches ?? series.batches) === 0;
     charts.hidden = empty;
     for (const link of jumps.children) {
       link.hidden = empty && ["#condition", "#tracks", "#batch"].includes(link.getAttribute("href"));
     }
     spans.parentElement.hidden = empty;
-    fill(first, empty ? nothingYet(told) : "");
+    fill(first, empty ? nothingYet(info) : "");
     if (empty) return;
     const shown = group.range ?? [seconds(series.from), seconds(series.to)];
     fill(
       spanText,
-      `${local(1000 * shown[0])} to ${local(1000 * shown[1])} (${zone()}), ${count(series.batches, "batch", "batches")}${series.reduced ? ", reduced for drawing, extremes kept" : ""}`,
+      `${local(1000 * shown[0])} to ${local(1000 * shown[1])} (${zone()}), ${count(series.batches, "batch", "batches")}${series.reduced ? ", thinned for display with extremes kept" : ""}`,
     );
     figures.parameters.update(series, limit);
     figures.heat.update(series);
@@ -190,22 +191,22 @@ export function structure(id) {
     });
   }
 
-  async function loadTold() {
-    const [told, overview] = await Promise.all([read(at(id)), read("v1/overview")]);
-    state.told = told;
+  async function loadInfo() {
+    const [info, overview] = await Promise.all([read(at(id)), read("v1/overview")]);
+    state.info = info;
     state.item = overview.items.find((item) => item.id === id) ?? null;
     fill(headline, head(id, state));
-    used.update(told, state.item?.batches ?? 0);
+    used.update(info, state.item?.batches ?? 0);
   }
 
   const quietly = (work) => () => work().catch(() => {});
   const refresh = {
-    told: throttled(quietly(loadTold), 1500),
+    info: throttled(quietly(loadInfo), 1500),
     series: throttled(quietly(loadSeries), 800),
-    // A batch moves the end of the record too, which only a read of all of it tells.
+    // A new batch also moves the end of the record, which only a request without a time range returns.
     grown: throttled(
       quietly(async () => {
-        await loadTold();
+        await loadInfo();
         if (group.range && length !== undefined) {
           const { from, to } = await read(at(id, "/series?points=10"));
           whole = [seconds(from), seconds(to)];
@@ -218,7 +219,7 @@ export function structure(id) {
     diagnoses: throttled(quietly(diagnoses.load), 1000),
     all: throttled(
       quietly(async () => {
-        await loadTold();
+        await loadInfo();
         await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load()]);
         await detail.again();
       }),
@@ -231,7 +232,7 @@ export function structure(id) {
     element,
     async load() {
       showSpans();
-      await loadTold();
+      await loadInfo();
       await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load()]);
     },
     event(name, data) {
@@ -252,20 +253,20 @@ export function structure(id) {
 
 const iso = (time_s) => new Date(1000 * time_s).toISOString();
 
-/** State and the one sentence that says what is the matter. */
-function head(id, { told, item }) {
+/** Heading with the state and a summary of the latest batch. */
+function head(id, { info, item }) {
   const latest = item?.latest;
   const silent = item?.state === "silent";
   const sentence = [];
   if (latest && latest.trust === "rejected")
-    sentence.push("The latest batch is rejected: its probability of damage is withheld.");
+    sentence.push("The latest batch was rejected; its probability of damage is withheld.");
   else if (latest && latest.max_probability_of_damage !== null && latest.max_probability_of_damage !== undefined)
     sentence.push(
       `Latest batch: highest probability of damage ${percent(latest.max_probability_of_damage)} (${latest.max_parameter})${latest.exceeds ? ", above the limit" : ""}.`,
     );
-  if (item && !told.model) sentence.push("No trained baseline serves this structure.");
-  else if (item && !told.undamaged && item.batches > 0) sentence.push("Next step: declare the undamaged state.");
-  if (silent) sentence.push("Check the logger and its connection.");
+  if (item && !info.model) sentence.push("There is no trained model for this structure.");
+  else if (item && !info.undamaged && item.batches > 0) sentence.push("Next step: declare the undamaged reference.");
+  if (silent) sentence.push("Check the data logger and its connection.");
   return [
     h(
       "div",
@@ -274,7 +275,7 @@ function head(id, { told, item }) {
       item && stateChip(item.state),
       item && h("span", { class: "soft" }, stateText(item.state)),
     ),
-    told.definition.description && h("p", { class: "fine" }, told.definition.description),
+    info.definition.description && h("p", { class: "fine" }, info.definition.description),
     h("p", { class: "lead" }, sentence.join(" ")),
     item &&
       h(
@@ -296,18 +297,18 @@ function head(id, { told, item }) {
   ];
 }
 
-function nothingYet(told) {
+function nothingYet(info) {
   return h(
     "div",
     { class: "blank" },
-    h("h2", null, "Nothing measured yet"),
+    h("h2", null, "No measurements yet"),
     h(
       "p",
       null,
-      "The structure is known",
-      told.model ? " and its model is ready" : "",
-      ". Send the first batch and it appears here by itself:",
+      "The structure is registered",
+      info.model ? " and its trained model is ready" : "",
+      ". Send the first batch; it appears here automatically:",
     ),
-    h("pre", { tabindex: 0 }, h("code", null, postLine(told))),
+    h("pre", { tabindex: 0 }, h("code", null, postLine(info))),
   );
 }

@@ -1,11 +1,11 @@
-// uPlot as this page uses it: its size follows the page, its colours the theme, its cursor the keyboard.
+// Charts with uPlot: responsive size, colours of the theme, keyboard control, and a common time axis.
 
 import uPlot from "../vendor/uPlot.esm.js";
 import { colour, faint, stripes } from "./theme.js";
 
 const FONT = "12px system-ui, sans-serif";
 const DAY_S = 86400;
-/** Room for numbers left of every chart, so that charts below one another share their time axis. */
+/** Width in pixels of the left axis of every chart, so that the time axes of stacked charts are aligned. */
 export const LEFT = 68;
 
 const date = new Intl.DateTimeFormat(undefined, { day: "numeric", month: "short" });
@@ -34,7 +34,7 @@ const axis = (more) => ({
   ...more,
 });
 
-/** The time axis; without labels where another chart below has them. */
+/** The time axis; without labels if a chart below shows them. */
 export function timeAxis(labels = true) {
   return axis({ values: labels ? timeLabels : () => [], size: labels ? 40 : 8, space: 74 });
 }
@@ -49,17 +49,17 @@ export function acrossAxis(label, more = {}) {
   return axis({ label, labelSize: 18, size: 28, space: 50, ...more });
 }
 
-/** A curve; gaps stay gaps. */
+/** A curve, interrupted at gaps in the data. */
 export function curve(name, more = {}) {
   return { stroke: () => colour(name), width: 1.5, spanGaps: false, points: { show: false }, ...more };
 }
 
-/** Points of a curve, shown when they are few enough to be seen one by one. */
+/** Shows the points of a curve if there are few enough to distinguish them. */
 export function fewPoints(count) {
   return { show: count < 90, size: 5 };
 }
 
-/** An edge of an interval: drawn as the band only. */
+/** A bound of an interval; it is invisible and only delimits a band. */
 export const edge = () => ({ stroke: "transparent", width: 0, points: { show: false }, spanGaps: false });
 
 /** The band between two series. */
@@ -67,7 +67,7 @@ export function band(upper, lower, name, opacity = 0.2) {
   return { series: [upper, lower], fill: () => faint(name, opacity) };
 }
 
-/** A constant line across a chart, to be called in `draw`. */
+/** A line at a constant value; call it in the `draw` hook. */
 export function rule(u, value, name, dash = [6, 4], scale = "y") {
   if (value === null || value === undefined) return;
   const across = scale === "y";
@@ -86,7 +86,7 @@ export function rule(u, value, name, dash = [6, 4], scale = "y") {
   });
 }
 
-/** Shades intervals of time `[from_s, to_s]`, with stripes if wanted. */
+/** Shades time intervals `[from_s, to_s]`, optionally with stripes. */
 export function shade(u, intervals, name, { opacity = 0.14, striped = false } = {}) {
   const { left, top, width, height } = u.bbox;
   draw(u, (pen) => {
@@ -99,14 +99,14 @@ export function shade(u, intervals, name, { opacity = 0.14, striped = false } = 
   });
 }
 
-/** Draws with the pen's settings put back afterwards. */
+/** Draws on the canvas of a chart and restores the settings of its context afterwards. */
 export function draw(u, work) {
   u.ctx.save();
   work(u.ctx);
   u.ctx.restore();
 }
 
-/** A mark at a place of the canvas: `cross`, `triangle`, `ring`, `dot`. */
+/** A mark at a position on the canvas: `cross`, `triangle`, `ring` or `dot`. */
 export function mark(pen, shape, x, y, size_px) {
   const r = (size_px / 2) * devicePixelRatio;
   pen.beginPath();
@@ -130,8 +130,8 @@ export function mark(pen, shape, x, y, size_px) {
 }
 
 /**
- * A chart in `parent` that lives until `parent` leaves the page. Options are uPlot's, less the width. The keys ← → Home End
- * move the cursor, Enter selects by `options.select(index)`, as a click does.
+ * Creates a chart in `parent`. Options are those of uPlot without the width, plus `select`. The keys ←, →, Home and End move
+ * the cursor; Enter and a click call `options.select(index)`.
  */
 export function chart(parent, options, data, keyboard = parent) {
   const place = document.createElement("div");
@@ -175,48 +175,48 @@ export function chart(parent, options, data, keyboard = parent) {
     let pressedAt = 0;
     u.over.addEventListener("pointerdown", (event) => (pressedAt = event.clientX));
     u.over.addEventListener("click", (event) => {
-      // The end of a drag is no click.
+      // The end of a drag also raises a click event, which must not select a point.
       if (Math.abs(event.clientX - pressedAt) < 4 && Number.isInteger(u.cursor.idx)) select(u.cursor.idx);
     });
   }
   const end = () => {
-    if (!alive.delete(end)) return;
+    if (!liveCharts.delete(end)) return;
     resize.disconnect();
     window.removeEventListener("theme", recolour);
     keyboard?.removeEventListener("keydown", move);
     u.destroy();
     place.remove();
   };
-  alive.add(end);
+  liveCharts.add(end);
   return { u, end };
 }
 
-/** Charts on the page. */
-const alive = new Set();
+/** `end` functions of all charts on the page. */
+const liveCharts = new Set();
 
-/** Ends all charts: a page that stays open for weeks must not keep those of views it has left. */
+/** Removes all charts. Otherwise a page that stays open for weeks would keep the charts of earlier views in memory. */
 export function endCharts() {
-  [...alive].forEach((end) => end());
+  [...liveCharts].forEach((end) => end());
 }
 
-/** Charts over one span of time: one cursor, one zoom. */
+/** Charts with a common time span, cursor and zoom. */
 export class TimeGroup {
   constructor(onZoom) {
     this.sync = uPlot.sync(`group-${Math.random()}`);
     this.onZoom = onZoom;
-    /** What is shown, seconds; `null` shows all there is. */
+    /** Time span shown, in seconds; `null` shows the whole record `all`. */
     this.range = null;
     this.all = [0, 1];
   }
 
-  /** Settings that every chart of the group needs. */
+  /** uPlot options common to all charts of the group. */
   options() {
     const zoom = (u) => {
       const { left, width } = u.select;
       u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
       if (width < 8) return;
       const range = [u.posToVal(left, "x"), u.posToVal(left + width, "x")];
-      // Charts that share the cursor report the same selection: one of them is enough.
+      // All charts with the common cursor report the same selection; only the first report counts.
       if (this.range && Math.abs(range[0] - this.range[0]) + Math.abs(range[1] - this.range[1]) < 1) return;
       this.onZoom(range);
     };
@@ -235,7 +235,7 @@ export class TimeGroup {
 /** Seconds since 1970 of an RFC 3339 time. */
 export const seconds = (iso) => Date.parse(iso) / 1000;
 
-/** A pause this many times the usual step is a gap, if it is to be seen at all: this share of the whole span. */
+/** A pause is a gap if it is longer than `GAP` median steps and than the share `GAP_SHARE` of the whole time span. */
 const GAP = 6;
 export const GAP_SHARE = 0.02;
 
@@ -244,8 +244,8 @@ function median(values) {
 }
 
 /**
- * Columns with a row of nulls in every long pause, so that no line is drawn across it.
- * Gives `{times, columns, origin, gaps}`; `origin[i]` is the row before, or -1.
+ * Inserts a row of nulls into every gap, so that no line is drawn across it. Returns `{times, columns, origin, gaps}`, where
+ * `origin[i]` is the index of row `i` in the input, or -1 for an inserted row.
  */
 export function withGaps(times, columns) {
   const steps = times.slice(1).map((t, i) => t - times[i]);
@@ -266,7 +266,7 @@ export function withGaps(times, columns) {
   return out;
 }
 
-/** Merges options of several sources: hooks are chained, the rest is replaced two levels deep. */
+/** Merges uPlot options: hooks are concatenated, other objects are merged one level deep, all else is replaced. */
 export function merged(...sources) {
   const out = {};
   for (const source of sources) {

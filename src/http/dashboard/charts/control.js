@@ -1,4 +1,4 @@
-// A control chart: the shift of each batch and its running mean, with their limits and the alarms.
+// The control chart: shift of each batch and its moving average, with limits and alarms.
 
 import { h } from "../dom.js";
 import { count, local, number, timeElement, words } from "../format.js";
@@ -10,25 +10,25 @@ import { colour } from "./theme.js";
 
 const KEYS = [
   { mark: "dot-1", text: "shift of a batch" },
-  { mark: "dash-bad", text: "its limit" },
-  { mark: "line-2", text: "running mean (EWMA)" },
-  { mark: "dash-2", text: "its limit" },
-  { mark: "triangle", text: "alarming or pending" },
-  { mark: "ring", text: "held: moved nothing" },
+  { mark: "dash-bad", text: "limit of the shift" },
+  { mark: "line-2", text: "moving average (EWMA)" },
+  { mark: "dash-2", text: "limit of the moving average" },
+  { mark: "triangle", text: "alarm or pending" },
+  { mark: "ring", text: "held: chart not updated" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
 ];
 
-const label = (chart) => (chart === FIT_CHART ? "fit of the simulation" : chart);
+const label = (chart) => (chart === FIT_CHART ? "simulation fit" : chart);
 
 const isBeyond = (state) => state === "alarming" || state === "pending";
 
 export function control(group, selectBatch) {
-  const picker = h("div", { class: "picker", role: "group", "aria-label": "Control chart of" });
+  const picker = h("div", { class: "picker", role: "group", "aria-label": "Control chart for" });
   const frame = figure({
     name: "control",
     title: "Control chart",
-    hint: "Shift towards damage from the undamaged state, in standard errors. On the chart of the fit, 1 stands for a rejected batch.",
+    hint: "Shift towards damage relative to the undamaged reference, in standard errors. In the chart “simulation fit”, 1 means a rejected batch.",
     keys: KEYS,
     tools: picker,
   });
@@ -43,10 +43,10 @@ export function control(group, selectBatch) {
     const all = series.charts.filter((c) => c.times.length > 0);
     if (all.length === 0) {
       picker.replaceChildren();
-      return frame.empty("Control charts begin with the first batch after an undamaged state was declared.");
+      return frame.empty("Control charts begin with the first batch after an undamaged reference has been declared.");
     }
     frame.empty(null);
-    // Unless somebody chose, the chart that needs them most.
+    // Unless the user has chosen a chart, the one with the most urgent state is shown.
     const worst = all.toSorted(
       (a, b) => urgency(a.state.at(-1)) - urgency(b.state.at(-1)) || (a.chart === FIT_CHART) - (b.chart === FIT_CHART),
     )[0];
@@ -122,30 +122,37 @@ export function control(group, selectBatch) {
     });
     one = chart(frame.plot, options, [filled.times, shift, shiftLimit, ewma, ewmaLimit]);
 
-    const what = (row) => `${stateWord(c.state[row])}${c.held[row] ? ", held" : ""}`;
+    const stateOf = (row) => `${stateWord(c.state[row])}${c.held[row] ? ", held" : ""}`;
     function readout(u) {
       const row = filled.origin[u.cursor.idx ?? -1] ?? -1;
       if (row < 0) return "";
       return [
         timeElement(c.times[row]),
-        ` · ${label(c.chart)}: shift ${number(c.shift[row], 3)} (limit ${number(c.shift_limit[row], 3)}), running mean ${number(c.ewma[row], 3)} (limit ${number(c.ewma_limit[row], 3)}) · ${what(row)}`,
+        ` · ${label(c.chart)}: shift ${number(c.shift[row], 3)} (limit ${number(c.shift_limit[row], 3)}), moving average ${number(c.ewma[row], 3)} (limit ${number(c.ewma_limit[row], 3)}) · ${stateOf(row)}`,
       ];
     }
     const last = c.times.length - 1;
     frame.summarise(
-      `Chart of ${label(c.chart)}, ${count(c.times.length, "batch", "batches")} to ${local(c.times[last])}. Latest: ${what(last)}, shift ` +
-        `${number(c.shift[last], 3)} of ${number(c.shift_limit[last], 3)} standard errors; ${count(alarms.length, "alarm")} in view. ` +
-        "Arrow keys read the values, Enter opens the batch.",
+      `Control chart for ${label(c.chart)}, ${count(c.times.length, "batch", "batches")} to ${local(c.times[last])}. Latest: ${stateOf(last)}, shift ` +
+        `${number(c.shift[last], 3)} standard errors (limit ${number(c.shift_limit[last], 3)}); ${count(alarms.length, "alarm")} in this time span. ` +
+        "Use the arrow keys to read the values and Enter to open the batch.",
     );
     frame.tabulate(() => ({
-      columns: ["Time", "Shift (standard errors)", "Limit", "Running mean", "Limit", "State"],
+      columns: [
+        "Time",
+        "Shift (standard errors)",
+        "Limit of the shift",
+        "Moving average",
+        "Limit of the average",
+        "State",
+      ],
       rows: c.times.map((time, i) => [
         timeElement(time),
         number(c.shift[i], 3),
         number(c.shift_limit[i], 3),
         number(c.ewma[i], 3),
         number(c.ewma_limit[i], 3),
-        words(what(i)),
+        words(stateOf(i)),
       ]),
     }));
   };

@@ -1,4 +1,4 @@
-// Prior, undamaged and posterior density of each parameter for one batch.
+// Prior, reference and posterior density of each parameter for one batch.
 
 import { h } from "../dom.js";
 import { number, quantity } from "../format.js";
@@ -8,7 +8,7 @@ import { colour } from "./theme.js";
 
 const KEYS = [
   { mark: "band-1", text: "this batch" },
-  { mark: "line-3-dash", text: "undamaged state" },
+  { mark: "line-3-dash", text: "undamaged reference" },
   { mark: "dash", text: "prior" },
   { mark: "dash-bad", text: "threshold δ" },
 ];
@@ -17,7 +17,7 @@ export function densities() {
   const grid = h("div", { class: "grid three", dataset: { figures: "densities" } });
   let charts = [];
   return {
-    element: h("div", { class: "stack" }, h("h3", null, "Densities"), keyList(KEYS), grid),
+    element: h("div", { class: "stack" }, h("h3", null, "Probability densities"), keyList(KEYS), grid),
     update(detail) {
       charts.forEach((c) => c.end());
       charts = [];
@@ -26,7 +26,7 @@ export function densities() {
         const frame = figure({ name: `density-${p.name}`, title: p.name, level: "h4" });
         grid.append(frame.element);
         if (p.grid.length === 0) {
-          frame.empty("No samples of this parameter.");
+          frame.empty("No samples for this parameter.");
           continue;
         }
         charts.push(densityChart(frame, p));
@@ -73,16 +73,16 @@ function densityChart(frame, p) {
   function readout(u) {
     const i = u.cursor.idx;
     if (i === null || i === undefined) return "";
-    return `${quantity(p.grid[i], unit)}: this batch ${number(p.posterior[i], 3)}, undamaged ${number(undamaged[i], 3)}, prior ${number(p.prior[i], 3)}`;
+    return `${quantity(p.grid[i], unit)}: this batch ${number(p.posterior[i], 3)}, undamaged reference ${number(undamaged[i], 3)}, prior ${number(p.prior[i], 3)}`;
   }
   const peak = (values) => p.grid[values.indexOf(Math.max(...values))];
   frame.summarise(
     `Density of ${p.name}. This batch peaks at ${quantity(peak(p.posterior), unit)}` +
-      `${p.undamaged ? `, the undamaged state at ${quantity(peak(p.undamaged), unit)}` : ""}` +
-      `${p.threshold === null || p.threshold === undefined ? "" : `; threshold δ ${quantity(p.threshold, unit)}`}. Arrow keys read the values.`,
+      `${p.undamaged ? `, the undamaged reference at ${quantity(peak(p.undamaged), unit)}` : ""}` +
+      `${p.threshold === null || p.threshold === undefined ? "" : `; threshold δ ${quantity(p.threshold, unit)}`}. Use the arrow keys to read the values.`,
   );
   frame.tabulate(() => ({
-    columns: [unit ? `${p.name} (${unit})` : p.name, "This batch", "Undamaged state", "Prior"],
+    columns: [unit ? `${p.name} (${unit})` : p.name, "This batch", "Undamaged reference", "Prior"],
     rows: p.grid.map((x, i) => [
       number(x, 5),
       number(p.posterior[i], 3),
@@ -94,15 +94,16 @@ function densityChart(frame, p) {
   return { u, end };
 }
 
-/** Share of its peak below which a density counts as nothing, and the least share of the prior that is shown. */
-const NOTHING = 0.005;
+/** Share of its peak below which a density is negligible. */
+const NEGLIGIBLE = 0.005;
+/** Smallest share of the prior range that is shown. */
 const LEAST_SHOWN = 0.25;
 
-/** The part of the prior in which there is something to see, with air; the table has all of it. */
+/** The part of the prior range in which the densities are not negligible, with padding; the table shows the whole range. */
 function span({ grid, posterior, undamaged, threshold }) {
   const places = [posterior, undamaged ?? []].flatMap((values) => {
     const peak = Math.max(...values);
-    return grid.filter((_, i) => values[i] > NOTHING * peak);
+    return grid.filter((_, i) => values[i] > NEGLIGIBLE * peak);
   });
   if (threshold !== null && threshold !== undefined) places.push(threshold);
   const [first, last] = [grid[0], grid.at(-1)];

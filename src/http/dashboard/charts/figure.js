@@ -1,13 +1,13 @@
-// The frame of every chart: title, keys, the drawing, a line that reads the cursor, and the same data as a table.
+// The frame of every chart: title, legend, plot, a line with the values at the cursor, and the data as a table.
 
 import { fill, h, icon } from "../dom.js";
 
-/** Most rows of a table: a longer one is cut at its old end, and says so. */
+/** Maximum number of rows of a table; a longer table is cut, and its caption says so. */
 const MOST_ROWS = 500;
 
 let numbering = 0;
 
-/** What the marks of a drawing mean; one list may serve several figures. */
+/** The legend of one or several figures. */
 export function keyList(keys) {
   return h(
     "ul",
@@ -17,8 +17,9 @@ export function keyList(keys) {
 }
 
 /**
- * A figure. `keys` are `{mark, text}`; marks are classes of `figures.css`. What a figure offers:
- * `plot` (where to draw), `summarise(text)`, `read(nodes)`, `empty(text)`, `tabulate(() => ({columns, rows, newestLast}))`.
+ * Creates a figure. `keys` are the legend entries `{mark, text}`; marks are classes of `figures.css`. Returns the `element`,
+ * the `plot` to draw in, and `summarise(text)` (for screen readers), `read(nodes)` (values at the cursor), `empty(text)`
+ * (why there is no plot, or `null`), `tabulate(() => ({columns, rows, newestLast}))`.
  */
 export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
   numbering += 1;
@@ -101,10 +102,10 @@ export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
   toggle.addEventListener("click", () => {
     table.hidden = !table.hidden;
     toggle.setAttribute("aria-expanded", String(!table.hidden));
-    fill(toggle, icon(table.hidden ? "table" : "chart"), table.hidden ? "Show as table" : "Hide the table");
+    fill(toggle, icon(table.hidden ? "table" : "chart"), table.hidden ? "Show as table" : "Hide table");
     drawTable();
   });
-  // Charts share their cursor: only the one in use speaks.
+  // Charts share a cursor; only the focused chart announces its values to screen readers.
   plot.addEventListener("focus", () => readout.setAttribute("aria-live", "polite"));
   plot.addEventListener("blur", () => readout.removeAttribute("aria-live"));
 

@@ -1,4 +1,4 @@
-// Probability of damage as a map: parameters up, time across.
+// Heat map of the probability of damage: one row per parameter, one column per batch.
 
 import { count, local, percent, timeElement } from "../format.js";
 import { LEFT, chart, draw, mark, merged, seconds, timeAxis, valueAxis } from "./base.js";
@@ -6,7 +6,7 @@ import { figure } from "./figure.js";
 import { rejectedBatches } from "./parameters.js";
 import { colour } from "./theme.js";
 
-/** Steps of the map, with their upper ends; the first is what the undamaged state shows. */
+/** Upper ends of the colour steps; the first step covers what an undamaged structure shows. */
 const STEPS = [0.05, 0.2, 0.4, 0.6, 0.8, 1.0];
 
 const stepOf = (probability) => STEPS.findIndex((end) => probability <= end + 1e-12);
@@ -15,7 +15,7 @@ export function heat(group, selectBatch) {
   const ends = STEPS.map((end) => Math.round(100 * end));
   const frame = figure({
     name: "heat",
-    title: "Probability of damage, parameter by time",
+    title: "Probability of damage over time, all parameters",
     keys: [
       ...ends.map((end, i) => ({ mark: `heat-${i}`, text: i === 0 ? `up to ${end} %` : `${ends[i - 1]} to ${end} %` })),
       { mark: "cross", text: "withheld: batch rejected" },
@@ -32,9 +32,9 @@ export function heat(group, selectBatch) {
       one = null;
       const rows = parameters.filter((p) => p.probability_of_damage.some((v) => v !== null && v !== undefined));
       if (rows.length === 0)
-        return frame.empty("Needs an undamaged state to compare with: see “Model and undamaged state”.");
+        return frame.empty("Requires an undamaged reference: see “Trained model and undamaged reference”.");
       frame.empty(null);
-      // Reduction may keep different batches for each parameter: the map knows them all.
+      // A thinned series may keep different batches for each parameter; the map shows all of them.
       const cells = new Map();
       rows.forEach((p, r) =>
         p.times.forEach((time, i) => {
@@ -61,7 +61,7 @@ export function heat(group, selectBatch) {
             const [from, wide] = [Math.floor(a), Math.max(Math.ceil(b) - Math.floor(a), 2 * devicePixelRatio)];
             rows.forEach((_, r) => {
               const value = column.values[r];
-              // Nothing was kept here, or nothing compared: batches of the undamaged state itself.
+              // Undefined: the batch is not in the thinned series. Null: withheld, or not compared (batches of the reference).
               if (value === undefined || (value === null && !rejected.has(column.batch))) return;
               const y = Math.round(u.valToPos(r, "y", true));
               const tall = Math.round(u.valToPos(r + 1, "y", true)) - y - 2 * devicePixelRatio;
@@ -95,32 +95,32 @@ export function heat(group, selectBatch) {
       });
       one = chart(frame.plot, options, [times, times.map(() => 0)]);
 
-      const told = ({ batch, values }, r) => {
-        if (values[r] === undefined) return "not kept here";
+      const describe = ({ batch, values }, r) => {
+        if (values[r] === undefined) return "omitted from the thinned series";
         if (values[r] === null) return rejected.has(batch) ? "withheld" : "not compared";
         return percent(values[r]);
       };
       function readout(u) {
         const column = columns[u.cursor.idx ?? -1];
         return column
-          ? [timeElement(column.time), ` · ${rows.map((p, r) => `${p.name} ${told(column, r)}`).join(" · ")}`]
+          ? [timeElement(column.time), ` · ${rows.map((p, r) => `${p.name} ${describe(column, r)}`).join(" · ")}`]
           : "";
       }
       const latest = columns.at(-1);
       const most = rows.map((_, r) => r).sort((a, b) => (latest.values[b] ?? -1) - (latest.values[a] ?? -1))[0];
       frame.summarise(
         `${count(rows.length, "parameter")} over ${count(columns.length, "batch", "batches")} to ${local(latest.time)}. ` +
-          `Highest in the latest batch: ${rows[most].name} ${told(latest, most)}. Arrow keys read the values, Enter opens the batch.`,
+          `Highest in the latest batch: ${rows[most].name} ${describe(latest, most)}. Use the arrow keys to read the values and Enter to open the batch.`,
       );
       frame.tabulate(() => ({
         columns: ["Time", ...rows.map((p) => p.name)],
-        rows: columns.map((c) => [timeElement(c.time), ...rows.map((_, r) => told(c, r))]),
+        rows: columns.map((c) => [timeElement(c.time), ...rows.map((_, r) => describe(c, r))]),
       }));
     },
   };
 }
 
-/** Each column reaches half-way to its neighbours, but not across a long pause. */
+/** Left and right edge of each column: half-way to its neighbours, but not across a long pause. */
 function edgesOf(times) {
   const steps = times
     .slice(1)

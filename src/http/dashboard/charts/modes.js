@@ -1,4 +1,4 @@
-// Predicted against measured frequencies of one batch: what the simulation leaves over, in per cent of its prediction.
+// Deviation of the measured frequencies of one batch from the prediction of the updated simulation, in per cent.
 
 import { number } from "../format.js";
 import { acrossAxis, chart, draw, mark, rule, valueAxis } from "./base.js";
@@ -10,11 +10,11 @@ const mean = (values) => (values.length > 0 ? values.reduce((sum, v) => sum + v,
 export function modes() {
   const frame = figure({
     name: "modes",
-    title: "Measured against predicted frequencies",
-    hint: "Each measurement of the batch beside what the updated simulation predicts for it, in per cent of the predicted mean.",
+    title: "Measured and predicted frequencies",
+    hint: "Deviation of each measured frequency from the mean that the updated simulation predicts, in per cent.",
     keys: [
       { mark: "dot-1", text: "measured" },
-      { mark: "band-2", text: "predicted, 90 % interval without measurement noise" },
+      { mark: "band-2", text: "predicted: 90 % interval without measurement noise" },
     ],
     level: "h3",
   });
@@ -25,14 +25,14 @@ export function modes() {
       one?.end();
       one = null;
       const list = (detail?.modes ?? []).filter((m) => Number.isFinite(m.predicted_mean_hz));
-      if (list.length === 0) return frame.empty("Nothing was predicted for this batch.");
+      if (list.length === 0) return frame.empty("No predicted frequencies for this batch.");
       frame.empty(null);
-      const share = (mode, hz) => 100 * (hz / mode.predicted_mean_hz - 1);
+      const deviation = (mode, hz) => 100 * (hz / mode.predicted_mean_hz - 1);
       const rows = list.map((mode) => ({
         ...mode,
-        low: share(mode, mode.predicted_low_hz),
-        high: share(mode, mode.predicted_high_hz),
-        measured: mode.measured_hz.filter((v) => v !== null).map((hz) => share(mode, hz)),
+        low: deviation(mode, mode.predicted_low_hz),
+        high: deviation(mode, mode.predicted_high_hz),
+        measured: mode.measured_hz.filter((v) => v !== null).map((hz) => deviation(mode, hz)),
       }));
       const extent = Math.max(...rows.flatMap((r) => [r.low, r.high, ...r.measured].map(Math.abs)), 0.01) * 1.15;
       const paint = (u) =>
@@ -46,7 +46,7 @@ export function modes() {
             pen.fillRect(x - half, top, 2 * half, Math.max(bottom - top, 2));
             pen.strokeRect(x - half, top, 2 * half, Math.max(bottom - top, 2));
             row.measured.forEach((value, n) => {
-              // Side by side in the order of measuring, so that none hides another.
+              // Measurements are spread horizontally in their order, so that their marks do not overlap.
               const place = x + half * 0.85 * (row.measured.length === 1 ? 0 : (2 * n) / (row.measured.length - 1) - 1);
               pen.fillStyle = colour("curve-1");
               mark(pen, "dot", place, u.valToPos(value, "y", true), 4);
@@ -72,14 +72,14 @@ export function modes() {
         },
         [rows.map((_, i) => i + 1), rows.map(() => 0)],
       );
-      const told = (row) =>
+      const describe = (row) =>
         `predicted ${number(row.predicted_mean_hz, 5)} Hz (${number(row.predicted_low_hz, 5)} to ${number(row.predicted_high_hz, 5)}), ` +
-        `${row.measured.length} measured, ${number(mean(row.measured), 2)} % from the prediction on average`;
+        `${row.measured.length} measured, mean deviation from the prediction ${number(mean(row.measured), 2)} %`;
       function readout(u) {
         const row = rows[u.cursor.idx ?? -1];
-        return row ? `${label(row)}: ${told(row)}` : "";
+        return row ? `${label(row)}: ${describe(row)}` : "";
       }
-      frame.summarise(`${rows.map((row) => `${label(row)}: ${told(row)}`).join("; ")}.`);
+      frame.summarise(`${rows.map((row) => `${label(row)}: ${describe(row)}`).join("; ")}.`);
       frame.tabulate(() => ({
         columns: [
           "Mode",

@@ -1,4 +1,4 @@
-// Each parameter: its mean with the 90 % interval against the threshold, and below it the probability of damage.
+// For each parameter, the mean with its 90 % interval and the threshold, and below it the probability of damage.
 
 import { h } from "../dom.js";
 import { count, local, number, percent, percentWithin, quantity, timeElement } from "../format.js";
@@ -20,41 +20,41 @@ import {
 } from "./base.js";
 import { figure, keyList } from "./figure.js";
 import { colour } from "./theme.js";
-import { spread } from "./tracks.js";
+import { paddedRange } from "./tracks.js";
 
 const KEYS = [
   { mark: "line-1", text: "mean" },
   { mark: "band-1", text: "90 % interval" },
   { mark: "dash-bad", text: "threshold δ" },
-  { mark: "dash", text: "undamaged mean" },
+  { mark: "dash", text: "mean of the reference" },
   { mark: "line-2", text: "probability of damage" },
-  { mark: "triangle", text: "above its limit" },
+  { mark: "triangle", text: "above the limit" },
   { mark: "cross", text: "withheld: batch rejected" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
 ];
 
-/** The chart that follows how well the simulation fits; the others are named after their parameter. */
+/** Name of the control chart for the fit of the simulation; all other charts have the name of their parameter. */
 export const FIT_CHART = "simulation:fit";
 
-/** Later than any measurement, seconds. */
-const NEVER_S = 1e11;
+/** End of an open alarm: later than any measurement, in seconds. */
+const OPEN_END_S = 1e11;
 
-/** Spans of time of the alarms of a chart, seconds; those still open have no end. */
+/** Time spans `[from_s, to_s]` of the alarms of a chart, without withdrawn ones. */
 export function alarmSpans(alarms, chart) {
   const isOfChart = (a) =>
     chart === FIT_CHART ? a.kind === "simulation_does_not_fit" : a.kind === "damage" && a.parameter === chart;
   return alarms
     .filter((a) => isOfChart(a) && a.state !== "withdrawn")
-    .map((a) => [seconds(a.opened_at), a.ended_at ? seconds(a.ended_at) : NEVER_S]);
+    .map((a) => [seconds(a.opened_at), a.ended_at ? seconds(a.ended_at) : OPEN_END_S]);
 }
 
-/** Ids of the batches whose probabilities are withheld; those of the undamaged state have none either. */
+/** IDs of rejected batches, whose probability of damage is withheld. Batches of the reference have no probability either. */
 export function rejectedBatches(series) {
   return new Set(series.trust.filter((item) => item.verdict === "rejected").map((item) => item.batch));
 }
 
-/** Charts of all parameters in a grid; `selectBatch(id)` when somebody picks a point. */
+/** Charts of all parameters in a grid; `selectBatch(id)` is called when the user selects a point. */
 export function parameters(group, selectBatch) {
   const grid = h("div", { class: "grid", dataset: { figures: "parameters" } });
   const made = new Map();
@@ -92,7 +92,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
 
   const update = (p, series, limit) => {
     end();
-    if (p.times.length === 0) return frame.empty("Not assessed in this span of time.");
+    if (p.times.length === 0) return frame.empty("No assessed batch in this time span.");
     frame.empty(null);
     const filled = withGaps(p.times.map(seconds), [
       p.mean,
@@ -121,7 +121,9 @@ function parameterFigure(group, { name, unit }, selectBatch) {
       bands: [band(3, 2, "curve-1", 0.22)],
       axes: [timeAxis(false), valueAxis(title)],
       scales: {
-        y: { range: (u, a, b) => spread(Math.min(a ?? Infinity, ...include), Math.max(b ?? -Infinity, ...include)) },
+        y: {
+          range: (u, a, b) => paddedRange(Math.min(a ?? Infinity, ...include), Math.max(b ?? -Infinity, ...include)),
+        },
       },
       hooks: {
         drawClear: [background],
@@ -144,7 +146,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
       bands: [band(3, 2, "curve-2", 0.22)],
       axes: [
         timeAxis(),
-        valueAxis("damage (%)", { values: (u, splits) => splits.map((v) => String(Math.round(100 * v))) }),
+        valueAxis("probability (%)", { values: (u, splits) => splits.map((v) => String(Math.round(100 * v))) }),
       ],
       scales: { y: { range: [-0.04, 1.04] } },
       hooks: {
@@ -166,26 +168,32 @@ function parameterFigure(group, { name, unit }, selectBatch) {
       const row = filled.origin[u.cursor.idx ?? -1] ?? -1;
       if (row < 0) return "";
       const damage = p.probability_of_damage[row] ?? null;
-      const told =
+      const damageText =
         damage === null
           ? isWithheld(row)
             ? "probability of damage withheld"
-            : "not compared with an undamaged state"
+            : "not compared with an undamaged reference"
           : `probability of damage ${percentWithin(damage, p.pod_low[row], p.pod_high[row])}`;
       return [
         timeElement(p.times[row]),
-        ` · ${quantity(p.mean[row], unit)} (${number(p.low[row])} to ${number(p.high[row])}) · ${told}`,
+        ` · ${quantity(p.mean[row], unit)} (${number(p.low[row])} to ${number(p.high[row])}) · ${damageText}`,
       ];
     }
     const last = p.probability_of_damage.at(-1);
     frame.summarise(
       `${count(p.times.length, "batch", "batches")} to ${local(p.times.at(-1))}. Latest mean ${quantity(p.mean.at(-1), unit)}` +
         `${p.threshold === null ? "" : `, threshold ${quantity(p.threshold, unit)}`}, probability of damage ` +
-        `${last === null || last === undefined ? "not given" : percent(last)}; withheld for ${count(withheld.length, "batch", "batches")}. ` +
-        "Arrow keys read the values, Enter opens the batch.",
+        `${last === null || last === undefined ? "not available" : percent(last)}; withheld for ${count(withheld.length, "batch", "batches")}. ` +
+        "Use the arrow keys to read the values and Enter to open the batch.",
     );
     frame.tabulate(() => ({
-      columns: ["Time", `Mean (${unit})`, "90 % interval", "Probability of damage", "90 % interval"],
+      columns: [
+        "Time",
+        `Mean (${unit})`,
+        "90 % interval of the mean",
+        "Probability of damage",
+        "90 % interval of the probability",
+      ],
       rows: p.times.map((time, i) => [
         timeElement(time),
         number(p.mean[i]),

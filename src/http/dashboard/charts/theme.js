@@ -1,13 +1,13 @@
-// Colours of the charts: those of the style sheets, read again when the theme changes.
+// Colours of the charts, taken from the style sheets and read again when the theme changes.
 
 let cache = new Map();
 
-/** Resolves a colour for the canvas, which knows no custom properties and no `light-dark()`. */
+/** A hidden element that resolves colours: the canvas supports neither custom properties nor `light-dark()`. */
 const probe = document.createElement("span");
 probe.hidden = true;
 document.body.append(probe);
 
-/** A colour of the style sheet by its name there. */
+/** The value of a colour by its name in the style sheet. */
 export function colour(name) {
   if (!cache.has(name)) {
     probe.style.color = `var(--${name})`;
@@ -21,13 +21,13 @@ export function faint(name, opacity) {
   return `color-mix(in srgb, ${colour(name)} ${Math.round(100 * opacity)}%, transparent)`;
 }
 
-/** Forgets the colours; charts draw again on the event `theme`. */
+/** Clears the cached colours and raises the event `theme`, on which charts are redrawn. */
 export function themeChanged() {
   cache = new Map();
   window.dispatchEvent(new Event("theme"));
 }
 
-/** Stripes for "nothing was measured here" and "maintenance": told apart without colour. */
+/** A stripe pattern, so that periods without measurements can be recognised without colour. */
 export function stripes(context, name) {
   const tile = document.createElement("canvas");
   const size = Math.round(8 * devicePixelRatio);

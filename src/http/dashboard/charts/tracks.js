@@ -1,4 +1,4 @@
-// Frequencies over time, one lane a mode, with the covariates below; pauses striped, missing modes marked.
+// Frequencies over time, one panel per mode, with the covariates below. Pauses are striped, missing modes are marked.
 
 import { count, local, number, quantity, timeElement } from "../format.js";
 import { GAP_SHARE, chart, curve, draw, fewPoints, mark, merged, seconds, shade, timeAxis, valueAxis } from "./base.js";
@@ -7,7 +7,7 @@ import { colour } from "./theme.js";
 
 const LANE_PX = 112;
 
-/** Units that stand at the end of the name of a covariate. */
+/** Units by the suffix of the name of a covariate. */
 const UNITS = {
   c: "°C",
   k: "K",
@@ -35,20 +35,20 @@ function covariateLabel(name) {
     : { label: name.replaceAll("_", " "), unit: "" };
 }
 
-/** Values of mode `m` at every kept measurement. */
+/** Values of mode `m` in all measurements of the series. */
 const lane = (frequencies, m) => frequencies.values_hz.map((row) => row?.[m] ?? null);
 
 export function tracks(group) {
   const frame = figure({
     name: "tracks",
-    title: "Measured frequencies and conditions",
-    hint: "One lane a mode. Drag to zoom, double-click to see all again.",
+    title: "Measured frequencies and covariates",
+    hint: "One panel per mode. Drag to zoom, double-click to reset.",
     keys: [
-      { mark: "line-1", text: "frequency, Hz" },
-      { mark: "dash", text: "nominal" },
-      { mark: "line-3", text: "condition" },
+      { mark: "line-1", text: "frequency (Hz)" },
+      { mark: "dash", text: "nominal frequency" },
+      { mark: "line-3", text: "covariate" },
       { mark: "cross", text: "mode not identified" },
-      { mark: "striped", text: "nothing measured" },
+      { mark: "striped", text: "no measurements" },
     ],
   });
   let charts = [];
@@ -59,7 +59,7 @@ export function tracks(group) {
       charts.forEach((c) => c.end());
       charts = [];
       const times = frequencies?.times.map(seconds) ?? [];
-      if (times.length === 0) return frame.empty("No measurement in this span of time.");
+      if (times.length === 0) return frame.empty("No measurements in this time span.");
       frame.empty(null);
       const modes = Array.from({ length: frequencies.modes }, (_, m) => lane(frequencies, m));
       const covariates = Object.entries(frequencies.covariates ?? {});
@@ -69,7 +69,7 @@ export function tracks(group) {
       const pauses = times.flatMap((_, i) =>
         isPause[i] ? [[times[i - 1] ?? times[i], times[i + 1] ?? times[i]]] : [],
       );
-      // Measurements may come in bursts, and then there is a pause after each: striped are only those that stand out.
+      // Measurements may arrive in bursts with a pause after each; only pauses much longer than the usual one are striped.
       const lengths = pauses.map(([from, to]) => to - from).sort((a, b) => a - b);
       const usual = lengths.length > 4 ? 2 * lengths[Math.floor(lengths.length / 2)] : 0;
       const least = Math.max(usual, GAP_SHARE * (times.at(-1) - times[0]));
@@ -92,7 +92,7 @@ export function tracks(group) {
           height: LANE_PX + (last ? 32 : 0),
           series: [{}, curve(one.colour, { points: fewPoints(times.length) })],
           axes: [timeAxis(last), valueAxis(one.label)],
-          scales: { y: { range: (u, low, high) => spread(low, high) } },
+          scales: { y: { range: (u, low, high) => paddedRange(low, high) } },
           hooks: {
             drawClear: [
               (u) => {
@@ -118,14 +118,14 @@ export function tracks(group) {
         const values = modes.map(
           (values, m) => `mode ${m + 1} ${values[row] === null ? "not identified" : quantity(values[row], "Hz", 5)}`,
         );
-        const conditions = covariates.map(([name, values]) => `${name} ${number(values[row])}`);
-        return [timeElement(frequencies.times[row]), ` · ${[...values, ...conditions].join(" · ")}`];
+        const covariateValues = covariates.map(([name, values]) => `${name} ${number(values[row])}`);
+        return [timeElement(frequencies.times[row]), ` · ${[...values, ...covariateValues].join(" · ")}`];
       }
       const missing = modes.reduce((sum, values) => sum + values.filter((v, i) => v === null && !isPause[i]).length, 0);
       frame.summarise(
-        `${count(frequencies.modes, "mode")} at ${count(times.length, "point")}${reduced ? ", extremes kept of more measurements," : ""} from ` +
+        `${count(frequencies.modes, "mode")} at ${count(times.length, "point")}${reduced ? " (thinned, extremes kept)" : ""} from ` +
           `${local(frequencies.times[0])} to ${local(frequencies.times.at(-1))}; ${count(missing, "value")} not identified, ` +
-          `${count(gaps.length, "long pause")}. Arrow keys read the values.`,
+          `${count(gaps.length, "long pause")}. Use the arrow keys to read the values.`,
       );
       frame.tabulate(() => ({
         columns: ["Time", ...modes.map((_, m) => `Mode ${m + 1} (Hz)`), ...covariates.map(([name]) => name)],
@@ -145,11 +145,11 @@ export function tracks(group) {
   };
 }
 
-/** A range with air, also when all values are the same. */
-export function spread(low, high) {
+/** An axis range with padding, also if all values are equal. */
+export function paddedRange(low, high) {
   if (low === null || high === null) return [0, 1];
-  const air = (high - low) * 0.08 || Math.abs(high) * 0.01 || 1;
-  return [low - air, high + air];
+  const padding = (high - low) * 0.08 || Math.abs(high) * 0.01 || 1;
+  return [low - padding, high + padding];
 }
 
 function nominal(u, value) {

@@ -1,11 +1,11 @@
-// The strip of trust: every batch as accepted, accepted with notes, or rejected.
+// Trust of every batch over time: accepted, accepted with findings, or rejected.
 
 import { count, local, number, timeElement, words } from "../format.js";
 import { LEFT, chart, draw, mark, merged, seconds, shade, timeAxis, valueAxis } from "./base.js";
 import { figure } from "./figure.js";
 import { colour } from "./theme.js";
 
-const ROWS = ["rejected", "notes", "accepted"];
+const ROWS = ["rejected", "findings", "accepted"];
 const SHAPES = [
   ["cross", "bad"],
   ["triangle", "warn"],
@@ -20,7 +20,7 @@ export function trust(group, selectBatch) {
     title: "Trust and data quality",
     keys: [
       { mark: "dot-good", text: "accepted" },
-      { mark: "triangle-warn", text: "accepted, with notes" },
+      { mark: "triangle-warn", text: "accepted, with findings" },
       { mark: "cross", text: "rejected: probability of damage withheld" },
     ],
   });
@@ -31,7 +31,7 @@ export function trust(group, selectBatch) {
     update({ trust: items, maintenance }) {
       one?.end();
       one = null;
-      if (items.length === 0) return frame.empty("No assessed batch in this span of time.");
+      if (items.length === 0) return frame.empty("No assessed batch in this time span.");
       frame.empty(null);
       const times = items.map((item) => seconds(item.time));
       const windows = maintenance.map((w) => [seconds(w.from), seconds(w.to)]);
@@ -61,21 +61,24 @@ export function trust(group, selectBatch) {
       });
       one = chart(frame.plot, options, [times, times.map(() => 0)]);
 
-      const said = (item) => (item.findings.length > 0 ? item.findings.map(words).join(", ") : "nothing to note");
+      const findingText = (item) => (item.findings.length > 0 ? item.findings.map(words).join(", ") : "no findings");
       function readout(u) {
         const item = items[u.cursor.idx ?? -1];
         return item
-          ? [timeElement(item.time), ` · ${item.verdict} · ${said(item)} · p of fit ${number(item.p_value, 2)}`]
+          ? [
+              timeElement(item.time),
+              ` · ${item.verdict} · ${findingText(item)} · p-value of the fit ${number(item.p_value, 2)}`,
+            ]
           : "";
       }
       const tally = [0, 1, 2].map((row) => items.filter((item) => rowOf(item) === row).length);
       frame.summarise(
-        `${count(items.length, "batch", "batches")} to ${local(items.at(-1).time)}: ${tally[2]} accepted, ${tally[1]} accepted with notes, ` +
-          `${tally[0]} rejected. Arrow keys read them, Enter opens the batch.`,
+        `${count(items.length, "batch", "batches")} to ${local(items.at(-1).time)}: ${tally[2]} accepted, ${tally[1]} accepted with findings, ` +
+          `${tally[0]} rejected. Use the arrow keys to read the values and Enter to open the batch.`,
       );
       frame.tabulate(() => ({
-        columns: ["Time", "Verdict", "Findings", "p of fit"],
-        rows: items.map((item) => [timeElement(item.time), item.verdict, said(item), number(item.p_value, 2)]),
+        columns: ["Time", "Verdict", "Findings", "p-value of the fit"],
+        rows: items.map((item) => [timeElement(item.time), item.verdict, findingText(item), number(item.p_value, 2)]),
       }));
     },
   };

@@ -1,4 +1,4 @@
-// Alarms of a structure: what is open, what was, and who has seen it.
+// Open and past alarms of a structure, with their acknowledgements.
 
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
@@ -10,26 +10,26 @@ const STATE = {
   withdrawn: ["cross", "idle", "Withdrawn"],
 };
 
-/** Alarms that are over and shown all the same. */
-const SHOWN_OVER = 2;
+/** Number of past alarms shown without unfolding the list of older ones. */
+const PAST_SHOWN = 2;
 
-/** An alarm in words. */
+/** A description of an alarm. */
 export function alarmWords(alarm) {
   if (alarm.kind === "damage")
     return `${alarm.parameter} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
-  if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit what is measured";
-  if (alarm.kind === "silence") return "no measurement for longer than agreed";
+  if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit the measurements";
+  if (alarm.kind === "silence") return "no measurement within the configured time";
   return words(alarm.kind).toLowerCase();
 }
 
-/** Asks who has seen an alarm; resolves to the alarm as it is then. */
+/** Dialog to acknowledge an alarm; resolves to the acknowledged alarm. */
 export function acknowledgeDialog(structure, alarm) {
   return ask({
     title: "Acknowledge the alarm",
     body: h(
       "p",
       null,
-      `${structure}: ${alarmWords(alarm)}. The alarm stays open until the measurements end it; others see that you know of it.`,
+      `${structure}: ${alarmWords(alarm)}. The alarm stays open until the measurements end it. Your acknowledgement is visible to all users.`,
     ),
     fields: [
       {
@@ -40,17 +40,17 @@ export function acknowledgeDialog(structure, alarm) {
         autocomplete: "name",
         value: localStorage.getItem("modalwatch.name") ?? "",
       },
-      { name: "note", label: "Note (may be empty)", type: "textarea", maxlength: 500 },
+      { name: "note", label: "Note (optional)", type: "textarea", maxlength: 500 },
     ],
     confirm: "Acknowledge",
     submit: async ({ by, note }) => {
       const body = { by: by.trim() };
-      // Notes are one line: the service takes printable characters only.
+      // The service accepts printable characters only, so line breaks are replaced by spaces.
       const line = note.trim().replace(/\s+/g, " ");
       if (line) body.note = line;
       const seen = await send(at(structure, `/alarms/${alarm.alarm}/acknowledgement`), body);
       localStorage.setItem("modalwatch.name", body.by);
-      notify(`Alarm ${alarm.alarm} of ${structure} is acknowledged.`);
+      notify(`Alarm ${alarm.alarm} of ${structure} has been acknowledged.`);
       return seen;
     },
   });
@@ -67,14 +67,14 @@ export function alarms(structure) {
   const load = async () => {
     try {
       const { items } = await read(at(structure, "/alarms?limit=50"));
-      // What is open, and the last that are over; the rest folds away.
-      const over = items.filter((alarm) => alarm.state !== "open");
-      const older = over.slice(SHOWN_OVER);
+      // Open alarms and the latest past ones are shown; older ones are folded.
+      const past = items.filter((alarm) => alarm.state !== "open");
+      const older = past.slice(PAST_SHOWN);
       const shown = items.filter((alarm) => !older.includes(alarm));
       refill(
         content,
         items.length === 0
-          ? h("p", { class: "soft" }, "There has been no alarm.")
+          ? h("p", { class: "soft" }, "No alarms so far.")
           : [
               h("ul", { class: "alarms" }, shown.map(line)),
               older.length > 0 &&
@@ -112,7 +112,7 @@ export function alarms(structure) {
           h(
             "span",
             { class: "fine" },
-            `seen by ${alarm.acknowledgement.by}, `,
+            `acknowledged by ${alarm.acknowledgement.by}, `,
             timeElement(alarm.acknowledgement.at),
             alarm.acknowledgement.note && `: ${alarm.acknowledgement.note}`,
           ),

@@ -1,4 +1,4 @@
-// One batch in detail: its densities, its frequencies against the prediction, and what speaks for or against it.
+// One batch in detail: probability densities, measured and predicted frequencies, trust and findings.
 
 import { at, read } from "../api.js";
 import { densities } from "../charts/density.js";
@@ -8,9 +8,9 @@ import { count, digest, local, number, percentWithin, quantity, timeElement, wor
 import { trustChip } from "../states.js";
 
 const EFFECTS = {
-  reject: ["cross", "bad", "rejects the batch"],
-  hold_alarm: ["note", "warn", "holds alarms"],
-  note: ["note", "idle", "to note"],
+  reject: ["cross", "bad", "batch rejected"],
+  hold_alarm: ["note", "warn", "damage charts not updated"],
+  note: ["note", "idle", "information"],
 };
 
 export function batch(structure) {
@@ -25,13 +25,13 @@ export function batch(structure) {
     "section",
     { id: "batch", class: "panel", "aria-labelledby": "batch-title" },
     h("h2", { id: "batch-title", tabindex: -1 }, "Batch"),
-    h("p", { class: "row" }, h("label", { for: "batch-picker" }, "Batch of"), earlier, picker, later),
+    h("p", { class: "row" }, h("label", { for: "batch-picker" }, "Batch measured until"), earlier, picker, later),
     description,
     drawn,
   );
   let list = [];
   let chosen = null;
-  /** The newest batch is followed until somebody chooses another. */
+  /** Whether the newest batch is shown as it arrives; ends when the user chooses another batch. */
   let following = true;
 
   const step = (by) => {
@@ -46,17 +46,17 @@ export function batch(structure) {
 
   const show = async () => {
     const id = chosen;
-    const place = list.findIndex((item) => item.batch === id);
+    const index = list.findIndex((item) => item.batch === id);
     picker.value = id ?? "";
-    earlier.disabled = place < 0 || place >= list.length - 1;
-    later.disabled = place <= 0;
+    earlier.disabled = index < 0 || index >= list.length - 1;
+    later.disabled = index <= 0;
     element.classList.add("busy");
     try {
       const path = at(structure, `/batches/${encodeURIComponent(id)}`);
-      // A batch that could not be assessed has no detail; what is known of it is shown all the same.
-      const [told, detail] = await Promise.all([read(path), read(`${path}/detail`).catch((error) => ({ error }))]);
+      // A batch that could not be assessed has no detail; its other data are shown nevertheless.
+      const [info, detail] = await Promise.all([read(path), read(`${path}/detail`).catch((error) => ({ error }))]);
       if (id !== chosen) return;
-      fill(description, describe(told), detail.error && told.assessment && problem(detail.error, show));
+      fill(description, describe(info), detail.error && info.assessment && problem(detail.error, show));
       drawn.hidden = Boolean(detail.error);
       if (!detail.error) {
         density.update(detail);
@@ -71,7 +71,7 @@ export function batch(structure) {
 
   return {
     element,
-    /** The batches of the span in view; follows the newest. */
+    /** Takes the batches of the time span in view. */
     async update(series) {
       const newest = [...series.trust].reverse();
       const changed = newest.length !== list.length || newest[0]?.batch !== list[0]?.batch;
@@ -80,7 +80,7 @@ export function batch(structure) {
         drawn.hidden = true;
         picker.disabled = true;
         chosen = null;
-        return fill(description, h("p", { class: "soft" }, "No assessed batch in this span of time."));
+        return fill(description, h("p", { class: "soft" }, "No assessed batch in this time span."));
       }
       picker.disabled = false;
       if (following || !chosen) chosen = list[0].batch;
@@ -100,7 +100,7 @@ export function batch(structure) {
       }
       if (changed || drawn.hidden) await show();
     },
-    /** Another batch, from a chart. */
+    /** Shows the batch that was selected in a chart. */
     async select(id) {
       await choose(id);
       element.scrollIntoView({
@@ -113,30 +113,30 @@ export function batch(structure) {
   };
 }
 
-function describe(told) {
-  const a = told.assessment;
+function describe(info) {
+  const a = info.assessment;
   const facts = [
-    ["Measured", h("span", null, timeElement(told.measured_from), " to ", timeElement(told.measured_to))],
-    ["Received", timeElement(told.received_at)],
+    ["Measured", h("span", null, timeElement(info.measured_from), " to ", timeElement(info.measured_to))],
+    ["Received", timeElement(info.received_at)],
     [
       "Measurements",
       a
-        ? `${told.measurement_count}, of which ${a.measurements_used} used, ${a.measurements_left_out} left out, ${a.measurements_outside} outside the prior`
-        : String(told.measurement_count),
+        ? `${info.measurement_count}, of which ${a.measurements_used} used, ${a.measurements_left_out} left out, ${a.measurements_outside} outside the prior`
+        : String(info.measurement_count),
     ],
-    ["Source", told.source],
-    ["State", words(told.state)],
+    ["Source", info.source],
+    ["State", words(info.state)],
     a && [
       "Trust",
       h(
         "span",
         null,
         trustChip(a.trust, a.findings.length),
-        a.fit_p_value !== null ? ` p of fit ${number(a.fit_p_value, 2)}` : "",
+        a.fit_p_value !== null ? ` p-value of the fit ${number(a.fit_p_value, 2)}` : "",
       ),
     ],
-    a && ["Model", digest(a.model_digest)],
-    ["Batch", h("code", null, told.batch)],
+    a && ["Trained model", digest(a.model_digest)],
+    ["Batch", h("code", null, info.batch)],
   ].filter(Boolean);
   return [
     h(
@@ -144,14 +144,14 @@ function describe(told) {
       { class: "facts" },
       facts.map(([name, value]) => h("div", null, h("dt", null, name), h("dd", null, value))),
     ),
-    told.failure && h("p", { class: "callout bad" }, icon("alarm"), `The assessment failed: ${told.failure}`),
-    told.next_step && h("p", { class: "callout" }, icon("note"), told.next_step),
+    info.failure && h("p", { class: "callout bad" }, icon("alarm"), `The assessment failed: ${info.failure}`),
+    info.next_step && h("p", { class: "callout" }, icon("note"), info.next_step),
     a?.trust === "rejected" &&
       h(
         "p",
         { class: "callout bad" },
         icon("cross"),
-        "Rejected: the probability of damage is withheld and no damage alarm raised. The findings say why.",
+        "Rejected: the probability of damage is withheld and no damage alarm is raised. The findings give the reasons.",
       ),
     a?.findings.length > 0 && h("ul", { class: "findings", "aria-label": "Findings" }, a.findings.map(finding)),
     a && parameterTable(a),
@@ -189,7 +189,7 @@ function parameterTable(a) {
       cell("Mean", quantity(p.mean, p.unit)),
       cell("90 % interval", interval(p.mean_interval)),
       cell("Threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
-      cell("Change", p.relative_change === null ? "–" : `${number(100 * p.relative_change, 3)} %`),
+      cell("Change from reference", p.relative_change === null ? "–" : `${number(100 * p.relative_change, 3)} %`),
       cell(
         "Probability of damage",
         p.probability_of_damage === null
@@ -201,7 +201,14 @@ function parameterTable(a) {
         p.exceeds && h("span", { class: "chip bad" }, icon("alarm"), "above the limit"),
       ),
     );
-  const columns = ["Parameter", "Mean", "90 % interval", "Threshold δ", "Change", "Probability of damage"];
+  const columns = [
+    "Parameter",
+    "Mean",
+    "90 % interval",
+    "Threshold δ",
+    "Change from reference",
+    "Probability of damage",
+  ];
   return h(
     "table",
     { class: "cards" },

@@ -1,4 +1,4 @@
-// What the simulation gets wrong: diagnoses, their reports, and the extension of the model by what they found.
+// Diagnoses of the simulation, their reports, and the extension of the model by the causes found.
 
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
@@ -6,13 +6,13 @@ import { age, number, words } from "../format.js";
 import { progress } from "../jobs.js";
 import { jobChip } from "../states.js";
 
-/** Verdicts that name something a model can be extended by. */
+/** Verdicts that name causes by which the model can be extended. */
 const EXTENDS = ["cause", "several", "ambiguous"];
 
 export function diagnosis(structure, changed) {
   const content = h("div", null);
   const begin = h("button", { type: "button", onclick: () => diagnose() }, "Diagnose");
-  const back = h("button", { type: "button", class: "danger", onclick: () => stepBack() }, "Step back");
+  const back = h("button", { type: "button", class: "danger", onclick: () => stepBack() }, "Undo last extension");
   const element = h(
     "section",
     { id: "diagnosis", class: "panel", "aria-labelledby": "diagnosis-title" },
@@ -20,7 +20,7 @@ export function diagnosis(structure, changed) {
     h(
       "p",
       { class: "fine" },
-      "A diagnosis shows where the simulation deviates from what is measured, names the cause, and measures what naming it gains.",
+      "A diagnosis shows where the simulation deviates from the measurements, identifies the cause, and quantifies the gain from modelling it.",
     ),
     content,
     h("p", { class: "buttons start" }, begin, back),
@@ -29,7 +29,7 @@ export function diagnosis(structure, changed) {
   const load = async () => {
     try {
       const { items } = await read(at(structure, "/diagnoses"));
-      // Progress is with the single diagnosis only.
+      // The list lacks progress and gain; they are read for the newest diagnosis and for those that are running.
       const full = await Promise.all(
         items
           .slice(0, 10)
@@ -39,7 +39,7 @@ export function diagnosis(structure, changed) {
       refill(
         content,
         full.length === 0
-          ? h("p", { class: "soft" }, "There has been no diagnosis yet.")
+          ? h("p", { class: "soft" }, "No diagnosis yet.")
           : h("ul", { class: "alarms" }, full.map(line)),
       );
     } catch (error) {
@@ -47,13 +47,13 @@ export function diagnosis(structure, changed) {
     }
   };
   const details = async (item) => {
-    const told = await read(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}`);
+    const answer = await read(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}`);
     return {
-      progress: told.progress,
-      failure: told.failure ?? told.extension?.failure,
-      gain: told.result?.gain ?? null,
-      extension: told.extension?.state ?? null,
-      added: told.extension?.result?.added,
+      progress: answer.progress,
+      failure: answer.failure ?? answer.extension?.failure,
+      gain: answer.result?.gain ?? null,
+      extension: answer.extension?.state ?? null,
+      added: answer.extension?.result?.added,
     };
   };
   const isBusy = (item) => item.state === "running" || item.extension === "running";
@@ -77,10 +77,10 @@ export function diagnosis(structure, changed) {
           h(
             "span",
             { class: "fine" },
-            `The model was extended by it${item.added?.length ? `: ${item.added.join("; ")}` : ""}.`,
+            `The model has been extended${item.added?.length ? `: ${item.added.join("; ")}` : ""}.`,
           ),
         item.failure && h("span", { class: "fine bad-text" }, item.failure),
-        h("span", { class: "fine" }, "begun ", age(item.created_at)),
+        h("span", { class: "fine" }, "started ", age(item.created_at)),
       ),
       done && h("a", { class: "button", href: `#/diagnoses/${encodeURIComponent(item.diagnosis)}` }, "Report"),
       extendable && h("button", { type: "button", class: "primary", onclick: () => extend(item) }, "Extend the model"),
@@ -93,7 +93,7 @@ export function diagnosis(structure, changed) {
       body: h(
         "p",
         null,
-        "All batches of the structure are searched for what the simulation gets wrong; the last quarter is held out to measure the gain. It runs in the background for seconds to minutes and changes nothing.",
+        "All batches of the structure are searched for systematic deviations of the simulation; the last quarter is held out to measure the gain. The diagnosis runs in the background for seconds to minutes and changes nothing.",
       ),
       confirm: "Diagnose",
       submit: () => send(at(structure, "/diagnoses"), {}),
@@ -109,11 +109,11 @@ export function diagnosis(structure, changed) {
           "ul",
           null,
           [
-            "A new version of the structure gets this cause as an effect.",
-            "A new baseline is trained and calibrated for it, in the background, for minutes.",
-            "If it passes its calibration it takes the place of the present one at once; otherwise nothing changes.",
-            "The undamaged state is taken again from the same batches, and all batches are assessed again: charts and alarms change.",
-            "“Step back” returns to the version before.",
+            "A new version of the structure is created with the causes found as effects.",
+            "A new model is trained and calibrated in the background, which takes minutes.",
+            "If it passes its calibration, it replaces the present model at once; otherwise nothing changes.",
+            "The undamaged reference is renewed from the same batches and all batches are assessed again: charts and alarms change.",
+            "“Undo last extension” restores the previous version.",
           ].map((text) => h("li", null, text)),
         ),
       ],
@@ -121,24 +121,24 @@ export function diagnosis(structure, changed) {
       submit: () => send(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}/extension`, {}),
     });
     if (done) {
-      notify("The extension runs; its progress is shown here and under Jobs.");
+      notify("The extension is running. Its progress is shown here and under “Jobs”.");
       await load();
     }
   };
   const stepBack = async () => {
     const done = await ask({
-      title: "Step back?",
+      title: "Undo the last extension?",
       body: h(
         "p",
         null,
-        "The version of the structure before the last extension comes back with its baseline, and all batches are assessed again. The extension stays stored with its diagnosis.",
+        "The version of the structure before the last extension is restored with its trained model, and all batches are assessed again. The extension stays stored with its diagnosis.",
       ),
-      confirm: "Step back",
+      confirm: "Undo extension",
       danger: true,
       submit: () => send(at(structure, "/extension"), undefined, "DELETE"),
     });
     if (done) {
-      notify("Went back to the version before; batches are being assessed again.");
+      notify("The previous version has been restored; all batches are being assessed again.");
       await load();
       changed();
     }
@@ -155,6 +155,6 @@ function gainWords(gain) {
     "span",
     { class: "fine" },
     icon("chart"),
-    `Gain on ${gain.holdout_rows} held-out measurements: error of a predicted frequency ${number(mean(before), 2)} % → ${number(mean(after), 2)} %, false alarms per 1000 batches ${number(alarms.before, 2)} → ${number(alarms.after, 2)}.`,
+    `Gain on ${gain.holdout_rows} held-out measurements: mean RMS error of the predicted frequencies ${number(mean(before), 2)} % → ${number(mean(after), 2)} %, false alarms per 1000 batches ${number(alarms.before, 2)} → ${number(alarms.after, 2)}.`,
   );
 }

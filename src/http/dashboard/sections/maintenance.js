@@ -1,10 +1,10 @@
-// Maintenance windows: batches measured in them move no chart.
+// Maintenance windows: batches measured in them do not update the control charts.
 
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, problem } from "../dom.js";
 import { timeElement, zone } from "../format.js";
 
-/** A time for an input field, in the viewer's zone. */
+/** A time in the viewer's zone, in the format of a `datetime-local` field. */
 function field(date) {
   const shifted = new Date(date.getTime() - 60000 * date.getTimezoneOffset());
   return shifted.toISOString().slice(0, 16);
@@ -12,7 +12,7 @@ function field(date) {
 
 export function maintenance(structure, changed) {
   const content = h("div", null);
-  const add = h("button", { type: "button", onclick: () => addWindow() }, icon("wrench"), "Add a window");
+  const add = h("button", { type: "button", onclick: () => addWindow() }, icon("wrench"), "Add a maintenance window");
   const element = h(
     "section",
     { id: "maintenance", class: "panel", "aria-labelledby": "maintenance-title" },
@@ -41,7 +41,7 @@ export function maintenance(structure, changed) {
           ? h(
               "p",
               { class: "soft" },
-              "No window. Batches measured during work on the structure raise alarms unless a window is given before they arrive.",
+              "No maintenance windows. Batches measured during work on the structure can raise alarms unless a window is added before they arrive.",
             )
           : h("ul", { class: "alarms" }, items.map(line)),
       );
@@ -56,7 +56,7 @@ export function maintenance(structure, changed) {
       body: h(
         "p",
         null,
-        "Batches measured in the window are stored and assessed, but move no chart and raise no alarm.",
+        "Batches measured in the window are stored and assessed, but do not update the control charts and raise no alarm.",
       ),
       fields: [
         { name: "from", label: `From (${zone()})`, type: "datetime-local", required: true, value: field(now) },

@@ -1,4 +1,4 @@
-// The model in use with its calibration, and the undamaged state it compares with.
+// The trained model with its calibration, and the undamaged reference that batches are compared with.
 
 import { at, read, send } from "../api.js";
 import { ask, cell, fill, h, icon, notify } from "../dom.js";
@@ -9,15 +9,15 @@ export function model(structure, changed) {
   const element = h(
     "section",
     { id: "model", class: "panel", "aria-labelledby": "model-title" },
-    h("h2", { id: "model-title" }, "Model and undamaged state"),
+    h("h2", { id: "model-title" }, "Trained model and undamaged reference"),
     content,
   );
   let shown = null;
   return {
     element,
-    update(told, batches) {
-      // Each batch brings the same again: what somebody has opened here stays open.
-      const key = JSON.stringify([told, batches > 0]);
+    update(info, batches) {
+      // Redraw only after a change, so that details opened by the user stay open when a batch arrives.
+      const key = JSON.stringify([info, batches > 0]);
       if (key === shown) return;
       shown = key;
       fill(
@@ -25,13 +25,13 @@ export function model(structure, changed) {
         h(
           "div",
           { class: "columns" },
-          h("div", null, h("h3", null, "Model in use"), told.model ? inUse(told) : missing(told)),
+          h("div", null, h("h3", null, "Trained model"), info.model ? inUse(info) : missing(info)),
           h(
             "div",
             null,
-            h("h3", null, "Undamaged state"),
-            told.undamaged ? undamaged(told.undamaged) : firstStep(told, batches),
-            told.model &&
+            h("h3", null, "Undamaged reference"),
+            info.undamaged ? undamaged(info.undamaged) : firstStep(info, batches),
+            info.model &&
               batches > 0 &&
               h(
                 "p",
@@ -40,10 +40,10 @@ export function model(structure, changed) {
                   "button",
                   {
                     type: "button",
-                    class: told.undamaged ? "" : "primary",
+                    class: info.undamaged ? "" : "primary",
                     onclick: () => declare(structure, changed),
                   },
-                  told.undamaged ? "Declare another undamaged state" : "Declare the undamaged state",
+                  info.undamaged ? "Declare another undamaged reference" : "Declare the undamaged reference",
                 ),
               ),
           ),
@@ -60,15 +60,15 @@ const facts = (list) =>
     list.filter(Boolean).map(([name, value]) => h("div", null, h("dt", null, name), h("dd", null, value))),
   );
 
-function missing(told) {
+function missing(info) {
   return [
-    h("p", { class: "callout" }, icon("note"), told.model_missing ?? "No trained baseline serves this structure."),
+    h("p", { class: "callout" }, icon("note"), info.model_missing ?? "There is no trained model for this structure."),
     h(
       "p",
       null,
-      "Batches are stored and wait. Train a baseline for exactly this definition, put it into the models folder and start the service again:",
+      "Batches are stored and wait for their assessment. Train a model for exactly this definition, copy it to the models folder and restart the service:",
     ),
-    h("pre", { tabindex: 0 }, h("code", null, `modalwatch train --structure structure.toml --out models/${told.id}`)),
+    h("pre", { tabindex: 0 }, h("code", null, `modalwatch train --structure structure.toml --out models/${info.id}`)),
   ];
 }
 
@@ -79,17 +79,20 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
   return [
     facts([
       definition.description && ["Structure", definition.description],
-      ["Model", digest(m.digest)],
-      ["Definition", digest(structureDigest)],
-      ["Trained by", `modalwatch ${m.program_version}, ${m.training_samples.toLocaleString()} simulations`],
-      noise && ["Noise trained for", `${number(noise.lowest)} to ${number(noise.highest)} times that of the structure`],
+      ["Digest of the model", digest(m.digest)],
+      ["Digest of the structure", digest(structureDigest)],
+      ["Trained with", `modalwatch ${m.program_version}, ${m.training_samples.toLocaleString()} simulations`],
+      noise && [
+        "Trained noise range",
+        `${number(noise.lowest)} to ${number(noise.highest)} × the noise of the structure`,
+      ],
       [
         "Validation",
-        `−log likelihood ${number(validation.negative_log_likelihood, 3)} ± ${number(validation.negative_log_likelihood_error, 2)} nats`,
+        `negative log-likelihood ${number(validation.negative_log_likelihood, 3)} ± ${number(validation.negative_log_likelihood_error, 2)} nats`,
       ],
       emulator && [
         "Emulator",
-        `${count(emulator.runs, "run")}, error ${emulator.error_percent.map((e) => number(e, 2)).join(", ")} % by mode`,
+        `${count(emulator.runs, "run")}, error ${emulator.error_percent.map((e) => number(e, 2)).join(", ")} % (one value per mode)`,
       ],
     ]),
     h(
@@ -97,14 +100,14 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
       { class: `callout ${passed ? "good" : "bad"}` },
       icon(passed ? "check" : "alarm"),
       passed
-        ? `Calibration passed: ${count(calibration.cells.length, "condition")}, ${calibration.simulations} simulated measurements each.`
+        ? `Calibration passed: ${count(calibration.cells.length, "case")}, ${calibration.simulations} simulated measurements each.`
         : `Calibration failed: ${calibration.failures.slice(0, 3).join("; ")}${calibration.failures.length > 3 ? `; and ${calibration.failures.length - 3} more` : ""}.`,
     ),
     calibrationTable(calibration.cells),
   ];
 }
 
-/** One row a condition: how often the stated intervals hold the true value. */
+/** One row per noise level and missing mode: how often the posterior intervals contain the true value. */
 function calibrationTable(cells) {
   if (cells.length === 0) return null;
   const range = (values) => {
@@ -120,25 +123,25 @@ function calibrationTable(cells) {
         { scope: "row" },
         `${number(condition.noise_multiple, 2)} × noise, ${condition.missing_mode ? `without mode ${condition.missing_mode}` : "all modes"}`,
       ),
-      cell("50 % intervals hold", range(condition.parameters.map((p) => p.coverage_50))),
-      cell("90 % intervals hold", range(condition.parameters.map((p) => p.coverage_90))),
-      cell("p (TARP)", number(condition.tarp_p_value, 2)),
+      cell("Coverage of 50 % intervals", range(condition.parameters.map((p) => p.coverage_50))),
+      cell("Coverage of 90 % intervals", range(condition.parameters.map((p) => p.coverage_90))),
+      cell("p-value (TARP)", number(condition.tarp_p_value, 2)),
     );
   return h(
     "details",
     null,
-    h("summary", null, "Calibration by condition"),
+    h("summary", null, "Calibration by noise level and missing mode"),
     h(
       "table",
       { class: "cards" },
-      h("caption", { class: "hidden-text" }, "Calibration by condition"),
+      h("caption", { class: "hidden-text" }, "Calibration by noise level and missing mode"),
       h(
         "thead",
         null,
         h(
           "tr",
           null,
-          ["Condition", "50 % intervals hold", "90 % intervals hold", "p (TARP)"].map((c) =>
+          ["Noise and modes", "Coverage of 50 % intervals", "Coverage of 90 % intervals", "p-value (TARP)"].map((c) =>
             h("th", { scope: "col" }, c),
           ),
         ),
@@ -157,7 +160,7 @@ function undamaged(state) {
       ["Version", `${state.version}, declared ${local(state.created_at)}`],
       ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}`],
       ["Limit", `probability of damage above ${percent(state.threshold_probability)}`],
-      conditions.length > 0 && ["Conditions", conditions.join("; ")],
+      conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
     ]),
     state.doubts.length > 0 &&
       h(
@@ -170,7 +173,7 @@ function undamaged(state) {
     h(
       "table",
       { class: "cards" },
-      h("caption", { class: "hidden-text" }, "Parameters of the undamaged state"),
+      h("caption", { class: "hidden-text" }, "Parameters of the undamaged reference"),
       h(
         "thead",
         null,
@@ -198,32 +201,32 @@ function undamaged(state) {
   ];
 }
 
-function firstStep(told, batches) {
-  if (!told.model) return h("p", { class: "soft" }, "Comes after the model.");
+function firstStep(info, batches) {
+  if (!info.model) return h("p", { class: "soft" }, "Available as soon as there is a trained model.");
   if (batches === 0) {
     return [
-      h("p", null, "Nothing has been measured yet. Send the first batch:"),
-      h("pre", { tabindex: 0 }, h("code", null, postLine(told))),
+      h("p", null, "No measurements yet. Send the first batch:"),
+      h("pre", { tabindex: 0 }, h("code", null, postLine(info))),
     ];
   }
   return h(
     "p",
     { class: "callout" },
     icon("note"),
-    "There is no undamaged state yet: parameters are estimated, but no probability of damage and no alarm can be given. Choose batches measured while the structure was known to be sound.",
+    "There is no undamaged reference yet: parameters are estimated, but there is no probability of damage and no damage alarm. Choose batches measured while the structure was known to be undamaged.",
   );
 }
 
-/** A command line that posts one measurement of this structure. */
-export function postLine(told) {
+/** A shell command that posts one measurement of this structure. */
+export function postLine(info) {
   const measurement = {
     measured_at: new Date().toISOString().slice(0, 19) + "Z",
-    frequencies_hz: told.nominal_frequencies_hz.map((f) => Number(f.toPrecision(4))),
+    frequencies_hz: info.nominal_frequencies_hz.map((f) => Number(f.toPrecision(4))),
   };
-  return `curl ${location.origin}/v1/structures/${told.id}/batches \\\n  -H 'content-type: application/json' \\\n  -d '${JSON.stringify({ measurements: [measurement] })}'`;
+  return `curl ${location.origin}/v1/structures/${info.id}/batches \\\n  -H 'content-type: application/json' \\\n  -d '${JSON.stringify({ measurements: [measurement] })}'`;
 }
 
-/** Lets somebody choose batches for a new undamaged state. */
+/** Dialog to choose the batches of a new undamaged reference. */
 async function declare(structure, changed) {
   let items;
   try {
@@ -254,16 +257,16 @@ async function declare(structure, changed) {
   });
   const list = h("ul", { class: "choices", tabindex: 0, "aria-label": "Batches" }, boxes);
   const done = await ask({
-    title: "Declare the undamaged state",
+    title: "Declare the undamaged reference",
     body: [
       h(
         "p",
         null,
-        "Later batches are compared with these. Choose batches from the time in which the structure was known to be sound, over as many conditions as there are. All batches are judged again by the new state, and alarms of the old one are withdrawn.",
+        "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available. All batches are compared again with the new reference, and alarms based on the old one are withdrawn.",
       ),
       list,
     ],
-    fields: [{ name: "p", label: "Limit: probability of damage above, %", type: "text", required: true, value: "5" }],
+    fields: [{ name: "p", label: "Limit of the probability of damage (%)", type: "text", required: true, value: "5" }],
     confirm: "Declare",
     submit: ({ p }) => {
       const batches = [...list.querySelectorAll("input:checked")].map((box) => box.value);
@@ -273,7 +276,7 @@ async function declare(structure, changed) {
     },
   });
   if (done) {
-    notify(`Undamaged state ${done.version} of ${structure} is declared.`);
+    notify(`Version ${done.version} of the undamaged reference of ${structure} has been declared.`);
     changed();
   }
 }
