@@ -1,6 +1,8 @@
-//! The baselines of `models/` and the files of `migrations/` are built into the program: a new file must build it again.
+//! The models of `models/`, the files of `migrations/` and the pages of `docs/` are embedded in the program, which must be built
+//! again when one of them is added or changed.
 
 fn main() {
+    println!("cargo:rerun-if-changed=docs");
     println!("cargo:rerun-if-changed=models");
     println!("cargo:rerun-if-changed=migrations");
 }

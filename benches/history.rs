@@ -219,7 +219,7 @@ async fn queries(folder: &Path, large: usize) {
     BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
     let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
     println!("  the service is there after {:.0} s, its check of the file included", started.elapsed().as_secs_f64());
-    let client = reqwest::Client::new();
+    let client = modalwatch::notify::client_builder().build().unwrap();
     let get = async |path: &str| {
         let started = Instant::now();
         let response = client.get(format!("{url}{path}")).send().await.expect("the service answers");

@@ -11,7 +11,7 @@ use candle_nn::{AdamW, Optimizer as _};
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, Par};
 use modalwatch::flow::fused::Fused;
-use modalwatch::flow::train::{mean_loss, Pairs};
+use modalwatch::flow::pairs::{mean_loss, Pairs};
 use modalwatch::flow::weights::untrained_flow;
 use modalwatch::flow::{Architecture, FlowSettings};
 use modalwatch::stats;

@@ -1,4 +1,4 @@
-//! Which inputs a spread in the outputs comes from: Sobol' indices, by first order and in total, with intervals.
+//! Global sensitivity analysis: first-order and total Sobol' indices with confidence intervals.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -8,26 +8,27 @@ use serde::Serialize;
 
 use crate::stats;
 
-/// Points a scrambled Sobol' sequence has; `sobol_burley` gives unspecified numbers beyond, and checks only in debug.
+/// Largest number of points of a scrambled Sobol' sequence. Beyond it `sobol_burley` returns unspecified numbers, and checks only
+/// in debug builds.
 pub const MAX_SAMPLES: usize = 1 << 16;
 
-/// Inputs at most: each takes two of the dimensions of the sequence.
+/// Largest number of inputs: each needs two dimensions of the sequence.
 pub const MAX_INPUTS: usize = sobol_burley::NUM_DIMENSIONS as usize / 2;
 
-/// Rows that one task works through. Sums run within a task and then over tasks in order: the same bits on any number
-/// of threads.
+/// Number of rows of one parallel task. Sums are formed within each task and then over the tasks in order, which gives the same bits
+/// on any number of threads.
 const TASK_ROWS: usize = 16;
 
-/// Standard deviation, as a share of the largest magnitude, up to which an output is rounding and does not vary.
+/// An output is constant up to rounding if its standard deviation is below this share of its largest magnitude.
 const ROUNDING: f64 = 1e-12;
 
-/// Outputs from here on have squares that overflow in sums.
+/// Smallest magnitude of an output that is rejected, because sums of its squares would overflow.
 const LARGEST_OUTPUT: f64 = 1e150;
 
-/// An input, uniform between two bounds and independent of the others.
+/// An input of the model, uniformly distributed between two bounds and independent of the other inputs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Input {
-    /// Its name in the result.
+    /// Name in the result.
     pub name: String,
     /// Lower bound, in the unit of the input.
     pub lower: f64,
@@ -35,12 +36,12 @@ pub struct Input {
     pub upper: f64,
 }
 
-/// How many model runs, and the seed of their points.
+/// Number of model runs, and seed of their points.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Settings {
-    /// Rows N of one replicate: a power of two up to [`MAX_SAMPLES`]. Sobol' points lose their balance in between.
+    /// Number of rows N of one replicate: a power of two up to [`MAX_SAMPLES`]. Sobol' points are only balanced for powers of two.
     pub samples: usize,
-    /// Independent scramblings R, at least 2: their spread gives the intervals.
+    /// Number of independently scrambled replicates R, at least 2. Their spread gives the confidence intervals.
     pub replicates: usize,
     /// Seed of the scramblings.
     pub seed: u64,
@@ -52,32 +53,32 @@ impl Default for Settings {
     }
 }
 
-/// A share of the variance of an output, with its interval.
+/// A Sobol' index, which is a share of the variance of an output, with its confidence interval.
 ///
-/// Neither is cut off at 0 or 1: an index near 0 may come out slightly negative.
+/// The values are not restricted to 0 to 1: the estimate of a small index can be slightly negative.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Index {
     /// Mean over the replicates.
     pub value: f64,
-    /// 90 % confidence interval from Student's t of the replicates; no width where all of them agree to the bit.
+    /// 90 % confidence interval by Student's t distribution over the replicates.
     pub interval_90: [f64; 2],
 }
 
-/// Indices of one output, an entry per input in each.
+/// Sobol' indices of one output, with one entry for each input.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Indices {
-    /// Share of the variance that each input explains alone.
+    /// First-order indices: share of the variance that each input explains alone, `[d]`.
     pub first: Vec<Index>,
-    /// Share of the variance that each input takes part in: alone and with others.
+    /// Total indices: share of the variance that each input contributes to, alone or in interaction with others, `[d]`.
     pub total: Vec<Index>,
 }
 
-/// Spread of one output, and where it comes from.
+/// Variance of one output, and its Sobol' indices.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct OutputSensitivity {
     /// Variance over the input ranges, in the squared unit of the output.
     pub variance: f64,
-    /// `None` (JSON null) where the output does not vary, to rounding: there is nothing to share out then.
+    /// `None` (JSON null) if the output is constant up to rounding.
     pub indices: Option<Indices>,
 }
 
@@ -86,38 +87,38 @@ pub struct OutputSensitivity {
 pub struct Sensitivity {
     /// Names of the inputs, in the order of every list of indices.
     pub inputs: Vec<String>,
-    /// One entry per output of the model, in its order.
+    /// One entry for each output of the model, in its order.
     pub outputs: Vec<OutputSensitivity>,
-    /// Model runs: N(d + 2)R, and the one at the centre of the ranges.
+    /// Number of model runs: N(d + 2)R, plus one at the centre of the ranges.
     pub evaluations: usize,
 }
 
-/// Why there are no indices.
+/// Why the indices cannot be computed.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error<E> {
-    /// No inputs, or more than the sequence has dimensions for.
+    /// There are no inputs, or more than the sequence has dimensions for.
     #[error("{inputs} inputs: from 1 to {MAX_INPUTS} are possible")]
     Inputs {
-        /// Inputs given.
+        /// Number of inputs.
         inputs: usize,
     },
-    /// A range without width, or without bounds.
-    #[error("input {name:?} has the range [{lower}, {upper}]: the bounds must be finite, the upper one above")]
+    /// The range of an input is empty or infinite.
+    #[error("input {name:?} has the range [{lower}, {upper}]: the bounds must be finite, the upper above the lower")]
     Range {
-        /// Its name.
+        /// Name of the input.
         name: String,
         /// Lower bound.
         lower: f64,
         /// Upper bound.
         upper: f64,
     },
-    /// Not a number of points for which the sequence is balanced.
+    /// The number of samples is not one for which the sequence is balanced.
     #[error("{samples} samples: a power of two from 2 to {MAX_SAMPLES} is needed")]
     Samples {
         /// Samples asked for.
         samples: usize,
     },
-    /// Too few replicates to see a spread.
+    /// There are too few replicates for an interval.
     #[error("{replicates} replicates: at least 2 are needed for an interval")]
     Replicates {
         /// Replicates asked for.
@@ -128,23 +129,23 @@ pub enum Error<E> {
     Model {
         /// Inputs of the run.
         at: Vec<f64>,
-        /// What the model says.
+        /// Error of the model.
         source: E,
     },
-    /// An output is not finite, or its square is beyond f64.
-    #[error("output {output} of the model at {at:?} is {value}: no variance can be taken of it")]
+    /// An output is not finite or too large.
+    #[error("output {output} of the model at {at:?} is {value}: it must be finite and below {LARGEST_OUTPUT:e} in magnitude")]
     NotFinite {
         /// Inputs of the run.
         at: Vec<f64>,
-        /// Number of the output, from 0.
+        /// Index of the output, from 0.
         output: usize,
-        /// Its value.
+        /// Value of the output.
         value: f64,
     },
     /// The model has no outputs.
-    #[error("the model gives no outputs")]
+    #[error("the model has no outputs: at least one is needed")]
     NoOutputs,
-    /// Runs of the model differ in the number of outputs.
+    /// The number of outputs differs between runs of the model.
     #[error("the model gives {found} outputs at {at:?}, and {expected} at the centre of the ranges")]
     Outputs {
         /// Inputs of the run.
@@ -163,17 +164,18 @@ pub enum Error<E> {
 ///  T_i = E(Var(f | x_~i)) / V =    Σ_n (f(A) − f(A_B^i))² / 2NV
 /// ```
 ///
-/// A and B are `[N, d]`, the two halves of 2d-dimensional Owen-scrambled Sobol' points; A_B^i is A with column i of B;
-/// V is the variance of f over A and B together. Each replicate scrambles anew; an index is the mean over the
-/// replicates. `model` takes `[d]` in the units of the inputs, and runs on all threads of the rayon pool; the result is
-/// the same bits on any number of them. `progress` is told (runs done, runs in all) now and then, from any thread, not
-/// always in order.
+/// A and B are `[N, d]`, the two halves of 2d-dimensional Owen-scrambled Sobol' points. A_B^i is A with column i from B. V is the
+/// variance of f over A and B together. Each replicate is scrambled independently, and an index is the mean over the replicates.
+/// `model` takes the inputs `[d]` in their units and returns the outputs. It runs on all threads of the rayon pool; the result has
+/// the same bits on any number of threads. `progress` is called from any thread with (runs completed, total runs), not necessarily
+/// in order.
 ///
 /// Source: Jansen (1999) for both estimators; Saltelli et al. (2010), Table 2, for the design; Owen (1998) for
 /// replicates of scrambled points.
 ///
 /// # Errors
-/// [`Error`]: unusable inputs or settings, or a model run that fails; of several, always the same one.
+/// [`Error`] for invalid inputs or settings, or for a model run that fails. If several runs fail, the error is always that of the
+/// same one.
 pub fn sobol_indices<E, F>(
     inputs: &[Input],
     settings: &Settings,
@@ -203,12 +205,13 @@ where
     })
 }
 
+/// Checks inputs and settings.
 fn check<E>(inputs: &[Input], settings: &Settings) -> Result<(), Error<E>> {
     let &Settings { samples, replicates, .. } = settings;
     if inputs.is_empty() || inputs.len() > MAX_INPUTS {
         return Err(Error::Inputs { inputs: inputs.len() });
     }
-    // Two finite bounds may have a width beyond f64.
+    // The width of a range with finite bounds can overflow.
     let unusable = |input: &&Input| !(input.lower < input.upper && (input.upper - input.lower).is_finite());
     if let Some(Input { name, lower, upper }) = inputs.iter().find(unusable) {
         return Err(Error::Range { name: name.clone(), lower: *lower, upper: *upper });
@@ -222,7 +225,7 @@ fn check<E>(inputs: &[Input], settings: &Settings) -> Result<(), Error<E>> {
     Ok(())
 }
 
-/// All runs to be made.
+/// The design of all model runs.
 struct Design<'a, F> {
     inputs: &'a [Input],
     samples: usize,
@@ -232,7 +235,7 @@ struct Design<'a, F> {
     model: F,
 }
 
-/// What is kept of some rows of one replicate.
+/// Results of some rows of one replicate.
 struct Task {
     /// f(A), f(B) of the first row, f(A) of the second, …: each `[outputs]`.
     values: Vec<f64>,
@@ -258,7 +261,7 @@ impl<F> Design<'_, F> {
     {
         let tasks = self.tasks_of_replicate();
         let done = AtomicUsize::new(0);
-        // A failure ends the tasks behind it, never those before: the first failure in order is always found.
+        // A failure cancels only later tasks, so that the first failure in order is always found.
         let first_failure = AtomicUsize::new(usize::MAX);
         let results: Vec<Option<Result<Task, Error<E>>>> = (0..tasks * self.scramblings.len())
             .into_par_iter()
@@ -307,9 +310,9 @@ impl<F> Design<'_, F> {
         Ok(Task { values, first, total })
     }
 
-    /// Inputs of one row, from the dimensions of the sequence that begin with `dimension`.
+    /// Inputs of one row, taken from the dimensions of the sequence starting with `dimension`, `[d]`.
     fn point(&self, row: usize, dimension: usize, scrambling: u32) -> Vec<f64> {
-        // The crate rounds down to one of 2²³ cells; their centres are unbiased, and never a bound.
+        // The crate rounds down to one of 2²³ cells. Their centres are unbiased and never equal a bound.
         const HALF_CELL: f64 = 1.0 / (1 << 24) as f64;
         let coordinate = |(column, input): (usize, &Input)| {
             let u = sobol_burley::sample(row as u32, (dimension + column) as u32, scrambling);
@@ -318,6 +321,7 @@ impl<F> Design<'_, F> {
         self.inputs.iter().enumerate().map(coordinate).collect()
     }
 
+    /// Checked outputs of one model run.
     fn outputs_at<E>(&self, at: &[f64]) -> Result<Vec<f64>, Error<E>>
     where
         F: Fn(&[f64]) -> Result<Vec<f64>, E>,
@@ -335,11 +339,11 @@ impl<F> Design<'_, F> {
 
 /// Estimates of one replicate.
 struct Replicate {
-    /// Variance over A and B, and whether it is more than rounding, `[outputs]`.
+    /// Variance over A and B, and whether it exceeds rounding errors, `[outputs]`.
     variances: Vec<(f64, bool)>,
-    /// Estimates of S, `[outputs, inputs]`; meaningless for an output that does not vary.
+    /// Estimates of S, `[outputs, inputs]`; meaningless for a constant output.
     first: Vec<f64>,
-    /// Estimates of T, likewise.
+    /// Estimates of T, `[outputs, inputs]`; meaningless for a constant output.
     total: Vec<f64>,
 }
 
@@ -355,7 +359,7 @@ impl Replicate {
                 (variance, variance.sqrt() > ROUNDING * largest)
             })
             .collect();
-        // ½ · mean square over the variance.
+        // Half the mean square, divided by the variance. `rows` has 2N entries, which includes the factor ½.
         let share = |squares: fn(&Task) -> &[f64], index: usize| {
             let sum: f64 = tasks.iter().map(|task| squares(task)[index]).sum();
             sum / (rows.len() as f64 * variances[index / inputs].0)
@@ -368,13 +372,14 @@ impl Replicate {
     }
 }
 
+/// Means and confidence intervals over the replicates.
 fn summary(replicates: &[Replicate], output: usize, inputs: usize) -> OutputSensitivity {
     let variances: Vec<f64> = replicates.iter().map(|replicate| replicate.variances[output].0).collect();
     let t = stats::student_t_quantile(0.95, replicates.len() - 1);
     let index = |estimate: &dyn Fn(&Replicate) -> f64| {
         let estimates: Vec<f64> = replicates.iter().map(estimate).collect();
         let value = stats::mean(&estimates);
-        let std = stats::sample_std(&estimates).expect("two replicates at least were checked");
+        let std = stats::sample_std(&estimates).expect("the settings have at least two replicates");
         let half_width = t * std / (estimates.len() as f64).sqrt();
         Index { value, interval_90: [value - half_width, value + half_width] }
     };

@@ -30,7 +30,7 @@
 //!  simulator                             the bench      parameters in, natural frequencies out
 //!  physics | emulator | gsa | flow       workshops      structures | tables of runs | global sensitivity | networks
 //!  parameter · measurement               what is unknown · what arrives
-//!  quantity · stats · plot · reduction · volume   the foundation
+//!  quantity · stats · simd · plot · reduction · volume   the foundation
 //! ```
 //!
 //! # Reading order
@@ -118,6 +118,7 @@ pub mod posterior;
 pub mod quantity;
 pub mod reduction;
 pub mod reproduce;
+pub mod simd;
 pub mod simulator;
 pub mod stats;
 pub mod store;

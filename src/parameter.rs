@@ -1,34 +1,34 @@
-//! What is unknown about a structure: names, units, priors, and the column order of every θ matrix.
+//! The unknown parameters θ of a structure: names, units, priors, and the column order of every θ matrix.
 
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-/// Which change of a parameter counts as damage.
+/// Direction of change of a parameter that is damage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum DamageDirection {
-    /// Loss: P(x < δ). The default, since damage lowers stiffness.
+    /// A decrease: P(x < δ). This is the default, because damage reduces stiffness.
     #[default]
     Decrease,
-    /// Growth: P(x > δ).
+    /// An increase: P(x > δ).
     Increase,
-    /// Estimated, but never a sign of damage.
+    /// No change is damage: the parameter is only estimated.
     None,
 }
 
-/// One unknown of the structure with a uniform prior between `lower` and `upper`.
+/// An unknown parameter with a uniform prior between `lower` and `upper`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Parameter {
-    /// Name, unique in its space.
+    /// Unique name.
     pub name: String,
-    /// Unit of the value, for people.
+    /// Unit of the value, for display.
     pub unit: String,
-    /// Lower end of the uniform prior, in `unit`.
+    /// Lower bound of the uniform prior, in `unit`.
     pub lower: f64,
-    /// Upper end of the uniform prior, in `unit`.
+    /// Upper bound of the uniform prior, in `unit`.
     pub upper: f64,
-    /// Which change counts as damage.
+    /// Direction of change that is damage.
     pub damage: DamageDirection,
 }
 
@@ -38,24 +38,24 @@ impl Parameter {
         self.lower..self.upper
     }
 
-    /// Whether a share of its value means anything: the prior keeps clear of 0.
+    /// Whether relative changes of the parameter are meaningful: the prior does not include 0.
     pub fn has_share(&self) -> bool {
         self.lower > 0.0 || self.upper < 0.0
     }
 
-    /// Position of a value in the prior interval, 0 at `lower` and 1 at `upper`.
+    /// Position of a value in the prior interval: 0 at `lower`, 1 at `upper`.
     pub fn to_unit(&self, value: f64) -> f64 {
         (value - self.lower) / (self.upper - self.lower)
     }
 
-    /// The value at a position of the prior interval; inverse of [`Self::to_unit`].
+    /// The value at a position in the prior interval, the inverse of [`Self::to_unit`].
     pub fn from_unit(&self, position: f64) -> f64 {
         self.lower + position * (self.upper - self.lower)
     }
 }
 
-/// The parameters in the column order of every θ matrix of the crate. Names are unique, each prior has `lower < upper`:
-/// the structure file's reader (`simulator::definition`) has checked it.
+/// The parameters in the column order of every θ matrix. Names are unique and each prior has `lower < upper`, which the check of
+/// the structure file guarantees.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct ParameterSpace {
@@ -63,7 +63,7 @@ pub struct ParameterSpace {
 }
 
 impl ParameterSpace {
-    /// A space of checked parameters.
+    /// A space of parameters that have been checked.
     pub fn new(parameters: Vec<Parameter>) -> Self {
         Self { parameters }
     }
@@ -73,7 +73,7 @@ impl ParameterSpace {
         self.parameters.len()
     }
 
-    /// True without parameters.
+    /// Whether there are no parameters.
     pub fn is_empty(&self) -> bool {
         self.parameters.is_empty()
     }
@@ -83,7 +83,7 @@ impl ParameterSpace {
         self.parameters.iter()
     }
 
-    /// The parameters in column order, by index.
+    /// The parameters in column order, as a slice.
     pub fn as_slice(&self) -> &[Parameter] {
         &self.parameters
     }

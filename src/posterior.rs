@@ -1,13 +1,13 @@
-//! Samples of the structural parameters of each measurement of a batch, whoever produced them.
+//! Posterior samples of the structural parameters for each measurement of a batch, from any method of inference.
 
 use nalgebra::DMatrix;
 
-use crate::parameter::ParameterSpace;
+use crate::parameter::{Parameter, ParameterSpace};
 
-/// Distance to a prior edge below which a sample counts as lying at the edge, as a share of the prior's width.
-pub const EDGE: f64 = 0.01;
+/// A sample within this distance of a bound of the prior is considered to lie at the bound; a share of the prior's width.
+pub const BOUND_MARGIN: f64 = 0.01;
 
-/// Posterior samples of n measurements: `draws` rows each, in the order of the measurements.
+/// Posterior samples of n measurements, `draws` for each.
 #[derive(Debug, Clone)]
 pub struct PosteriorSamples {
     theta: DMatrix<f64>,
@@ -16,23 +16,23 @@ pub struct PosteriorSamples {
 }
 
 impl PosteriorSamples {
-    /// `theta`: `[n·draws, d]`, the rows of one measurement together, in parameter units.
+    /// `theta`: `[n·draws, d]` in parameter units; the rows of one measurement are contiguous.
     ///
     /// # Panics
-    /// When the number of rows is no multiple of `draws`: a bug.
+    /// When the number of rows is not a multiple of `draws`, which would be a bug.
     pub fn new(theta: DMatrix<f64>, draws: usize) -> Self {
         assert!(draws > 0 && theta.nrows().is_multiple_of(draws), "{} rows of {draws} draws each", theta.nrows());
         Self { theta, draws, simulations: 0 }
     }
 
-    /// The same, weighed or moved by so many simulations.
+    /// The same samples, with the number of simulations that were used to weight or move them.
     #[must_use]
     pub const fn after(mut self, simulations: usize) -> Self {
         self.simulations = simulations;
         self
     }
 
-    /// Simulations that weighed or moved the samples; 0 where they are those of a flow as it drew them.
+    /// Number of simulations that were used to weight or move the samples; 0 for unmodified draws of a flow.
     pub const fn simulations(&self) -> usize {
         self.simulations
     }
@@ -42,17 +42,17 @@ impl PosteriorSamples {
         self.theta.nrows() / self.draws
     }
 
-    /// Samples for each measurement.
+    /// Number of samples for each measurement.
     pub fn draws(&self) -> usize {
         self.draws
     }
 
-    /// All samples, `[n·draws, d]`.
+    /// All samples, `[n·draws, d]`, parameter units.
     pub fn theta(&self) -> &DMatrix<f64> {
         &self.theta
     }
 
-    /// All samples of one parameter.
+    /// All samples of one parameter, `[n·draws]`.
     pub fn column(&self, parameter: usize) -> Vec<f64> {
         self.theta.column(parameter).iter().copied().collect()
     }
@@ -60,7 +60,7 @@ impl PosteriorSamples {
     /// The first `draws` samples of each measurement.
     ///
     /// # Panics
-    /// When there are fewer: a bug.
+    /// When there are fewer, which would be a bug.
     #[must_use]
     pub fn first(&self, draws: usize) -> Self {
         assert!(draws <= self.draws, "{draws} of {} draws", self.draws);
@@ -70,10 +70,10 @@ impl PosteriorSamples {
             .after(self.simulations)
     }
 
-    /// These samples of each measurement, then those of `further`.
+    /// The samples of each measurement, followed by those of `further` for the same measurement.
     ///
     /// # Panics
-    /// When those are of other measurements or parameters: a bug.
+    /// When `further` has another number of measurements, which would be a bug.
     #[must_use]
     pub fn joined(&self, further: &Self) -> Self {
         assert!(self.measurements() == further.measurements(), "samples of the same measurements");
@@ -96,11 +96,12 @@ impl PosteriorSamples {
         })
     }
 
-    /// Share of the samples of each parameter that lie within [`EDGE`] of an end of its prior.
+    /// Posterior mass at the prior bounds, `[d]`: the share of the samples of each parameter within [`BOUND_MARGIN`] of a
+    /// bound.
     pub fn prior_bound_mass(&self, space: &ParameterSpace) -> Vec<f64> {
-        let share = |(index, parameter): (usize, &crate::parameter::Parameter)| {
-            let at_edge = |value: &&f64| !(EDGE..=1.0 - EDGE).contains(&parameter.to_unit(**value));
-            self.theta.column(index).iter().filter(at_edge).count() as f64 / self.theta.nrows() as f64
+        let share = |(index, parameter): (usize, &Parameter)| {
+            let at_bound = |value: &&f64| !(BOUND_MARGIN..=1.0 - BOUND_MARGIN).contains(&parameter.to_unit(**value));
+            self.theta.column(index).iter().filter(at_bound).count() as f64 / self.theta.nrows() as f64
         };
         space.iter().enumerate().map(share).collect()
     }
@@ -112,7 +113,7 @@ mod tests {
 
     #[test]
     fn joined_samples_stay_with_their_measurement() {
-        // Measurement · 10 + draw; the further ones begin at draw 2.
+        // Each value is measurement · 10 + draw; the further samples begin at draw 2.
         let of = |first: usize, draws: usize| {
             let value = |row: usize, _| (row / draws * 10 + first + row % draws) as f64;
             PosteriorSamples::new(DMatrix::from_fn(3 * draws, 1, value), draws)

@@ -1,4 +1,4 @@
-//! Values that cross a border (HTTP, SQL, a file) and are valid once they exist.
+//! Values exchanged over HTTP, SQL or files. Their constructors check them, so that every existing value is valid.
 
 use std::fmt;
 
@@ -6,21 +6,21 @@ use data_encoding::HEXLOWER;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
-/// A value outside the range of its quantity.
+/// A value is outside the valid range of its quantity.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{value} {unit} is no {quantity}: it must be {must}")]
 pub struct OutOfRange {
-    /// What the value was meant to be.
+    /// Name of the quantity.
     pub quantity: &'static str,
     /// Unit of `value`; empty for text and pure numbers.
     pub unit: &'static str,
-    /// The value as it came.
+    /// The value as received.
     pub value: String,
-    /// What would be right.
+    /// What the value must be.
     pub must: &'static str,
 }
 
-/// A natural frequency: finite and above 0 Hz.
+/// A natural frequency in Hz, finite and above 0.
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize, utoipa::ToSchema)]
 #[serde(transparent)]
 #[schema(value_type = f64, exclusive_minimum = 0)]
@@ -47,7 +47,7 @@ impl Hertz {
     }
 }
 
-/// A probability: in [0, 1].
+/// A probability in [0, 1].
 #[derive(Debug, Clone, Copy, PartialEq, PartialOrd, Serialize)]
 #[serde(transparent)]
 pub struct Probability(f64);
@@ -56,7 +56,7 @@ impl Probability {
     /// Checks a probability.
     ///
     /// # Errors
-    /// [`OutOfRange`] unless `value` lies in [0, 1].
+    /// [`OutOfRange`] unless `value` is in [0, 1].
     pub fn new(value: f64) -> Result<Self, OutOfRange> {
         let valid = (0.0..=1.0).contains(&value);
         valid.then_some(Self(value)).ok_or_else(|| OutOfRange {
@@ -73,16 +73,16 @@ impl Probability {
     }
 }
 
-/// A point in time, whole microseconds since 1970-01-01T00:00:00Z; written as RFC 3339 in UTC.
+/// A point in time with a resolution of one microsecond, written as RFC 3339 in UTC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, utoipa::ToSchema)]
 #[schema(value_type = String, format = DateTime, examples("2026-03-01T12:00:00Z"))]
 pub struct Timestamp(jiff::Timestamp);
 
 impl Timestamp {
-    /// Reads RFC 3339 with an offset; anything finer than a microsecond is cut off.
+    /// Reads a time in RFC 3339 with an offset. Fractions of a microsecond are dropped.
     ///
     /// # Errors
-    /// [`OutOfRange`] when the text is no such time or has no offset.
+    /// [`OutOfRange`] if the text is not such a time or has no offset.
     pub fn parse(text: &str) -> Result<Self, OutOfRange> {
         let time: jiff::Timestamp = text.trim().parse().map_err(|_| OutOfRange {
             quantity: "time",
@@ -93,10 +93,10 @@ impl Timestamp {
         Self::from_micros(time.as_microsecond())
     }
 
-    /// From microseconds since 1970-01-01T00:00:00Z.
+    /// The time a number of microseconds after 1970-01-01T00:00:00Z.
     ///
     /// # Errors
-    /// [`OutOfRange`] beyond the years ±9999.
+    /// [`OutOfRange`] outside the years ±9999.
     pub fn from_micros(micros: i64) -> Result<Self, OutOfRange> {
         let time = jiff::Timestamp::from_microsecond(micros);
         time.map(Self).map_err(|_| OutOfRange {
@@ -107,7 +107,7 @@ impl Timestamp {
         })
     }
 
-    /// The system clock now.
+    /// The present time of the system clock.
     pub fn now() -> Self {
         fault_point!("clock", |micros| {
             let micros = micros.and_then(|text| text.parse().ok()).expect("the test gives microseconds");
@@ -136,7 +136,7 @@ impl Serialize for Timestamp {
 
 /// Name of a structure: 1 to 64 of `a–z 0–9 - _ .`, beginning with a letter or digit.
 ///
-/// It becomes a path segment and a folder name, so nothing else is let in.
+/// It is used as a URL path segment and as a folder name, so that no other characters are allowed.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(try_from = "String", into = "String")]
 #[schema(value_type = String, min_length = 1, max_length = 64, pattern = "^[a-z0-9][a-z0-9._-]*$", examples("three-dof"))]
@@ -146,7 +146,7 @@ impl StructureId {
     /// Checks an id.
     ///
     /// # Errors
-    /// [`OutOfRange`] when it is empty, longer than 64 or has other characters.
+    /// [`OutOfRange`] if it is empty, longer than 64 characters or contains other characters.
     pub fn parse(text: &str) -> Result<Self, OutOfRange> {
         let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_.".contains(c);
         let starts_well = text.chars().next().is_some_and(|c| c.is_ascii_alphanumeric());
@@ -185,14 +185,14 @@ impl From<StructureId> for String {
     }
 }
 
-/// SHA-256 of some content, written as 64 hexadecimal digits.
+/// A SHA-256 digest, written as 64 hexadecimal digits.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(transparent)]
 #[schema(value_type = String, pattern = "^[0-9a-f]{64}$")]
 pub struct Digest(String);
 
 impl Digest {
-    /// Digest of several byte strings; each is preceded by its length, so that no two lists collide.
+    /// Digest of several byte strings. Each is preceded by its length, so that different lists do not give the same input.
     pub fn of(parts: &[&[u8]]) -> Self {
         let mut hasher = Sha256::new();
         for part in parts {
@@ -202,14 +202,14 @@ impl Digest {
         Self::from_hasher(hasher)
     }
 
-    /// Digest of a file's bytes, as `sha256sum` prints it.
+    /// Digest of the bytes of a file, as `sha256sum` prints it.
     pub fn of_file(bytes: &[u8]) -> Self {
         let mut hasher = Sha256::new();
         hasher.update(bytes);
         Self::from_hasher(hasher)
     }
 
-    /// A digest read back from where it was stored; compared with, never computed on.
+    /// A digest that was stored as text. It is not checked.
     pub fn from_stored(text: String) -> Self {
         Self(text)
     }
@@ -230,7 +230,7 @@ impl fmt::Display for Digest {
     }
 }
 
-/// Foreign text made safe for a message: at most 80 characters, control characters escaped.
+/// Text from a client in quotation marks, for a message: at most 80 characters, with control characters escaped.
 pub fn shown(text: &str) -> String {
     let mut short: String = text.chars().take(80).flat_map(char::escape_debug).collect();
     if text.chars().nth(80).is_some() {

@@ -1,47 +1,48 @@
-//! Long series made short enough for a screen, without losing what stands out in them.
+//! Reduces long series to a size that can be plotted, without losing extremes, missing values or gaps.
 //!
-//! The time of a series is cut into buckets of equal length. Of each bucket stay the first and the last row, and for each
-//! channel the rows with the smallest and the largest value and the first row that has none. What was kept does not depend on
-//! the order in which the rows come, but for rows that tie. Memory is that of the kept rows and eight bytes for each row.
+//! The time span of a series is divided into buckets of equal length. In each bucket, the first and the last row are kept,
+//! and for each channel the rows with the smallest and the largest value and the first row with a missing value. The result
+//! does not depend on the order in which the rows arrive, except for ties. The memory is that of the kept rows and eight
+//! bytes per row.
 
 use std::sync::Arc;
 
-/// A time without rows counts as a gap when it is longer than so many median spacings.
+/// A time without rows is a gap when it is longer than this number of median spacings.
 pub const GAP_SPACINGS: i64 = 10;
 
-/// Rows that a bucket can keep on behalf of one channel: first, last, smallest, largest, missing.
+/// Rows that a bucket keeps for a single channel: first, last, smallest, largest, missing.
 const ROLES_OF_ONE_CHANNEL: usize = 5;
 
-/// A row of a series: one value a channel at one time.
+/// A row of a series: one value per channel at one time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Row<T> {
     /// Microseconds since 1970.
     pub time_us: i64,
-    /// One value a channel; NaN where there is none.
+    /// One value per channel; NaN where it is missing.
     pub values: Vec<f64>,
-    /// What the row carries besides.
+    /// Data of the caller.
     pub tag: T,
 }
 
-/// What is left of a series, in the order of time.
+/// A reduced series, in the order of time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reduced<T> {
-    /// Rows that were kept, as they came.
+    /// The kept rows, unchanged.
     pub rows: Vec<Row<T>>,
-    /// Gaps: the middle of the time without rows, and the index of the kept row behind it.
+    /// Gaps: the middle of the time without rows (microseconds), and the index of the kept row after it.
     pub gaps: Vec<(i64, usize)>,
-    /// True when rows were left out.
+    /// Whether rows were dropped.
     pub reduced: bool,
 }
 
-/// Takes the rows of a series one by one and keeps those that a plot needs.
+/// Receives the rows of a series one by one and keeps those that a plot needs.
 #[derive(Debug)]
 pub struct Reducer<T> {
     span: (i64, i64),
     points: usize,
     channels: usize,
     times: Vec<i64>,
-    /// All rows, until they are more than `points`.
+    /// All rows, until there are more than `points`.
     all: Vec<Arc<Numbered<T>>>,
     buckets: Vec<Option<Box<Bucket<T>>>>,
 }
@@ -63,10 +64,10 @@ struct Bucket<T> {
 }
 
 impl<T> Reducer<T> {
-    /// A reducer of rows between two times, both included. Series of at most `points` rows stay as they are; of longer ones
-    /// stay at most 2·`points` rows for each channel.
+    /// A reducer for rows between two times, both inclusive, in microseconds since 1970. A series of at most `points` rows
+    /// is kept unchanged; of a longer one at most 2·`points` rows per channel are kept.
     ///
-    /// A row outside the times counts to the bucket next to it.
+    /// A row outside the times is assigned to the nearest bucket.
     pub fn new(span: (i64, i64), points: usize, channels: usize) -> Self {
         Self { span, points, channels, times: Vec::new(), all: Vec::new(), buckets: Vec::new() }
     }
@@ -76,7 +77,7 @@ impl<T> Reducer<T> {
         (2 * self.points / ROLES_OF_ONE_CHANNEL).max(1)
     }
 
-    /// Bucket of a time.
+    /// Index of the bucket of a time.
     pub fn bucket(&self, time_us: i64) -> usize {
         let (from, to) = self.span;
         let length = (i128::from(to) - i128::from(from)).max(0) + 1;
@@ -84,18 +85,18 @@ impl<T> Reducer<T> {
         place.clamp(0, self.buckets() as i128 - 1) as usize
     }
 
-    /// Takes a row; `tag` is asked for only when the row is kept for now.
+    /// Adds a row. `tag` is called only when the row is kept, at least for now.
     pub fn push(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> T) {
         let pushed: Result<(), std::convert::Infallible> = self.try_push(time_us, values, || Ok(tag()));
         pushed.unwrap_or_else(|never| match never {});
     }
 
-    /// Takes a row with a tag that can fail.
+    /// Adds a row with a tag that can fail.
     ///
     /// # Errors
-    /// That of `tag`.
+    /// The error of `tag`.
     pub fn try_push<E>(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> Result<T, E>) -> Result<(), E> {
-        debug_assert_eq!(values.len(), self.channels, "one value a channel");
+        debug_assert_eq!(values.len(), self.channels, "one value per channel");
         let number = self.times.len();
         self.times.push(time_us);
         let whole = || {
@@ -117,13 +118,13 @@ impl<T> Reducer<T> {
         Bucket::take(&mut self.buckets[bucket], time_us, values, whole)
     }
 
-    /// The rows that were kept, and the gaps between them.
+    /// The kept rows, and the gaps between them.
     pub fn finish(mut self) -> Reduced<T> {
         let mut kept = self.all;
         kept.extend(self.buckets.into_iter().flatten().flat_map(|bucket| bucket.rows()));
         kept.sort_by_key(|row| (row.row.time_us, row.number));
         kept.dedup_by_key(|row| row.number);
-        // Each row was held by one or several places of its bucket, of which one is left.
+        // A row can have several roles in its bucket; after removing duplicates one handle on it remains.
         let rows: Vec<Row<T>> = kept.into_iter().filter_map(Arc::into_inner).map(|row| row.row).collect();
         self.times.sort_unstable();
         Reduced { gaps: gaps(&self.times, &rows), reduced: rows.len() < self.times.len(), rows }
@@ -131,14 +132,14 @@ impl<T> Reducer<T> {
 }
 
 impl<T> Bucket<T> {
-    /// Takes a row into the places that it deserves; `row` makes it, at most once.
+    /// Offers a row to a bucket; `row` creates it, at most once, if it gets a role.
     fn take<E>(
-        place: &mut Option<Box<Self>>,
+        slot: &mut Option<Box<Self>>,
         time_us: i64,
         values: &[f64],
         row: impl FnOnce() -> Result<Arc<Numbered<T>>, E>,
     ) -> Result<(), E> {
-        let Some(bucket) = place else {
+        let Some(bucket) = slot else {
             let row = row()?;
             let none = || values.iter().map(|_| None).collect::<Vec<_>>();
             let mut bucket = Self {
@@ -148,58 +149,58 @@ impl<T> Bucket<T> {
                 largest: none(),
                 missing: none(),
             };
-            bucket.places(time_us, values).into_iter().for_each(|place| bucket.put(place, &row));
-            *place = Some(Box::new(bucket));
+            bucket.roles(time_us, values).into_iter().for_each(|role| bucket.put(role, &row));
+            *slot = Some(Box::new(bucket));
             return Ok(());
         };
-        let places = bucket.places(time_us, values);
-        if !places.is_empty() {
+        let roles = bucket.roles(time_us, values);
+        if !roles.is_empty() {
             let row = row()?;
-            for place in places {
-                bucket.put(place, &row);
+            for role in roles {
+                bucket.put(role, &row);
             }
         }
         Ok(())
     }
 
-    /// The places in which a row beats what is there.
-    fn places(&self, time_us: i64, values: &[f64]) -> Vec<Place> {
-        let mut places = Vec::new();
+    /// The roles in which a row replaces the current one.
+    fn roles(&self, time_us: i64, values: &[f64]) -> Vec<Role> {
+        let mut roles = Vec::new();
         if time_us < self.first.row.time_us {
-            places.push(Place::First);
+            roles.push(Role::First);
         }
         if time_us >= self.last.row.time_us {
-            places.push(Place::Last);
+            roles.push(Role::Last);
         }
         for (channel, value) in values.iter().enumerate() {
-            let held = |place: &Option<Arc<Numbered<T>>>| place.as_ref().map(|held| held.row.values[channel]);
+            let held = |row: &Option<Arc<Numbered<T>>>| row.as_ref().map(|held| held.row.values[channel]);
             if value.is_nan() {
                 let earlier = self.missing[channel].as_ref().is_none_or(|held| time_us < held.row.time_us);
-                places.extend(earlier.then_some(Place::Missing(channel)));
+                roles.extend(earlier.then_some(Role::Missing(channel)));
                 continue;
             }
             if held(&self.smallest[channel]).is_none_or(|least| *value < least) {
-                places.push(Place::Smallest(channel));
+                roles.push(Role::Smallest(channel));
             }
             if held(&self.largest[channel]).is_none_or(|most| *value > most) {
-                places.push(Place::Largest(channel));
+                roles.push(Role::Largest(channel));
             }
         }
-        places
+        roles
     }
 
-    fn put(&mut self, place: Place, row: &Arc<Numbered<T>>) {
+    fn put(&mut self, role: Role, row: &Arc<Numbered<T>>) {
         let row = Arc::clone(row);
-        match place {
-            Place::First => self.first = row,
-            Place::Last => self.last = row,
-            Place::Smallest(channel) => self.smallest[channel] = Some(row),
-            Place::Largest(channel) => self.largest[channel] = Some(row),
-            Place::Missing(channel) => self.missing[channel] = Some(row),
+        match role {
+            Role::First => self.first = row,
+            Role::Last => self.last = row,
+            Role::Smallest(channel) => self.smallest[channel] = Some(row),
+            Role::Largest(channel) => self.largest[channel] = Some(row),
+            Role::Missing(channel) => self.missing[channel] = Some(row),
         }
     }
 
-    /// The kept rows, each once; this drops all other handles on them.
+    /// The kept rows, each once; all other handles on them are dropped.
     fn rows(self) -> Vec<Arc<Numbered<T>>> {
         let of_channels = [self.smallest, self.largest, self.missing].into_iter().flatten().flatten();
         let mut rows: Vec<_> = [self.first, self.last].into_iter().chain(of_channels).collect();
@@ -211,7 +212,7 @@ impl<T> Bucket<T> {
 
 /// Why a bucket keeps a row.
 #[derive(Debug, Clone, Copy)]
-enum Place {
+enum Role {
     First,
     Last,
     Smallest(usize),
@@ -219,7 +220,8 @@ enum Place {
     Missing(usize),
 }
 
-/// Longest spacing that is no gap, from the times of all rows, ascending; `None` with fewer than two different times.
+/// Longest spacing that is not a gap, microseconds, from the ascending times of all rows; `None` with fewer than two
+/// different times.
 pub fn longest_spacing(times: &[i64]) -> Option<i64> {
     let mut spacings: Vec<i64> =
         times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).filter(|spacing| *spacing > 0).collect();
@@ -231,7 +233,7 @@ pub fn longest_spacing(times: &[i64]) -> Option<i64> {
     Some(median.saturating_mul(GAP_SPACINGS))
 }
 
-/// Between each two neighbours of the kept rows, the longest time without rows, if it is a gap.
+/// For each pair of neighbouring kept rows the longest time without rows between them, if it is a gap.
 fn gaps<T>(times: &[i64], rows: &[Row<T>]) -> Vec<(i64, usize)> {
     let Some(longest) = longest_spacing(times) else { return Vec::new() };
     let mut gaps = Vec::new();
@@ -257,7 +259,7 @@ mod tests {
 
     use super::*;
 
-    /// Rows of a series in any order: times, values of `channels` channels, numbers as tags.
+    /// Rows of a series in ascending order of time, with the values of `channels` channels.
     fn series(channels: usize) -> impl Strategy<Value = Vec<(i64, Vec<f64>)>> {
         let value = prop_oneof![9 => -1e3..1e3, 1 => Just(f64::NAN)];
         let step = prop_oneof![20 => 0_i64..1_000, 1 => 5_000_i64..100_000];
@@ -287,13 +289,13 @@ mod tests {
         a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits())
     }
 
-    /// Everything that holds of what is left, whatever came in and in whatever order.
+    /// Checks the properties that every reduced series has, whatever the rows and their order.
     fn check(input: &[(i64, Vec<f64>)], points: usize, channels: usize) {
         let (left, buckets) = reduce(input, points, channels);
         assert!(left.rows.windows(2).all(|pair| pair[0].time_us <= pair[1].time_us), "in the order of time");
         for row in &left.rows {
             let (time, values) = &input[row.tag];
-            assert!(*time == row.time_us && same(values, &row.values), "rows stay as they came");
+            assert!(*time == row.time_us && same(values, &row.values), "rows are unchanged");
         }
         let mut tags: Vec<usize> = left.rows.iter().map(|row| row.tag).collect();
         tags.sort_unstable();
@@ -363,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_of_time_are_no_danger() {
+    fn extreme_times_do_not_overflow() {
         let mut reducer = Reducer::new((i64::MIN, i64::MAX), 5, 1);
         for time in [i64::MIN, -1, 0, 1, i64::MAX, 3, 4] {
             reducer.push(time, &[0.0], || ());

@@ -1,4 +1,4 @@
-//! Moments, quantiles and the named random streams every draw of the crate comes from.
+//! Moments, quantiles, importance weights, and the named random streams that every draw of the crate comes from.
 
 use std::sync::OnceLock;
 
@@ -8,12 +8,12 @@ use rand_chacha::ChaCha12Rng;
 use sha2::{Digest as _, Sha256};
 use statrs::distribution::{ContinuousCDF as _, Normal, StudentsT};
 
-/// The random generator of the crate: same seed, same bits, on every machine.
+/// The random generator of the crate: the same seed gives the same bits on every machine.
 pub type Stream = ChaCha12Rng;
 
-/// An independent random stream for each pair of seed and purpose.
+/// An independent random stream for each pair of seed and purpose: ChaCha12, seeded with SHA-256 of both.
 ///
-/// Purposes keep draws apart: one more training sample does not shift the initial weights.
+/// Separate purposes keep draws independent of each other: one more training sample does not change the initial weights.
 pub fn stream(seed: u64, purpose: &str) -> Stream {
     let mut hasher = Sha256::new();
     hasher.update(seed.to_le_bytes());
@@ -21,42 +21,8 @@ pub fn stream(seed: u64, purpose: &str) -> Stream {
     ChaCha12Rng::from_seed(hasher.finalize().into())
 }
 
-/// exp(x) with a relative error below 3e-7; arguments beyond ±87, near the ends of f32, count as that.
-///
-/// By Cody–Waite reduction to |r| ≤ ½ ln 2 and a polynomial of degree 6, free of branches and calls, so that loops over it
-/// become vector instructions where the compiler knows of fused multiplication and addition: inside `pulp::with_simd`.
-#[inline(always)]
-pub fn exp_f32(x: f32) -> f32 {
-    // Adding 1.5·2²³ rounds to the nearest whole number and leaves it in the lowest bits.
-    const ROUND: f32 = 12_582_912.0;
-    const LN_2_HIGH: f32 = 0.693_359_4;
-    const LN_2_LOW: f32 = -2.121_944_4e-4;
-    let x = x.clamp(-87.0, 87.0);
-    let shifted = x.mul_add(std::f32::consts::LOG2_E, ROUND);
-    let whole = shifted - ROUND;
-    let r = whole.mul_add(-LN_2_LOW, whole.mul_add(-LN_2_HIGH, x));
-    let polynomial = r.mul_add(1.392_695e-3, 8.333_161e-3);
-    let polynomial = r.mul_add(polynomial, 4.166_664e-2);
-    let polynomial = r.mul_add(polynomial, 1.666_666_7e-1);
-    let polynomial = r.mul_add(polynomial, 0.5);
-    let polynomial = r.mul_add(polynomial, 1.0);
-    let polynomial = r.mul_add(polynomial, 1.0);
-    polynomial * f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
-}
-
-/// 1/x with a relative error below 2e-7, for x from 1 to 8e37.
-///
-/// By three of Newton's steps from a guess that takes the exponent apart: a division of sixteen numbers takes as long as all
-/// the rest of a logistic function.
-#[inline(always)]
-pub fn reciprocal_f32(x: f32) -> f32 {
-    let guess = f32::from_bits(0x7EF3_11C7_u32.wrapping_sub(x.to_bits()));
-    let better = |r: f32| r.mul_add((-x).mul_add(r, 1.0), r);
-    better(better(better(guess)))
-}
-
-/// Squared cosine of the angle between two vectors: 1 for the same up to sign and size, 0 for orthogonal ones or where one is
-/// zero. Of two mode shapes it is the modal assurance criterion (MAC).
+/// Squared cosine of the angle between two vectors of the same length: 1 for parallel vectors, 0 for orthogonal ones and
+/// where one of them is zero. For two mode shapes it is the modal assurance criterion (MAC).
 ///
 /// ```text
 ///  (aᵀb)²/(aᵀa · bᵀb)
@@ -78,7 +44,11 @@ pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// Sample standard deviation with n − 1; `None` below two values.
+/// Sample standard deviation with the divisor n − 1; `None` for fewer than two values.
+///
+/// ```text
+///  s = √( Σ (xᵢ − x̄)²/(n − 1) )
+/// ```
 pub fn sample_std(values: &[f64]) -> Option<f64> {
     if values.len() < 2 {
         return None;
@@ -88,7 +58,7 @@ pub fn sample_std(values: &[f64]) -> Option<f64> {
     Some((squares / (values.len() - 1) as f64).sqrt())
 }
 
-/// Coefficient of determination of `estimate` for `truth`.
+/// Coefficient of determination of `estimate` for `truth`, two slices of the same length.
 ///
 /// ```text
 ///  R² = 1 − Σ (truth − estimate)² / Σ (truth − mean(truth))²
@@ -100,7 +70,11 @@ pub fn r_squared(truth: &[f64], estimate: &[f64]) -> f64 {
     1.0 - residual / total
 }
 
-/// Quantile by linear interpolation between order statistics (Hyndman & Fan type 7); NaN for an empty slice.
+/// Quantile of unsorted values by linear interpolation between order statistics; NaN for an empty slice. `level` is clamped
+/// to the interval from 0 to 1.
+///
+/// Source: R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
+/// definition 7.
 pub fn quantile(values: &[f64], level: f64) -> f64 {
     if values.is_empty() {
         return f64::NAN;
@@ -119,25 +93,25 @@ pub fn normal_cdf(z: f64) -> f64 {
     Normal::standard().cdf(z)
 }
 
-/// Quantile of the standard normal, Φ⁻¹(p).
+/// Quantile of the standard normal, Φ⁻¹(p), for p between 0 and 1.
 pub fn normal_quantile(p: f64) -> f64 {
     Normal::standard().inverse_cdf(p)
 }
 
-/// Standard normal quantiles from a table, straight lines between: to 1e-5, in a tenth of the time of [`normal_quantile`], which
-/// the outermost levels are from.
+/// Standard normal quantiles by linear interpolation in a table: accurate to 1e-5, in a tenth of the time of
+/// [`normal_quantile`], which is used for levels in the tails.
 pub struct NormalQuantiles {
-    /// Those of the levels i/CELLS.
+    /// Quantiles at the levels i/`CELLS`.
     values: Vec<f64>,
 }
 
 impl NormalQuantiles {
     const CELLS: usize = 8192;
 
-    /// Level below which, and above one less which, lines are too straight.
+    /// Below this level, and above 1 minus this level, linear interpolation is too coarse.
     const OUTERMOST: f64 = 0.01;
 
-    /// The table, made at the first call.
+    /// The table, computed at the first call and shared afterwards.
     pub fn shared() -> &'static Self {
         static TABLE: OnceLock<NormalQuantiles> = OnceLock::new();
         TABLE.get_or_init(|| {
@@ -159,15 +133,15 @@ impl NormalQuantiles {
     }
 }
 
-/// Quantile of Student's t with `degrees_of_freedom`, at least 1.
+/// Quantile of Student's t distribution with ν = `degrees_of_freedom`, for p between 0 and 1. ν = 0 is treated as 1.
 ///
-/// Above 1,000 by Fisher's expansion about the normal quantile z, to 1e-8:
+/// Above 1,000 degrees of freedom by Fisher's expansion about the normal quantile z, accurate to 1e-8:
 ///
 /// ```text
 ///  t = z + (z³ + z)/4ν + (5z⁵ + 16z³ + 3z)/96ν²
 /// ```
 pub fn student_t_quantile(p: f64, degrees_of_freedom: usize) -> f64 {
-    // statrs is off by 3e-6 at a hundred thousand degrees of freedom, and does not return at a hundred million.
+    // statrs has an error of 3e-6 at 100,000 degrees of freedom and does not terminate at 100 million.
     const EXPANDED: usize = 1000;
     let nu = degrees_of_freedom.max(1) as f64;
     if degrees_of_freedom > EXPANDED {
@@ -177,8 +151,14 @@ pub fn student_t_quantile(p: f64, degrees_of_freedom: usize) -> f64 {
     StudentsT::new(0.0, 1.0, nu).expect("scale and degrees of freedom are positive").inverse_cdf(p)
 }
 
-/// Weights of these logarithms, the greatest 1; `None` where fewer than the share `effective` of the samples would count, by
-/// (Σw)²/Σw², or none has a weight.
+/// Importance weights from their logarithms, scaled so that the largest is 1.
+///
+/// ```text
+///  w_s = exp(ln w_s − max ln w),    effective sample size (Σw)²/Σw²
+/// ```
+///
+/// `None` where the effective sample size is less than the share `effective` of the number of samples, or where no
+/// logarithm is finite.
 pub fn weights(log_weights: &[f64], effective: f64) -> Option<Vec<f64>> {
     let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     if !largest.is_finite() {
@@ -189,7 +169,8 @@ pub fn weights(log_weights: &[f64], effective: f64) -> Option<Vec<f64>> {
     (sum * sum / squares >= effective * weights.len() as f64).then_some(weights)
 }
 
-/// `draws` indices by systematic resampling: each as often as its weight says to within one, in random order.
+/// Indices of `draws` samples by systematic resampling, in random order. Index i occurs `draws`·wᵢ/Σw times, rounded up or
+/// down to an integer.
 pub fn systematic(weights: &[f64], draws: usize, stream: &mut Stream) -> Vec<usize> {
     let step = weights.iter().sum::<f64>() / draws as f64;
     let offset: f64 = stream.random();
@@ -223,23 +204,6 @@ mod tests {
     }
 
     #[test]
-    fn the_fast_exponential_is_the_exponential() {
-        for i in -8_600..=8_600 {
-            let x = i as f32 / 100.0;
-            let exact = f64::from(x).exp();
-            assert!((f64::from(exp_f32(x)) / exact - 1.0).abs() < 3e-7, "at {x}");
-        }
-    }
-
-    #[test]
-    fn reciprocals_hold_to_single_precision_over_their_range() {
-        for step in 0..=100_000 {
-            let x = 10_f32.powf(37.9 * step as f32 / 100_000.0);
-            assert!((f64::from(reciprocal_f32(x)) * f64::from(x) - 1.0).abs() < 2e-7, "at {x}");
-        }
-    }
-
-    #[test]
     fn moments_and_quantiles_of_a_ramp_are_the_closed_forms() {
         let ramp: Vec<f64> = (0..=100).map(f64::from).collect();
         assert!((mean(&ramp) - 50.0).abs() < 1e-12);
@@ -257,7 +221,7 @@ mod tests {
         // Tables: 1.833 at 9, and the normal quantile in the limit.
         assert!((student_t_quantile(0.95, 9) - 1.833_112_93).abs() < 1e-7);
         assert!((student_t_quantile(0.95, 1_000_000_000) - normal_quantile(0.95)).abs() < 1e-8);
-        // Both ways meet: from 1,000 to 1,001 it falls by (z³ + z)/4ν² = 1.5e-6.
+        // The two methods agree where they meet: from 1,000 to 1,001 the quantile falls by (z³ + z)/4ν² = 1.5e-6.
         assert!((student_t_quantile(0.95, 1000) - student_t_quantile(0.95, 1001) - 1.524e-6).abs() < 2e-8);
     }
 
@@ -292,7 +256,7 @@ mod tests {
     fn weights_count_only_where_they_leave_half_of_the_draws() {
         let usual = weights(&[0.0, 0.1, -0.1], 0.5).unwrap();
         assert!((usual[1] / usual[2] - 0.2_f64.exp()).abs() < 1e-12);
-        // A few draws in a hump that is none weigh nothing, and change nothing for the others.
+        // A few draws in a spurious mode have negligible weight and do not affect the others.
         let mut leaked = vec![0.0; 98];
         leaked.extend([-300.0, f64::NEG_INFINITY]);
         let found = weights(&leaked, 0.5).unwrap();

@@ -1,11 +1,11 @@
-//! The volume that a folder lies on: how much room there is, and whether it is a disk of this machine.
+//! The file system that a folder is on: its free space, and whether it is local.
 //!
-//! SQLite keeps a database whole by file locks and by shared memory beside it. Network file systems promise neither.
+//! SQLite protects a database by file locks and shared memory. Network file systems guarantee neither.
 
 use std::io;
 use std::path::Path;
 
-/// A file system kind by the number that Linux gives it: number, name, whether it is reached over a network.
+/// File system types on Linux: magic number, name, whether it is a network file system.
 const KINDS: [(u32, &str, bool); 22] = [
     (0x0000_ef53, "ext4", false),
     (0x5846_5342, "xfs", false),
@@ -31,23 +31,23 @@ const KINDS: [(u32, &str, bool); 22] = [
     (0x0bd0_0bd0, "lustre", true),
 ];
 
-/// A volume.
+/// A mounted file system.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Volume {
-    /// Bytes that this user may still write.
+    /// Free space available to this user, bytes.
     pub free_bytes: u64,
-    /// Bytes of the volume.
+    /// Size, bytes.
     pub total_bytes: u64,
-    /// Name of the file system, or its number where the name is not known.
+    /// Name of the file system type, or its magic number in hexadecimal where the name is unknown.
     pub file_system: String,
-    /// True when it is reached over a network.
+    /// Whether it is a network file system.
     pub network: bool,
 }
 
-/// The volume of a folder or file that exists.
+/// The volume of an existing folder or file.
 ///
 /// # Errors
-/// What the operating system says.
+/// The error of the operating system.
 pub fn of(path: &Path) -> io::Result<Volume> {
     let room = rustix::fs::statvfs(path)?;
     let (file_system, network) = kind(path)?;
@@ -59,10 +59,10 @@ pub fn of(path: &Path) -> io::Result<Volume> {
     })
 }
 
-/// Bytes that may still be written on the volume of `path`: a single call, for asking before each write.
+/// Free space on the volume of `path`, bytes: a single system call, cheap enough to make before each write.
 ///
 /// # Errors
-/// What the operating system says.
+/// The error of the operating system.
 pub fn free_bytes(path: &Path) -> io::Result<u64> {
     let room = rustix::fs::statvfs(path)?;
     Ok(room.f_bavail.saturating_mul(room.f_frsize))
@@ -73,7 +73,7 @@ fn kind(path: &Path) -> io::Result<(String, bool)> {
     Ok(named(rustix::fs::statfs(path)?.f_type as u32))
 }
 
-/// Elsewhere the numbers mean other things.
+/// On other systems the magic numbers have other meanings.
 #[cfg(not(target_os = "linux"))]
 fn kind(_: &Path) -> io::Result<(String, bool)> {
     Ok(("unknown".to_owned(), false))
@@ -90,15 +90,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_local_folder_has_room_and_is_no_network() {
+    fn a_local_folder_has_free_space_and_is_not_on_a_network() {
         let volume = of(Path::new("/")).unwrap();
         assert!(!volume.network && volume.total_bytes >= volume.free_bytes && volume.total_bytes > 0, "{volume:?}");
         assert!(of(Path::new("/no/such/folder")).is_err());
     }
 
     #[test]
-    fn network_file_systems_are_told_apart() {
-        // Numbers from linux/magic.h, written here a second time on purpose.
+    fn network_file_systems_are_recognised() {
+        // Numbers from linux/magic.h, repeated here on purpose.
         for (number, name, network) in [(0x6969, "nfs", true), (0xff53_4d42, "cifs", true), (0xef53, "ext4", false)] {
             assert_eq!(named(number), (name.to_owned(), network));
         }

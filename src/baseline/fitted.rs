@@ -1,36 +1,24 @@
-//! Draws and densities of a flow that starts at the best fit, and what it is trained on; see [`super::start`].
+//! Draws, densities and training pairs of a flow that starts at the best fit; see [`super::start`].
 
 use candle_core::{DType, Device, Tensor};
 use nalgebra::{DMatrix, DMatrixView};
 use rayon::prelude::*;
 
+use super::error::InferenceError;
+use super::model::{fit_condition, Baseline};
 use super::observation::Observation;
 use super::resample::Proposals;
-use super::start::{features, locate_all, Located};
-use super::{Baseline, InferenceError};
-use crate::flow::train::Pairs;
+use super::start::{locate_all, Located};
+use crate::flow::pairs::Pairs;
 use crate::parameter::Parameter;
 use crate::simulator::{Simulator, TrainingSet};
 use crate::stats;
 
-/// Measurements fitted at a time: the precision of each has d² numbers.
+/// Measurements fitted at a time: the precision matrix of each has d² entries.
 const AT_A_TIME: usize = 64;
 
 impl Baseline {
-    /// Whether the flow starts at the best fit of each measurement: many parameters, or mode shapes.
-    pub fn starts_at_fit(&self) -> bool {
-        self.manifest.conditions.starts_at_fit
-    }
-
-    pub(super) fn locate(&self, observations: &[Observation]) -> Result<Vec<Located>, InferenceError> {
-        let expected = self.simulator.modes();
-        if let Some(o) = observations.iter().find(|o| o.frequencies_hz.len() != expected) {
-            return Err(InferenceError::Modes { found: o.frequencies_hz.len(), expected });
-        }
-        locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))
-    }
-
-    /// The flow's draws about the best fits, inside the prior.
+    /// The flow's draws about the best fits, `draws` per observation, inside the prior.
     ///
     /// # Errors
     /// [`InferenceError`] for another number of modes or a draw that is not finite.
@@ -47,13 +35,12 @@ impl Baseline {
         let mut log_density = Vec::with_capacity(theta.nrows());
         let mut moved = vec![false; observations.len()];
         for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
-            let located = self.locate(part)?;
-            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
+            let (located, context) = self.locate(part)?;
             let (x, own) = self.draw_from_flow(&context, draws, &mut stream)?;
             let x = x.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>()?;
             log_density.extend(own.to_dtype(DType::F64)?.to_vec1::<f64>()?);
             let drawn = x.chunks_exact(d * draws).zip(&located).enumerate();
-            // Each measurement has a stream of its own: the same draws for any number of threads.
+            // Each measurement has its own stream, so that the draws do not depend on the number of threads.
             let placed: Vec<(DMatrix<f64>, bool)> = drawn
                 .collect::<Vec<_>>()
                 .into_par_iter()
@@ -85,7 +72,8 @@ impl Baseline {
         Ok(Proposals { theta, log_density, moved })
     }
 
-    /// Log-density in the unit box of the prior of each row of `theta`, the same number of rows for each observation, nats.
+    /// Log-density of each row of `theta` in the unit box of the prior, nats. `theta` `[n·k, d]` has the same number k of
+    /// rows for each of the n observations.
     ///
     /// # Errors
     /// [`InferenceError`] for another number of modes.
@@ -95,15 +83,15 @@ impl Baseline {
         observations: &[Observation],
     ) -> Result<Vec<f64>, InferenceError> {
         let prior = self.space().as_slice();
-        let (d, each) = (prior.len(), theta.nrows() / observations.len().max(1));
+        let each = theta.nrows() / observations.len().max(1);
         let mut all = Vec::with_capacity(theta.nrows());
         for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
-            let located = self.locate(part)?;
-            let context = condition(&located, d)?.to_dtype(self.flow.dtype())?;
+            let (located, context) = self.locate(part)?;
+            let features = context.dim(1)?;
             let x = to_flow(&located, prior, &theta.rows(chunk * AT_A_TIME * each, part.len() * each))?;
             let x = x.to_dtype(self.flow.dtype())?;
-            let shape = (part.len(), each, features(d));
-            let repeated = context.unsqueeze(1)?.expand(shape)?.reshape((part.len() * each, features(d)))?;
+            let shape = (part.len(), each, features);
+            let repeated = context.unsqueeze(1)?.expand(shape)?.reshape((part.len() * each, features))?;
             let log_q = self.flow.log_prob(&x, &repeated)?.to_dtype(DType::F64)?.to_vec1::<f64>()?;
             all.extend(log_q.into_iter().enumerate().map(|(row, log_q)| log_q + located[row / each].log_det()));
         }
@@ -111,7 +99,8 @@ impl Baseline {
     }
 }
 
-/// What lies beyond the best fits of the measurements of a set, and what the flow is told of each.
+/// Training pairs: the deviation of each parameter vector from the best fit of its measurement, and the condition of the
+/// flow at that fit.
 ///
 /// # Errors
 /// [`InferenceError::Simulation`], which a checked prior rules out.
@@ -125,12 +114,12 @@ pub(super) fn fitted_pairs(
     for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
         let located = locate_all(simulator, part).map_err(|e| InferenceError::Simulation(e.to_string()))?;
         x.push(to_flow(&located, prior, &set.theta.rows(chunk * AT_A_TIME, part.len()))?.to_dtype(DType::F32)?);
-        y.push(condition(&located, prior.len())?.to_dtype(DType::F32)?);
+        y.push(fit_condition(&located, prior.len())?.to_dtype(DType::F32)?);
     }
     Ok(Pairs { x: Tensor::cat(&x, 0)?, y: Tensor::cat(&y, 0)? })
 }
 
-/// Largest |u − u'| after x → z → x', u the position in the prior box.
+/// Largest |u − u'| after x → z → x', where u is the position in the prior box.
 ///
 /// # Errors
 /// [`InferenceError`] for another number of modes.
@@ -140,8 +129,7 @@ pub(super) fn inverse_error_from_fit(
     observations: &[Observation],
 ) -> Result<f64, InferenceError> {
     let prior = baseline.space().as_slice();
-    let located = baseline.locate(observations)?;
-    let context = condition(&located, prior.len())?.to_dtype(DType::F32)?;
+    let (located, context) = baseline.locate(observations)?;
     let unit = |row: usize| DMatrix::from_fn(prior.len(), 1, |k, _| prior[k].to_unit(theta[(row, k)]));
     let x = to_flow(&located, prior, &theta.as_view())?.to_dtype(DType::F32)?;
     let (z, _) = baseline.flow.forward(&x, &context)?;
@@ -152,7 +140,7 @@ pub(super) fn inverse_error_from_fit(
     Ok(back.into_iter().zip(&located).enumerate().map(error).fold(0.0, f64::max))
 }
 
-/// Rows of `theta`, the same number for each fit and in their order, as the flow has them, `[rows, d]`, f64.
+/// Maps rows of `theta`, the same number for each fit and in their order, to the space of the flow, f64 `[rows, d]`.
 ///
 /// # Errors
 /// A candle error, which would be a bug.
@@ -168,13 +156,4 @@ fn to_flow(
         x.extend_from_slice(fit.to_flow(&unit).as_slice());
     }
     Tensor::from_vec(x, (theta.nrows(), d), &Device::Cpu)
-}
-
-/// What the flow is told of each fit, `[n, features]`, f64.
-///
-/// # Errors
-/// A candle error, which would be a bug.
-pub(super) fn condition(located: &[Located], parameters: usize) -> Result<Tensor, candle_core::Error> {
-    let values: Vec<f64> = located.iter().flat_map(Located::features).collect();
-    Tensor::from_vec(values, (located.len(), features(parameters)), &Device::Cpu)
 }

@@ -1,104 +1,95 @@
-//! Which parameters the modes of a structure can tell apart, at its noise.
+//! Which parameters the modes of a structure can distinguish at its noise.
 
 use nalgebra::DMatrix;
-use serde::{Deserialize, Serialize};
 
+use super::error::InferenceError;
+use super::manifest::{IdentifiabilityRecord, ParameterIdentifiability, GROUP_CORRELATION, UNRESOLVED};
+use super::model::Baseline;
 use super::observation::{measure, measure_shapes, Observation};
-use super::{Baseline, InferenceError};
+use crate::parameter::ParameterSpace;
+use crate::physics;
 use crate::physics::eigen::transposed_product;
-use crate::simulator::Simulator;
+use crate::simulator::{Simulator, TrainingSet};
 use crate::stats;
 
-/// Points of the prior that are looked at.
+/// Points of the prior at which identifiability is measured.
 const POINTS: usize = 200;
 
-/// Posterior draws at each.
+/// Posterior draws at each point.
 const DRAWS: usize = 60;
 
-/// Correlation of two parameters, over posteriors of measurements from the whole prior, beyond which they form a group.
-const GROUP_CORRELATION: f64 = 0.8;
+/// Precision of a uniform prior in the unit box: one over its variance 1/12.
+const PRIOR_PRECISION: f64 = 12.0;
 
-/// Share of the prior variance that must remain of a parameter before it can be grouped: one that is known well needs no
-/// group, whatever its correlation.
-const UNRESOLVED: f64 = 0.02;
-
-/// What the modes say of each parameter of one complete measurement at the structure's noise; part of the manifest.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct IdentifiabilityRecord {
-    /// One entry a parameter.
-    pub parameters: Vec<ParameterIdentifiability>,
-    /// Groups of parameters that cannot be told apart, by name: their damage is told for the group.
-    pub groups: Vec<Vec<String>>,
-}
-
-/// What one measurement says of one parameter, over the prior.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ParameterIdentifiability {
-    /// Name of the parameter.
-    pub name: String,
-    /// Median standard deviation by the local Fisher information with the prior, in the parameter's unit.
-    pub fisher_std: f64,
-    /// Root mean posterior variance of the flow, in the parameter's unit: more than `fisher_std` where several distant
-    /// points give the same frequencies.
-    pub posterior_std: f64,
-    /// Share of the prior variance that one measurement leaves, by the flow: 0 known, 1 unknown.
-    pub variance_left: f64,
-    /// The parameter that it is confused with most, and their correlation.
-    pub confused_with: Option<(String, f64)>,
-}
-
-/// A group of parameters that the modes cannot tell apart.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Group {
-    /// `group:` and the names, joined by `+`.
-    pub name: String,
-    /// Their columns.
-    pub columns: Vec<usize>,
-}
-
-/// Measures what can be told apart, from the Fisher information and from the flow's posterior.
-///
-/// ```text
-///  F = Jᵀ R⁻¹ J,    J = ∂ ln f/∂u, ∂φ/∂u over the prior's width,    C = (F + 12·1)⁻¹    (1/12: variance of a uniform prior)
-/// ```
+/// Measures which parameters one measurement can distinguish, from the Fisher information ([`local_covariance`]) and from
+/// the posterior of the flow, averaged over the prior.
 ///
 /// # Errors
 /// [`InferenceError`] when a draw is not finite or a simulation fails inside the prior.
 pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<IdentifiabilityRecord, InferenceError> {
-    let simulator = baseline.simulator();
-    let space = baseline.space();
+    let (simulator, space) = (baseline.simulator(), baseline.space());
     let failed = |e: &dyn std::fmt::Display| InferenceError::Simulation(e.to_string());
     let set = simulator.training_set(POINTS, seed).map_err(|e| failed(&e))?;
-    let mut stream = stats::stream(seed, "identifiability");
-    let (mut fisher, mut observations) = (Vec::new(), Vec::new());
-    for row in 0..POINTS {
+    let local = |row: usize| {
         let theta: Vec<f64> = set.theta.row(row).iter().copied().collect();
         let exact: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
-        let sizes = &set.effect_sizes[row];
-        let there = simulator.under(sizes);
-        fisher.push(local_covariance(&there, &theta, &exact).map_err(|e| failed(&e))?);
-        observations.push(match baseline.manifest().conditions.noise_range {
-            Some(_) => {
-                let mut one = measure(simulator, &exact, sizes, &vec![Some(1.0); exact.len()], &mut stream);
-                if let Some(shapes) = set.shapes.get(row) {
-                    measure_shapes(simulator, &mut one, shapes, &vec![false; exact.len()], &mut stream);
-                }
-                one
-            }
-            None => Observation {
-                noise_multiple: vec![0.0; exact.len()],
-                effect_sizes: sizes.clone(),
-                ..Observation::complete(&exact)
-            },
-        });
-    }
-    // Without noise the simulation makes points of the draws, which would leave rounding errors to be told apart.
-    let theta = match baseline.manifest().conditions.noise_range {
-        Some(_) => baseline.infer(&observations, DRAWS, seed)?.theta().clone(),
-        None => baseline.propose(&observations, DRAWS, seed)?.theta,
+        local_covariance(&simulator.under(&set.effect_sizes[row]), &theta, &exact)
     };
+    let fisher = (0..POINTS).map(local).collect::<Result<Vec<_>, _>>().map_err(|e| failed(&e))?;
+    let noisy = baseline.manifest().conditions.noise_range.is_some();
+    let observations = observe(simulator, &set, noisy, seed);
+    // Without noise the simulation would shrink the draws to points, whose covariance is rounding error.
+    let theta = if noisy {
+        baseline.infer(&observations, DRAWS, seed)?.theta().clone()
+    } else {
+        baseline.propose(&observations, DRAWS, seed)?.theta
+    };
+    let covariance = mean_covariance(&theta, space);
+    let d = space.len();
+    let correlation =
+        |i: usize, j: usize| covariance[(i, j)] / (covariance[(i, i)] * covariance[(j, j)]).sqrt().max(1e-300);
+    let parameters = space.iter().enumerate().map(|(k, p)| {
+        let width = p.upper - p.lower;
+        let local: Vec<f64> = fisher.iter().map(|c| c[(k, k)].sqrt() * width).collect();
+        let partner =
+            (0..d).filter(|&j| j != k).max_by(|&a, &b| correlation(k, a).abs().total_cmp(&correlation(k, b).abs()));
+        ParameterIdentifiability {
+            name: p.name.clone(),
+            fisher_std: stats::quantile(&local, 0.5),
+            posterior_std: covariance[(k, k)].sqrt() * width,
+            variance_left: (PRIOR_PRECISION * covariance[(k, k)]).min(1.0),
+            confused_with: partner.map(|j| (space.as_slice()[j].name.clone(), correlation(k, j))),
+        }
+    });
+    let parameters: Vec<ParameterIdentifiability> = parameters.collect();
+    let groups = groups(space, |i, j| {
+        parameters[i].variance_left > UNRESOLVED
+            && parameters[j].variance_left > UNRESOLVED
+            && correlation(i, j).abs() > GROUP_CORRELATION
+    });
+    Ok(IdentifiabilityRecord { parameters, groups })
+}
+
+/// One complete measurement of each pair, with the structure's noise or exact.
+fn observe(simulator: &Simulator, set: &TrainingSet, noisy: bool, seed: u64) -> Vec<Observation> {
+    let mut stream = stats::stream(seed, "identifiability");
+    let one = |(row, sizes): (usize, &Vec<f64>)| {
+        let exact: Vec<f64> = set.frequencies_hz.row(row).iter().copied().collect();
+        if !noisy {
+            let noise_multiple = vec![0.0; exact.len()];
+            return Observation { noise_multiple, effect_sizes: sizes.clone(), ..Observation::complete(&exact) };
+        }
+        let mut one = measure(simulator, &exact, sizes, &vec![Some(1.0); exact.len()], &mut stream);
+        if let Some(shapes) = set.shapes.get(row) {
+            measure_shapes(simulator, &mut one, shapes, &vec![false; exact.len()], &mut stream);
+        }
+        one
+    };
+    set.effect_sizes.iter().enumerate().map(one).collect()
+}
+
+/// Covariance of the posterior in the unit box, averaged over the points, `[d, d]`. `theta`: `[POINTS·DRAWS, d]`.
+fn mean_covariance(theta: &DMatrix<f64>, space: &ParameterSpace) -> DMatrix<f64> {
     let d = space.len();
     let unit = |row: usize, column: usize| space.as_slice()[column].to_unit(theta[(row, column)]);
     let mut covariance = DMatrix::<f64>::zeros(d, d);
@@ -114,88 +105,76 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
             }
         }
     }
-    let correlation =
-        |i: usize, j: usize| covariance[(i, j)] / (covariance[(i, i)] * covariance[(j, j)]).sqrt().max(1e-300);
-    let parameters = space.iter().enumerate().map(|(k, p)| {
-        let width = p.upper - p.lower;
-        let local: Vec<f64> = fisher.iter().map(|c| c[(k, k)].sqrt() * width).collect();
-        let partner =
-            (0..d).filter(|&j| j != k).max_by(|&a, &b| correlation(k, a).abs().total_cmp(&correlation(k, b).abs()));
-        ParameterIdentifiability {
-            name: p.name.clone(),
-            fisher_std: stats::quantile(&local, 0.5),
-            posterior_std: covariance[(k, k)].sqrt() * width,
-            variance_left: (12.0 * covariance[(k, k)]).min(1.0),
-            confused_with: partner.map(|j| (space.as_slice()[j].name.clone(), correlation(k, j))),
-        }
-    });
-    let parameters: Vec<ParameterIdentifiability> = parameters.collect();
-    let together = |i: usize, j: usize| {
-        let alike = space.as_slice()[i].unit == space.as_slice()[j].unit
-            && space.as_slice()[i].damage == space.as_slice()[j].damage;
-        alike
-            && parameters[i].variance_left > UNRESOLVED
-            && parameters[j].variance_left > UNRESOLVED
-            && correlation(i, j).abs() > GROUP_CORRELATION
-    };
-    let mut group_of: Vec<usize> = (0..d).collect();
-    for i in 0..d {
+    covariance
+}
+
+/// Groups of parameters, by name, that are linked by `confused`. Only parameters of the same unit and direction of damage
+/// can form a group.
+fn groups(space: &ParameterSpace, confused: impl Fn(usize, usize) -> bool) -> Vec<Vec<String>> {
+    let parameters = space.as_slice();
+    let alike =
+        |i: usize, j: usize| parameters[i].unit == parameters[j].unit && parameters[i].damage == parameters[j].damage;
+    let mut group_of: Vec<usize> = (0..parameters.len()).collect();
+    for i in 0..parameters.len() {
         for j in 0..i {
-            if together(i, j) {
+            if alike(i, j) && confused(i, j) {
                 let (from, to) = (group_of[i], group_of[j]);
                 group_of.iter_mut().filter(|g| **g == from).for_each(|g| *g = to);
             }
         }
     }
     let members = |g: usize| -> Vec<String> {
-        (0..d).filter(|&k| group_of[k] == g).map(|k| space.as_slice()[k].name.clone()).collect()
+        (0..parameters.len()).filter(|&k| group_of[k] == g).map(|k| parameters[k].name.clone()).collect()
     };
-    let groups = (0..d).map(members).filter(|names| names.len() > 1).collect();
-    Ok(IdentifiabilityRecord { parameters, groups })
+    (0..parameters.len()).map(members).filter(|names| names.len() > 1).collect()
 }
 
-/// Covariance of one measurement's parameters in the unit box, by the Fisher information and the prior's variance.
+/// Covariance of the parameters given one complete measurement at the structure's noise, `[d, d]`, in the unit box of the
+/// prior, by the Fisher information; see [`fisher_covariance`]. Mode shapes are included where the structure has
+/// instrumented points.
+///
+/// `theta`: `[d]`, parameter units; `exact_hz`: its frequencies. A relative noise below 1e-5 is taken as 1e-5.
 ///
 /// # Errors
-/// [`crate::physics::Error`] where the simulation fails.
+/// [`physics::Error`] where the simulation fails.
 pub fn local_covariance(
     simulator: &Simulator,
     theta: &[f64],
     exact_hz: &[f64],
-) -> Result<DMatrix<f64>, crate::physics::Error> {
+) -> Result<DMatrix<f64>, physics::Error> {
     let there = simulator.linearise(theta, simulator.modes(), simulator.shape_points() > 0)?;
+    let std_hz = exact_hz.iter().enumerate().map(|(mode, f)| simulator.std_hz(mode, *f).max(1e-5 * f));
+    let covariance =
+        fisher_covariance(simulator, &there.frequency_slopes, &std_hz.collect::<Vec<_>>(), &there.shape_slopes);
+    let d = simulator.space().len();
+    Ok(covariance.unwrap_or_else(|| DMatrix::identity(d, d) / PRIOR_PRECISION))
+}
+
+/// Covariance of the parameters in the unit box of the prior, `[d, d]`, by the Fisher information of one measurement and
+/// the variance 1/12 of the uniform prior.
+///
+/// ```text
+///  C = (Jᵀ R⁻¹ J + 12·1)⁻¹,    J: derivatives of frequencies and shapes by u,   R: variances of their noise
+/// ```
+///
+/// `frequency_slopes`: ∂f/∂θ `[modes, d]`, Hz per parameter unit; `std_hz`: noise of each mode, Hz; `shape_slopes`: ∂φ/∂θ
+/// of each mode, `[points, d]`, empty without shapes. `None` where the sum is not positive definite, which needs values
+/// that are not finite.
+pub fn fisher_covariance(
+    simulator: &Simulator,
+    frequency_slopes: &DMatrix<f64>,
+    std_hz: &[f64],
+    shape_slopes: &[DMatrix<f64>],
+) -> Option<DMatrix<f64>> {
     let parameters = simulator.space().as_slice();
-    let width = |k: usize| parameters[k].upper - parameters[k].lower;
-    let scaled = DMatrix::from_fn(exact_hz.len(), parameters.len(), |mode, k| {
-        // A structure without noise is looked at with that of a very good test.
-        let std_hz = simulator.std_hz(mode, exact_hz[mode]).max(1e-5 * exact_hz[mode]);
-        there.frequency_slopes[(mode, k)] * width(k) / std_hz
-    });
     let d = parameters.len();
-    let mut precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * 12.0;
-    for slopes in there.shape_slopes {
+    let width = |k: usize| parameters[k].upper - parameters[k].lower;
+    let scaled = DMatrix::from_fn(std_hz.len(), d, |mode, k| frequency_slopes[(mode, k)] * width(k) / std_hz[mode]);
+    let mut precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * PRIOR_PRECISION;
+    for slopes in shape_slopes {
         let scaled =
             DMatrix::from_fn(slopes.nrows(), d, |point, k| slopes[(point, k)] * width(k) / simulator.shape_std());
         precision += transposed_product(&scaled, &scaled);
     }
-    Ok(precision.cholesky().map_or_else(|| DMatrix::identity(d, d) / 12.0, |c| c.inverse()))
-}
-
-impl ParameterIdentifiability {
-    /// True when one measurement leaves much of it open, because it cannot be told from another.
-    pub fn is_confused(&self) -> bool {
-        let strongly = |(_, correlation): &(String, f64)| correlation.abs() > GROUP_CORRELATION;
-        self.variance_left > UNRESOLVED && self.confused_with.as_ref().is_some_and(strongly)
-    }
-}
-
-impl IdentifiabilityRecord {
-    /// The groups with their columns in the space of `baseline`.
-    pub fn resolve(&self, space: &crate::parameter::ParameterSpace) -> Vec<Group> {
-        let group = |names: &Vec<String>| Group {
-            name: format!("group:{}", names.join("+")),
-            columns: names.iter().filter_map(|name| space.position(name)).collect(),
-        };
-        self.groups.iter().map(group).filter(|group| group.columns.len() > 1).collect()
-    }
+    Some(precision.cholesky()?.inverse())
 }

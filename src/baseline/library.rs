@@ -1,15 +1,15 @@
-//! Where baselines are found: those shipped inside the program, and those of a models folder.
+//! The library of structures and trained models: those embedded in the program, and those of a models folder.
 //!
 //! ```text
 //!  DIR/<folder>/structure.toml (or .json)                 the structure
-//!  DIR/<folder>/<name>.safetensors + <name>.json          a trained baseline of it
+//!  DIR/<folder>/<name>.safetensors + <name>.json          a trained model of it
 //! ```
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::Baseline;
+use super::model::Baseline;
 use crate::flow::checkpoint::LARGEST_FILE_BYTES;
 use crate::quantity::{Digest, StructureId};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
@@ -19,16 +19,16 @@ use crate::simulator::Simulator;
 #[folder = "models/"]
 struct Shipped;
 
-/// A structure of the library, with its baseline if one could be loaded.
+/// A structure of the library, with its trained model if one could be loaded.
 #[derive(Clone)]
 pub struct Entry {
     /// The structure.
     pub simulator: Simulator,
-    /// Its trained baseline.
+    /// Its trained model.
     pub baseline: Option<Arc<Baseline>>,
 }
 
-/// A file of the models folder that was not read, and why.
+/// A file of the models folder that could not be read, and why.
 struct Unread {
     file: String,
     reason: String,
@@ -39,13 +39,13 @@ struct Unread {
 pub struct Refusal {
     /// The file.
     pub file: String,
-    /// The structure it belongs to, if that much could be read.
+    /// The structure that it belongs to, if that could be determined.
     pub structure: Option<StructureId>,
-    /// Why, and what would be right.
+    /// Why it was refused.
     pub reason: String,
 }
 
-/// All structures and baselines at hand.
+/// All structures and trained models that were found.
 #[derive(Clone, Default)]
 pub struct Library {
     entries: BTreeMap<StructureId, Entry>,
@@ -53,18 +53,18 @@ pub struct Library {
     folder: Option<PathBuf>,
 }
 
-/// The two files of a trained baseline.
+/// The two files of a trained model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BaselineFiles {
     /// The manifest.
     pub manifest: Vec<u8>,
     /// The weights.
     pub weights: Vec<u8>,
-    /// `program` for those shipped inside it, else the folder.
+    /// `program` for files embedded in the program, otherwise the folder.
     pub kept_in: String,
 }
 
-/// Why a models folder cannot be read at all.
+/// The models folder cannot be listed.
 #[derive(Debug, thiserror::Error)]
 #[error("the models folder {path} cannot be read: {source}")]
 pub struct FolderError {
@@ -72,13 +72,14 @@ pub struct FolderError {
     source: std::io::Error,
 }
 
-/// Files of one folder of the library, by name.
+/// Contents of the files of one folder of the library, by file name.
 type Folder = BTreeMap<String, Vec<u8>>;
 
 impl Library {
-    /// The shipped baselines, and over them those of `folder`: a folder for the same structure replaces the shipped one.
+    /// Loads the embedded models and those of `folder`. A structure in `folder` replaces the embedded structure of the same
+    /// id.
     ///
-    /// A file that is refused is no error: the other baselines serve, and [`Self::refusals`] says what is wrong.
+    /// A refused file is not an error: the other models are loaded, and [`Self::refusals`] gives the reason.
     ///
     /// # Errors
     /// [`FolderError`] when `folder` cannot be listed.
@@ -100,7 +101,7 @@ impl Library {
         Ok(library)
     }
 
-    /// The same places read again: what lies there now.
+    /// Loads the embedded models and the same folder again.
     ///
     /// # Errors
     /// [`FolderError`] when the folder cannot be listed.
@@ -108,12 +109,12 @@ impl Library {
         Self::open(self.folder.as_deref())
     }
 
-    /// The folder that goes over the shipped baselines.
+    /// The models folder, if there is one.
     pub fn folder(&self) -> Option<&Path> {
         self.folder.as_deref()
     }
 
-    /// The files of the baseline with this digest, if they still lie where they were read from.
+    /// The files of the model with this digest, if they still exist where they were read from.
     ///
     /// # Errors
     /// [`FolderError`] when the folder cannot be listed.
@@ -152,7 +153,7 @@ impl Library {
         &self.refusals
     }
 
-    /// Takes up a folder; the structure in it, if there is one.
+    /// Adds the structure and model of a folder. Returns the id of the structure, if the folder has one.
     fn add(&mut self, origin: &str, files: &Folder) -> Option<StructureId> {
         let (name, text) = files.iter().find(|(name, _)| is_definition(name))?;
         let simulator = match read_definition(name, text, |file| in_folder(files, file)) {
@@ -173,7 +174,11 @@ impl Library {
             };
             match Baseline::load(manifest, weights, &simulator) {
                 Ok(loaded) if baseline.is_none() => baseline = Some(Arc::new(loaded)),
-                Ok(_) => self.refuse(path, Some(&id), &"another baseline of this folder, earlier by name, is in use"),
+                Ok(_) => self.refuse(
+                    path,
+                    Some(&id),
+                    &"another model of this folder, whose name comes earlier in the alphabet, is in use",
+                ),
                 Err(error) => self.refuse(path, Some(&id), &error),
             }
         }
@@ -196,23 +201,23 @@ pub enum StructureFileError {
         path: PathBuf,
         /// The cause.
         source: std::io::Error,
-        /// What could have been meant instead.
+        /// Ids of the shipped structures, as a suggestion.
         shipped: String,
     },
-    /// It is no structure.
+    /// The file is not a valid structure.
     #[error("{path}: {source}")]
     Definition {
         /// The file.
         path: PathBuf,
-        /// What is wrong, with its place.
+        /// The problems, each with its path in the file.
         source: DefinitionError,
     },
 }
 
-/// Reads a structure file, TOML or, with the extension `json`, JSON.
+/// Reads a structure file: JSON with the extension `json`, otherwise TOML.
 ///
 /// # Errors
-/// [`StructureFileError`] with the file's name and the place in it.
+/// [`StructureFileError`] with the file name and the path inside the file.
 pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError> {
     let bytes = std::fs::read(path).map_err(|source| {
         let shipped = shipped_folders().into_keys().collect::<Vec<_>>().join(", ");
@@ -224,7 +229,7 @@ pub fn read_structure_file(path: &Path) -> Result<Simulator, StructureFileError>
         .map_err(|source| StructureFileError::Definition { path: path.to_owned(), source })
 }
 
-/// A shipped or stored structure for the command line: a file, or the id of a shipped structure.
+/// Finds a structure for the command line: a file, or the id of an embedded structure. An existing file takes precedence.
 ///
 /// # Errors
 /// [`StructureFileError`] when it is neither.
@@ -241,7 +246,7 @@ pub fn find_structure(path_or_id: &str) -> Result<Simulator, StructureFileError>
     }
 }
 
-/// A text file of a folder in memory.
+/// A text file of a folder that was read into memory.
 fn in_folder(files: &Folder, file: &str) -> std::io::Result<String> {
     let bytes = files.get(file).ok_or_else(|| std::io::Error::from(std::io::ErrorKind::NotFound))?;
     String::from_utf8(bytes.clone()).map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e))
@@ -280,7 +285,8 @@ fn shipped_folders() -> BTreeMap<String, Folder> {
     folders
 }
 
-/// The files of a models folder by folder, and those that were not read: one bad file must not keep the service from starting.
+/// The files of a models folder by subfolder, and those that could not be read: one bad file must not prevent the service
+/// from starting.
 fn read_folders(path: &Path) -> std::io::Result<BTreeMap<String, (Folder, Vec<Unread>)>> {
     let mut folders = BTreeMap::new();
     for entry in std::fs::read_dir(path)? {
@@ -305,13 +311,13 @@ fn read_folders(path: &Path) -> std::io::Result<BTreeMap<String, (Folder, Vec<Un
     Ok(folders)
 }
 
-/// A file that is no larger than any of ours can be; what is wrong with it otherwise.
+/// Reads a file unless it is larger than any model file can be; otherwise returns the reason.
 fn read_bounded(path: &Path) -> Result<Vec<u8>, String> {
     let most = LARGEST_FILE_BYTES as u64;
     let cannot = |error: std::io::Error| format!("it cannot be read: {error}");
     let bytes = std::fs::metadata(path).map_err(cannot)?.len();
     if bytes > most {
-        return Err(format!("it has {bytes} bytes, larger than the {most} that are read"));
+        return Err(format!("it has {bytes} bytes, more than the {most} that are accepted"));
     }
     std::fs::read(path).map_err(cannot)
 }

@@ -1,22 +1,30 @@
-//! The record beside the weights: how a baseline was made, what was measured of it, and how to check it.
+//! The record that accompanies the weights: how a model was trained, what was measured of it, and how to check it.
 
 use serde::{Deserialize, Serialize};
 
-use super::calibration::CalibrationRecord;
-use super::identifiability::IdentifiabilityRecord;
+use super::conditions::{Conditions, Whitening};
+use crate::flow::architecture::Architecture;
 use crate::flow::train::{Stopped, TrainSettings};
-use crate::flow::Architecture;
+use crate::parameter::ParameterSpace;
 use crate::quantity::{Digest, StructureId};
 
-/// Version of the manifest's layout.
+/// Version of the manifest format.
 pub const FORMAT: u32 = 2;
 
-/// Everything about a trained baseline but its weights. It holds no clock time and no machine name: the same command
-/// gives the same bytes.
+/// Absolute posterior correlation, averaged over measurements from the whole prior, above which two parameters form a
+/// group.
+pub(super) const GROUP_CORRELATION: f64 = 0.8;
+
+/// Share of the prior variance that must remain before a parameter can join a group. A well-determined parameter needs no
+/// group, whatever its correlation.
+pub(super) const UNRESOLVED: f64 = 0.02;
+
+/// Everything about a trained model except its weights. It contains no clock time and no machine name, so that the same
+/// command gives the same bytes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// Layout, [`FORMAT`].
+    /// Version of the format, [`FORMAT`].
     pub format: u32,
     /// Version of the program that trained it.
     pub program_version: String,
@@ -26,126 +34,72 @@ pub struct Manifest {
     pub structure_digest: Digest,
     /// SHA-256 of the weight file.
     pub weights_sha256: Digest,
-    /// Sizes of the flow.
+    /// Sizes of the flow and its permutations.
     pub architecture: Architecture,
-    /// Standardiser of the observations.
+    /// Standardisation of the log-frequencies.
     pub whitening: Whitening,
-    /// What was varied in training beside the parameters.
+    /// What was varied in training besides the parameters.
     pub conditions: Conditions,
     /// How it was trained.
     pub training: TrainingRecord,
-    /// What it reached on pairs it never saw.
+    /// Accuracy on held-out pairs.
     pub validation: ValidationRecord,
-    /// Whether it is as sure as it should be.
+    /// Whether its posterior intervals have the stated coverage.
     pub calibration: CalibrationRecord,
-    /// What the modes can tell apart.
+    /// Which parameters the modes can distinguish.
     pub identifiability: IdentifiabilityRecord,
-    /// An inference whose result is known.
+    /// An inference with a known result.
     pub self_test: SelfTest,
 }
 
-/// Mean and Cholesky factor of the log-frequencies (ln Hz) over the training set.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Whitening {
-    /// Mean of ln f, one entry a mode.
-    pub mean: Vec<f64>,
-    /// Lower triangular factor L of the covariance, by rows.
-    pub factor: Vec<Vec<f64>>,
-}
-
-/// What the flow is conditioned on beside the frequencies.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Conditions {
-    /// Lower and upper end of the box it was trained in, one pair a parameter, in parameter units: the prior with a margin.
-    /// Draws beyond the prior are drawn again.
-    pub training_box: Vec<[f64; 2]>,
-    /// Noise of the frequencies; `None` for a structure without noise, whose measurements must be complete and exact.
-    pub noise_range: Option<NoiseRange>,
-    /// Whether the flow starts at the best fit of each measurement, see [`super::start`].
-    #[serde(default, skip_serializing_if = "is_false")]
-    pub starts_at_fit: bool,
-    /// Effects that a covariate moves: the flow is told their sizes.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub effects: Vec<EffectRange>,
-}
-
-#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
-fn is_false(value: &bool) -> bool {
-    !value
-}
-
-/// Sizes of one effect that a flow was trained for.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct EffectRange {
-    /// Its place among all sizes of the structure's effects.
-    pub column: usize,
-    /// Least size.
-    pub lowest: f64,
-    /// Greatest size.
-    pub highest: f64,
-}
-
-/// The noise a flow was trained for, as multiples of the structure's own; modes may be missing within it.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(deny_unknown_fields)]
-pub struct NoiseRange {
-    /// Least noise: less is taken as this much.
-    pub lowest: f64,
-    /// Most noise: a mode with more counts as missing.
-    pub highest: f64,
-}
-
-/// How a baseline was trained.
+/// How a model was trained.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingRecord {
     /// Simulated pairs it was trained on.
     pub samples: usize,
-    /// Simulated pairs that chose the best epoch.
+    /// Simulated pairs that selected the best epoch.
     pub validation_samples: usize,
-    /// Schedule and seed.
+    /// Training schedule and seed.
     pub settings: TrainSettings,
-    /// Epoch whose weights were kept, from 1.
+    /// Epoch whose weights were kept, counted from 1.
     pub best_epoch: usize,
-    /// Why training ended.
+    /// Why the training ended.
     pub stopped: Stopped,
 }
 
-/// Figures on simulated pairs that neither trained nor chose anything.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+/// Accuracy on held-out simulated pairs, which were used neither for training nor for selecting the epoch.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ValidationRecord {
     /// Pairs used.
     pub samples: usize,
-    /// Mean of −log q(u | y) with u in the unit box, nats.
+    /// Mean of −ln q(u | y) with u the position in the prior box, nats.
     pub negative_log_likelihood: f64,
     /// Standard error of that mean, nats.
     pub negative_log_likelihood_error: f64,
-    /// One entry for each parameter.
+    /// One entry per parameter.
     pub parameters: Vec<ParameterValidation>,
-    /// Largest |x − f⁻¹(f(x))| as a share of the prior's width, in f32.
+    /// Largest |x − f⁻¹(f(x))| in f32, as a share of the prior's width.
     pub inverse_error: f64,
 }
 
-/// How well one parameter is recovered (paper Fig. 8).
+/// How well one parameter is recovered. Source: Wang et al. (2025), Fig. 8.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ParameterValidation {
     /// Name of the parameter.
     pub name: String,
-    /// R² of posterior means.
+    /// R² of the posterior means.
     pub r_squared_mean: f64,
     /// R² of single posterior samples.
     pub r_squared_single: f64,
-    /// 99.9 % quantile of |single sample − truth|, in the parameter's unit: how far off the worst draws are.
+    /// 99.9 % quantile of |posterior sample − truth|, in the parameter's unit.
     pub error_quantile_999: f64,
 }
 
-/// An inference whose result is known: a loaded baseline must repeat it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// An inference with a known result, which a loaded model must reproduce.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SelfTest {
     /// One complete measurement, Hz.
@@ -155,6 +109,131 @@ pub struct SelfTest {
     pub shapes: Vec<Vec<f64>>,
     /// Seed of the draws.
     pub seed: u64,
-    /// The draws, one row each, in parameter units.
+    /// The expected draws, one row each, in parameter units.
     pub expected: Vec<Vec<f64>>,
+}
+
+/// Calibration of the posterior: ranks, coverage and TARP over noise levels and missing modes.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CalibrationRecord {
+    /// Simulated measurements per cell.
+    pub simulations: usize,
+    /// Posterior draws per measurement.
+    pub draws: usize,
+    /// Reasons why the calibration fails; empty when it passes.
+    pub failures: Vec<String>,
+    /// One entry per noise level and set of modes.
+    pub cells: Vec<Cell>,
+}
+
+/// Calibration at one noise level with one set of modes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(as = CalibrationCell)]
+pub struct Cell {
+    /// Noise as a multiple of the structure's noise.
+    pub noise_multiple: f64,
+    /// Number of the missing mode, counted from 1; `None` for complete measurements.
+    pub missing_mode: Option<usize>,
+    /// Whether the mode shapes are missing; `None` for a structure without instrumented points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub without_shapes: Option<bool>,
+    /// p-value of uniform TARP ranks, for all parameters jointly.
+    pub tarp_p_value: f64,
+    /// One entry per parameter.
+    pub parameters: Vec<CellParameter>,
+}
+
+/// Calibration of one parameter in one cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+#[schema(as = CalibrationParameter)]
+pub struct CellParameter {
+    /// Name of the parameter.
+    pub name: String,
+    /// p-value of uniform ranks.
+    pub rank_p_value: f64,
+    /// Share of the true values inside the central 50 % interval.
+    pub coverage_50: f64,
+    /// Share of the true values inside the central 90 % interval.
+    pub coverage_90: f64,
+    /// Factor that stretches the 90 % interval about the median to its nominal coverage (conformal calibration); 1 where
+    /// the coverage is close enough to nominal.
+    pub interval_scale: f64,
+}
+
+impl CalibrationRecord {
+    /// True when no test failed.
+    pub fn passed(&self) -> bool {
+        self.failures.is_empty()
+    }
+
+    /// Factor for the 90 % interval of parameter `column` of one measurement, taken from the cell with the nearest noise
+    /// level. `complete`: all modes are present; `shapes`: mode shapes are present.
+    pub fn interval_scale(&self, column: usize, noise_multiple: f64, complete: bool, shapes: bool) -> f64 {
+        // Where a flow starts at the best fit, missing modes widen the fit itself, so that all cells are complete.
+        let all_complete = self.cells.iter().all(|cell| cell.missing_mode.is_none());
+        let fitting = self.cells.iter().filter(|cell| {
+            (all_complete || cell.missing_mode.is_none() == complete) && cell.without_shapes != Some(shapes)
+        });
+        let distance = |cell: &&Cell| (cell.noise_multiple / noise_multiple).ln().abs();
+        let nearest = fitting.min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        nearest.map_or(1.0, |cell| cell.parameters[column].interval_scale)
+    }
+}
+
+/// What one complete measurement at the structure's noise reveals about each parameter.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct IdentifiabilityRecord {
+    /// One entry per parameter.
+    pub parameters: Vec<ParameterIdentifiability>,
+    /// Groups of parameters, by name, that cannot be distinguished. Their damage is reported for the group as a whole.
+    pub groups: Vec<Vec<String>>,
+}
+
+/// What one measurement reveals about one parameter, summarised over the prior.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ParameterIdentifiability {
+    /// Name of the parameter.
+    pub name: String,
+    /// Median standard deviation from the local Fisher information and the prior, in the parameter's unit.
+    pub fisher_std: f64,
+    /// Root mean posterior variance of the flow, in the parameter's unit. It exceeds `fisher_std` where several distant
+    /// points of the prior give the same frequencies.
+    pub posterior_std: f64,
+    /// Posterior variance of the flow as a share of the prior variance: 0 means known exactly, 1 means nothing was learnt.
+    pub variance_left: f64,
+    /// The parameter with the largest absolute posterior correlation, and that correlation.
+    pub confused_with: Option<(String, f64)>,
+}
+
+/// A group of parameters that the modes cannot distinguish.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Group {
+    /// `group:` and the names, joined by `+`.
+    pub name: String,
+    /// Their columns in θ.
+    pub columns: Vec<usize>,
+}
+
+impl ParameterIdentifiability {
+    /// True when much of the prior variance remains because the parameter is strongly correlated with another.
+    pub fn is_confused(&self) -> bool {
+        let strongly = |(_, correlation): &(String, f64)| correlation.abs() > GROUP_CORRELATION;
+        self.variance_left > UNRESOLVED && self.confused_with.as_ref().is_some_and(strongly)
+    }
+}
+
+impl IdentifiabilityRecord {
+    /// The groups with their columns in `space`.
+    pub fn resolve(&self, space: &ParameterSpace) -> Vec<Group> {
+        let group = |names: &Vec<String>| Group {
+            name: format!("group:{}", names.join("+")),
+            columns: names.iter().filter_map(|name| space.position(name)).collect(),
+        };
+        self.groups.iter().map(group).filter(|group| group.columns.len() > 1).collect()
+    }
 }

@@ -1,4 +1,4 @@
-//! The parameters of the prior box that come nearest to a measurement, and how near they come.
+//! The point of the prior box that fits a measurement best, and the misfit that remains.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -7,41 +7,44 @@ use super::start::{locate, Located};
 use crate::physics;
 use crate::simulator::Simulator;
 
-/// Standard deviation below which a relative residual is not resolved: what is left of a search that has converged.
+/// Smallest relative standard deviation used to scale residuals: the residual of a converged search is of this order.
 const RESOLUTION: f64 = 2.5e-5;
 
-/// A measurement with no more modes than parameters counts as reached, without a search, where the posterior mean comes
-/// this near (relative) beyond its noise: a trained flow is that exact, and a box edge shows as far more.
+/// A measurement with no more modes than parameters is accepted as reproducible, without a search, where the relative
+/// residual of the posterior mean exceeds the noise by no more than this. A trained flow is this accurate, and a bound of
+/// the box causes a far larger residual.
 const FLOW_ACCURACY: f64 = 0.003;
 
-/// Standard deviations of the noise that a direction of the prior box must move the frequencies by, over its whole width,
-/// to count as absorbing a degree of freedom: a weaker one bends before it has absorbed anything.
+/// A direction of the prior box absorbs a degree of freedom of the residuals if it moves the frequencies by at least this
+/// many standard deviations of the noise over its whole width. A weaker direction reaches the bounds before it absorbs
+/// anything.
 const ABSORBING: f64 = 6.0;
 
-/// Noise, as a multiple of its standard deviation, that is no sign of being outside: one in 16,000 frequencies.
+/// Residual, in standard deviations of the noise, that is still attributed to noise: one in 16,000 frequencies exceeds it.
 const NOISE_MULTIPLE: f64 = 4.0;
 
+/// Most iterations of the search.
 const ITERATIONS: usize = 40;
 
-/// The point of the prior box nearest to a measurement.
+/// The point of the prior box that fits a measurement best.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Nearest {
-    /// Its frequencies, all modes, Hz.
+    /// Frequencies at that point, all modes, Hz.
     pub frequencies_hz: Vec<f64>,
     /// Σ over the modes present of ((ln f_i − ln f_i(x))/s_i)², s_i the relative standard deviation of the noise.
     pub chi_squared: f64,
-    /// Modes present less the directions in which parameters, not at an edge of the box, absorb noise: what `chi_squared` is
-    /// compared with.
+    /// Expected value of `chi_squared`: modes present less the directions in which parameters away from the bounds absorb
+    /// noise.
     pub degrees_of_freedom: usize,
     /// (ln f_i − ln f_i(x))/s_i of each mode, 0 where it is missing.
     pub standardised_residuals: DVector<f64>,
-    /// Covariance of these residuals where the noise is all there is, `[m, m]`: the projector on what the parameters cannot
-    /// absorb.
+    /// Covariance of these residuals under noise alone, `[m, m]`: the projector on the directions that the parameters
+    /// cannot absorb.
     pub projector: DMatrix<f64>,
 }
 
-/// The nearest point where mode shapes are measured too: the fit that the flow starts at. Its residuals are of both kinds, and
-/// are judged for each measurement by their sum alone.
+/// The result where mode shapes are measured too: the fit that the flow starts at. Only the sum of the squared residuals of
+/// frequencies and shapes is used; residuals of single modes are not reported.
 fn of_fit(fit: Located, modes: usize) -> Nearest {
     Nearest {
         frequencies_hz: fit.frequencies_hz,
@@ -52,14 +55,14 @@ fn of_fit(fit: Located, modes: usize) -> Nearest {
     }
 }
 
-/// Looks for the nearest point of the prior box, beginning at `start` (`[d]`, parameter units).
+/// Finds the point of the prior box that fits a measurement best, starting from `start` (`[d]`, parameter units).
 ///
 /// ```text
 ///  minimise Σ_i ( (ln f_i − ln f_i(x))/s_i )²   over the prior box, by projected Levenberg–Marquardt
 /// ```
 ///
-/// The minimum over a linear model with normal noise is χ²-distributed with as many degrees of freedom as there are modes
-/// beyond the parameters that are free at the minimum; if the truth lies inside the box it is at most that.
+/// For a linear model with normal noise the minimum is χ²-distributed; its degrees of freedom are the modes present less
+/// the parameters that are free at the minimum. If the truth lies inside the box, the minimum is at most that.
 ///
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
@@ -79,17 +82,17 @@ fn nearest_by_frequencies(
     let simulator = &observation.simulator(simulator);
     let search = Search::new(simulator, observation, RESOLUTION);
     let (present, parameters) = (search.modes.len(), simulator.space().len());
-    // What is not known of the effects may be anything: such a measurement tests nothing.
-    let known = observation.possible_sizes.is_empty();
+    // With a missing covariate the size of its effect is unknown, so that the measurement tests nothing.
+    let known = !observation.is_marginalised();
     let determined = known && present > parameters;
     let mut found = search.at(search.unit(start))?;
-    let (mut at_edge, mut absorbed) = (0, if known { present.min(parameters) } else { present });
+    let (mut at_bound, mut absorbed) = (0, if known { present.min(parameters) } else { present });
     let mut projector = DMatrix::zeros(present, present);
     if known && (determined || !search.reaches(&found)) {
         found = search.descend(found)?;
         let slopes = search.slopes(&found)?;
         let free = found.free(&slopes);
-        at_edge = parameters - free.len();
+        at_bound = parameters - free.len();
         absorbed = 0;
         if determined || free.is_empty() {
             projector = DMatrix::identity(present, present);
@@ -103,7 +106,7 @@ fn nearest_by_frequencies(
             }
         }
     }
-    let tested = known && (determined || at_edge > 0 || !search.reaches(&found));
+    let tested = known && (determined || at_bound > 0 || !search.reaches(&found));
     let chi_squared = if tested { found.error.norm_squared() } else { 0.0 };
     let (mut standardised_residuals, mut expanded) =
         (DVector::zeros(simulator.modes()), DMatrix::zeros(simulator.modes(), simulator.modes()));
@@ -113,8 +116,8 @@ fn nearest_by_frequencies(
             expanded[(mode, other)] = projector[(row, column)];
         }
     }
-    // Where nothing should be left over and something is, the measurement lies beyond what the simulation can give (a fold
-    // of the map, not an edge of the box): that is told like an edge.
+    // A residual where none is expected means that the simulation cannot produce the measurement (beyond a fold of the map
+    // rather than a bound of the box): it is reported like a bound.
     let beyond = usize::from(chi_squared > 0.0 && !search.reaches(&found));
     Ok(Nearest {
         chi_squared,
@@ -125,26 +128,26 @@ fn nearest_by_frequencies(
     })
 }
 
-/// The frequencies of a measurement, to be looked for in the unit box of the prior.
+/// A least-squares search for the frequencies of a measurement in the unit box of the prior.
 pub(super) struct Search<'a> {
     simulator: &'a Simulator,
-    /// The modes present,
+    /// Indices of the modes present.
     modes: Vec<usize>,
-    /// their frequencies, Hz,
+    /// Their frequencies, Hz.
     measured_hz: Vec<f64>,
-    /// and the relative standard deviations of their noise.
+    /// Relative standard deviations of their noise.
     relative_std: Vec<f64>,
 }
 
 /// A point of the unit box.
 struct Point {
-    /// Where it is.
+    /// Position, `[d]`.
     u: DVector<f64>,
-    /// All its frequencies, Hz.
+    /// Frequencies of all modes, Hz.
     frequencies_hz: Vec<f64>,
     /// (ln f_i − ln f_i(x))/s_i of the modes present.
     error: DVector<f64>,
-    /// Simulations on the way here.
+    /// Simulations that the search has taken.
     simulations: usize,
 }
 
@@ -152,14 +155,14 @@ struct Point {
 pub(super) struct Descent {
     /// Parameters, `[d]`.
     pub theta: Vec<f64>,
-    /// How far the worst of its frequencies is off, relative.
-    pub off: f64,
-    /// Simulations that it took.
+    /// Largest absolute relative residual of a frequency.
+    pub residual: f64,
+    /// Simulations that the search has taken.
     pub simulations: usize,
 }
 
 impl Point {
-    /// Parameters that are not at an edge which they want to leave; `slopes` as of [`Search::slopes`].
+    /// Parameters that are not held at a bound by the descent direction; `slopes` as given by [`Search::slopes`].
     fn free(&self, slopes: &DMatrix<f64>) -> Vec<usize> {
         let descent = slopes.tr_mul(&self.error);
         let leaves = |i: usize| (self.u[i] <= 0.0 && descent[i] < 0.0) || (self.u[i] >= 1.0 && descent[i] > 0.0);
@@ -168,8 +171,8 @@ impl Point {
 }
 
 impl<'a> Search<'a> {
-    /// Of a measurement by a simulation under its conditions; what is left of a search that has converged is a hundredth of
-    /// `resolution` (relative), or of the noise where that is more.
+    /// A search for `observation` with the simulator under its effects. The relative residual of a converged search is
+    /// about a hundredth of `resolution`, or of the noise where that is larger.
     pub(super) fn new(simulator: &'a Simulator, observation: &Observation, resolution: f64) -> Self {
         let frequencies = observation.frequencies_hz.iter().enumerate();
         let (modes, measured_hz): (Vec<usize>, Vec<f64>) =
@@ -180,13 +183,13 @@ impl<'a> Search<'a> {
         Self { simulator, modes, measured_hz, relative_std }
     }
 
-    /// Parameters in the unit box, those beyond it at its edge.
+    /// Position of parameters in the unit box, clamped to it.
     fn unit(&self, theta: &[f64]) -> DVector<f64> {
         let parameters = self.simulator.space().iter();
         DVector::from_iterator(theta.len(), parameters.zip(theta).map(|(p, x)| p.to_unit(*x).clamp(0.0, 1.0)))
     }
 
-    /// The parameters of a point.
+    /// The parameters at a position of the unit box.
     fn theta(&self, u: &DVector<f64>) -> Vec<f64> {
         self.simulator.space().iter().zip(u).map(|(p, u)| p.from_unit(*u)).collect()
     }
@@ -198,7 +201,7 @@ impl<'a> Search<'a> {
         Ok(Point { u, frequencies_hz, error, simulations: 1 })
     }
 
-    /// d ln f/du over s, `[modes present, d]`: the box is the unit cube, the errors count in standard deviations.
+    /// (d ln f/du)/s, `[modes present, d]`: derivatives over the unit box, in standard deviations of the noise.
     fn slopes(&self, point: &Point) -> Result<DMatrix<f64>, physics::Error> {
         let jacobian = self.simulator.jacobian(&self.theta(&point.u))?;
         let parameters = self.simulator.space().as_slice();
@@ -208,19 +211,19 @@ impl<'a> Search<'a> {
         }))
     }
 
-    /// Whether a point gives the measurement, as near as a flow comes, beyond its noise.
+    /// Whether a point reproduces the measurement within its noise and the accuracy of a flow.
     fn reaches(&self, point: &Point) -> bool {
         let near = |(error, std): (&f64, &f64)| error.abs() * std <= FLOW_ACCURACY + NOISE_MULTIPLE * std;
         point.error.iter().zip(&self.relative_std).all(near)
     }
 
-    /// The minimum of the errors that lies downhill from a point, by projected Levenberg–Marquardt.
+    /// Descends from a point to a local minimum of the squared errors, by projected Levenberg–Marquardt.
     fn descend(&self, start: Point) -> Result<Point, physics::Error> {
         let (mut point, mut damping) = (start, 1e-3);
         let mut simulations = point.simulations;
         let mut slopes = self.slopes(&point)?;
         for _ in 0..ITERATIONS {
-            // A parameter at an edge that wants to leave stays there and out of the step of the others.
+            // A parameter held at a bound stays there and takes no part in the step.
             let free = point.free(&slopes);
             if free.is_empty() {
                 break;
@@ -252,14 +255,14 @@ impl<'a> Search<'a> {
         Ok(Point { simulations, ..point })
     }
 
-    /// The minimum of the errors that lies downhill from parameters `[d]`.
+    /// Descends from parameters `theta` (`[d]`) to a local minimum of the squared errors.
     ///
     /// # Errors
     /// [`physics::Error`], which a checked prior rules out.
     pub(super) fn descend_from(&self, theta: &[f64]) -> Result<Descent, physics::Error> {
         let point = self.descend(self.at(self.unit(theta))?)?;
-        let off =
+        let residual =
             point.error.iter().zip(&self.relative_std).map(|(error, std)| (error * std).abs()).fold(0.0, f64::max);
-        Ok(Descent { theta: self.theta(&point.u), off, simulations: point.simulations })
+        Ok(Descent { theta: self.theta(&point.u), residual, simulations: point.simulations })
     }
 }

@@ -1,56 +1,60 @@
-//! One measurement as the flow sees it: log-frequencies, the size of their noise, and which modes are missing.
+//! One measurement as the flow sees it: log-frequencies, their noise level, and a mask of missing modes.
 
 use candle_core::{Device, Tensor};
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
-use super::manifest::{Conditions, EffectRange, NoiseRange, Whitening};
+use super::conditions::{Conditions, NoiseRange, Whitening};
 use crate::measurement::shape::unit_shape;
 use crate::simulator::Simulator;
 use crate::stats::Stream;
 
-/// Noise a trained flow covers unless asked otherwise, as multiples of the structure's own.
+/// Default noise range of a trained model, as multiples of the structure's noise.
 pub const DEFAULT_NOISE_RANGE: NoiseRange = NoiseRange { lowest: 0.1, highest: 5.0 };
 
-/// Share of the training measurements that have all modes.
-const SHARE_COMPLETE: f64 = 0.6;
-/// Share of the training measurements without any mode shape, of a structure with instrumented points.
-const SHARE_WITHOUT_SHAPES: f64 = 0.2;
-/// Share of the shapes that are missing in the others.
-const SHARE_SHAPE_MISSING: f64 = 0.02;
-/// Share of the training measurements whose modes all have the same noise, as a multiple of the structure's.
-const SHARE_COMMON_NOISE: f64 = 0.6;
-
-/// Frequencies of one measurement and the standard deviation of each.
+/// Frequencies and mode shapes of one measurement, their noise, and the sizes of the effects at its time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
-    /// One entry a mode, Hz; `None` where the mode was not identified. At least one is present.
+    /// One entry per mode, Hz; `None` where the mode was not identified. At least one is present.
     pub frequencies_hz: Vec<Option<f64>>,
-    /// Standard deviation of each frequency as a multiple of the structure's own; 1 where a mode is missing.
+    /// Standard deviation of each frequency as a multiple of the structure's noise; 1 where the mode is missing.
     pub noise_multiple: Vec<f64>,
-    /// Shape of each mode at the instrumented points, of unit norm; `None` where it was not identified. Empty without any.
+    /// Shape of each mode at the instrumented points, of unit norm; `None` where it was not identified. Empty without
+    /// shapes.
     pub shapes: Vec<Option<Vec<f64>>>,
-    /// Sizes of the structure's effects under the covariates of the measurement; empty where nothing is known of them, or
-    /// there are none.
+    /// Sizes of the structure's effects at the covariates of the measurement; empty where the structure has no effects or
+    /// their sizes are unknown.
     pub effect_sizes: Vec<f64>,
-    /// Sizes to go through, each as probable as the others, where a covariate is not known.
-    pub possible_sizes: Vec<Vec<f64>>,
+    /// Equally probable effect sizes to marginalise over, where a covariate is missing; else empty.
+    pub sizes_to_marginalise: Vec<Vec<f64>>,
 }
 
 impl Observation {
-    /// All modes, each with the structure's own noise.
+    /// A measurement of all modes, each with the structure's noise.
     pub fn complete(frequencies_hz: &[f64]) -> Self {
         Self {
             frequencies_hz: frequencies_hz.iter().copied().map(Some).collect(),
             noise_multiple: vec![1.0; frequencies_hz.len()],
             shapes: Vec::new(),
             effect_sizes: Vec::new(),
-            possible_sizes: Vec::new(),
+            sizes_to_marginalise: Vec::new(),
         }
     }
 
-    /// The simulation under the effects of this measurement.
+    /// Whether the posterior is marginalised over a missing covariate.
+    pub fn is_marginalised(&self) -> bool {
+        !self.sizes_to_marginalise.is_empty()
+    }
+
+    /// This measurement with each of the possible effect sizes.
+    pub(super) fn at_each_size(&self) -> Vec<Self> {
+        let at =
+            |sizes: &Vec<f64>| Self { effect_sizes: sizes.clone(), sizes_to_marginalise: Vec::new(), ..self.clone() };
+        self.sizes_to_marginalise.iter().map(at).collect()
+    }
+
+    /// The simulation with the effects of this measurement.
     pub fn simulator(&self, simulator: &Simulator) -> Simulator {
         if simulator.effects().is_empty() {
             simulator.clone()
@@ -59,18 +63,18 @@ impl Observation {
         }
     }
 
-    /// Modes that are there.
+    /// Number of modes present.
     pub fn modes_present(&self) -> usize {
         self.frequencies_hz.iter().flatten().count()
     }
 
-    /// Shape of mode `mode`, where the mode is there and its shape is known.
+    /// Shape of mode `mode`, where both the mode and its shape were identified.
     pub fn shape(&self, mode: usize) -> Option<&[f64]> {
         self.frequencies_hz[mode]?;
         self.shapes.get(mode)?.as_deref()
     }
 
-    /// True when some mode has a shape.
+    /// Whether at least one mode has a shape.
     pub fn has_shapes(&self) -> bool {
         (0..self.frequencies_hz.len()).any(|mode| self.shape(mode).is_some())
     }
@@ -81,76 +85,14 @@ impl Observation {
     }
 }
 
-/// A measurement as a baseline takes it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Admitted {
-    /// What the flow is asked; `None` when no mode is left.
-    pub observation: Option<Observation>,
-    /// Some mode had less noise than the baseline was trained for.
-    pub below_range: bool,
-    /// Some mode had more, and is left out.
-    pub above_range: bool,
-    /// Covariates that an effect needs and the measurement lacks.
-    pub covariates_missing: Vec<String>,
-    /// Covariates beyond what an effect was learnt from.
-    pub covariates_beyond: Vec<String>,
-}
-
-impl Conditions {
-    /// Numbers the flow is given for each mode: the whitened log-frequency, with noise its size and the mask,
-    /// and the size of each effect that a covariate moves.
-    pub fn channels(&self) -> usize {
-        let own = if self.noise_range.is_some() { 3 } else { 1 };
-        own + self.effects.len()
-    }
-
-    /// Which shapes of one simulated measurement are missing.
-    pub fn draw_shapes(modes: usize, stream: &mut Stream) -> Vec<bool> {
-        let without = stream.random::<f64>() < SHARE_WITHOUT_SHAPES;
-        (0..modes).map(|_| stream.random::<f64>() < SHARE_SHAPE_MISSING || without).collect()
-    }
-
-    /// Numbers that a flow of `parameters` parameters is told of a best fit; 0 where it does not start there.
-    pub fn fixed_context(&self, parameters: usize) -> usize {
-        if self.starts_at_fit {
-            super::start::features(parameters)
-        } else {
-            0
-        }
-    }
-
-    /// Noise multiples and a mask for one simulated measurement: `None` where a mode is missing.
-    ///
-    /// Without noise, all modes are there and exact: posteriors of fewer exact modes than parameters have no density.
-    pub fn draw(&self, modes: usize, stream: &mut Stream) -> Vec<Option<f64>> {
-        let Some(range) = &self.noise_range else { return vec![Some(0.0); modes] };
-        let level = |stream: &mut Stream| range.lowest * (range.highest / range.lowest).powf(stream.random::<f64>());
-        let common = level(stream);
-        let mut multiples = vec![Some(common); modes];
-        if stream.random::<f64>() >= SHARE_COMMON_NOISE {
-            for multiple in &mut multiples {
-                *multiple = Some(level(stream));
-            }
-        }
-        if modes > 1 && stream.random::<f64>() >= SHARE_COMPLETE {
-            // One missing mode is the common case: half of the incomplete measurements.
-            let missing = if stream.random::<bool>() { 1 } else { stream.random_range(1..modes) };
-            for _ in 0..missing {
-                let mode = stream.random_range(0..modes);
-                if multiples.iter().flatten().count() > 1 {
-                    multiples[mode] = None;
-                }
-            }
-        }
-        multiples
-    }
-}
-
-/// A simulated measurement of exact frequencies: noise added to the modes that are there.
+/// Simulates a measurement: adds noise to the exact frequencies of the modes that are present.
 ///
 /// ```text
-///  f̃_i = f_i + a_i·s_i(f_i)·N(0, 1),    a_i the noise multiple, s_i the structure's own standard deviation
+///  f̃_i = f_i + a_i·s_i(f_i)·N(0, 1),    a_i the noise multiple, s_i the standard deviation of the structure's noise, Hz
 /// ```
+///
+/// `exact_hz` and `multiples`: one entry per mode, a multiple `None` for a missing mode; `effect_sizes`: sizes of all
+/// effects.
 pub fn measure(
     simulator: &Simulator,
     exact_hz: &[f64],
@@ -159,10 +101,10 @@ pub fn measure(
     stream: &mut Stream,
 ) -> Observation {
     let one = |(mode, (exact, multiple)): (usize, (&f64, &Option<f64>))| {
-        // Drawn for missing modes too: the stream then does not depend on the masks.
+        // Drawn for missing modes too, so that the stream does not depend on the mask.
         let normal: f64 = stream.sample(StandardNormal);
         let std_hz = simulator.std_hz(mode, *exact);
-        // The mirror image of the few draws that would be negative: noise is far smaller than a frequency.
+        // The few negative draws are reflected: noise is far smaller than a frequency.
         multiple.map(|multiple| (exact + multiple * std_hz * normal).abs().max(f64::MIN_POSITIVE))
     };
     Observation {
@@ -170,14 +112,15 @@ pub fn measure(
         noise_multiple: multiples.iter().map(|m| m.unwrap_or(1.0)).collect(),
         shapes: Vec::new(),
         effect_sizes: effect_sizes.to_vec(),
-        possible_sizes: Vec::new(),
+        sizes_to_marginalise: Vec::new(),
     }
 }
 
-/// Gives a simulated measurement the shapes of its modes, with noise; those of `exact` where they are not missing.
+/// Adds noisy mode shapes to a simulated measurement, except for those that `missing` marks, one entry per mode.
+/// `exact`: `[points, modes]`, columns of unit norm.
 ///
 /// ```text
-///  φ̃ = (φ + s·N(0, 1))/|…|,    s: standard deviation of each number of a shape of unit norm
+///  φ̃ = (φ + s·N(0, 1))/|…|,    s: standard deviation of each component of a shape of unit norm
 /// ```
 pub fn measure_shapes(
     simulator: &Simulator,
@@ -188,19 +131,19 @@ pub fn measure_shapes(
 ) {
     let std = simulator.shape_std();
     let one = |(shape, missing): (nalgebra::DVectorView<'_, f64>, &bool)| {
-        // Drawn for missing ones too, as above.
+        // Drawn for missing shapes too, as above.
         let noisy: Vec<f64> = shape.iter().map(|x| x + std * stream.sample::<f64, _>(StandardNormal)).collect();
         unit_shape(&noisy).filter(|_| !missing)
     };
     observation.shapes = exact.column_iter().zip(missing).map(one).collect();
 }
 
-/// Turns observations into the input of the flow.
+/// Converts observations to the input of the flow.
 #[derive(Debug, Clone)]
 pub struct Encoder {
     whitening: Whitening,
     conditions: Conditions,
-    /// Covariance of ln f over the prior, for the conditional mean of missing modes.
+    /// Covariance of ln f over the prior, `[m, m]`, for the conditional mean of missing modes.
     covariance: DMatrix<f64>,
 }
 
@@ -213,11 +156,12 @@ impl Encoder {
         Self { whitening: whitening.clone(), conditions: conditions.clone(), covariance }
     }
 
-    /// Input `[n, channels, m]`, f64: whitened log-frequencies; with noise, the position of the noise in its trained
-    /// range (logarithmic, −1 to 1) and the mask.
+    /// Input of the flow, f64 `[n, channels, m]`. The channels are: the whitened log-frequencies; with noise, the position
+    /// of the noise in its trained range (logarithmic, −1 to 1) and the mask (1 for a missing mode); the position of each
+    /// effect's size in its trained range (−1 to 1).
     ///
-    /// A missing log-frequency is replaced by its mean given the others, under the normal distribution that has the
-    /// moments of the prior: with the mask it holds all that is known.
+    /// A missing log-frequency is replaced by its conditional mean given the others, under the normal distribution with the
+    /// moments of the prior. Together with the mask this loses no information.
     ///
     /// # Errors
     /// A candle error, which would be a bug.
@@ -251,7 +195,7 @@ impl Encoder {
         Tensor::from_vec(values, (observations.len(), channels, modes), &Device::Cpu)
     }
 
-    /// ln f of each mode, missing ones by their conditional mean.
+    /// ln f of each mode, with the conditional mean for missing modes.
     fn completed_logs(&self, observation: &Observation) -> Vec<f64> {
         let frequencies = &observation.frequencies_hz;
         let mean = &self.whitening.mean;
@@ -270,19 +214,5 @@ impl Encoder {
         (0..frequencies.len())
             .map(|mode| if frequencies[mode].is_some() { ln(mode) } else { conditional(mode) })
             .collect()
-    }
-}
-
-impl EffectRange {
-    /// Position of a size in the range, −1 at the lowest and 1 at the highest.
-    pub fn position(&self, size: f64) -> f64 {
-        (2.0 * size - self.lowest - self.highest) / (self.highest - self.lowest)
-    }
-}
-
-impl NoiseRange {
-    /// Position of a multiple in the range, −1 at the lowest and 1 at the highest, by its logarithm.
-    pub fn position(&self, multiple: f64) -> f64 {
-        2.0 * (multiple / self.lowest).ln() / (self.highest / self.lowest).ln() - 1.0
     }
 }

@@ -1,4 +1,4 @@
-//! Draws of a flow moved to where the simulation gives an exact measurement.
+//! Moves draws of a flow to parameters that reproduce a measurement without noise.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
@@ -7,23 +7,25 @@ use super::nearest::{Descent, Search};
 use super::observation::Observation;
 use crate::simulator::Simulator;
 
-/// Relative distance from a measurement that counts as one. Near a fold of x → f(x) the distance of the parameters goes with its
-/// root: a coarser one would end on the way.
+/// Scale of the relative residuals in the search. Near a fold of x → f(x) the error of the parameters is proportional to
+/// the square root of the residual, so that a coarser scale would end the search too early.
 const RESOLUTION: f64 = 1e-10;
 
-/// Relative distance within which parameters give a measurement.
-const GIVEN: f64 = 1e-8;
+/// Largest relative residual for which parameters reproduce a measurement.
+const REPRODUCED: f64 = 1e-8;
 
-/// Moves each draw, `[n·draws, d]`, downhill to parameters that give its measurement; simulations that it took.
+/// Moves each draw of `theta`, `[n·draws, d]`, downhill to parameters that reproduce its measurement. Returns the number of
+/// simulations.
 ///
 /// ```text
 ///  x → argmin over the prior box, downhill from x, of Σ_i ( ln f_i − ln f_i(x) )²
 /// ```
 ///
-/// The posterior of a measurement without noise lies on {x: f(x) = y}, a few points where there are as many modes as
-/// parameters. A flow is blurred where the frequencies hardly change along a direction, and leaves draws between such points:
-/// its draws tell which of the points there are, the simulation where they are. A draw that ends at an edge of the prior, short
-/// of its measurement, takes the place of one that did not; where none gives the measurement, nothing better is known.
+/// The posterior of a measurement without noise lies on {x: f(x) = y}: isolated points where there are as many modes as
+/// parameters. A flow is inaccurate in directions along which the frequencies hardly change, and leaves draws between these
+/// points. The draws therefore only determine which point is approached; the simulation determines its position. A draw
+/// that ends at a bound of the prior without reproducing its measurement is replaced by one that does. Where no draw does,
+/// all stay where they ended.
 pub(super) fn project(simulator: &Simulator, observations: &[Observation], theta: &mut DMatrix<f64>) -> usize {
     let draws = theta.nrows() / observations.len().max(1);
     let of_one = |(row, observation): (usize, &Observation)| {
@@ -31,16 +33,16 @@ pub(super) fn project(simulator: &Simulator, observations: &[Observation], theta
         let search = Search::new(&simulator, observation, RESOLUTION);
         let one = |draw: usize| {
             let theta: Vec<f64> = theta.row(row * draws + draw).iter().copied().collect();
-            // Where the simulation fails there is nothing to go by.
-            search.descend_from(&theta).unwrap_or(Descent { theta, off: f64::INFINITY, simulations: 0 })
+            // Where the simulation fails, the draw stays where it is.
+            search.descend_from(&theta).unwrap_or(Descent { theta, residual: f64::INFINITY, simulations: 0 })
         };
         (0..draws).map(one).collect::<Vec<_>>()
     };
     let ends: Vec<Vec<Descent>> = observations.par_iter().enumerate().map(of_one).collect();
     for (row, ends) in ends.iter().enumerate() {
-        let mut given = ends.iter().filter(|end| end.off <= GIVEN).cycle();
+        let mut reproduced = ends.iter().filter(|end| end.residual <= REPRODUCED).cycle();
         for (draw, end) in ends.iter().enumerate() {
-            let there = if end.off <= GIVEN { end } else { given.next().unwrap_or(end) };
+            let there = if end.residual <= REPRODUCED { end } else { reproduced.next().unwrap_or(end) };
             there.theta.iter().enumerate().for_each(|(k, value)| theta[(row * draws + draw, k)] = *value);
         }
     }
@@ -73,8 +75,8 @@ mod tests {
     }
 
     #[test]
-    fn draws_go_to_the_points_that_give_the_measurement() {
-        // Two points of the prior with the same frequencies, found by another program (many starts of Newton's method).
+    fn draws_move_to_the_points_that_reproduce_the_measurement() {
+        // Two points of the prior with the same frequencies, found by another program (Newton's method from many starts).
         let (one, other) = ([6.914_217_86, 3.029_716_03, 3.145_239_17], [6.765_661_3, 3.148_597_95, 3.137_577_11]);
         let frequencies_hz = three_dof().frequencies_hz(&one).unwrap();
         let draws = [[6.95, 3.0, 3.15], [6.72, 3.19, 3.13], one];
@@ -89,8 +91,9 @@ mod tests {
     }
 
     #[test]
-    fn a_draw_that_ends_short_of_the_measurement_takes_the_place_of_one_that_does_not() {
-        // The twin of this point lies beyond the prior: from behind the fold, the way down ends at an edge.
+    fn a_draw_that_does_not_reproduce_the_measurement_is_replaced_by_one_that_does() {
+        // The second point with these frequencies lies outside the prior: from behind the fold, the descent ends at a
+        // bound.
         let truth = [6.62, 3.306, 3.787];
         let frequencies_hz = three_dof().frequencies_hz(&truth).unwrap();
         let towards_the_twin = |i: u32| [6.62 + 0.02 * f64::from(i), 3.306 - 0.016 * f64::from(i), 3.787];
@@ -100,19 +103,19 @@ mod tests {
                 let there = three_dof().frequencies_hz(&theta.row(row).iter().copied().collect::<Vec<_>>()).unwrap();
                 there.iter().zip(&frequencies_hz).map(|(f, y)| (f / y - 1.0).abs()).fold(0.0, f64::max)
             };
-            (0..theta.nrows()).filter(|row| off(*row) > GIVEN).count()
+            (0..theta.nrows()).filter(|row| off(*row) > REPRODUCED).count()
         };
         let alone: usize = starts.iter().map(|start| short(&moved(exact(&frequencies_hz), &[*start]).0)).sum();
-        assert!(0 < alone && alone < starts.len(), "{alone} of the draws end short of it by themselves");
+        assert!(0 < alone && alone < starts.len(), "{alone} of the draws do not reproduce it by themselves");
         assert_eq!(short(&moved(exact(&frequencies_hz), &starts).0), 0);
     }
 
     #[test]
-    fn a_measurement_that_nothing_gives_ends_inside_the_prior() {
+    fn draws_of_a_measurement_that_nothing_reproduces_stay_inside_the_prior() {
         let beyond: Vec<f64> = three_dof().frequencies_hz(&[7.0, 7.0, 7.0]).unwrap().iter().map(|f| 1.02 * f).collect();
         let (theta, _) = moved(exact(&beyond), &[[6.0, 6.5, 6.8], [5.0, 5.0, 5.0]]);
         assert!(theta.iter().all(|value| (3.0..=7.0).contains(value)), "{theta}");
-        // Both are at the nearest point, as near as the frequencies tell.
+        // Both are at the nearest point, as accurately as the frequencies determine it.
         assert!((theta.row(0) - theta.row(1)).amax() < 0.05, "{theta}");
     }
 }

@@ -1,4 +1,4 @@
-//! Draws of a flow set right by the simulation: sampling, importance, resampling.
+//! Sampling–importance resampling: draws of a flow, weighted by the exact likelihood of the simulation.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
@@ -7,33 +7,33 @@ use super::observation::Observation;
 use crate::simulator::Simulator;
 use crate::stats;
 
-/// Share of the proposals that the weights must leave effective. Where the flow is further from the posterior (few sharp
-/// frequencies of many parameters: a thread through the box), a few draws would stand for all, and the sample would be narrower
-/// than it should: there the flow's own draws stay, which its calibration vouches for.
+/// Smallest effective sample size, as a share of the proposals, for which the draws are resampled. Where the flow differs
+/// more from the posterior (few accurate frequencies of many parameters give a thin curved posterior), a few draws would
+/// dominate and the sample would be too narrow. There the draws of the flow are kept, whose calibration has been measured.
 const EFFECTIVE: f64 = 0.5;
 
-/// Observations of one task: fewer cost more in handing over than they take.
-const AT_A_TIME: usize = 8;
+/// Fewest observations per task, so that the cost of scheduling stays small.
+const LEAST_PER_TASK: usize = 8;
 
-/// Draws of a flow, and what they are weighed by.
+/// Draws of a flow as importance proposals.
 pub(super) struct Proposals {
-    /// The same number for each observation, `[n·draws, d]`, parameter units.
+    /// Draws, the same number for each observation, `[n·draws, d]`, parameter units.
     pub theta: DMatrix<f64>,
-    /// Log-density of each under the flow, in parameter units, up to a constant; nats.
+    /// Log-density of each draw under the flow, in parameter units, up to a constant; nats.
     pub log_density: Vec<f64>,
-    /// Observations some of whose draws were moved to an edge of the prior: their densities mean nothing.
+    /// Whether draws of an observation were moved to the bounds of the prior, which invalidates their densities.
     pub moved: Vec<bool>,
 }
 
-/// Draws `draws` of the proposals of each observation, by their weights.
+/// Resamples `draws` of the proposals of each observation by their importance weights, `[n·draws, d]`.
 ///
 /// ```text
 ///  w_s = p(y | x_s)/q(x_s | y),    ln p(y | x) = −Σ_i ½((y_i − f_i(x))/s_i)² + ln s_i,   s_i the noise at f_i(x)
 /// ```
 ///
-/// under the uniform prior, over the modes present; systematic resampling, then a shuffle, so that any first few are a sample
-/// too. A flow that bridges two humps leaves draws between them and in humps that are none: here they go. Where the weights
-/// leave fewer than half of the proposals effective, the flow's draws are kept as they are.
+/// under the uniform prior; the sum is over the modes present. Resampling is systematic, followed by a shuffle, so that any
+/// first few draws are a sample too. Spurious modes of the flow, such as bridges between two modes of the posterior, are
+/// removed. Where the effective sample size is less than half of the proposals, the flow's draws are kept unchanged.
 ///
 /// Source: D. B. Rubin (1988), Using the SIR algorithm to simulate posterior distributions, Bayesian Statistics 3, 395–402.
 pub(super) fn resample(
@@ -51,9 +51,9 @@ pub(super) fn resample(
         if proposals.moved[row] {
             return rows.take(draws).collect();
         }
-        // What has no number has no weight.
-        let log_weight = |place: usize| {
-            let weight = log_likelihoods[place] - proposals.log_density[place];
+        // Non-finite weights are set to zero.
+        let log_weight = |row: usize| {
+            let weight = log_likelihoods[row] - proposals.log_density[row];
             if weight.is_finite() {
                 weight
             } else {
@@ -69,12 +69,12 @@ pub(super) fn resample(
             None => rows.take(draws).collect(),
         }
     };
-    let rows = (0..observations.len()).into_par_iter().with_min_len(AT_A_TIME);
-    let places: Vec<usize> = rows.flat_map_iter(choose).collect();
-    DMatrix::from_fn(places.len(), d, |row, column| proposals.theta[(places[row], column)])
+    let rows = (0..observations.len()).into_par_iter().with_min_len(LEAST_PER_TASK);
+    let chosen: Vec<usize> = rows.flat_map_iter(choose).collect();
+    DMatrix::from_fn(chosen.len(), d, |row, column| proposals.theta[(chosen[row], column)])
 }
 
-/// ln p(y | x) of each row of `theta`, the same number of rows for each observation.
+/// ln p(y | x) up to a constant for each row of `theta` `[n·k, d]`, k rows for each of the n observations; nats.
 pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation], theta: &DMatrix<f64>) -> Vec<f64> {
     let each = theta.nrows() / observations.len().max(1);
     let of = |(row, observation): (usize, &Observation)| {
@@ -83,10 +83,11 @@ pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation
         let runs = frequencies_hz.chunks_exact(simulator.modes());
         runs.map(|frequencies_hz| log_likelihood(&simulator, observation, frequencies_hz)).collect::<Vec<f64>>()
     };
-    observations.par_iter().with_min_len(AT_A_TIME).enumerate().flat_map_iter(of).collect()
+    observations.par_iter().with_min_len(LEAST_PER_TASK).enumerate().flat_map_iter(of).collect()
 }
 
-/// `frequencies_hz`: of one run, NaN where there are none.
+/// ln p(y | x) up to a constant. `frequencies_hz`: the simulated frequencies of x; NaN where the simulation failed, which
+/// gives −∞.
 fn log_likelihood(simulator: &Simulator, observation: &Observation, frequencies_hz: &[f64]) -> f64 {
     if frequencies_hz.iter().any(|f| f.is_nan()) {
         return f64::NEG_INFINITY;

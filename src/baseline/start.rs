@@ -1,8 +1,9 @@
-//! Where a flow of many parameters starts: the best fit of each measurement and the normal distribution about it.
+//! The starting point of a flow with many parameters: the best fit of each measurement and the normal distribution about
+//! it.
 //!
-//! A flow of a hundred parameters would spend its training on finding out what Newton's method knows: which parameters come
-//! nearest to a measurement. Here each measurement is fitted first, by the simulation and its derivatives, and the flow
-//! learns only what the posterior has beyond the normal distribution at the fit:
+//! A flow with a hundred parameters would spend its training on learning what Newton's method computes: which parameters
+//! fit a measurement best. Each measurement is therefore fitted first, with the simulation and its derivatives, and the
+//! flow only learns how the posterior differs from the normal distribution at the fit:
 //!
 //! ```text
 //!  û    = argmin ½ |r(u)|² + 6 |u − ½|²          r: residuals in standard deviations, u: position in the prior box
@@ -10,9 +11,9 @@
 //!  x    = Rᵀ (u − û),    flow:  x ⟷ z | û, ln std of each parameter, ln a
 //! ```
 //!
-//! a² is the misfit at û beyond what the noise explains, 1 for one that fits: where the search stops in a false valley, the
-//! start is wide rather than sure of a wrong place. Modes are paired anew at each step, by MAC and frequency, so that a
-//! measurement may have modes in another order than the simulation, or lack some, or lack shapes.
+//! a² is the misfit at û beyond what the noise explains, and 1 where the fit is good: where the search stops in a local
+//! minimum, the starting distribution is wide. Modes are paired anew at each step, by MAC and frequency, so that a
+//! measurement may have its modes in another order than the simulation, or lack modes or shapes.
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
@@ -26,55 +27,51 @@ use crate::physics::shapes::pair_modes;
 use crate::simulator::{Linearised, Simulator};
 use crate::stats::{normal_cdf, normal_quantile, Stream};
 
-/// Parameters from which a flow starts at the best fit.
+/// Number of parameters from which on a flow starts at the best fit.
 pub const MANY_PARAMETERS: usize = 17;
 
 /// Precision of the uniform prior of a position in the box: one over its variance 1/12.
 const PRIOR_PRECISION: f64 = 12.0;
 
-/// Most steps of the search; it takes five or six where the noise is small.
+/// Most steps of the search. It takes five or six steps where the noise is small.
 const STEPS: usize = 20;
 
-/// Far off, the noise counts as this share of the root mean square residual: full steps on sharp residuals overshoot.
+/// Far from the minimum, residuals are scaled so that their root mean square is one over this number: full Newton steps on
+/// residuals of many standard deviations overshoot.
 const CAUTION: f64 = 0.8;
 
-/// The search ends with a step that is expected to gain less than this, nats: 2 is less than a standard deviation in a single
-/// of a hundred directions, and the step itself is still made.
+/// The search ends with a step whose expected gain is less than this, nats; the step itself is still taken. With a hundred
+/// parameters a gain of 2 means less than a standard deviation in a single direction.
 const LEAST_GAIN: f64 = 2.0;
 
-/// Standard deviations of χ² that the misfit may exceed its mean by without widening the start.
+/// Number of standard deviations of χ² by which the misfit may exceed its mean before the starting distribution is widened.
 const MISFIT_ALLOWED: f64 = 3.0;
 
-/// Rounds over the parameters of a draw that lie beyond the prior.
+/// Rounds of redrawing the parameters of a draw that lie outside the prior.
 const ROUNDS: usize = 2;
 
-/// Whether the flow of a structure starts at the best fit: where its parameters are many or its mode shapes are measured. It
-/// needs noise to weigh residuals by.
+/// Whether the flow of a structure starts at the best fit: where it has many parameters or its mode shapes are measured.
+/// The fit needs measurement noise to weight the residuals.
 pub fn starts_at_fit(simulator: &Simulator) -> bool {
     simulator.is_noisy() && (simulator.space().len() >= MANY_PARAMETERS || simulator.shape_points() > 0)
-}
-
-/// Numbers that a flow is told of the fit of a measurement to a structure with `parameters` parameters.
-pub fn features(parameters: usize) -> usize {
-    2 * parameters + 1
 }
 
 /// The best fit of a measurement.
 #[derive(Debug, Clone)]
 pub struct Located {
-    /// û: position of the parameters in the prior box, `[d]`; may lie a little beyond it.
+    /// û: position of the parameters in the prior box, `[d]`. It may lie slightly outside.
     pub unit: DVector<f64>,
     /// Precision R Rᵀ of the normal distribution about û, `[d, d]`.
     pub precision: DMatrix<f64>,
-    /// Its lower triangular factor R.
+    /// Lower triangular Cholesky factor R, `[d, d]`.
     pub factor: DMatrix<f64>,
-    /// Standard deviation of each position under that distribution.
+    /// Standard deviation of each position under that distribution, `[d]`.
     pub std: DVector<f64>,
     /// Sum of the squared residuals, in standard deviations of the noise.
     pub chi_squared: f64,
-    /// Residuals less the directions in which parameters absorb them.
+    /// Number of residuals less the directions in which parameters absorb them.
     pub degrees_of_freedom: f64,
-    /// a² − 1 ≥ 0: the misfit beyond what noise explains.
+    /// a² − 1 ≥ 0: the misfit beyond what the noise explains.
     pub excess: f64,
     /// Simulated frequency of each mode of the measurement, Hz.
     pub frequencies_hz: Vec<f64>,
@@ -82,16 +79,16 @@ pub struct Located {
 
 /// Residuals of a measurement at one point and their derivatives.
 struct Residuals {
-    /// (measured − simulated)/std: frequencies by their logarithms, shapes by their numbers.
+    /// (measured − simulated)/std: logarithms of the frequencies, then components of the shape, mode by mode, `[rows]`.
     values: DVector<f64>,
-    /// Derivatives of what is simulated, over the standard deviations, per width of the prior, `[rows, d]`.
+    /// Derivatives of the simulated values by u, in standard deviations of the noise, `[rows, d]`.
     slopes: DMatrix<f64>,
-    /// Rows less one for each shape, whose norm is no measurement.
+    /// Number of rows, less one for each shape, since the norm of a shape is not measured.
     free: f64,
     frequencies_hz: Vec<f64>,
 }
 
-/// Fits each measurement; in parallel, the same bits for any number of threads.
+/// Fits each measurement, in parallel; the result does not depend on the number of threads.
 ///
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
@@ -99,14 +96,14 @@ pub fn locate_all(simulator: &Simulator, observations: &[Observation]) -> Result
     observations.par_iter().map(|observation| locate(simulator, observation)).collect()
 }
 
-/// Fits one measurement, see the module.
+/// Fits one measurement by Gauss–Newton steps on the tempered posterior, see the module.
 ///
 /// # Errors
 /// [`physics::Error`], which a checked prior rules out.
 pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Located, physics::Error> {
     let simulator = &observation.simulator(simulator);
     let prior = simulator.space().as_slice();
-    // As far beyond the prior as a flow is trained: the simulation is sound there.
+    // The search may leave the prior as far as a flow is trained: the simulation is valid there.
     let wide = simulator.training_space();
     let limits: Vec<(f64, f64)> =
         prior.iter().zip(wide.iter()).map(|(p, w)| (p.to_unit(w.lower), p.to_unit(w.upper))).collect();
@@ -126,7 +123,7 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
         for (position, (change, (lowest, highest))) in u.iter_mut().zip(step.iter().zip(&limits)) {
             *position = (*position + change).clamp(*lowest, *highest);
         }
-        // Not `>=`: NaN must end it too.
+        // Written so that NaN ends the search too.
         let goes_on = gain >= LEAST_GAIN || tempering < 1.0;
         if taken == STEPS || !goes_on {
             return Ok(located(u, residuals, &normal, &step));
@@ -134,12 +131,12 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
     }
 }
 
-/// The normal distribution at the end of the search, whose last step was small enough for its derivatives to hold.
+/// The normal distribution at the end of the search. The derivatives are still valid after the last, small step.
 fn located(unit: DVector<f64>, residuals: Residuals, normal: &DMatrix<f64>, step: &DVector<f64>) -> Located {
     let left = residuals.values - &residuals.slopes * step;
     let chi_squared = left.norm_squared();
     let (_, full) = precision(normal, 1.0);
-    // Share of each direction that is known from the data rather than from the prior, summed.
+    // The number of directions that are determined by the data rather than by the prior.
     let absorbed = unit.len() as f64 - PRIOR_PRECISION * inverse(&full).norm_squared();
     let degrees_of_freedom = (residuals.free - absorbed).max(0.0);
     let expected = degrees_of_freedom + MISFIT_ALLOWED * (2.0 * degrees_of_freedom.max(1.0)).sqrt();
@@ -151,7 +148,7 @@ fn located(unit: DVector<f64>, residuals: Residuals, normal: &DMatrix<f64>, step
     Located { unit, precision, factor, std, chi_squared, degrees_of_freedom, excess, frequencies_hz }
 }
 
-/// JᵀJ·weight + 12·1 and its lower triangular factor.
+/// JᵀJ·weight + 12·1, `[d, d]`, and its lower triangular factor.
 fn precision(normal: &DMatrix<f64>, weight: f64) -> (DMatrix<f64>, DMatrix<f64>) {
     let mut precision = normal * weight;
     for i in 0..precision.nrows() {
@@ -167,12 +164,13 @@ fn solve(factor: &DMatrix<f64>, right: &DVector<f64>) -> DVector<f64> {
     factor.tr_solve_lower_triangular(&factor.solve_lower_triangular(right).expect(regular)).expect(regular)
 }
 
-/// R⁻¹; the squared norms of its columns are the variances.
+/// R⁻¹. The squared norms of its columns are the variances.
 fn inverse(factor: &DMatrix<f64>) -> DMatrix<f64> {
     let identity = DMatrix::identity(factor.nrows(), factor.nrows());
     factor.solve_lower_triangular(&identity).expect("a Cholesky factor has no zero on its diagonal")
 }
 
+/// Residuals and derivatives at the position `u` of the prior box, with the modes of measurement and simulation paired.
 fn residuals_at(
     simulator: &Simulator,
     observation: &Observation,
@@ -226,15 +224,16 @@ fn residuals_at(
 }
 
 impl Located {
-    /// What the flow is told: û and the standard deviations, both in those of the prior, and the misfit.
+    /// Condition of the flow: û and the logarithms of the standard deviations, both in units of the prior's standard
+    /// deviation, and ln a.
     pub(super) fn features(&self) -> impl Iterator<Item = f64> + '_ {
         let wide = PRIOR_PRECISION.sqrt();
-        let place = self.unit.iter().map(move |u| wide * (u - 0.5));
+        let position = self.unit.iter().map(move |u| wide * (u - 0.5));
         let std = self.std.iter().map(move |std| (wide * std).ln());
-        place.chain(std).chain(std::iter::once(0.5 * self.excess.ln_1p()))
+        position.chain(std).chain(std::iter::once(0.5 * self.excess.ln_1p()))
     }
 
-    /// x = Rᵀ (u − û) of positions in the prior box, one column each.
+    /// x = Rᵀ (u − û) of positions u in the prior box, one column each, `[d, n]`.
     pub fn to_flow(&self, unit: &DMatrix<f64>) -> DMatrix<f64> {
         let mut deviation = unit.clone();
         for mut column in deviation.column_iter_mut() {
@@ -243,7 +242,7 @@ impl Located {
         transposed_product(&self.factor, &deviation)
     }
 
-    /// Positions in the prior box of x, one column each; the inverse of [`Self::to_flow`]. They may lie beyond the box.
+    /// u = û + R⁻ᵀ x, one column each, `[d, n]`; the inverse of [`Self::to_flow`]. Positions may lie outside the box.
     pub fn from_flow(&self, x: &DMatrix<f64>) -> DMatrix<f64> {
         let solvable = "a Cholesky factor has no zero on its diagonal";
         let mut unit = self.factor.tr_solve_lower_triangular(x).expect(solvable);
@@ -253,19 +252,20 @@ impl Located {
         unit
     }
 
-    /// ln|det ∂x/∂u|.
+    /// ln|det ∂x/∂u| = Σ ln R_ii.
     pub fn log_det(&self) -> f64 {
         self.factor.diagonal().iter().map(|r| r.ln()).sum()
     }
 
-    /// Draws the positions of `draw` (`[d]`) that lie beyond the prior anew, each given all others, under the normal
-    /// distribution cut off at the prior; true when there were some.
+    /// Redraws the positions of `draw` (`[d]`) that lie outside the prior, each given all others, from the normal
+    /// distribution truncated to the prior. Returns whether there were any.
     ///
     /// ```text
     ///  u_i | others ~ N(u_i − (P(u − û))_i/P_ii, 1/P_ii) on [0, 1],    P = R Rᵀ
     /// ```
     ///
-    /// Of a hundred parameters some lie beyond the prior in nearly every draw: drawing all anew would go on for ever.
+    /// With a hundred parameters, nearly every draw has some parameters outside the prior: rejecting whole draws would not
+    /// end.
     pub fn draw_back(&self, draw: &mut [f64], stream: &mut Stream) -> bool {
         let beyond: Vec<usize> = (0..draw.len()).filter(|&i| !(0.0..=1.0).contains(&draw[i])).collect();
         for _ in 0..ROUNDS {
@@ -281,7 +281,7 @@ impl Located {
                 let (mean, std) = (draw[i] - pull / own, own.sqrt().recip());
                 let (low, high) = (normal_cdf(-mean / std), normal_cdf((1.0 - mean) / std));
                 let level = low + (high - low) * stream.random::<f64>();
-                // Far beyond, both levels are 0 or 1: the edge it is.
+                // Far outside, both levels are 0 or 1, and the result is the bound.
                 let level = level.clamp(f64::MIN_POSITIVE, 1.0 - f64::EPSILON);
                 draw[i] = (mean + std * normal_quantile(level)).clamp(0.0, 1.0);
             }

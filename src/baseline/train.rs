@@ -1,42 +1,49 @@
-//! From a structure to a trained baseline.
+//! Training of a model for a structure, and its certification.
 
 use candle_core::{DType, Tensor};
 use nalgebra::DMatrix;
+use rand::RngCore as _;
 
-use super::calibration::{calibrate, CalibrationRecord};
+use super::calibration::calibrate;
+use super::conditions::{Conditions, EffectRange, NoiseRange, Whitening};
+use super::error::{InferenceError, LoadError};
 use super::fitted::{fitted_pairs, inverse_error_from_fit};
-use super::identifiability::{identifiability, IdentifiabilityRecord};
+use super::identifiability::identifiability;
 use super::manifest::{
-    Conditions, EffectRange, Manifest, NoiseRange, ParameterValidation, SelfTest, TrainingRecord, ValidationRecord,
-    Whitening, FORMAT,
+    CalibrationRecord, IdentifiabilityRecord, Manifest, ParameterValidation, SelfTest, TrainingRecord,
+    ValidationRecord, FORMAT,
 };
+use super::model::Baseline;
 use super::observation::{measure, measure_shapes, Encoder, Observation};
+use super::real_line::{logistic, to_real_line};
 use super::start::starts_at_fit;
-use super::{to_real_line, Baseline, InferenceError};
-use crate::flow::sampler::Sampler;
-use crate::flow::train::{EpochReport, Pairs, Stopped, TrainSettings};
-use crate::flow::{checkpoint, weights, FlowSettings};
+use crate::flow::architecture::{Architecture, FlowSettings};
+use crate::flow::pairs::Pairs;
+use crate::flow::train::{EpochReport, Stopped, TrainOutcome, TrainSettings};
+use crate::flow::weights::Weights;
+use crate::flow::{checkpoint, weights, Flow};
+use crate::parameter::{Parameter, ParameterSpace};
 use crate::quantity::Digest;
 use crate::simulator::{Simulator, TrainingSet};
-use crate::stats;
+use crate::stats::{self, Stream};
 
-/// Pairs that choose the best epoch.
+/// Pairs that select the best epoch.
 const VALIDATION_SAMPLES: usize = 1_000;
-/// Pairs the manifest's figures are measured on.
-const HELD_OUT_SAMPLES: usize = 2_000;
-/// The same where each is fitted first, which takes a fifth of a second at three hundred parameters.
-const HELD_OUT_FITTED: usize = 300;
-/// Pairs that choose the best epoch there.
+/// Pairs that select the best epoch where the flow starts at the best fit.
 const VALIDATION_FITTED: usize = 500;
-/// Draws for each held-out pair.
+/// Pairs on which the accuracy in the manifest is measured.
+const HELD_OUT_SAMPLES: usize = 2_000;
+/// The same where the flow starts at the best fit: a fit takes 0.2 s with three hundred parameters.
+const HELD_OUT_FITTED: usize = 300;
+/// Draws per held-out pair.
 const HELD_OUT_DRAWS: usize = 10;
 /// Draws of the self-test.
 const SELF_TEST_DRAWS: usize = 4;
-/// Fewest training samples: below, the covariance of the frequencies itself is uncertain.
+/// Fewest training samples. With fewer, the covariance of the frequencies is too uncertain.
 pub const MINIMUM_SAMPLES: usize = 100;
 
-/// Training samples unless asked otherwise. A measurement that is fitted first costs milliseconds, and the flow has little left
-/// to learn: fewer of them, and the fewer the more parameters.
+/// Default number of training samples. Where the flow starts at the best fit, each sample takes milliseconds and the flow
+/// has little left to learn, so that the number is smaller and falls with the number of parameters.
 pub fn default_samples(simulator: &Simulator) -> usize {
     match (starts_at_fit(simulator), simulator.is_noisy()) {
         (true, _) => (1_000_000 / simulator.space().len()).clamp(3_000, 40_000),
@@ -45,7 +52,8 @@ pub fn default_samples(simulator: &Simulator) -> usize {
     }
 }
 
-/// Passes over the training samples unless asked otherwise. Where noise is drawn once, more of them learn the noise by heart.
+/// Default number of epochs. Where the flow starts at the best fit the noise is drawn only once, and more epochs would
+/// overfit it.
 pub fn default_epochs(simulator: &Simulator) -> usize {
     match (starts_at_fit(simulator), simulator.is_noisy()) {
         (true, _) => 8,
@@ -54,7 +62,7 @@ pub fn default_epochs(simulator: &Simulator) -> usize {
     }
 }
 
-/// Why no baseline came of a training.
+/// Why a training gave no model.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Too few samples asked for.
@@ -68,8 +76,8 @@ pub enum Error {
         /// Its value.
         value: f64,
     },
-    /// A noise range that is none.
-    #[error("the noise range {lowest} to {highest} is none: two multiples of the structure's noise, both above 0, ascending, with 1 between them")]
+    /// The noise range is not valid.
+    #[error("the noise range {lowest} to {highest} is not valid: give two ascending multiples of the structure's noise, both above 0, with 1 between them")]
     NoiseRange {
         /// Lowest multiple given.
         lowest: f64,
@@ -79,29 +87,29 @@ pub enum Error {
     /// The simulation failed somewhere in the prior.
     #[error("the simulation failed: {0}")]
     Simulation(#[from] crate::simulator::Error),
-    /// Frequencies that do not vary, or not independently.
-    #[error("over the prior, a frequency does not vary or two vary as one: there is nothing to learn from them")]
+    /// The covariance of the frequencies over the prior is singular.
+    #[error("over the prior, a frequency does not vary or two frequencies vary in proportion: they carry no information on the parameters")]
     Degenerate,
-    /// The flow was not trained.
+    /// The training of the flow failed.
     #[error(transparent)]
     Flow(#[from] crate::flow::train::Error),
     /// The weights could not be written.
     #[error(transparent)]
     Checkpoint(#[from] checkpoint::Error),
-    /// The trained flow does not infer.
+    /// The trained model failed in an inference.
     #[error(transparent)]
     Inference(#[from] InferenceError),
-    /// The new baseline does not pass its own checks: a bug.
-    #[error("the new baseline is refused: {0}")]
-    Refused(#[from] Box<super::LoadError>),
+    /// The new model does not pass its own checks: a bug.
+    #[error("the new model is refused: {0}")]
+    Refused(#[from] Box<LoadError>),
     /// Tensors of the wrong shape: a bug.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),
 }
 
-/// A trained baseline and its two files.
+/// A trained model and its two files.
 pub struct Trained {
-    /// Ready for use, loaded back from the files below.
+    /// The model, loaded back from the files below.
     pub baseline: Baseline,
     /// The manifest file.
     pub manifest_json: Vec<u8>,
@@ -109,18 +117,20 @@ pub struct Trained {
     pub weights: Vec<u8>,
 }
 
-/// Simulates `samples` pairs from the prior of `simulator`, trains a flow on them and measures what it reached.
+/// Trains a model on `samples` simulated pairs from the prior of `simulator`, and measures its accuracy and calibration.
 ///
-/// Where the structure has measurement noise, its size, the noise itself and the missing modes are drawn afresh in each
+/// Where the structure has measurement noise, its level, the noise itself and the missing modes are drawn afresh in each
 /// epoch, so that the flow never sees a measurement twice.
 ///
-/// Where parameters are many or mode shapes are measured, each measurement is fitted first and the flow learns what lies beyond
-/// the fit, see [`super::start`]; its noise is then drawn once, since a fit takes a thousand times as long as a draw.
+/// Where the flow starts at the best fit, see [`super::start`], it learns how the posterior differs from the normal
+/// distribution at the fit. The noise is then drawn only once, since a fit takes a thousand times as long as a draw.
 ///
 /// The same simulator, settings and seed give the same bytes, whatever the number of threads.
 ///
+/// Source: Wang et al. (2025), §3.2, Eq. 20. The certification is ours.
+///
 /// # Errors
-/// [`Error`] for settings out of range, a simulation that fails in the prior, or a training that diverges at once.
+/// [`Error`] for settings out of range, a simulation that fails in the prior, or a training that diverges in its first epoch.
 pub fn train(
     simulator: &Simulator,
     samples: usize,
@@ -131,94 +141,111 @@ pub fn train(
 ) -> Result<Trained, Error> {
     check(samples, noise_range, flow_settings, settings)?;
     let fitted = starts_at_fit(simulator);
-    // Where each measurement is fitted, its distribution reaches over the edge of the prior by itself.
+    // The normal distribution at a fit reaches beyond the prior by itself and needs no margin.
     let space = if fitted { simulator.space().clone() } else { simulator.training_space() };
-    let noisy = simulator.is_noisy();
-    let training_box = space.iter().map(|p| [p.lower, p.upper]).collect();
     let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
     let training = draw(samples, "training set")?;
-    let effects = effect_ranges(simulator, &training);
-    let noise_range = noisy.then_some(noise_range);
-    let conditions = Conditions { training_box, noise_range, starts_at_fit: fitted, effects };
-    let whitening = Whitening::fit(&rows(&training.frequencies_hz)).ok_or(Error::Degenerate)?;
-    let encoder = Encoder::new(&whitening, &conditions);
-    let observed = |set: &TrainingSet, purpose: &str| {
-        let mut stream = stats::stream(settings.seed, purpose);
-        observe(simulator, &conditions, set, &mut stream)
+    let conditions = Conditions {
+        training_box: space.iter().map(|p| [p.lower, p.upper]).collect(),
+        noise_range: simulator.is_noisy().then_some(noise_range),
+        starts_at_fit: fitted,
+        effects: effect_ranges(simulator, &training),
     };
-
+    let whitening = Whitening::fit(&rows(&training.frequencies_hz)).ok_or(Error::Degenerate)?;
     let mut permutations = stats::stream(settings.seed, "permutations");
     let mut architecture =
         flow_settings.architecture(space.len(), simulator.modes(), conditions.channels(), &mut permutations);
     architecture.fixed_context = conditions.fixed_context(space.len());
-    let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
     let validation_samples = if fitted { VALIDATION_FITTED } else { VALIDATION_SAMPLES };
     let validation = draw(validation_samples, "validation set")?;
-    let of_validation = observed(&validation, "observations of validation");
-    let outcome = if fitted {
-        let observations = observed(&training, "observations");
-        let pairs = fitted_pairs(simulator, &training, &observations)?;
-        let validation = fitted_pairs(simulator, &validation, &of_validation)?;
-        let epoch = |_| Ok(pairs.clone());
-        crate::flow::train::train(&flow, &weights, samples, epoch, &validation, settings, on_epoch)?
-    } else {
-        let x = to_real_line(&training.theta, &space)?.to_dtype(DType::F32)?;
+
+    let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
+    let task = Task { simulator, space: &space, conditions: &conditions, whitening: &whitening, settings };
+    let outcome = task.run(&flow, &weights, &training, &validation, on_epoch)?;
+    let weights = checkpoint::to_bytes(&weights)?;
+    let training = TrainingRecord {
+        samples,
+        validation_samples,
+        settings: settings.clone(),
+        best_epoch: outcome.best_epoch,
+        stopped: outcome.stopped,
+    };
+    let manifest = draft_manifest(simulator, &weights, architecture, (whitening, conditions), training);
+    let digest = manifest.weights_sha256.clone();
+    certify(&Baseline::new(flow, simulator, manifest, digest)?, weights)
+}
+
+/// What the training of a flow needs besides the pairs.
+struct Task<'a> {
+    simulator: &'a Simulator,
+    space: &'a ParameterSpace,
+    conditions: &'a Conditions,
+    whitening: &'a Whitening,
+    settings: &'a TrainSettings,
+}
+
+impl Task<'_> {
+    /// Trains `flow`, whose variables are `weights`.
+    fn run(
+        &self,
+        flow: &Flow,
+        weights: &Weights,
+        training: &TrainingSet,
+        validation: &TrainingSet,
+        on_epoch: impl FnMut(EpochReport),
+    ) -> Result<TrainOutcome, Error> {
+        let samples = training.theta.nrows();
+        let of_validation = self.observed(validation, "observations of validation");
+        if self.conditions.starts_at_fit {
+            let observations = self.observed(training, "observations");
+            let pairs = fitted_pairs(self.simulator, training, &observations)?;
+            let validation = fitted_pairs(self.simulator, validation, &of_validation)?;
+            let epoch = |_| Ok(pairs.clone());
+            return Ok(crate::flow::train::train(flow, weights, samples, epoch, &validation, self.settings, on_epoch)?);
+        }
+        let encoder = Encoder::new(self.whitening, self.conditions);
+        let x = to_real_line(&training.theta, self.space)?.to_dtype(DType::F32)?;
         let epoch = |epoch: usize| {
-            let observations = observed(&training, &format!("observations of epoch {epoch}"));
+            let observations = self.observed(training, &format!("observations of epoch {epoch}"));
             Ok(Pairs { x: x.clone(), y: encoder.encode(&observations)?.to_dtype(DType::F32)? })
         };
-        let x = to_real_line(&validation.theta, &space)?.to_dtype(DType::F32)?;
+        let x = to_real_line(&validation.theta, self.space)?.to_dtype(DType::F32)?;
         let validation = Pairs { x, y: encoder.encode(&of_validation)?.to_dtype(DType::F32)? };
-        crate::flow::train::train(&flow, &weights, samples, epoch, &validation, settings, on_epoch)?
-    };
+        Ok(crate::flow::train::train(flow, weights, samples, epoch, &validation, self.settings, on_epoch)?)
+    }
 
-    let weight_bytes = checkpoint::to_bytes(&weights)?;
-    let manifest = Manifest {
+    fn observed(&self, set: &TrainingSet, purpose: &str) -> Vec<Observation> {
+        observe(self.simulator, self.conditions, set, &mut stats::stream(self.settings.seed, purpose))
+    }
+}
+
+/// The manifest of a trained flow before certification, which measures the empty records.
+fn draft_manifest(
+    simulator: &Simulator,
+    weights: &[u8],
+    architecture: Architecture,
+    (whitening, conditions): (Whitening, Conditions),
+    training: TrainingRecord,
+) -> Manifest {
+    Manifest {
         format: FORMAT,
         program_version: env!("CARGO_PKG_VERSION").to_owned(),
         structure: simulator.id().clone(),
         structure_digest: simulator.digest().clone(),
-        weights_sha256: Digest::of_file(&weight_bytes),
+        weights_sha256: Digest::of_file(weights),
         architecture,
         whitening,
         conditions,
-        training: TrainingRecord {
-            samples,
-            validation_samples,
-            settings: settings.clone(),
-            best_epoch: outcome.best_epoch,
-            stopped: outcome.stopped,
-        },
-        validation: ValidationRecord {
-            samples: 0,
-            negative_log_likelihood: 0.0,
-            negative_log_likelihood_error: 0.0,
-            parameters: Vec::new(),
-            inverse_error: 0.0,
-        },
-        calibration: CalibrationRecord { simulations: 0, draws: 0, failures: Vec::new(), cells: Vec::new() },
-        identifiability: IdentifiabilityRecord { parameters: Vec::new(), groups: Vec::new() },
-        self_test: SelfTest {
-            frequencies_hz: Vec::new(),
-            shapes: Vec::new(),
-            seed: settings.seed,
-            expected: Vec::new(),
-        },
-    };
-    let draft = Baseline {
-        sampler: Sampler::new(&flow)?,
-        flow,
-        encoder,
-        training_space: space,
-        simulator: simulator.clone(),
-        digest: manifest.weights_sha256.clone(),
-        manifest,
-    };
-    certify(&draft, weight_bytes)
+        validation: ValidationRecord::default(),
+        calibration: CalibrationRecord::default(),
+        identifiability: IdentifiabilityRecord::default(),
+        self_test: SelfTest { seed: training.settings.seed, ..SelfTest::default() },
+        training,
+    }
 }
 
-/// Measures a baseline anew, as at the end of its training: for one that an earlier version of this program trained, whose
-/// inference was another. Its weights stay, its manifest and so its digest become those that training it now would give.
+/// Certifies a model again, as at the end of its training, for a model from an earlier version of this program with another
+/// inference. The weights stay the same; the manifest, and with it the digest, become those that a training now would give.
 ///
 /// # Errors
 /// As [`train`].
@@ -226,7 +253,7 @@ pub fn renew(baseline: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
     certify(baseline, weights)
 }
 
-/// The trained flow measures itself: what goes into the manifest is what a loaded baseline gives.
+/// Measures accuracy, calibration and identifiability of a trained model, completes its manifest, and loads it back.
 fn certify(draft: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
     let simulator = draft.simulator();
     let mut manifest = draft.manifest.clone();
@@ -245,17 +272,17 @@ fn certify(draft: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
         exact.map_or_else(Vec::new, |s| s.column_iter().map(|shape| shape.iter().copied().collect()).collect());
     let shapes = manifest.self_test.shapes.iter().cloned().map(Some).collect();
     let observation = Observation { shapes, ..Observation::complete(&manifest.self_test.frequencies_hz) };
-    // The flow's own draws: which of them the simulation keeps can hang on the last digit.
+    // The self-test uses the flow's draws: resampling can depend on their last digits.
     let test_draws = draft.propose(&[observation], SELF_TEST_DRAWS, manifest.self_test.seed)?;
     manifest.self_test.expected = rows(&test_draws.theta);
 
-    let mut manifest_json = serde_json::to_vec_pretty(&manifest).map_err(|e| Box::new(super::LoadError::from(e)))?;
+    let mut manifest_json = serde_json::to_vec_pretty(&manifest).map_err(|e| Box::new(LoadError::from(e)))?;
     manifest_json.push(b'\n');
     let baseline = Baseline::load(&manifest_json, &weights, simulator).map_err(Box::new)?;
     Ok(Trained { baseline, manifest_json, weights })
 }
 
-/// True when the training ended before its last epoch because the loss was not finite.
+/// Whether the training ended before its last epoch because the loss was not finite.
 pub fn diverged(manifest: &Manifest) -> bool {
     matches!(manifest.training.stopped, Stopped::Diverged { .. })
 }
@@ -284,13 +311,12 @@ fn check(samples: usize, noise_range: NoiseRange, flow: &FlowSettings, settings:
     }
 }
 
-/// A seed for each of the three sets, so that they never share a draw.
+/// A seed for each purpose, so that the sets never share a draw.
 fn purpose_seed(seed: u64, purpose: &str) -> u64 {
-    use rand::RngCore as _;
     stats::stream(seed, purpose).next_u64()
 }
 
-/// Sizes that the effects moved by a covariate have in a training set.
+/// Ranges of sizes in a training set, of the effects that vary with a covariate.
 fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
     let mut first = 0;
     let mut ranges = Vec::new();
@@ -300,7 +326,7 @@ fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
         if effect.varies() {
             let sizes = || set.effect_sizes.iter().map(|sizes| sizes[column]);
             let (lowest, highest) = (sizes().fold(f64::INFINITY, f64::min), sizes().fold(f64::NEG_INFINITY, f64::max));
-            // An effect that never moves is no condition.
+            // The size of a constant effect carries no information.
             if lowest < highest {
                 ranges.push(EffectRange { column, lowest, highest });
             }
@@ -309,12 +335,12 @@ fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
     ranges
 }
 
-/// A measurement of each pair, with noise and missing modes drawn as in training.
+/// Simulates one measurement of each pair of a set, with noise and missing modes drawn as in training.
 pub fn observe(
     simulator: &Simulator,
     conditions: &Conditions,
     set: &TrainingSet,
-    stream: &mut stats::Stream,
+    stream: &mut Stream,
 ) -> Vec<Observation> {
     let one = |(row, (exact, sizes)): (usize, (Vec<f64>, &Vec<f64>))| {
         let multiples = conditions.draw(exact.len(), stream);
@@ -328,7 +354,10 @@ pub fn observe(
     rows(&set.frequencies_hz).into_iter().zip(&set.effect_sizes).enumerate().map(one).collect()
 }
 
-/// Measures a baseline on pairs it has not seen: likelihood, R² (paper Fig. 8), inverse error.
+/// Measures a model on held-out pairs: mean log-density of the truth, R² of posterior means and samples, inverse error of
+/// the flow. `theta`: `[n, d]`, the truths of the n observations.
+///
+/// Source: Wang et al. (2025), Fig. 8.
 ///
 /// # Errors
 /// [`InferenceError`] when a draw is not finite.
@@ -342,7 +371,7 @@ pub fn validate(
     let losses: Vec<f64> = baseline.log_density_unit_box(theta, observations)?.iter().map(|log_q| -log_q).collect();
     let samples = baseline.infer(observations, HELD_OUT_DRAWS, seed)?;
     let means = samples.means();
-    let validation = |(column, parameter): (usize, &crate::parameter::Parameter)| {
+    let validation = |(column, parameter): (usize, &Parameter)| {
         let truth: Vec<f64> = theta.column(column).iter().copied().collect();
         let mean: Vec<f64> = means.column(column).iter().copied().collect();
         let single: Vec<f64> = samples.column(column).into_iter().step_by(HELD_OUT_DRAWS).collect();
@@ -364,7 +393,7 @@ pub fn validate(
     })
 }
 
-/// Largest |u − u'| after x → z → x', u the position in the prior box.
+/// Largest |u − u'| after x → z → x', where u is the position in the training box.
 fn inverse_error(
     baseline: &Baseline,
     theta: &DMatrix<f64>,
@@ -374,12 +403,12 @@ fn inverse_error(
         return inverse_error_from_fit(baseline, theta, observations);
     }
     let x = to_real_line(theta, &baseline.training_space)?.to_dtype(DType::F32)?;
-    let context = baseline.flow.summarise(&baseline.condition(observations)?)?;
+    let context = baseline.condition(observations)?;
     let (z, _) = baseline.flow.forward(&x, &context)?;
     let back = baseline.flow.inverse(&z, &context)?;
     let unit = |t: &Tensor| t.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();
     let pairs = unit(&x)?.into_iter().zip(unit(&back.0)?);
-    Ok(pairs.map(|(a, b)| (super::logistic(a) - super::logistic(b)).abs()).fold(0.0, f64::max))
+    Ok(pairs.map(|(a, b)| (logistic(a) - logistic(b)).abs()).fold(0.0, f64::max))
 }
 
 /// Rows of a matrix.

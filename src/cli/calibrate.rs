@@ -1,4 +1,4 @@
-//! `modalwatch calibrate`: is a trained baseline as sure as it should be, with plots.
+//! `modalwatch calibrate`: simulation-based calibration of a trained baseline, with plots.
 
 use std::path::{Path, PathBuf};
 
@@ -6,8 +6,9 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::write_whole;
-use crate::baseline::calibration::{calibrate as measure, place, CalibrationRecord, CellRanks, DRAWS};
+use crate::baseline::calibration::{calibrate as measure, cell_title, CellRanks, DRAWS};
 use crate::baseline::library::{find_structure, Library};
+use crate::baseline::manifest::CalibrationRecord;
 use crate::baseline::train::renew;
 use crate::baseline::Baseline;
 use crate::plot::{escaped, page, table, Line, Plot};
@@ -18,17 +19,17 @@ pub struct CalibrateArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// The trained baseline's .safetensors, with its .json beside it; the shipped one without it
+    /// The .safetensors file of the trained baseline, with its .json beside it [default: the shipped baseline]
     #[arg(long)]
     model: Option<PathBuf>,
-    /// Seed of the simulations; training has used others
+    /// Seed of the simulations; the training uses other seeds
     #[arg(long, default_value_t = 1_000_003)]
     seed: u64,
-    /// Write what is measured into the manifest beside --model, as training it now would: for a baseline that an earlier
-    /// version of this program trained
+    /// Write the measured calibration to the manifest beside --model, as a new training would: for a baseline that was trained
+    /// by an earlier version of this program
     #[arg(long, requires = "model")]
     renew: bool,
-    /// HTML page with the plots to write
+    /// Write the plots as one HTML page
     #[arg(long)]
     out: Option<PathBuf>,
     /// Print the record as JSON
@@ -36,10 +37,10 @@ pub struct CalibrateArgs {
     json: bool,
 }
 
-/// Measures, prints, and fails when the calibration does.
+/// Measures and prints the calibration.
 ///
 /// # Errors
-/// A baseline that is refused, a file that cannot be written, a calibration that fails.
+/// An invalid baseline, a file that cannot be written, a calibration that fails.
 pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     let mut baseline = load(&args.structure, args.model.as_deref())?;
     if let Some(path) = args.model.as_deref().filter(|_| args.renew) {
@@ -61,12 +62,13 @@ pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The shipped baseline of a structure, or one from a file.
+/// The shipped baseline of a structure, or the one in a file.
 pub(super) fn load(structure: &str, model: Option<&Path>) -> anyhow::Result<std::sync::Arc<Baseline>> {
     let simulator = find_structure(structure)?;
     let Some(weights) = model else {
         let entry = Library::open(None)?.get(simulator.id()).and_then(|e| e.baseline.clone());
-        return entry.with_context(|| format!("no baseline of {} is shipped: give --model", simulator.id()));
+        return entry
+            .with_context(|| format!("no baseline of {} is shipped: name a file with --model", simulator.id()));
     };
     let read = |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
     let loaded = Baseline::load(&read(&weights.with_extension("json"))?, &read(weights)?, &simulator);
@@ -80,7 +82,7 @@ fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
     let cell_rows = record.cells.iter().flat_map(|cell| {
         cell.parameters.iter().map(move |p| {
             vec![
-                place(cell.noise_multiple, cell.missing_mode, cell.without_shapes),
+                cell_title(cell.noise_multiple, cell.missing_mode, cell.without_shapes),
                 p.name.clone(),
                 format!("{:.3}", p.coverage_90),
                 format!("{:.3}", p.coverage_50),
@@ -119,9 +121,10 @@ fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) ->
     };
     let names: Vec<String> = baseline.space().iter().map(|p| p.name.clone()).collect();
     let plots: String = ranks.iter().map(|cell| plot(cell, &names).svg()).collect();
-    let explain = "<p>Each line: share of the simulations whose true value has at most this rank among the posterior draws, \
-                   less what a right posterior gives (0). Within the grey band 99 % of right posteriors stay. Above on the \
-                   left and below on the right: too sure; the other way: too unsure.</p>";
+    let explain = "<p>Each line shows the share of simulations whose true value has at most this rank among the posterior draws, \
+                   minus the share for a calibrated posterior. 99 % of calibrated posteriors stay inside the grey band. A line \
+                   above the band on the left and below it on the right means that the posteriors are too narrow; the opposite \
+                   means that they are too wide.</p>";
     page(
         &format!("Calibration of {}", baseline.simulator().id()),
         &[
@@ -131,7 +134,7 @@ fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) ->
     )
 }
 
-/// Difference of the cumulative ranks from the uniform.
+/// The distribution of the ranks in a cell minus the uniform distribution.
 fn plot(cell: &CellRanks, names: &[String]) -> Plot {
     let difference = |ranks: &[usize]| -> Vec<(f64, f64)> {
         let mut counts = vec![0_usize; DRAWS + 1];
@@ -153,7 +156,7 @@ fn plot(cell: &CellRanks, names: &[String]) -> Plot {
     let mut lines: Vec<Line> =
         parameters.map(|(name, ranks)| Line { name: name.clone(), points: difference(ranks) }).collect();
     lines.push(Line { name: "TARP".to_owned(), points: difference(&cell.tarp_ranks) });
-    // Largest excursion of an empirical distribution, 99 %: Kolmogorov's 1.63/√n.
+    // 99 % quantile of the largest deviation of an empirical distribution by Kolmogorov: 1.63/√n.
     let width = 1.63 / (cell.tarp_ranks.len() as f64).sqrt();
     Plot {
         title: cell.title.clone(),

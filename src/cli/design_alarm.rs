@@ -1,10 +1,10 @@
-//! `modalwatch design-alarm`: what the alarm charts of a structure will find, before anything is measured.
+//! `modalwatch design-alarm`: the changes that the alarm charts of a structure will detect, computed before anything is
+//! measured.
 
 use std::path::PathBuf;
 
 use anyhow::Context as _;
 use clap::Args;
-use nalgebra::DMatrix;
 use serde::Serialize;
 
 use super::{named_numbers, write_whole};
@@ -12,49 +12,50 @@ use crate::alarm::chart::{shared, standard_error};
 use crate::alarm::detection::{detection, Detection};
 use crate::alarm::limits::{limits, Limits, Situation};
 use crate::alarm::AlarmSettings;
+use crate::baseline::identifiability::fisher_covariance;
 use crate::baseline::library::find_structure;
 use crate::damage::ChartReference;
-use crate::parameter::DamageDirection;
+use crate::parameter::{DamageDirection, Parameter};
 use crate::plot::{page, table, Line, Plot};
-use crate::simulator::Simulator;
+use crate::simulator::{DerivedStiffness, Simulator};
 
-/// Simulate the alarm charts of a structure: false alarms, delay, and the loss found with 90 % probability.
+/// Simulate the alarm charts of a structure: false alarms, delay, and the loss that is detected with 90 % probability.
 #[derive(Debug, Args)]
 pub struct DesignAlarmArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// Healthy population of one parameter, as name=mean,std in its unit; once for each parameter
+    /// Undamaged population of one parameter, as name=mean,std in its unit; once per parameter
     #[arg(long = "parameter", required = true, value_parser = |t: &str| named_numbers(t, 2, "name=mean,std"))]
     parameters: Vec<(String, Vec<f64>)>,
-    /// Measurements of a batch
+    /// Number of measurements per batch
     #[arg(long, default_value_t = 20)]
     measurements: usize,
-    /// Measurements of the undamaged state
+    /// Number of measurements of the undamaged reference
     #[arg(long, default_value_t = 100)]
     baseline: usize,
-    /// Noise as a multiple of the structure's
+    /// Noise as a multiple of the structure's noise
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
-    /// Wanted mean run of healthy batches to a false alarm
+    /// Required mean number of undamaged batches between false alarms
     #[arg(long, default_value_t = AlarmSettings::default().mean_run_batches)]
     mean_run_batches: f64,
-    /// Points above the limit that make an alarm
+    /// Number of points above the limit that raise an alarm
     #[arg(long, default_value_t = AlarmSettings::default().needed)]
     needed: usize,
-    /// Points in a row among which they must be
+    /// Number of consecutive points that are considered
     #[arg(long, default_value_t = AlarmSettings::default().window)]
     window: usize,
-    /// Weight of the newest batch in the moving average; 0 switches it off
+    /// Weight of the latest batch in the moving average; 0 disables it
     #[arg(long, default_value_t = AlarmSettings::default().ewma_weight)]
     ewma_weight: f64,
-    /// Damaged batches within which a loss shall be found
+    /// Number of damaged batches within which a loss must be detected
     #[arg(long, default_value_t = 3)]
     within: usize,
-    /// Seed of everything random
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// HTML page with the plot to write
+    /// Write an HTML page with plots to this file
     #[arg(long)]
     out: Option<PathBuf>,
     /// Print the result as JSON
@@ -84,76 +85,58 @@ struct ParameterReport {
     unit: String,
     mean: f64,
     std: f64,
-    /// Standard deviation that the noise gives one measurement's parameter.
+    /// Standard deviation of the parameter due to the noise of one measurement.
     noise_std: f64,
-    /// Standard error of a batch against the undamaged state.
+    /// Standard error of the difference between a batch and the undamaged reference.
     standard_error: f64,
-    /// Relative change found within the batches with 90 % probability (a90).
+    /// Relative change that is detected within the given batches with 90 % probability (a90).
     a90: Option<f64>,
-    /// For a parameter that sets springs by a law: the same as loss of their stiffness.
+    /// For a parameter that sets springs by a law: the same change as a loss of their stiffness.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     a90_of_stiffness: Vec<(String, f64)>,
 }
 
-/// Simulates and prints.
+/// The population of one parameter and the accuracy of its estimates.
+#[derive(Clone, Copy)]
+struct Moments {
+    mean: f64,
+    std: f64,
+    noise_std: f64,
+}
+
+/// Simulates the charts and prints what they detect.
 ///
 /// # Errors
 /// A structure or population that is refused, a file that cannot be written.
 pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
-    anyhow::ensure!(args.measurements > 0 && args.within > 0, "--measurements and --within must be at least 1");
-    anyhow::ensure!(args.baseline >= 2, "--baseline must be at least 2 measurements");
-    anyhow::ensure!(args.noise > 0.0 && args.noise.is_finite(), "--noise must be above 0");
-    let settings = AlarmSettings {
-        mean_run_batches: args.mean_run_batches,
-        needed: args.needed,
-        window: args.window,
-        ewma_weight: args.ewma_weight,
-        ..AlarmSettings::default()
-    };
-    if let Some((key, value, must)) = settings.problem() {
-        anyhow::bail!("{key} is {value}: it must be {must}");
-    }
+    let settings = settings(args)?;
     let moments = moments(&simulator, &args.parameters)?;
     let noise_std = noise_std(&simulator, &moments, args.noise)?;
-    let watched: Vec<usize> =
-        (0..moments.len()).filter(|&k| simulator.space().as_slice()[k].damage != DamageDirection::None).collect();
-    anyhow::ensure!(!watched.is_empty(), "no parameter of {} has a damaged side", simulator.id());
-    let reference = |k: usize| ChartReference {
-        mean: moments[k].0,
-        std: moments[k].1.hypot(noise_std[k]),
-        within: noise_std[k].powi(2),
-        measurements: args.baseline,
-        batches: 1,
-        degrees_of_freedom: args.baseline - 1,
-        between_batches_std: 0.0,
-    };
-    let error = |k: usize| standard_error(&reference(k), noise_std[k].powi(2), args.measurements);
-    // The same for all: batch and undamaged state have the same noise.
-    let shared = shared(&reference(watched[0]), noise_std[watched[0]].powi(2), args.measurements);
+    let of = |k: usize| Moments { mean: moments[k].0, std: moments[k].1, noise_std: noise_std[k] };
+    let watched: Vec<(&Parameter, usize)> =
+        simulator.space().iter().zip(0..).filter(|(p, _)| p.damage != DamageDirection::None).collect();
+    anyhow::ensure!(!watched.is_empty(), "no parameter of {} has a direction of damage", simulator.id());
+    // This share is the same for all charts, since batch and undamaged reference have the same noise.
+    let first = of(watched[0].1);
+    let shared = shared(&reference(first, args.baseline), first.noise_std.powi(2), args.measurements);
     let situation = Situation { shared, degrees_of_freedom: args.baseline - 1, charts: watched.len() };
     let limits = limits(situation, &settings);
     let found = detection(situation, &limits, &settings, args.within, args.seed);
     let shift_90 = found.shift_found(0.9);
-    let parameter = |k: usize| {
-        let p = &simulator.space().as_slice()[k];
-        let change = shift_90.map(|shift| shift * error(k));
+    let parameter = |&(p, k): &(&Parameter, usize)| {
+        let own = of(k);
+        let error = standard_error(&reference(own, args.baseline), own.noise_std.powi(2), args.measurements);
+        let change = shift_90.map(|shift| shift * error);
         ParameterReport {
             name: p.name.clone(),
             unit: p.unit.clone(),
-            mean: moments[k].0,
-            std: moments[k].1,
-            noise_std: noise_std[k],
-            standard_error: error(k),
-            a90: change.map(|change| change / moments[k].0.abs()),
-            a90_of_stiffness: change.map_or_else(Vec::new, |change| {
-                let towards = if p.damage == DamageDirection::Increase { 1.0 } else { -1.0 };
-                let loss = |s: crate::simulator::DerivedStiffness| {
-                    let (before, after) = (s.value(moments[k].0), s.value(moments[k].0 + towards * change));
-                    (s.name, (before - after) / before)
-                };
-                simulator.derived_stiffnesses().into_iter().filter(|s| s.parameter == k).map(loss).collect()
-            }),
+            mean: own.mean,
+            std: own.std,
+            noise_std: own.noise_std,
+            standard_error: error,
+            a90: change.map(|change| change / own.mean.abs()),
+            a90_of_stiffness: change.map_or_else(Vec::new, |change| stiffness_losses(&simulator, k, own.mean, change)),
         }
     };
     let report = Report {
@@ -167,7 +150,7 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
         healthy_run_batches: found.healthy_run_batches,
         healthy_run_error: found.healthy_run_error,
         within_batches: args.within,
-        parameters: watched.iter().map(|&k| parameter(k)).collect(),
+        parameters: watched.iter().map(parameter).collect(),
         curve: found.curve.clone(),
     };
     if let Some(path) = &args.out {
@@ -181,10 +164,54 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The alarm settings of the arguments, which are checked.
+fn settings(args: &DesignAlarmArgs) -> anyhow::Result<AlarmSettings> {
+    anyhow::ensure!(args.measurements > 0 && args.within > 0, "--measurements and --within must be at least 1");
+    anyhow::ensure!(args.baseline >= 2, "--baseline must be at least 2 measurements");
+    anyhow::ensure!(args.noise > 0.0 && args.noise.is_finite(), "--noise must be above 0");
+    let settings = AlarmSettings {
+        mean_run_batches: args.mean_run_batches,
+        needed: args.needed,
+        window: args.window,
+        ewma_weight: args.ewma_weight,
+        ..AlarmSettings::default()
+    };
+    match settings.problem() {
+        Some((key, value, must)) => anyhow::bail!("{key} is {value}: it must be {must}"),
+        None => Ok(settings),
+    }
+}
+
+/// The undamaged reference that `measurements` measurements of a population give.
+fn reference(of: Moments, measurements: usize) -> ChartReference {
+    ChartReference {
+        mean: of.mean,
+        std: of.std.hypot(of.noise_std),
+        within: of.noise_std.powi(2),
+        measurements,
+        batches: 1,
+        degrees_of_freedom: measurements - 1,
+        between_batches_std: 0.0,
+    }
+}
+
+/// For a parameter that sets springs by a law: the relative loss of stiffness of each when the parameter changes by
+/// `change` towards damage.
+fn stiffness_losses(simulator: &Simulator, column: usize, mean: f64, change: f64) -> Vec<(String, f64)> {
+    let damage = simulator.space().as_slice()[column].damage;
+    let towards = if damage == DamageDirection::Increase { 1.0 } else { -1.0 };
+    let loss = |s: DerivedStiffness| {
+        let (before, after) = (s.value(mean), s.value(mean + towards * change));
+        (s.name, (before - after) / before)
+    };
+    simulator.derived_stiffnesses().into_iter().filter(|s| s.parameter == column).map(loss).collect()
+}
+
+/// Mean and standard deviation of each parameter, in the order of the space.
 fn moments(simulator: &Simulator, given: &[(String, Vec<f64>)]) -> anyhow::Result<Vec<(f64, f64)>> {
     let triples: Vec<(String, f64, f64)> = given.iter().map(|(name, n)| (name.clone(), n[0], n[1])).collect();
     crate::simulator::population::Population::new(simulator.space(), &triples)?;
-    let one = |p: &crate::parameter::Parameter| {
+    let one = |p: &Parameter| {
         let (name, mean, std) =
             triples.iter().find(|(name, ..)| *name == p.name).context("every parameter is given")?;
         anyhow::ensure!(
@@ -198,7 +225,8 @@ fn moments(simulator: &Simulator, given: &[(String, Vec<f64>)]) -> anyhow::Resul
     simulator.space().iter().map(one).collect()
 }
 
-/// Standard deviation of each parameter of one measurement, by the Fisher information with the prior at the mean.
+/// Standard deviation of each parameter given the frequencies of one measurement, in its unit, by the Fisher information at
+/// the mean and the prior.
 fn noise_std(simulator: &Simulator, moments: &[(f64, f64)], noise: f64) -> anyhow::Result<Vec<f64>> {
     let theta: Vec<f64> = moments.iter().map(|m| m.0).collect();
     let (jacobian, frequencies) = (simulator.jacobian(&theta)?, simulator.frequencies_hz(&theta)?);
@@ -207,33 +235,30 @@ fn noise_std(simulator: &Simulator, moments: &[(f64, f64)], noise: f64) -> anyho
         "structure {} has no measurement noise: state it in measurement_noise",
         simulator.id()
     );
-    let width = |k: usize| simulator.space().as_slice()[k].upper - simulator.space().as_slice()[k].lower;
-    let scaled = DMatrix::from_fn(jacobian.nrows(), jacobian.ncols(), |mode, k| {
-        jacobian[(mode, k)] * width(k) / (noise * simulator.std_hz(mode, frequencies[mode]))
-    });
-    let d = moments.len();
-    let precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * 12.0;
-    let covariance = precision.cholesky().context("the Fisher information with the prior is positive")?.inverse();
-    Ok((0..d).map(|k| covariance[(k, k)].sqrt() * width(k)).collect())
+    let std_hz: Vec<f64> = frequencies.iter().enumerate().map(|(mode, f)| noise * simulator.std_hz(mode, *f)).collect();
+    let covariance = fisher_covariance(simulator, &jacobian, &std_hz, &[])
+        .context("the Fisher information of the frequencies is not finite")?;
+    let std = |(k, p): (usize, &Parameter)| covariance[(k, k)].sqrt() * (p.upper - p.lower);
+    Ok(simulator.space().iter().enumerate().map(std).collect())
 }
 
 fn print(report: &Report) {
     println!(
-        "{}: batches of {} against an undamaged state of {}, noise × {}",
+        "{}: batches of {} measurements compared with an undamaged reference of {}, noise × {}",
         report.structure, report.measurements, report.baseline_measurements, report.noise_multiple
     );
     let ewma = report.ewma_limit_standard_errors.map_or("off".to_owned(), |l| format!("{l:.2}"));
     println!("limits: one batch {:.2} standard errors, moving average {ewma}", report.shift_limit_standard_errors);
     println!(
-        "healthy operation: {:.0} ± {:.0} batches to the first false alarm (wanted {:.0})",
+        "healthy operation: {:.0} ± {:.0} batches to the first false alarm (required {:.0})",
         report.healthy_run_batches, report.healthy_run_error, report.wanted_run_batches
     );
     println!(
         "\n{:>16} {:>10} {:>10} {:>12} {:>14} {:>22}",
-        "parameter", "mean", "std", "noise std", "std error", "found with 90 % (a90)"
+        "parameter", "mean", "std", "noise std", "std error", "detected, 90 % (a90)"
     );
     for p in &report.parameters {
-        let a90 = p.a90.map_or("not found".to_owned(), |a| format!("{:.2} %", 100.0 * a));
+        let a90 = p.a90.map_or("not detected".to_owned(), |a| format!("{:.2} %", 100.0 * a));
         println!(
             "{:>16} {:>10.4} {:>10.4} {:>12.5} {:>14.5} {a90:>22}",
             p.name, p.mean, p.std, p.noise_std, p.standard_error
@@ -242,7 +267,10 @@ fn print(report: &Report) {
             println!("{:>16} as loss of stiffness of {spring}: {:.2} %", "", 100.0 * loss);
         }
     }
-    println!("a90: change found within {} damaged batches with a probability of 90 %", report.within_batches);
+    println!(
+        "a90: change that is detected within {} damaged batches with a probability of 90 %",
+        report.within_batches
+    );
 }
 
 fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
@@ -256,7 +284,7 @@ fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
             .collect(),
     };
     let plot = Plot {
-        title: format!("Found within {} batches of {}", report.within_batches, report.measurements),
+        title: format!("Detected within {} batches of {}", report.within_batches, report.measurements),
         x_label: "change of the mean, %".to_owned(),
         y_label: "probability of an alarm".to_owned(),
         lines: report.parameters.iter().map(line).collect(),
@@ -277,14 +305,14 @@ fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
         .parameters
         .iter()
         .map(|p| {
-            let a90 = p.a90.map_or("not found".to_owned(), |a| format!("{:.2} %", 100.0 * a));
+            let a90 = p.a90.map_or("not detected".to_owned(), |a| format!("{:.2} %", 100.0 * a));
             vec![p.name.clone(), format!("{:.4}", p.mean), format!("{:.4}", p.std), format!("{:.5}", p.noise_std), a90]
         })
         .collect();
     let facts = format!(
-        "<p>Batches of {} measurements against an undamaged state of {}, noise {} times the structure's. Limits: one batch \
-         {:.2} standard errors, moving average {:.2}. Healthy operation runs {:.0} ± {:.0} batches to its first false alarm \
-         (wanted {:.0}).</p>",
+        "<p>Batches of {} measurements are compared with an undamaged reference of {}; the noise is {} times the structure's. \
+         Limits: one batch {:.2} standard errors, moving average {:.2}. Without damage there are {:.0} ± {:.0} batches to the \
+         first false alarm (required {:.0}).</p>",
         report.measurements,
         report.baseline_measurements,
         report.noise_multiple,
@@ -294,15 +322,15 @@ fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
         report.healthy_run_error,
         report.wanted_run_batches
     );
-    let header = ["parameter", "mean", "std", "noise std of one measurement", "found with 90 % (a90)"];
+    let header = ["parameter", "mean", "std", "noise std of one measurement", "detected with 90 % (a90)"];
     let plots = format!("<div class=\"plots\">{}{}</div>", plot.svg(), delay.svg());
     page(
         &format!("Alarms of {}", report.structure),
-        &[("What is found".to_owned(), facts + &table(&header, &rows) + &plots)],
+        &[("Detectable changes".to_owned(), facts + &table(&header, &rows) + &plots)],
     )
 }
 
-/// A delay over the shift, from where it is short enough to be seen.
+/// A delay over the shift, where it is short enough for the plot.
 fn delays(found: &Detection, value: impl Fn(&crate::alarm::detection::DetectionPoint) -> f64) -> Vec<(f64, f64)> {
     found.curve.iter().map(|p| (p.shift, value(p))).filter(|(_, run)| *run <= 30.0).collect()
 }

@@ -1,4 +1,4 @@
-//! `modalwatch diagnose`: what the simulation gets wrong, from a structure file and measurements.
+//! `modalwatch diagnose` and `modalwatch extend`: the effects that a simulation lacks, from a structure file and measurements.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -15,31 +15,31 @@ use crate::discrepancy::extend::extend as extend_structure;
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
-use crate::measurement::check::{check_measurements, Expectation, RawMeasurement};
+use crate::measurement::check::{check_measurements, Expectation, Problem, RawMeasurement};
 use crate::measurement::csv::{self, CsvOptions, Offered, Times};
 use crate::measurement::{Covariate, CovariateKind, ModalMeasurement};
 use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 
-/// What is diagnosed.
+/// The structure and the data of a diagnosis.
 #[derive(Debug, Args)]
 pub struct StudyArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// CSV of measurements; several are taken as one after another
+    /// CSV file of measurements; several files are joined in the order given
     #[arg(long, required = true)]
     data: Vec<PathBuf>,
-    /// Rows kept for measuring the gain: last:SHARE, or where:COLUMN=CATEGORY
+    /// Rows held out for measuring the gain: last:SHARE, or where:COLUMN=CATEGORY
     #[arg(long, default_value = "last:0.25")]
     holdout: Holdout,
-    /// Column of the time [default: measured_at, or the order of the rows]
+    /// Column that holds the time [default: measured_at, or the order of the rows]
     #[arg(long)]
     time: Option<String>,
-    /// Columns that hold settings: PARAMETER=COLUMN, separated by commas; set_<parameter> is known without
+    /// Columns that hold settings: PARAMETER=COLUMN, separated by commas; columns named set_<parameter> are recognised without it
     #[arg(long, value_delimiter = ',')]
     settings: Vec<String>,
-    /// Columns that are not read, separated by commas
+    /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
     /// Seed of the bootstrap
@@ -47,7 +47,7 @@ pub struct StudyArgs {
     seed: u64,
 }
 
-/// Find what the simulation gets wrong.
+/// Find the effects that a simulation lacks.
 #[derive(Debug, Args)]
 pub struct DiagnoseArgs {
     #[command(flatten)]
@@ -60,33 +60,33 @@ pub struct DiagnoseArgs {
     json: bool,
 }
 
-/// Measurements of tables, and what had to be guessed about them.
+/// Measurements from tables, with the assumptions made in reading them.
 pub struct Tables {
     /// All rows.
     pub measurements: Vec<ModalMeasurement>,
-    /// Covariates, declared or guessed.
+    /// Covariates, those of the structure first, then those found in the tables.
     pub covariates: Vec<Covariate>,
-    /// What was guessed, for people.
+    /// The assumptions, for a person.
     pub notes: Vec<String>,
-    /// Whether the tables have times; without, the order of the rows stands for them.
+    /// Whether the tables have times; if not, the order of the rows is used.
     pub timed: bool,
 }
 
-/// How tables are read.
+/// How to read tables.
 #[derive(Debug, Clone, Default)]
 pub struct TableArgs<'a> {
-    /// Column of the time.
+    /// Column that holds the time.
     pub time: Option<&'a str>,
     /// `PARAMETER=COLUMN`.
     pub settings: &'a [String],
-    /// Columns that are not read.
+    /// Columns to ignore.
     pub ignore: &'a [String],
 }
 
-/// Diagnoses, prints, and writes the report.
+/// Diagnoses, prints the result and writes the report.
 ///
 /// # Errors
-/// Files that are refused, data that no verdict can stand on.
+/// Invalid files, or data that do not allow a diagnosis.
 pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
     let Study { simulator, data, outcome } = studied(&args.study)?;
     if let Some(path) = &args.report {
@@ -104,6 +104,7 @@ pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// A diagnosis with what it was made from.
 struct Study {
     simulator: Simulator,
     data: Data,
@@ -127,7 +128,7 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     Ok(Study { simulator, data, outcome })
 }
 
-/// Diagnose, write the causes into a new version of the structure, and train its baseline.
+/// Diagnose, add the causes to a new version of the structure, and train its baseline.
 #[derive(Debug, Args)]
 pub struct ExtendArgs {
     #[command(flatten)]
@@ -135,13 +136,13 @@ pub struct ExtendArgs {
     /// Folder for structure.json, baseline.safetensors and baseline.json
     #[arg(long)]
     out: PathBuf,
-    /// Write the structure only; train later with `modalwatch train`
+    /// Only write the structure; it can be trained later with `modalwatch train`
     #[arg(long)]
     no_training: bool,
-    /// Simulated training samples [default: as `modalwatch train`]
+    /// Number of simulated training samples [default: as for `modalwatch train`]
     #[arg(long)]
     samples: Option<usize>,
-    /// Passes over the training samples [default: as `modalwatch train`]
+    /// Number of passes over the training samples [default: as for `modalwatch train`]
     #[arg(long)]
     epochs: Option<usize>,
     /// Write the report of the diagnosis as one HTML page
@@ -149,10 +150,10 @@ pub struct ExtendArgs {
     report: Option<PathBuf>,
 }
 
-/// Diagnoses, extends and trains.
+/// Diagnoses, extends the structure and trains its baseline.
 ///
 /// # Errors
-/// As [`diagnose`]; nothing to extend with; a training that gives no flow.
+/// As [`diagnose`]; no cause to add; a training that fails.
 pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
     let Study { simulator, data, outcome } = studied(&args.study)?;
     println!("{}", outcome.diagnosis.summary);
@@ -188,25 +189,23 @@ fn print(d: &Diagnosis) {
     for cause in &d.causes {
         println!("cause ({:?}, probability {:.3}): {}", cause.class, cause.probability, cause.sentence);
         for n in &cause.parameters {
-            println!(
-                "    {:>24} {:>12.5} ({:.5} … {:.5}) {}",
-                n.name, n.value, n.interval90[0], n.interval90[1], n.unit
-            );
+            let name = if n.name == "swing" { "effect range" } else { &n.name };
+            println!("    {name:>24} {:>12.5} ({:.5} … {:.5}) {}", n.value, n.interval90[0], n.interval90[1], n.unit);
         }
     }
     for a in d.alternatives.iter().take(5) {
         println!(
-            "instead of {}: {} ({:+.1} nats); told apart by {}",
-            a.instead_of, a.cause.sentence, a.log_evidence_difference, a.told_apart_by
+            "instead of cause {}: {} ({:+.1} nats); distinguished by {}",
+            a.instead_of, a.cause.sentence, a.log_evidence_difference, a.discriminating_measurement
         );
     }
     for m in d.misfit.iter().take(8) {
         let what = m.mode.map_or_else(|| m.parameter.clone().unwrap_or_default(), |mode| format!("mode {mode}"));
-        let covariate = m.covariate.as_deref().unwrap_or("constant");
-        println!("misfit: {what} with {covariate}: {:.3} %, p = {:.1e}", m.size_percent, m.p_value);
+        let covariate = m.covariate.as_ref().map_or_else(|| "constant".to_owned(), |c| format!("depends on {c}"));
+        println!("misfit: {what}, {covariate}: {:.3} %, p = {:.1e}", m.size_percent, m.p_value);
     }
     if let Some(r) = &d.remainder {
-        println!("left unexplained: {} (p = {:.1e})", r.function, r.p_value);
+        println!("unexplained: residuals depend on {} (p = {:.1e})", r.function, r.p_value);
     }
     if let Some(g) = &d.gain {
         println!("on {} rows held out:            before      after", g.holdout_rows);
@@ -215,7 +214,7 @@ fn print(d: &Diagnosis) {
         }
         let l = &g.log_density_per_row;
         println!(
-            "  log density a row (nats)   {:>10.3} {:>10.3}   gain {:.3} ± {:.3}",
+            "  log density per row (nats) {:>10.3} {:>10.3}   gain {:.3} ± {:.3}",
             l.before, l.after, l.difference, l.standard_error
         );
         println!("  inside 90 % intervals      {:>10.3} {:>10.3}", g.coverage90.before, g.coverage90.after);
@@ -229,62 +228,84 @@ fn print(d: &Diagnosis) {
     }
 }
 
-/// Reads tables of one structure; columns that it does not declare become covariates.
+/// A table that has been read into memory.
+type Table<'a> = (&'a Path, Vec<u8>);
+
+/// Reads tables of one structure. Columns that the structure does not declare become covariates.
 ///
 /// # Errors
-/// A table that is refused, with line and column.
+/// An invalid table, with line and column.
 pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>) -> anyhow::Result<Tables> {
-    let mut tables = Tables {
-        measurements: Vec::new(),
-        covariates: simulator.covariates().to_vec(),
-        notes: Vec::new(),
-        timed: false,
-    };
-    let mut texts: Vec<(&Path, Vec<u8>)> = Vec::new();
+    let mut files: Vec<Table<'_>> = Vec::new();
     for path in paths {
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-        texts.push((path, renamed(bytes, how.settings)?));
+        files.push((path, renamed(bytes, how.settings)?));
     }
     let mut options =
         CsvOptions { times: Times::RowNumber, ignore: how.ignore.to_vec(), time_column: how.time.map(str::to_owned) };
-    let refused = |path: &Path, problems: Vec<crate::measurement::check::Problem>| {
-        let lines: Vec<String> = problems.iter().map(|p| format!("  {}: {}", p.pointer, p.message)).collect();
-        anyhow::anyhow!("{} is refused:\n{}", path.display(), lines.join("\n"))
-    };
-    for (path, bytes) in &texts {
-        let offers = csv::offered(bytes, &tables.covariates, &options, MOST_LEVELS).map_err(|p| refused(path, p))?;
-        for offer in offers {
-            match offer {
-                Offered::Covariate(covariate) => {
-                    let kind = if covariate.kind == CovariateKind::Number { "a number" } else { "a category" };
-                    tables
-                        .notes
-                        .push(format!("column {} is not declared: taken as a covariate, {kind}", covariate.name));
-                    tables.covariates.push(covariate);
-                }
-                Offered::Ignored { name, values } => {
-                    let more = if values > MOST_LEVELS { "more than" } else { "" };
-                    tables.notes.push(format!(
-                        "column {name} is text with {more} {MOST_LEVELS} different values: not taken as a covariate"
-                    ));
-                    options.ignore.push(name);
-                }
+    let mut covariates = simulator.covariates().to_vec();
+    let mut notes = Vec::new();
+    for file in &files {
+        notes.extend(add_covariates(file, &mut covariates, &mut options)?);
+    }
+    let mut tables = Tables { measurements: Vec::new(), covariates, notes, timed: false };
+    read_rows(simulator, &files, &options, how.time, &mut tables)?;
+    anyhow::ensure!(!tables.measurements.is_empty(), "the {} tables hold no measurements", files.len());
+    Ok(tables)
+}
+
+fn refused(path: &Path, problems: &[Problem]) -> anyhow::Error {
+    let lines: Vec<String> = problems.iter().map(|p| format!("  {}: {}", p.pointer, p.message)).collect();
+    anyhow::anyhow!("{} is refused:\n{}", path.display(), lines.join("\n"))
+}
+
+/// Adds the undeclared columns of a table to the covariates, or to the ignored columns; returns a note for each.
+fn add_covariates(
+    (path, bytes): &Table<'_>,
+    covariates: &mut Vec<Covariate>,
+    options: &mut CsvOptions,
+) -> anyhow::Result<Vec<String>> {
+    let offers = csv::offered(bytes, covariates, options, MOST_LEVELS).map_err(|p| refused(path, &p))?;
+    let mut notes = Vec::new();
+    for offer in offers {
+        match offer {
+            Offered::Covariate(covariate) => {
+                let kind = if covariate.kind == CovariateKind::Number { "numeric" } else { "categorical" };
+                notes.push(format!("column {} is not declared: it is used as a {kind} covariate", covariate.name));
+                covariates.push(covariate);
+            }
+            Offered::Ignored { name, values } => {
+                let more = if values > MOST_LEVELS { "more than " } else { "" };
+                notes.push(format!(
+                    "column {name} is text with {more}{MOST_LEVELS} different values: it is not used as a covariate"
+                ));
+                options.ignore.push(name);
             }
         }
     }
+    Ok(notes)
+}
+
+/// Reads the measurements of all files into `tables`, and notes how times and empty rows were handled.
+fn read_rows(
+    simulator: &Simulator,
+    files: &[Table<'_>],
+    options: &CsvOptions,
+    time_column: Option<&str>,
+    tables: &mut Tables,
+) -> anyhow::Result<()> {
     let expectation =
         Expectation { covariates: &tables.covariates, ..simulator.expectation(Timestamp::now(), usize::MAX) };
     let mut times = BTreeSet::new();
     let (mut empty, mut local, mut moved, mut earlier_rows) = (0, 0, 0, 0_i64);
-    let mut all = Vec::new();
-    for (path, bytes) in &texts {
+    for (path, bytes) in files {
         let mut raw =
-            csv::read(bytes, simulator.modes(), &tables.covariates, &options).map_err(|p| refused(path, p))?;
+            csv::read(bytes, simulator.modes(), &tables.covariates, options).map_err(|p| refused(path, &p))?;
         let rows = raw.len();
-        if let Some(column) = how.time.filter(|_| raw.iter().all(|r| r.measured_at.is_none() || untimed(r))) {
-            anyhow::bail!("{} has no column {column}, which --time names", path.display());
+        if let Some(column) = time_column.filter(|_| raw.iter().all(|r| r.measured_at.is_none() || untimed(r))) {
+            anyhow::bail!("{} has no column {column}, which --time requires", path.display());
         }
-        // Tables without times follow one another.
+        // The rows of a table without times follow those of the tables before it.
         for row in raw.iter_mut().filter(|row| untimed(row)) {
             let time = row.measured_at.as_deref().and_then(|text| Timestamp::parse(text).ok());
             let later = time.and_then(|t| Timestamp::from_micros(t.micros() + earlier_rows * 1_000_000).ok());
@@ -299,36 +320,33 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
             local += usize::from(was_local);
             moved += usize::from(was_moved);
         }
-        if raw.is_empty() {
-            continue;
+        if !raw.is_empty() {
+            tables.measurements.extend(check_measurements(raw, &expectation).map_err(|p| refused(path, &p))?);
         }
-        all.extend(check_measurements(raw, &expectation).map_err(|p| refused(path, p))?);
     }
-    anyhow::ensure!(!all.is_empty(), "no measurements in {} tables", texts.len());
     if empty > 0 {
-        tables.notes.push(format!("{empty} rows without any frequency were left out"));
+        tables.notes.push(format!("{empty} rows without any frequency were ignored"));
     }
     if local > 0 {
-        tables.notes.push(format!("{local} times have no offset: taken as UTC"));
+        tables.notes.push(format!("{local} times have no offset and are read as UTC"));
     }
-    if moved > 0 && how.time.is_some() {
-        tables.notes.push(format!("{moved} times were there already: each moved by a microsecond"));
+    if moved > 0 && time_column.is_some() {
+        tables.notes.push(format!("{moved} times occurred before: each was moved by microseconds"));
     }
-    tables.measurements = all;
-    Ok(tables)
+    Ok(())
 }
 
-/// Whether a row has the number of its row for its time.
+/// Whether the time of a row only stands for its number, because the table has no times.
 fn untimed(row: &RawMeasurement) -> bool {
     row.measured_at.as_deref().is_some_and(|time| time.starts_with("1970-"))
 }
 
-/// A time without an offset is UTC; one that was there already moves on by microseconds.
+/// Reads a time without an offset as UTC, and moves a time that occurred before by microseconds; returns whether each was done.
 fn settle_time(row: &mut RawMeasurement, times: &mut BTreeSet<i64>) -> (bool, bool) {
     let Some(text) = &row.measured_at else { return (false, false) };
     let exact = Timestamp::parse(text).map(|time| (time, false));
     let local = |_| Timestamp::parse(&format!("{}Z", text.trim().replace(' ', "T"))).map(|time| (time, true));
-    // The check names a mistake with its line.
+    // An invalid time is reported with its line when the measurements are checked.
     let Ok((time, local)) = exact.or_else(local) else { return (false, false) };
     let mut micros = time.micros();
     while !times.insert(micros) {
@@ -341,19 +359,19 @@ fn settle_time(row: &mut RawMeasurement, times: &mut BTreeSet<i64>) -> (bool, bo
     (local, moved)
 }
 
-/// The table with the columns of settings named as such.
+/// The table with the columns of settings renamed to `set_<parameter>`.
 fn renamed(bytes: Vec<u8>, settings: &[String]) -> anyhow::Result<Vec<u8>> {
     if settings.is_empty() {
         return Ok(bytes);
     }
-    let text = String::from_utf8(bytes).context("not UTF-8: save the table as UTF-8")?;
+    let text = String::from_utf8(bytes).context("the table is not UTF-8: save it as UTF-8")?;
     let (mut header, rest) = {
         let (header, rest) = text.split_once('\n').unwrap_or((&text, ""));
         (header.to_owned(), rest.to_owned())
     };
     for setting in settings {
         let (parameter, column) =
-            setting.split_once('=').with_context(|| format!("{setting:?} should read PARAMETER=COLUMN"))?;
+            setting.split_once('=').with_context(|| format!("{setting:?} must read PARAMETER=COLUMN"))?;
         let separator = |c: char| matches!(c, ',' | ';' | '\t');
         let mut found = false;
         let mut renamed = String::new();

@@ -8,8 +8,8 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::write_whole;
+use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::find_structure;
-use crate::baseline::manifest::NoiseRange;
 use crate::baseline::train::train;
 use crate::baseline::Baseline;
 use crate::flow::train::TrainSettings;

@@ -1,4 +1,4 @@
-//! `modalwatch train`: structure in, baseline out.
+//! `modalwatch train`: trains the baseline of a structure by simulation.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -8,8 +8,9 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::write_whole;
+use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::{find_structure, read_structure_file};
-use crate::baseline::manifest::{Manifest, NoiseRange, ValidationRecord};
+use crate::baseline::manifest::{Manifest, ValidationRecord};
 use crate::baseline::train::{default_epochs, default_samples, diverged, train as train_baseline, Trained};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -32,13 +33,13 @@ pub struct TrainArgs {
     /// parameters or with mode shapes]
     #[arg(long)]
     epochs: Option<usize>,
-    /// Coupling units of the flow; more bend more and cost more [default: 4]
+    /// Coupling units of the flow; more units represent more complex posteriors and take longer [default: 4]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=64))]
     units: Option<u16>,
-    /// Noise the baseline shall cover, as multiples of the structure's own
+    /// Noise that the baseline must cover, as multiples of the noise of the structure
     #[arg(long, value_name = "LOW,HIGH", value_parser = noise_range, default_value = "0.1,5")]
     noise_range: NoiseRange,
-    /// Seed of everything random; the same seed gives the same files
+    /// Seed of all random numbers; the same seed gives the same files
     #[arg(long, default_value_t = TrainSettings::default().seed)]
     seed: u64,
     /// Print the result as JSON
@@ -46,24 +47,24 @@ pub struct TrainArgs {
     json: bool,
 }
 
-/// Trains, writes the files and prints what was reached.
+/// Trains the baseline, writes its files and prints its validation.
 ///
 /// # Errors
-/// A structure file that is refused, a training that gives no flow, a folder that cannot be written.
+/// An invalid structure file, a training that fails, a folder that cannot be written.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("models").join(simulator.id().as_str()));
-    // A folder that cannot be written should not be found out after minutes of training.
-    std::fs::create_dir_all(&out).with_context(|| format!("cannot make the folder {}", out.display()))?;
+    // Before the training, so that minutes are not wasted if the folder cannot be written.
+    std::fs::create_dir_all(&out).with_context(|| format!("cannot create the folder {}", out.display()))?;
 
     let own_file =
         ["structure.toml", "structure.json"].map(|name| out.join(name)).into_iter().find(|path| path.exists());
     if let Some(path) = &own_file {
-        // A baseline beside another structure's file would be refused when it is loaded.
+        // A baseline in the folder of another structure would be refused when it is loaded.
         let beside = read_structure_file(path)?;
         anyhow::ensure!(
             beside.digest() == simulator.digest(),
-            "{} describes another structure than {}: choose another --out",
+            "{} describes a different structure than {}: choose another folder with --out",
             path.display(),
             args.structure
         );
@@ -73,7 +74,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         let error = |mode: usize| format!("{:.2e}", table.emulator().relative_error(mode));
         let errors: Vec<String> = (0..simulator.modes()).map(error).collect();
         eprintln!(
-            "emulator of {} runs: relative error of the modes on runs left out {}",
+            "emulator of {} runs: relative error of each mode on runs left out {}",
             table.runs(),
             errors.join(", ")
         );
@@ -85,20 +86,11 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let settings = TrainSettings { epochs, seed: args.seed, ..TrainSettings::default() };
     let mut flow = FlowSettings::default();
     flow.units = args.units.map_or(flow.units, usize::from);
-    let bar = ProgressBar::new(epochs as u64);
-    let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
-    bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
     let started = Instant::now();
-    let trained = train_baseline(&simulator, samples, args.noise_range, &flow, &settings, |epoch| {
-        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
-        bar.set_position(epoch.epoch as u64);
-    })?;
-    bar.finish_and_clear();
+    let trained = train_into(&out, &simulator, samples, args.noise_range, &flow, &settings)?;
     let seconds = started.elapsed().as_secs_f64();
 
-    write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
-    write_whole(&out.join("baseline.json"), &trained.manifest_json)?;
-    // A folder that holds its own structure is found by `serve --models`.
+    // `serve --models` only finds folders that contain the structure.
     if own_file.is_none() {
         write_whole(&out.join("structure.json"), simulator.definition().canonical_json().as_bytes())?;
     }
@@ -119,19 +111,19 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     print_record(manifest);
     if diverged(manifest) {
         println!(
-            "The loss was not finite at the end: the weights of epoch {} were kept.",
+            "The loss was not finite at the end of the training: the weights of epoch {} were kept.",
             manifest.training.best_epoch
         );
     }
     Ok(())
 }
 
-/// Samples and epochs of a training, where they are not given.
+/// Number of samples and epochs of a training: those given, otherwise the defaults for the structure.
 pub(super) fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize>) -> (usize, usize) {
     (samples.unwrap_or_else(|| default_samples(simulator)), epochs.unwrap_or_else(|| default_epochs(simulator)))
 }
 
-/// Trains with a progress bar and writes the two files of the baseline into a folder.
+/// Trains with a progress bar and writes the two files of the baseline to a folder.
 pub(super) fn train_into(
     out: &std::path::Path,
     simulator: &Simulator,
@@ -153,6 +145,7 @@ pub(super) fn train_into(
     Ok(trained)
 }
 
+/// Prints the identifiability and the calibration of a baseline.
 pub(super) fn print_record(manifest: &Manifest) {
     for p in &manifest.identifiability.parameters {
         let (name, left) = (&p.name, 100.0 * p.variance_left);
@@ -162,14 +155,14 @@ pub(super) fn print_record(manifest: &Manifest) {
         );
     }
     for group in &manifest.identifiability.groups {
-        println!("these modes cannot tell apart: {}", group.join(", "));
+        println!("the modes cannot distinguish these parameters: {}", group.join(", "));
     }
     let calibration = &manifest.calibration;
     if calibration.passed() {
         println!("calibration passed in {} cells of {} simulations", calibration.cells.len(), calibration.simulations);
         return;
     }
-    println!("CALIBRATION FAILED: the service will not use this baseline unless it is told to");
+    println!("CALIBRATION FAILED: the service does not use this baseline unless it is configured to");
     for failure in &calibration.failures {
         println!("  {failure}");
     }
@@ -179,7 +172,7 @@ fn noise_range(text: &str) -> Result<NoiseRange, String> {
     let numbers: Vec<f64> = text.split(',').filter_map(|t| t.trim().parse().ok()).collect();
     match numbers[..] {
         [lowest, highest] => Ok(NoiseRange { lowest, highest }),
-        _ => Err("two numbers with a comma between them, such as 0.1,5".to_owned()),
+        _ => Err("must be two numbers separated by a comma, such as 0.1,5".to_owned()),
     }
 }
 

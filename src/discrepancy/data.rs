@@ -1,4 +1,4 @@
-//! Measurements as the study of discrepancies takes them: rows in time order, logarithms of frequencies, covariates.
+//! Measurements in the form that a diagnosis uses: rows in order of time, logarithms of frequencies, covariates, settings.
 
 use std::collections::BTreeMap;
 
@@ -7,13 +7,13 @@ use crate::quantity::{Digest, Hertz};
 use crate::simulator::law::{lagged, Input, Law, LawKind};
 use crate::simulator::Simulator;
 
-/// Name of time among the covariates; its unit is [`Data::time_unit`] since the first row.
+/// Name of the covariate time, counted from the first row in the unit [`Data::time_unit`].
 pub const TIME: &str = "time";
 
-/// Least relative standard deviation of a frequency: a structure without noise still has data of finite precision.
+/// Smallest relative standard deviation of a frequency: data have a finite precision even if no noise is stated.
 const LEAST_NOISE: f64 = 1e-5;
 
-/// Most categories that a text column may have to be a covariate.
+/// Greatest number of categories of a covariate.
 pub const MOST_LEVELS: usize = 12;
 
 const MICROS_A_DAY: f64 = 86_400e6;
@@ -21,42 +21,43 @@ const MICROS_A_DAY: f64 = 86_400e6;
 /// Values of a covariate.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Values {
-    /// NaN where missing.
+    /// One number for each row; NaN if missing.
     Numbers(Vec<f64>),
-    /// Names, and for each row an index among them.
+    /// Names of the categories, and for each row an index among them; `None` if missing.
     Categories(Vec<String>, Vec<Option<usize>>),
 }
 
-/// A covariate of the rows.
+/// A covariate with its values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Column {
-    /// Its name with its unit.
+    /// Its name, which ends with its unit.
     pub name: String,
     /// Its values.
     pub values: Values,
 }
 
-/// Rows of measurements in the order of time.
+/// n measurements of m modes and d parameters, in order of time.
 #[derive(Debug, Clone)]
 pub struct Data {
-    /// Days since the first row; where no time is known, the number of the row.
+    /// Days since the first row, `[n]`; the index of the row if no times are known.
     pub times_days: Vec<f64>,
-    /// `day`, or `row` where no time is known.
+    /// `day`, or `row` if no times are known.
     pub time_unit: &'static str,
-    /// ln f, `[n][m]`, f in Hz; NaN where a mode is missing.
+    /// ln f, `[n][m]`, f in Hz; NaN if a mode is missing.
     pub log_frequencies: Vec<Vec<f64>>,
-    /// Relative standard deviation of each frequency as stated by the row or the structure, `[n][m]`.
+    /// Relative standard deviation of each frequency as stated by the row or by the structure, with the error of an emulator,
+    /// `[n][m]`.
     pub noise: Vec<Vec<f64>>,
-    /// Parameters set by the experimenter, `[n][d]`.
+    /// Values of the parameters that the experimenter set, `[n][d]`, in their own units.
     pub settings: Vec<Vec<Option<f64>>>,
-    /// Covariates, time last.
+    /// Covariates; the last is time.
     pub columns: Vec<Column>,
     /// Digest of the measurements.
     pub digest: Digest,
 }
 
 impl Data {
-    /// Sorts measurements by time and turns them into rows.
+    /// Sorts measurements by time and converts them to rows.
     pub fn new(simulator: &Simulator, measurements: &[ModalMeasurement]) -> Self {
         let mut sorted: Vec<&ModalMeasurement> = measurements.iter().collect();
         sorted.sort_by_key(|m| m.measured_at);
@@ -86,7 +87,7 @@ impl Data {
         let mut columns: Vec<Column> =
             names.into_iter().map(|(name, category)| column(name, category, &sorted)).collect();
         columns.push(Column { name: TIME.to_owned(), values: Values::Numbers(times_days.clone()) });
-        let content = serde_json::to_vec(&sorted).expect("checked measurements are plain data");
+        let content = serde_json::to_vec(&sorted).expect("measurements can be written as JSON");
         Self {
             settings: sorted.iter().map(setting).collect(),
             digest: Digest::of(&[&content]),
@@ -98,7 +99,7 @@ impl Data {
         }
     }
 
-    /// The same with the order of the rows for their time: for tables without one.
+    /// The same data with the index of each row as its time, for tables without times.
     #[must_use]
     pub fn by_order(mut self) -> Self {
         self.times_days = (0..self.rows()).map(|row| row as f64).collect();
@@ -114,14 +115,14 @@ impl Data {
         self.times_days.len()
     }
 
-    /// The covariate of a name.
+    /// The covariate with this name.
     pub fn column(&self, name: &str) -> Option<&Column> {
         self.columns.iter().find(|c| c.name == name)
     }
 
-    /// The covariate of a law at each row; `lag_days` where the law has one.
+    /// The input of a law at each row, `[n]`; `lag_days` is used by a law with a lag.
     ///
-    /// A lag is followed over all rows, so this must be asked of all rows, not of a part of them.
+    /// The result is for all rows because a lagged covariate depends on all earlier ones.
     pub fn inputs(&self, law: &Law, lag_days: Option<f64>) -> Vec<Input> {
         let Some(column) = law.covariate.as_deref().and_then(|name| self.column(name)) else {
             return vec![if law.covariate.is_none() { Input::Number(0.0) } else { Input::Missing }; self.rows()];
@@ -144,7 +145,7 @@ impl Data {
 }
 
 impl Column {
-    /// Its numbers where they are known, in the order of `rows`.
+    /// Its known numbers in `rows`, in that order; empty for categories.
     pub fn numbers(&self, rows: &[usize]) -> Vec<f64> {
         match &self.values {
             Values::Numbers(values) => rows.iter().map(|r| values[*r]).filter(|v| v.is_finite()).collect(),

@@ -1,19 +1,20 @@
-//! Causes in words and numbers that people understand.
+//! Causes in words and numbers for a person.
 
-use nalgebra::DVector;
+use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::data::{Data, Values, TIME};
+use super::effect::FittedEffect;
+use super::fit::Fit;
 use super::grammar::{Candidate, Class};
-use super::model::{Effect, Fit};
-use super::select::Ranked;
+use super::rank::Ranked;
 use crate::physics::effect::Target;
 use crate::physics::{Form, Node};
 use crate::simulator::law::{Input, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
 
-/// Standard deviations to the edge of a 90 % interval.
+/// Half the width of a 90 % interval of a normal distribution, in standard deviations.
 const Z90: f64 = 1.644_853_626_951_472;
 
 /// What a cause acts on.
@@ -22,12 +23,12 @@ pub struct TargetName {
     /// `spring`, `spring_group`, `mass`, `mass_group`, `frequency_scale`, `frequency_offset`, `setting`, `added_spring`,
     /// `oscillator`, `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table.
     pub kind: String,
-    /// Spring, mass, beam, parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes.
+    /// Name of the spring, mass, beam or parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes.
     pub name: String,
-    /// Nodes of an added spring.
+    /// Nodes at the ends of an added spring.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub between: Option<[String; 2]>,
-    /// Category that differs.
+    /// The category that differs.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub level: Option<String>,
 }
@@ -35,28 +36,29 @@ pub struct TargetName {
 /// A number of a cause.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct NamedNumber {
-    /// `swing` over the middle 90 % of the covariate or `size`, then the numbers of the law.
+    /// First `swing`, the effect range (the effect at the 95 % quantile of the covariate minus that at the 5 % quantile), or
+    /// `size`; then the numbers of the law.
     pub name: String,
-    /// Its unit; `share` of the target where it is relative.
+    /// Its unit; `share` for a fraction of the target.
     pub unit: String,
     /// Most probable value.
     pub value: f64,
-    /// 90 % interval.
+    /// Ends of the 90 % interval.
     pub interval90: [f64; 2],
 }
 
-/// A cause, as the report gives it.
+/// A cause as it is reported.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Cause {
     /// What changes.
     pub target: TargetName,
     /// Form of the law.
     pub law: LawKind,
-    /// Under which covariate; `null` for a constant.
+    /// The covariate that it depends on; `null` for a constant.
     pub covariate: Option<String>,
-    /// For people.
+    /// The cause in one sentence without capital and full stop.
     pub sentence: String,
-    /// Probability among all candidates and none.
+    /// Posterior probability among all candidates and no further cause.
     pub probability: f64,
     /// Kind of cause.
     pub class: Class,
@@ -64,9 +66,9 @@ pub struct Cause {
     pub parameters: Vec<NamedNumber>,
 }
 
-/// Name of a target.
+/// The name of a candidate's target.
 pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
-    let structure = || simulator.structure().expect("only a structure has parts to name");
+    let structure = || simulator.structure().expect("targets with parts belong to a structure");
     let spring = |index: usize| structure().springs()[index].name.clone();
     let span = |index: usize| matches!(structure().springs()[index].form, Form::Bending(_));
     let node = |node: Node| structure().node_name(node).to_owned();
@@ -94,7 +96,7 @@ pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
             between = Some([node(*from), node(*to)]);
             ("added_spring", String::new())
         }
-        Target::Oscillator(host) => ("oscillator", node(Node::Freedom(*host))),
+        Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
     };
     TargetName { kind: kind.to_owned(), name, between, level: candidate.level.clone() }
@@ -109,8 +111,8 @@ fn order_name(order: &[usize]) -> String {
     format!("modes {} swapped", swapped.join(" and "))
 }
 
-/// What a person calls a target.
-pub fn phrase(name: &TargetName) -> String {
+/// A target as the subject of a sentence.
+fn phrase(name: &TargetName) -> String {
     let of = |what: &str| format!("{what} of {}", name.name);
     match name.kind.as_str() {
         "spring" => of("the stiffness"),
@@ -122,19 +124,19 @@ pub fn phrase(name: &TargetName) -> String {
         "mass_group" => "the mass of all bodies together".to_owned(),
         "frequency_scale" if name.name.is_empty() => "the scale of all measured frequencies".to_owned(),
         "frequency_scale" => of("the scale of the measured frequency"),
-        "frequency_offset" if name.name.is_empty() => "an offset of all measured frequencies".to_owned(),
-        "frequency_offset" => of("an offset of the measured frequency"),
+        "frequency_offset" if name.name.is_empty() => "the offset of all measured frequencies".to_owned(),
+        "frequency_offset" => of("the offset of the measured frequency"),
         "setting" => format!("the setting {}", name.name),
         "added_spring" => {
             let [a, b] = name.between.clone().unwrap_or_default();
-            format!("a spring between {a} and {b} that the simulation does not have")
+            format!("the stiffness of an additional spring between {a} and {b}")
         }
-        "oscillator" => format!("a body on a spring attached to {} that the simulation does not have", name.name),
+        "oscillator" => format!("an additional body on a spring attached to {}", name.name),
         _ => format!("the order of the modes ({})", name.name),
     }
 }
 
-/// Unit of the size of a target, and the factor and unit in which people read it.
+/// Unit of the size of a target, and the factor and unit in which a sentence gives it.
 fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
     let relative = || ("share".to_owned(), 100.0, "%".to_owned());
     let plain = |unit: &str| (unit.to_owned(), 1.0, unit.to_owned());
@@ -149,7 +151,7 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
 }
 
 /// Unit of a covariate, from the end of its name.
-pub fn covariate_unit(name: &str, unit_of_time: &str) -> String {
+fn covariate_unit(name: &str, unit_of_time: &str) -> String {
     let last = name.rsplit('_').next().unwrap_or_default();
     match last {
         _ if name == TIME => unit_of_time,
@@ -166,14 +168,20 @@ pub fn covariate_unit(name: &str, unit_of_time: &str) -> String {
     .to_owned()
 }
 
-/// The swing or size of an effect and its standard deviation.
-pub fn headline(data: &Data, effect: &Effect, psi: &[f64], covariance: &nalgebra::DMatrix<f64>) -> (f64, f64) {
+/// The effect range of an effect of a numeric covariate, otherwise its size, with its standard deviation.
+///
+/// ```text
+///  R = g(c₉₅; ψ) − g(c₅; ψ),    std(R)² = aᵀ C a,    a = ∂R/∂ψ
+/// ```
+///
+/// c₅, c₉₅: quantiles of the covariate; C: covariance of ψ, `[ψ, ψ]`. Units are those of the target.
+fn effect_range(data: &Data, effect: &FittedEffect, psi: &[f64], covariance: &DMatrix<f64>) -> (f64, f64) {
     if psi.is_empty() {
         return (0.0, 0.0);
     }
     let column = effect.law.covariate.as_deref().and_then(|name| data.column(name));
-    let swings = column.filter(|_| effect.law.kind != LawKind::Step).map(|c| &c.values);
-    let Some(Values::Numbers(values)) = swings else {
+    let values = column.filter(|_| effect.law.kind != LawKind::Step).map(|c| &c.values);
+    let Some(Values::Numbers(values)) = values else {
         return (psi[0], covariance[(0, 0)].max(0.0).sqrt());
     };
     let known: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
@@ -187,7 +195,8 @@ pub fn headline(data: &Data, effect: &Effect, psi: &[f64], covariance: &nalgebra
     (high - low, (slopes.dot(&(covariance * &slopes))).max(0.0).sqrt())
 }
 
-/// A ranked candidate in words and numbers; `fit` has its effect at `index`.
+/// A ranked candidate in words and numbers; its effect is number `index` of `fit`. Covariances are divided by the share of
+/// independent rows.
 pub fn cause(
     simulator: &Simulator,
     data: &Data,
@@ -197,11 +206,11 @@ pub fn cause(
     independent_share: f64,
 ) -> Cause {
     let (effect, psi) = (&fit.effects[index], &fit.psi[index]);
-    // Rows that follow one another are worth fewer.
+    // Correlated rows carry less information than the fit assumes.
     let covariance = fit.psi_covariance(index) / independent_share;
     let name = target_name(simulator, &ranked.candidate);
     let (unit, factor, shown_unit) = unit(simulator, &effect.target);
-    let (value, std) = headline(data, effect, psi, &covariance);
+    let (value, std) = effect_range(data, effect, psi, &covariance);
     let number = |name: String, unit: String, value: f64, std: f64| NamedNumber {
         name,
         unit,
@@ -240,7 +249,16 @@ pub fn cause(
             interval90: [at, at],
         });
     }
-    let sentence = sentence(&name, effect, psi, &covariance, (value, std), (factor, &shown_unit, data.time_unit));
+    let wording = Wording {
+        name: &name,
+        effect,
+        psi,
+        covariance: &covariance,
+        factor,
+        unit: &shown_unit,
+        time_unit: data.time_unit,
+    };
+    let sentence = wording.sentence((value, std));
     Cause {
         sentence,
         target: name,
@@ -252,87 +270,118 @@ pub fn cause(
     }
 }
 
-fn sentence(
-    name: &TargetName,
-    effect: &Effect,
-    psi: &[f64],
-    covariance: &nalgebra::DMatrix<f64>,
-    (value, std): (f64, f64),
-    (factor, unit, time_unit): (f64, &str, &str),
-) -> String {
-    let what = phrase(name);
-    let plus_minus = |value: f64, std: f64, unit: &str| {
-        // "Falls by" has the sign already; an added spring has none to change.
-        let size = if name.kind == "added_spring" { value } else { value.abs() };
-        let (value, std) = rounded(factor * size, factor * std);
-        format!("{value} ± {std} {unit}")
-    };
-    let changes = |value: f64| match (name.kind.as_str(), value < 0.0) {
-        ("added_spring", _) => "acts with",
-        (_, true) => "falls by",
-        (_, false) => "rises by",
-    };
-    let covariate = effect.law.covariate.clone().unwrap_or_default();
-    let over = covariate_unit(&covariate, time_unit);
-    let slope = || effect.numbers.iter().position(|n| n.name == "slope_per_unit");
-    match effect.law.kind {
-        _ if name.kind == "mode_assignment" => format!("{what} is not the one the data have"),
-        LawKind::Constant if name.kind == "oscillator" => {
-            let hz = covariance[(1, 1)].max(0.0).sqrt();
-            let (f, f_std) = rounded(psi[1], hz);
-            format!("{what} has {}, tuned to {f} ± {f_std} Hz", plus_minus(value, std, unit))
-        }
-        LawKind::Constant if name.kind == "added_spring" => format!("{what} has {}", plus_minus(value, std, unit)),
-        LawKind::Constant => {
-            let more = if value < 0.0 { "less" } else { "more" };
-            format!("{what} is {} {more} than the simulation has", plus_minus(value, std, unit))
-        }
-        LawKind::Step => format!(
-            "{what} {} {} from {time_unit} {:.0} of the data on",
-            changes(value),
-            plus_minus(value, std, unit),
-            effect.law.reference
-        ),
-        LawKind::Category => {
-            if let Some(level) = &name.level {
-                let size = plus_minus(value, std, unit);
-                return format!("{what} {} {size} where {covariate} is {level}", changes(value));
+/// An effect with everything that its sentence needs.
+struct Wording<'a> {
+    name: &'a TargetName,
+    effect: &'a FittedEffect,
+    psi: &'a [f64],
+    covariance: &'a DMatrix<f64>,
+    /// From the unit of the target to `unit`.
+    factor: f64,
+    unit: &'a str,
+    time_unit: &'a str,
+}
+
+impl Wording<'_> {
+    /// The sentence of an effect of this size or range, with its standard deviation.
+    fn sentence(&self, (value, std): (f64, f64)) -> String {
+        let what = phrase(self.name);
+        let covariate = self.effect.law.covariate.as_deref().unwrap_or_default();
+        let size = || self.plus_minus(value, std, self.unit);
+        let changes = self.changes(value);
+        match self.effect.law.kind {
+            _ if self.name.kind == "mode_assignment" => format!("{what} differs from that of the data"),
+            LawKind::Constant => self.constant(&what, value, &size()),
+            LawKind::Step => {
+                let (unit, at) = (self.time_unit, self.effect.law.reference);
+                format!("{what} {} {} from {unit} {at:.0} of the data on", self.verb(changes), size())
             }
-            let each = |(i, level): (usize, &String)| {
-                let std = covariance[(i, i)].max(0.0).sqrt();
-                format!("{level}: {} {}", if psi[i] < 0.0 { "−" } else { "+" }, plus_minus(psi[i], std, unit))
-            };
-            let each: Vec<String> = effect.law.levels.iter().enumerate().map(each).collect();
-            format!("{what} differs with {covariate} ({})", each.join(", "))
+            LawKind::Category => match &self.name.level {
+                Some(level) => format!("{what} {} {} where {covariate} is {level}", self.verb(changes), size()),
+                None => format!("{what} differs with {covariate} ({})", self.each_category()),
+            },
+            LawKind::Linear | LawKind::Lagged => self.slope(&what, covariate),
+            LawKind::Bilinear => self.two_slopes(&what, covariate),
+            LawKind::Quadratic | LawKind::Exponential => {
+                let shape = if self.effect.law.kind == LawKind::Quadratic { "quadratically" } else { "exponentially" };
+                format!("{what} {changes} {} from the 5 % to the 95 % quantile of {covariate}, {shape}", size())
+            }
         }
-        LawKind::Linear | LawKind::Lagged => {
-            let place = slope().unwrap_or_default();
-            let (slope, slope_std) = (psi[place], covariance[(place, place)].max(0.0).sqrt());
-            let later = match effect.lag() {
-                Some(lag) => format!(", following it with a lag of {:.1} {time_unit}s", psi[lag]),
-                None => String::new(),
-            };
-            let per = format!("{unit} per {over}");
-            format!("{what} {} {} of {covariate}{later}", changes(slope), plus_minus(slope, slope_std, &per))
+    }
+
+    /// `value ± std unit`; the verb of the sentence gives the sign, except for an added spring.
+    fn plus_minus(&self, value: f64, std: f64, unit: &str) -> String {
+        let size = if self.adds_spring() { value } else { value.abs() };
+        let (value, std) = rounded(self.factor * size, self.factor * std);
+        format!("{value} ± {std} {unit}")
+    }
+
+    fn adds_spring(&self) -> bool {
+        self.name.kind == "added_spring"
+    }
+
+    fn changes(&self, value: f64) -> &'static str {
+        match value {
+            _ if self.adds_spring() => "changes by",
+            v if v < 0.0 => "falls by",
+            _ => "rises by",
         }
-        LawKind::Bilinear => {
-            let first = effect.numbers.len() - 3;
-            let (below, above, knee) = (psi[first], psi[first + 1], psi[first + 2]);
-            format!(
-                "{what} changes by {:.3} {unit} per {over} of {covariate} below {knee:.1} {over} and by {:.3} above",
-                factor * below,
-                factor * above
-            )
+    }
+
+    /// The verb before a size; the size of an added spring is its stiffness, not a change.
+    fn verb(&self, changes: &'static str) -> &'static str {
+        if self.adds_spring() {
+            "is"
+        } else {
+            changes
         }
-        LawKind::Quadratic | LawKind::Exponential => {
-            let shape = if effect.law.kind == LawKind::Quadratic { "quadratically" } else { "exponentially" };
-            let size = plus_minus(value, std, unit);
-            format!("{what} {} {size} from low to high {covariate}, {shape}", changes(value))
+    }
+
+    fn constant(&self, what: &str, value: f64, size: &str) -> String {
+        if self.name.kind == "oscillator" {
+            let (f, std) = rounded(self.psi[1], self.covariance[(1, 1)].max(0.0).sqrt());
+            return format!("{what} has a mass of {size} and is tuned to {f} ± {std} Hz");
         }
+        if self.adds_spring() {
+            return format!("{what} is {size}");
+        }
+        let more = if value < 0.0 { "lower" } else { "higher" };
+        format!("{what} is {size} {more} than in the simulation")
+    }
+
+    fn each_category(&self) -> String {
+        let each = |(i, level): (usize, &String)| {
+            let std = self.covariance[(i, i)].max(0.0).sqrt();
+            let sign = if self.psi[i] < 0.0 { "−" } else { "+" };
+            format!("{level}: {sign} {}", self.plus_minus(self.psi[i].abs(), std, self.unit))
+        };
+        self.effect.law.levels.iter().enumerate().map(each).collect::<Vec<_>>().join(", ")
+    }
+
+    fn slope(&self, what: &str, covariate: &str) -> String {
+        let place = self.effect.numbers.iter().position(|n| n.name == "slope_per_unit").unwrap_or_default();
+        let (slope, std) = (self.psi[place], self.covariance[(place, place)].max(0.0).sqrt());
+        let later = match self.effect.lag() {
+            Some(lag) => format!(", which it follows with a lag of {:.1} {}s", self.psi[lag], self.time_unit),
+            None => String::new(),
+        };
+        let per = format!("{} per {}", self.unit, covariate_unit(covariate, self.time_unit));
+        format!("{what} {} {} of {covariate}{later}", self.changes(slope), self.plus_minus(slope, std, &per))
+    }
+
+    fn two_slopes(&self, what: &str, covariate: &str) -> String {
+        let first = self.effect.numbers.len() - 3;
+        let (below, above, knee) = (self.psi[first], self.psi[first + 1], self.psi[first + 2]);
+        let (unit, over) = (self.unit, covariate_unit(covariate, self.time_unit));
+        format!(
+            "{what} changes by {:.3} {unit} per {over} of {covariate} below {knee:.1} {over} and by {:.3} {unit} per {over} above",
+            self.factor * below,
+            self.factor * above
+        )
     }
 }
 
-/// A value and its standard deviation with two digits of the latter.
+/// A value and its standard deviation, rounded to two significant digits of the latter.
 pub fn rounded(value: f64, std: f64) -> (String, String) {
     if !(std > 0.0 && std.is_finite()) {
         return (format!("{value:.4}"), "0".to_owned());

@@ -1,11 +1,14 @@
-//! Extending: the causes of a diagnosis become effects of the structure.
+//! Extending a structure: the causes of a diagnosis become effects of a new version.
 
 use std::collections::BTreeMap;
 
-use super::data::{Data, Values};
+use super::data::{Data, Values, TIME};
+use super::diagnosis::{DiagnosisVerdict, Outcome};
+use super::effect::FittedEffect;
+use super::fit::{Fit, Start};
 use super::grammar::Class;
-use super::model::{Effect, Fit, Start, Study};
-use super::{Outcome, Verdict};
+use super::rank::Ranked;
+use super::study::Study;
 use crate::measurement::CovariateKind;
 use crate::physics::effect::Target;
 use crate::simulator::definition::{CovariateDefinition, DefinitionError, EffectDefinition, StructureDefinition};
@@ -14,7 +17,7 @@ use crate::simulator::law::LawKind;
 use crate::simulator::Simulator;
 use crate::stats;
 
-/// Quantiles of a covariate that an effect remembers.
+/// Number of quantiles of a covariate that are stored with an effect.
 const SEEN: usize = 17;
 
 /// A structure with the causes of a diagnosis in it.
@@ -31,88 +34,109 @@ pub struct Extended {
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Nothing can be added.
-    #[error("there is nothing to extend the structure with: {}", if .0.is_empty() { "the diagnosis found no cause".to_owned() } else { .0.join("; ") })]
+    #[error("no cause can be added to the structure: {}", if .0.is_empty() { "the diagnosis found no cause".to_owned() } else { .0.join("; ") })]
     Nothing(Vec<String>),
-    /// What was found is not the whole of it.
+    /// The causes do not explain the data.
     #[error(
-        "what the diagnosis found does not explain the data: compensating a part of it would hide the rest; find out what is \
-         left first"
+        "the causes that were found do not explain the data; compensating for them would hide the remaining deviation, whose cause \
+         must be found first"
     )]
     Unexplained,
     /// The causes cannot be fitted in the form that a structure takes.
     #[error("the causes cannot be fitted in a form that an assessment can use")]
     NoFit,
-    /// The new structure is refused: its effects leave no frequencies somewhere.
+    /// The new structure is invalid: with its effects it has no frequencies somewhere.
     #[error("the extended structure is refused: {0}")]
     Definition(#[from] DefinitionError),
 }
 
-/// The structure with every cause that an assessment can account for.
+/// Adds every cause that an assessment can compensate for to the structure, and fits the numbers of all effects to all rows.
 ///
-/// A stiffness that changes with time stays out: it may be damage. A lagged effect is taken in its best form without a lag,
-/// a step in time and a setting stay out, since one batch does not say what came before or what was set.
+/// A stiffness that changes with time is left out, because it may be damage; so are a step in time and a setting, because a
+/// batch contains neither what came before it nor what was set. A lagged effect is replaced by its best form without a lag.
 ///
 /// # Errors
 /// [`Error`].
 pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<Extended, Error> {
-    if outcome.diagnosis.verdict == Verdict::NoneOfThese {
+    if outcome.diagnosis.verdict == DiagnosisVerdict::NoneOfThese {
         return Err(Error::Unexplained);
     }
     let bare = simulator.without_effects();
     let known = simulator.effects().len();
     let (mut added, mut left_out) = (Vec::new(), Vec::new());
-    let mut effects: Vec<Effect> = outcome.after.effects[..known].to_vec();
+    let mut effects: Vec<FittedEffect> = outcome.after.effects[..known].to_vec();
     let mut psi: Vec<Option<Vec<f64>>> = outcome.after.psi[..known].iter().cloned().map(Some).collect();
-    let causes = &outcome.diagnosis.causes;
-    let chosen: Vec<&super::Ranked> = outcome.causes.iter().collect();
-    let mut kept = Vec::new();
-    for (place, ranked) in chosen.iter().enumerate() {
-        let cause = &causes[place];
-        let mut leave = |why: &str| left_out.push(format!("{}: {why}", cause.sentence));
+    for (place, ranked) in outcome.causes.iter().enumerate() {
+        let sentence = &outcome.diagnosis.causes[place].sentence;
         let effect = &outcome.after.effects[known + place];
-        if ranked.candidate.class == Class::PossibleDamage {
-            leave("it may be damage, which is not compensated");
-            continue;
-        }
-        if outcome.maybe_damage[place] {
-            leave("these data cannot tell it from a stiffness that changes with time, which may be damage");
-            continue;
-        }
-        if matches!(effect.target, Target::SettingOffset(_) | Target::SettingScale(_)) {
-            leave("settings are no part of the structure; correct them where they are entered");
-            continue;
-        }
-        if effect.law.kind == LawKind::Step || effect.law.covariate.as_deref().is_some_and(super::is_time) {
-            leave("a change with time cannot be told from one batch; define the structure anew from that time on");
-            continue;
-        }
-        let mut values = outcome.after.psi[known + place].clone();
-        let mut effect = effect.clone();
-        if effect.law.kind == LawKind::Lagged {
-            let other = ranked.laws.iter().filter(|l| l.0 != LawKind::Lagged).max_by(|a, b| a.1.total_cmp(&b.1));
-            let law = other.map_or(LawKind::Linear, |l| l.0);
-            let with_level = effect.law.with_level;
-            effect = ranked.candidate.effect(&bare, data, &outcome.training, law, with_level, 0.0);
-            values = effect.numbers.iter().map(|n| n.prior_mean).collect();
+        if let Some(why) = why_left_out(ranked, effect, outcome.maybe_damage[place]) {
+            left_out.push(format!("{sentence}: {why}"));
+        } else if effect.law.kind == LawKind::Lagged {
+            let effect = without_lag(&bare, data, &outcome.training, ranked, effect);
+            let law = effect.law.kind.name();
             added.push(format!(
-                "{} (in its {} form without the lag: one batch does not say what came before)",
-                cause.sentence,
-                law.name()
+                "{sentence} (in its {law} form without the lag: a batch does not contain what came before)"
             ));
+            psi.push(Some(effect.numbers.iter().map(|n| n.prior_mean).collect()));
+            effects.push(effect);
         } else {
-            added.push(cause.sentence.clone());
+            added.push(sentence.clone());
+            psi.push(Some(outcome.after.psi[known + place].clone()));
+            effects.push(effect.clone());
         }
-        kept.push(place);
-        effects.push(effect);
-        psi.push(Some(values));
     }
-    if kept.is_empty() {
+    if added.is_empty() {
         return Err(Error::Nothing(left_out));
     }
     let study = Study::new(&bare, data);
     let all: Vec<usize> = (0..data.rows()).collect();
-    // Everything was chosen without the rows held out; the numbers may be learnt from all.
+    // The causes were chosen without the rows held out; their numbers may be fitted to all rows.
     let fit = study.fit(&all, &effects, Some(&Start { fit: &outcome.after, psi })).ok_or(Error::NoFit)?;
+    let definition = extended_definition(simulator, &bare, data, &fit, &added);
+    // Checks the whole structure: with an effect it may have no frequencies for some parameters.
+    Simulator::new(definition.clone())?;
+    Ok(Extended { definition, added, left_out })
+}
+
+/// Why a cause is not added to the structure; `None` if it is.
+fn why_left_out(ranked: &Ranked, effect: &FittedEffect, maybe_damage: bool) -> Option<&'static str> {
+    if ranked.candidate.class == Class::PossibleDamage {
+        return Some("it may be damage, which is not compensated");
+    }
+    if maybe_damage {
+        return Some("these data cannot distinguish it from a stiffness that changes with time, which may be damage");
+    }
+    if matches!(effect.target, Target::SettingOffset(_) | Target::SettingScale(_)) {
+        return Some("settings are not part of the structure; correct them where they are entered");
+    }
+    if effect.law.kind == LawKind::Step || effect.law.covariate.as_deref() == Some(TIME) {
+        return Some("a change with time cannot be recognised in one batch; define a new structure from that time on");
+    }
+    None
+}
+
+/// A lagged effect in the best of its forms without a lag, at the mean of its prior.
+fn without_lag(
+    simulator: &Simulator,
+    data: &Data,
+    rows: &[usize],
+    ranked: &Ranked,
+    effect: &FittedEffect,
+) -> FittedEffect {
+    let other = ranked.laws.iter().filter(|l| l.0 != LawKind::Lagged).max_by(|a, b| a.1.total_cmp(&b.1));
+    let law = other.map_or(LawKind::Linear, |l| l.0);
+    ranked.candidate.effect(simulator, data, rows, law, effect.law.with_level, 0.0)
+}
+
+/// The definition with the effects of a fit: first those of the structure, then those that were `added`.
+fn extended_definition(
+    simulator: &Simulator,
+    bare: &Simulator,
+    data: &Data,
+    fit: &Fit,
+    added: &[String],
+) -> StructureDefinition {
+    let known = simulator.effects().len();
     let mut definition = simulator.definition().clone();
     definition.parent = Some(simulator.digest().to_string());
     let old = std::mem::take(&mut definition.effects);
@@ -121,7 +145,7 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
             None => (old[place].name.clone(), old[place].description.clone()),
             Some(new) => (free_name(&definition, &old, place), Some(added[new].clone())),
         };
-        let written = definition_of(&bare, data, &fit, place, name, description);
+        let written = definition_of(bare, data, fit, place, name, description);
         let Some(mut written) = written else { continue };
         if let Some(before) = old.get(place) {
             written.seen.clone_from(&before.seen);
@@ -129,11 +153,10 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
         declare(&mut definition, data, effect);
         definition.effects.push(written);
     }
-    // The check of the whole: an effect may leave no frequencies somewhere.
-    Simulator::new(definition.clone())?;
-    Ok(Extended { definition, added, left_out })
+    definition
 }
 
+/// A name that no effect of the structure has.
 fn free_name(definition: &StructureDefinition, old: &[EffectDefinition], place: usize) -> String {
     let taken = |name: &str| definition.effects.iter().chain(old).any(|e| e.name == name);
     let mut number = place + 1;
@@ -143,8 +166,8 @@ fn free_name(definition: &StructureDefinition, old: &[EffectDefinition], place: 
     format!("effect{number}")
 }
 
-/// Declares the covariate of an effect, where the structure has not yet.
-fn declare(definition: &mut StructureDefinition, data: &Data, effect: &Effect) {
+/// Declares the covariate of an effect in the structure, unless it is declared already.
+fn declare(definition: &mut StructureDefinition, data: &Data, effect: &FittedEffect) {
     let Some(name) = &effect.law.covariate else { return };
     if definition.covariates.iter().any(|c| c.name == *name) {
         return;
@@ -154,6 +177,7 @@ fn declare(definition: &mut StructureDefinition, data: &Data, effect: &Effect) {
     definition.covariates.push(CovariateDefinition { name: name.clone(), kind });
 }
 
+/// Effect `place` of a fit as a structure file states it; `None` for a target that a file cannot state.
 fn definition_of(
     simulator: &Simulator,
     data: &Data,
@@ -179,7 +203,7 @@ fn definition_of(
     Some(EffectDefinition {
         name,
         description,
-        target: target_definition(&effect.target, simulator)?,
+        target: target_definition(&effect.target, simulator.structure(), simulator.space())?,
         law: effect.law.kind,
         covariate: effect.law.covariate.clone(),
         reference: effect.law.reference,

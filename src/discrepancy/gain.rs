@@ -1,4 +1,4 @@
-//! Measuring: what an extension gains on rows that no fit and no choice has seen.
+//! The gain from the causes, measured on rows that were used neither to choose nor to fit them.
 
 use std::collections::BTreeMap;
 
@@ -7,35 +7,37 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
-use super::model::{Fit, RowView, Study};
+use super::fit::Fit;
+use super::model::RowView;
+use super::study::Study;
 use crate::parameter::DamageDirection;
 use crate::stats;
 
-/// Rows of one batch, for shifts of parameters and alarms.
+/// Number of rows of a batch, for shifts of parameters and for alarms.
 const BATCH: usize = 10;
 
-/// Share of healthy batches that may raise an alarm.
+/// Share of undamaged batches that may raise an alarm.
 const ALARM_RATE: f64 = 0.001;
 
-/// Bootstrap samples of blocks.
+/// Number of bootstrap samples, and of the blocks of successive rows that they are drawn from.
 const BOOTSTRAPS: usize = 500;
 const BLOCKS: usize = 20;
 
-/// A figure before and after the extension.
+/// A figure without and with the causes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Change<T> {
-    /// By the simulation as it was.
+    /// Simulation without the causes.
     pub before: T,
-    /// With the causes that were found.
+    /// Simulation with the causes.
     pub after: T,
 }
 
-/// Log predictive density.
+/// Log predictive density, nats per row.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct DensityChange {
-    /// Nats a row, simulation as it was.
+    /// Simulation without the causes.
     pub before: f64,
-    /// Nats a row, with the causes.
+    /// Simulation with the causes.
     pub after: f64,
     /// After minus before.
     pub difference: f64,
@@ -43,29 +45,30 @@ pub struct DensityChange {
     pub standard_error: f64,
 }
 
-/// The gain table.
+/// Figures without and with the causes, on rows held out.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Gain {
-    /// Rows it was measured on.
+    /// Number of rows held out.
     pub holdout_rows: usize,
-    /// Root mean square error of each predicted frequency, per cent.
+    /// Root mean square of the residual ln y − M of each mode, per cent.
     pub rms_error_percent: Change<Vec<f64>>,
-    /// 90 % interval of after minus before for each mode, by bootstrap over blocks.
+    /// 90 % interval of the change of that error for each mode, by bootstrap over blocks.
     pub rms_difference_interval90: Vec<[f64; 2]>,
     /// Log predictive density of the logarithms of the frequencies.
     pub log_density_per_row: DensityChange,
-    /// Share of frequencies inside their 90 % interval.
+    /// Share of the frequencies inside their predicted 90 % interval.
     pub coverage90: Change<f64>,
-    /// Standard deviation of each parameter over healthy batches of ten rows, per cent of the stiffness it sets.
+    /// Standard deviation of each parameter between batches of ten rows, per cent of the stiffness that it sets.
     pub spread_of_parameters_percent: Change<BTreeMap<String, f64>>,
-    /// Batches of ten healthy rows, held out, that lie beyond the limit which the first quarter of the other rows, taken for
-    /// the undamaged state, sets for 1 in 1000.
+    /// Batches of ten rows held out, assumed undamaged, that exceed a control limit for 1 false alarm in 1000; the limit is set
+    /// from the first quarter of the other rows as the reference.
     pub false_alarms_per_1000: Change<f64>,
-    /// Loss of the stiffness that is seen worst, detected with 90 % probability in one batch of ten rows at a limit that
-    /// healthy batches really keep.
+    /// Smallest loss of the stiffness that is identified worst which one batch of ten rows detects with a probability of 90 %, at
+    /// a limit that 999 of 1000 undamaged batches do not exceed.
     pub smallest_detectable_loss_percent: Change<f64>,
 }
 
+/// The figures of one fit.
 struct Side {
     rms: Vec<f64>,
     densities: Vec<f64>,
@@ -76,7 +79,11 @@ struct Side {
     errors: Vec<Vec<f64>>,
 }
 
-/// The gain of `after` over `before` on `holdout`; `training` gives the scatter that alarm limits must live with.
+/// The gain of `after` over `before` on the rows of `holdout`; the scatter over `training` sets the alarm limits.
+///
+/// The standard error of the difference in log density is that of the mean over blocks of successive rows, and the intervals of
+/// the errors come from a bootstrap over the same blocks, because successive rows are correlated. `None` if the structure has
+/// no frequencies in some row.
 pub fn gain(
     study: &Study<'_>,
     training: &[usize],
@@ -174,7 +181,7 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
         DamageDirection::None => f64::NEG_INFINITY,
     };
     let alarms = undamaged.map_or(0, |undamaged| {
-        // Limit for one more batch, with the mean and the scatter known from that many batches.
+        // Prediction limit for one further batch, when mean and scatter are estimated from `count` batches.
         let count = undamaged.count as f64;
         let t = StudentsT::new(0.0, 1.0, count - 1.0).map_or(limit, |t| -t.inverse_cdf(level));
         let factor = t * (1.0 + 1.0 / count).sqrt();
@@ -207,14 +214,14 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
     })
 }
 
-/// What the first batches showed: mean and standard deviation of the shift of each free parameter.
+/// Mean and standard deviation of the shift of each free parameter over the first batches.
 struct Reference {
     moments: Vec<(f64, f64)>,
     count: usize,
 }
 
-/// The first quarter of the training rows in batches of ten, as a service would have been told to take for undamaged; at
-/// least five batches, or all.
+/// The reference from the first quarter of the training rows in separate batches of ten, at least five batches; `None` if there
+/// are fewer than two batches.
 fn reference(shifts: &[Vec<(usize, f64, f64)>]) -> Option<Reference> {
     let apart: Vec<&Vec<(usize, f64, f64)>> = shifts.iter().step_by(BATCH).collect();
     let count = (apart.len() / 4).max(5).min(apart.len());
@@ -228,11 +235,15 @@ fn reference(shifts: &[Vec<(usize, f64, f64)>]) -> Option<Reference> {
     Some(Reference { moments: (0..apart[0].len()).map(moment).collect(), count })
 }
 
-/// For each run of ten rows and each free parameter: (parameter, shift of its mean, standard error of the shift).
+/// For every ten successive rows and each free parameter: index of the parameter, shift of its mean, standard error of the
+/// shift, the last two in the parameter's unit.
 ///
 /// ```text
-///  δ = (Σ w JᵀV⁻¹J)⁻¹ Σ w JᵀV⁻¹e
+///  δ = (W⁻² + Σ w JᵀV⁻¹J)⁻¹ Σ w JᵀV⁻¹e
 /// ```
+///
+/// e: residuals of a row; V: their covariance; J: derivatives by the free parameters; w: weight of the row; W: width of each
+/// prior, diagonal.
 fn shifts(study: &Study<'_>, views: &[RowView]) -> Vec<Vec<(usize, f64, f64)>> {
     let free = study.free();
     let d = free.len();
@@ -245,7 +256,7 @@ fn shifts(study: &Study<'_>, views: &[RowView]) -> Vec<Vec<(usize, f64, f64)>> {
                     slopes.column_mut(column).fill(0.0);
                 }
             }
-            let solved = view.covariance.clone().cholesky().expect("noise is never 0");
+            let solved = view.covariance.clone().cholesky().expect("the noise of a row is never 0");
             let information = slopes.tr_mul(&solved.solve(&slopes)) * view.weight;
             (information, slopes.tr_mul(&solved.solve(&view.residual)) * view.weight)
         })
@@ -257,7 +268,7 @@ fn shifts(study: &Study<'_>, views: &[RowView]) -> Vec<Vec<(usize, f64, f64)>> {
     parts
         .windows(size)
         .filter_map(|window| {
-            // As much as the prior knows: without it, modes fewer than parameters would leave it singular.
+            // Without the prior, the information would be singular for fewer modes than parameters.
             let width =
                 |k: usize| study.simulator.space().as_slice()[k].upper - study.simulator.space().as_slice()[k].lower;
             let mut information = DMatrix::from_fn(d, d, |i, j| if i == j { width(free[i]).powi(-2) } else { 0.0 });

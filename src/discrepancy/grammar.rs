@@ -1,33 +1,34 @@
-//! The grammar of effects: every target × covariate that data can have, and the laws of each.
+//! The candidates: every combination of a target and a covariate, and the laws that each can follow.
 
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use super::data::{Column, Data, Values, TIME};
-use super::model::{Effect, Number};
+use super::data::{Column, Data, Values, MOST_LEVELS, TIME};
+use super::effect::{FittedEffect, Number};
 use crate::physics::effect::Target;
 use crate::physics::{Form, Node, Spring, Structure};
 use crate::simulator::law::{Law, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
 
-/// Springs are added between all pairs of nodes up to this many masses; beyond it only between neighbours' neighbours.
+/// With at most this many places, springs may be added between all pairs of them; with more, only between two places that have
+/// a common neighbour.
 const ALL_PAIRS_MASSES: usize = 12;
 
-/// Most springs that may be added at all.
+/// Greatest number of added springs that are considered.
 const MOST_ADDED: usize = 400;
 
-/// What kind of thing a cause is, which says how plausible it is and what to do about it.
+/// The kind of a cause, which determines its prior probability and what should be done about it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 #[schema(as = CauseClass)]
 pub enum Class {
-    /// Weather, load, moisture.
+    /// An environmental or operational condition, such as temperature, moisture or load.
     Environment,
-    /// The measuring chain.
+    /// A fault of the measuring chain.
     Instrument,
-    /// Who measured, how, and with what settings.
+    /// The person, the procedure or the settings of the test.
     SetUp,
     /// The simulation describes the structure wrongly.
     Structure,
@@ -35,24 +36,24 @@ pub enum Class {
     PossibleDamage,
 }
 
-/// A target with a covariate: what could be the cause. Its laws are ways to write it down.
+/// A possible cause: a target and the covariate that it depends on. It can follow one of several laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
     /// What changes.
     pub target: Target,
-    /// Under which covariate; `None` for a constant.
+    /// The covariate that it depends on; `None` for a constant.
     pub covariate: Option<String>,
-    /// The category that differs; `None` for other covariates, or when each category has its own number.
+    /// The category that differs; `None` for a numeric covariate, or if each category has its own number.
     pub level: Option<String>,
     /// Kind of cause.
     pub class: Class,
-    /// Springs or masses that there are, for a target of either.
+    /// For a target of springs or masses, their number in the structure.
     pub of: usize,
-    /// Weight before seeing data, relative to the others; ties only, a factor of a few.
+    /// Prior probability among the candidates. Those of different candidates differ by a factor of a few only.
     pub weight: f64,
 }
 
-/// All candidates of a structure and its data, with their priors summing to 1.
+/// All candidates for a structure and its data; their prior probabilities sum to 1.
 pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
     let mut all = Vec::new();
     for target in targets(simulator, data) {
@@ -79,10 +80,10 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
                 }
                 Values::Categories(names, indices) => {
                     let used: BTreeSet<usize> = rows.iter().filter_map(|r| indices[*r]).collect();
-                    if used.len() < 2 || used.len() > super::data::MOST_LEVELS {
+                    if used.len() < 2 || used.len() > MOST_LEVELS {
                         continue;
                     }
-                    // Of two categories either can be the odd one; the later in the alphabet is taken.
+                    // With two categories, only the difference between them matters: the alphabetically later one is used.
                     let skipped = usize::from(used.len() == 2);
                     for level in used.iter().skip(skipped) {
                         add(Some(&column.name), Some(&names[*level]));
@@ -105,12 +106,12 @@ fn is_category(data: &Data, covariate: Option<&str>) -> bool {
     covariate.and_then(|c| data.column(c)).is_some_and(|c| matches!(c.values, Values::Categories(..)))
 }
 
-/// Everything that could change.
-pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
+/// Every target that could change.
+fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     let modes = simulator.modes();
     let mut targets = simulator.structure().map_or_else(Vec::new, |structure| part_targets(simulator, structure));
     if simulator.table().is_some() {
-        // An emulator has no springs: what acts on them acts on the parameters that stand for them.
+        // An emulator has no springs: the parameters represent their stiffness.
         let shares = simulator.space().iter().enumerate().filter(|(_, parameter)| parameter.has_share());
         targets.extend(shares.map(|(column, _)| Target::ParameterScale(column)));
     }
@@ -125,9 +126,9 @@ pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     }
     if let Some(structure) = simulator.structure() {
         targets.extend(missing_springs(structure).into_iter().map(|(from, to)| Target::AddedSpring(from, to)));
-        targets.extend(structure.places().iter().map(|place| Target::Oscillator(place.freedom)));
+        targets.extend(structure.attachment_points().iter().map(|point| Target::Oscillator(point.dof)));
     }
-    // A mode that was overlooked, or two neighbours taken for each other.
+    // A mode that was not identified, or two neighbouring modes that were interchanged.
     if simulator.available_modes() > modes {
         let skipping = |skipped: usize| (0..modes).map(|m| m + usize::from(m >= skipped)).collect();
         targets.extend((0..modes).map(|skipped| Target::ModeOrder(skipping(skipped))));
@@ -140,7 +141,7 @@ pub fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     targets
 }
 
-/// Springs and masses, each by itself and in groups.
+/// Springs and masses, individually and in groups.
 fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
     let (springs, masses) = (structure.springs().len(), structure.masses().len());
     let mut targets: Vec<Target> = (0..springs).map(|s| Target::Springs(vec![s])).collect();
@@ -159,11 +160,11 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
     targets
 }
 
-/// Stiffness of each spring between places or a place and the ground, N/m: not of those that hold rotations.
+/// Stiffness of each spring that acts on translations only, N/m: between two places, or a place and the ground.
 fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
     let sideways = |node: &Node| match node {
         Node::Ground => true,
-        Node::Freedom(freedom) => structure.places().iter().any(|place| place.freedom == *freedom),
+        Node::Dof(dof) => structure.attachment_points().iter().any(|point| point.dof == *dof),
     };
     let between = |s: &&Spring| matches!(&s.form, Form::Spring(a, b) if sideways(a) && sideways(b));
     structure.springs().iter().filter(between).map(|s| s.n_per_m).collect()
@@ -171,14 +172,14 @@ fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
 
 /// Pairs of nodes that no spring joins.
 fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
-    let places: Vec<usize> = structure.places().iter().map(|place| place.freedom).collect();
+    let places: Vec<usize> = structure.attachment_points().iter().map(|point| point.dof).collect();
     let joined = |a: Node, b: Node| {
         let ends = [Form::Spring(a, b), Form::Spring(b, a)];
         structure.springs().iter().any(|s| ends.contains(&s.form))
     };
-    let mut neighbours = vec![std::collections::BTreeSet::new(); structure.freedoms()];
+    let mut neighbours = vec![std::collections::BTreeSet::new(); structure.dofs()];
     for spring in structure.springs() {
-        if let Form::Spring(Node::Freedom(a), Node::Freedom(b)) = spring.form {
+        if let Form::Spring(Node::Dof(a), Node::Dof(b)) = spring.form {
             neighbours[a].insert(b);
             neighbours[b].insert(a);
         }
@@ -186,12 +187,12 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
     let near = |a: usize, b: usize| places.len() <= ALL_PAIRS_MASSES || !neighbours[a].is_disjoint(&neighbours[b]);
     let mut pairs = Vec::new();
     for (index, &a) in places.iter().enumerate() {
-        if !joined(Node::Ground, Node::Freedom(a)) {
-            pairs.push((Node::Ground, Node::Freedom(a)));
+        if !joined(Node::Ground, Node::Dof(a)) {
+            pairs.push((Node::Ground, Node::Dof(a)));
         }
         for &b in &places[index + 1..] {
-            if !joined(Node::Freedom(a), Node::Freedom(b)) && near(a, b) {
-                pairs.push((Node::Freedom(a), Node::Freedom(b)));
+            if !joined(Node::Dof(a), Node::Dof(b)) && near(a, b) {
+                pairs.push((Node::Dof(a), Node::Dof(b)));
             }
         }
     }
@@ -199,8 +200,8 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
     pairs
 }
 
-/// Class and relative weight of a cause. Weights differ by a few only: they order what data cannot tell apart, and must not
-/// outvote them.
+/// Class and relative prior weight of a candidate. The weights differ by a factor of a few only, so that they rank candidates that
+/// data cannot distinguish, but do not outweigh data.
 fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
     let time = covariate == Some(TIME);
     match target {
@@ -228,12 +229,12 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
     }
 }
 
-/// Standard deviation of a numeric covariate over rows; 0 for a constant.
+/// Standard deviation of a numeric covariate over `rows`, in its own unit; 0 for a constant.
 pub fn spread(column: &Column, rows: &[usize]) -> f64 {
     let numbers = column.numbers(rows);
     let std = stats::sample_std(&numbers).unwrap_or(0.0);
     let size = numbers.iter().fold(0.0, |a: f64, v| a.max(v.abs()));
-    // A constant that rounding moves is a constant.
+    // Values that differ by rounding only are a constant.
     if std > 1e-9 * size {
         std
     } else {
@@ -242,7 +243,8 @@ pub fn spread(column: &Column, rows: &[usize]) -> f64 {
 }
 
 impl Candidate {
-    /// Whether it moves all frequencies by one share: all springs, all masses and the instrument's scale do the same.
+    /// Whether it multiplies all frequencies by the same factor, as the stiffness of all springs, the mass of all bodies and the
+    /// scale of the instrument do.
     pub fn acts_on_all(&self) -> bool {
         match &self.target {
             Target::Springs(indices) | Target::Masses(indices) => indices.len() == self.of,
@@ -251,12 +253,12 @@ impl Candidate {
         }
     }
 
-    /// What it depends on: covariate and category.
+    /// The covariate and the category that it depends on.
     pub fn input(&self) -> (Option<&str>, Option<&str>) {
         (self.covariate.as_deref(), self.level.as_deref())
     }
 
-    /// Laws by which it can be written.
+    /// The laws that it can follow.
     pub fn laws(&self, data: &Data) -> Vec<LawKind> {
         let Some(name) = &self.covariate else { return vec![LawKind::Constant] };
         if is_category(data, Some(name)) {
@@ -268,7 +270,7 @@ impl Candidate {
         vec![LawKind::Linear, LawKind::Quadratic, LawKind::Bilinear, LawKind::Exponential, LawKind::Lagged]
     }
 
-    /// Categories that get a number of their own; the most frequent one is what the others are compared with.
+    /// Categories that have a number; the most frequent category is the reference and has none.
     pub fn levels(&self, data: &Data, rows: &[usize]) -> Vec<String> {
         let column = self.covariate.as_deref().and_then(|name| data.column(name));
         let Some(Values::Categories(names, indices)) = column.map(|c| &c.values) else { return Vec::new() };
@@ -281,7 +283,8 @@ impl Candidate {
         used.iter().filter(|l| Some(**l) != most).map(|l| names[*l].clone()).collect()
     }
 
-    /// The effect under a law; `reference` of a step is its time in days.
+    /// The effect under a law, with priors for its numbers that are scaled by the typical size of the target and by the standard
+    /// deviation of the covariate. `step_days`: time of a step, days.
     pub fn effect(
         &self,
         simulator: &Simulator,
@@ -290,7 +293,7 @@ impl Candidate {
         kind: LawKind,
         with_level: bool,
         step_days: f64,
-    ) -> Effect {
+    ) -> FittedEffect {
         let column = self.covariate.as_deref().and_then(|c| data.column(c));
         let size = self.typical_size(simulator);
         let mut levels = Vec::new();
@@ -340,10 +343,10 @@ impl Candidate {
             let (prior_mean, prior_std) = (f64::midpoint(low, high), 0.5 * (high - low));
             numbers.push(Number { name: "frequency_hz".to_owned(), prior_mean, prior_std, bounds: (low, high) });
         }
-        Effect { target: self.target.clone(), law, numbers }
+        FittedEffect { target: self.target.clone(), law, numbers }
     }
 
-    /// Size that such an effect typically has: the scale of its prior.
+    /// The size that such an effect typically has, in the unit of its target: the standard deviation of its prior.
     pub fn typical_size(&self, simulator: &Simulator) -> f64 {
         match &self.target {
             Target::Springs(_) | Target::Masses(_) | Target::ParameterScale(_) | Target::SettingScale(_) => 0.1,
@@ -358,7 +361,7 @@ impl Candidate {
                 let structure = simulator.structure();
                 let sideways: Vec<f64> = structure.map_or_else(Vec::new, translational_n_per_m);
                 let mean = if sideways.is_empty() { 0.0 } else { stats::mean(&sideways) };
-                // A beam without springs: what its mass at its lowest frequency stands for.
+                // For a beam without springs, the stiffness k = m ω² of its mass at its lowest frequency.
                 let lowest = std::f64::consts::TAU * simulator.nominal_frequencies_hz()[0];
                 let kg: f64 = structure.map_or(0.0, |s| s.masses().iter().map(|m| m.kg).sum());
                 0.15 * if mean > 0.0 { mean } else { kg * lowest.powi(2) }

@@ -1,55 +1,56 @@
-//! Showing: where residuals, and what free parameters absorbed, go with a covariate; and what is left when nothing more
-//! can be named.
+//! Dependence of residuals and parameters on covariates: the misfit before any cause is added, and the remainder after the last.
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ChiSquared, ContinuousCDF as _, FisherSnedecor};
 
 use super::data::{Data, Values, TIME};
-use super::model::{Fit, Study};
+use super::fit::Fit;
+use super::model::RowView;
 use super::screen::Whitened;
+use super::study::Study;
 use crate::physics::effect::Target;
 use crate::simulator::law::lagged;
 use crate::stats;
 
-/// Shape of one misfit: a mode's residual, or a parameter's drift, over a covariate.
+/// Dependence of the residual of a mode, or of the best value of a parameter, on a covariate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Misfit {
     /// Mode, from 1, whose frequencies deviate.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub mode: Option<usize>,
-    /// Parameter that took up the deviation.
+    /// Parameter whose best value varies with the covariate, because it compensates for the deviation.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub parameter: Option<String>,
-    /// Covariate it goes with; `null` for a constant deviation.
+    /// Covariate that the deviation depends on; `null` for a constant deviation.
     pub covariate: Option<String>,
-    /// Range of the fitted curve over the covariate, per cent of the frequency or stiffness.
+    /// Effect range (5–95 %) of the fitted curve, per cent of the frequency or stiffness; of a constant, its mean.
     pub size_percent: f64,
-    /// Probability of as much by chance, times the number of looks, at most 1.
+    /// Probability of at least this deviation by chance, times the number of tests (Bonferroni), at most 1.
     pub p_value: f64,
 }
 
-/// What the best explanation leaves.
+/// A dependence that remains in the residuals of the best explanation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Remainder {
-    /// Function of the covariates that it goes with, such as `temperature_c × humidity_percent`.
+    /// Function of covariates that the residuals depend on, such as `temperature_c × humidity_percent`.
     pub function: String,
     /// Covariates of the function.
     pub covariates: Vec<String>,
-    /// Range of the remainder along the function by mode, per cent of the frequency.
+    /// Effect range (5–95 %) for each mode, per cent of the frequency.
     pub size_percent: Vec<f64>,
-    /// Probability of as much by chance, times the number of looks, at most 1.
+    /// Probability of at least this dependence by chance, times the number of tests (Bonferroni), at most 1.
     pub p_value: f64,
 }
 
-/// Misfit of a fit by mode and covariate and by parameter and covariate, the clearest first.
+/// Tests whether the residual of each mode and the best value of each free parameter depend on each covariate, and whether the
+/// mean residual of each mode differs from 0; the most significant first. `None` if the structure has no frequencies in some row.
 pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfit>> {
     let views = study.view(rows, fit)?;
     let space = study.simulator.space();
     let mut series: Vec<(Option<usize>, Option<String>, Vec<f64>)> = Vec::new();
     for mode in 0..study.simulator.modes() {
-        let value =
-            |v: &super::model::RowView| v.present.iter().position(|m| *m == mode).map_or(f64::NAN, |i| v.residual[i]);
+        let value = |v: &RowView| v.present.iter().position(|m| *m == mode).map_or(f64::NAN, |i| v.residual[i]);
         series.push((Some(mode + 1), None, views.iter().map(value).collect()));
     }
     for &k in study.free() {
@@ -75,15 +76,16 @@ pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfi
             found.push(Misfit { mode: Some(*mode), parameter: None, covariate: None, size_percent, p_value: p });
         }
     }
-    let looks = found.len() as f64;
+    let tests = found.len() as f64;
     for misfit in &mut found {
-        misfit.p_value = (misfit.p_value * looks).min(1.0);
+        misfit.p_value = (misfit.p_value * tests).min(1.0);
     }
     found.sort_by(|a, b| a.p_value.total_cmp(&b.p_value).then(b.size_percent.abs().total_cmp(&a.size_percent.abs())));
     Some(found)
 }
 
-/// Functions of one covariate that a residual is regressed on, beside a constant: u and u², or a column for each category.
+/// Regressors of a covariate beside the constant, `[q][rows]`: the standardised covariate u and u², or an indicator of each
+/// category but one. Empty for a constant covariate.
 fn regressors(values: &Values, rows: &[usize]) -> Vec<Vec<f64>> {
     match values {
         Values::Numbers(values) => {
@@ -95,7 +97,7 @@ fn regressors(values: &Values, rows: &[usize]) -> Vec<Vec<f64>> {
             let mut different: Vec<u64> = unit.iter().map(|u| u.to_bits()).collect();
             different.sort_unstable();
             different.dedup();
-            // Of two values only, the square says nothing new.
+            // With two values only, the square is linear in the value.
             let square = (different.len() > 2).then(|| unit.iter().map(|u| u * u).collect());
             [unit].into_iter().chain(square).collect()
         }
@@ -110,7 +112,7 @@ fn regressors(values: &Values, rows: &[usize]) -> Vec<Vec<f64>> {
     }
 }
 
-/// Values minus their mean over their standard deviation, missing ones 0; empty for a constant.
+/// (c − mean)/std; missing values become 0. Empty for a constant.
 fn standardised(values: &[f64]) -> Vec<f64> {
     let known: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
     let (mean, std) = (stats::mean(&known), stats::sample_std(&known).unwrap_or(0.0));
@@ -121,14 +123,21 @@ fn standardised(values: &[f64]) -> Vec<f64> {
     values.iter().map(|v| if v.is_finite() { (v - mean) / std } else { 0.0 }).collect()
 }
 
-/// Range of the fitted curve and the p-value of an F test, for as many rows as the residual's correlation in time is worth.
+/// Effect range (5–95 %) of a linear regression on `basis`, and the p-value of its F test; `None` for too few rows.
+///
+/// ```text
+///  F = (r·SS_fit / q) / (r·SS_residual / ν),    ν = max(r·n − q − 1, 1),    r = (1 − ρ)/(1 + ρ)
+/// ```
+///
+/// q: number of regressors; n: number of rows; ρ ≥ 0: correlation of successive residuals, which reduces the effective number of
+/// rows.
 fn regression(values: &[f64], basis: &[Vec<f64>]) -> Option<(f64, f64)> {
     let known: Vec<usize> = (0..values.len()).filter(|i| values[*i].is_finite()).collect();
     let (n, q) = (known.len(), basis.len());
     if n < 5 * (q + 1) {
         return None;
     }
-    // Gross outliers would rule the sum of squares: everything beyond five robust deviations counts as that.
+    // Gross outliers would dominate the sum of squares: values are limited to five robust standard deviations.
     let clipped = clip(&known.iter().map(|i| values[*i]).collect::<Vec<f64>>());
     let design =
         DMatrix::from_fn(n, q + 1, |row, column| if column == 0 { 1.0 } else { basis[column - 1][known[row]] });
@@ -149,6 +158,7 @@ fn regression(values: &[f64], basis: &[Vec<f64>]) -> Option<(f64, f64)> {
     Some((stats::quantile(&fitted, 0.95) - stats::quantile(&fitted, 0.05), p))
 }
 
+/// Mean of the known values, and the two-sided p-value of a test that it is 0.
 fn constant(values: &[f64]) -> Option<(f64, f64)> {
     let known = clip(&values.iter().copied().filter(|v| v.is_finite()).collect::<Vec<f64>>());
     let (mean, std) = (stats::mean(&known), stats::sample_std(&known)?);
@@ -156,6 +166,7 @@ fn constant(values: &[f64]) -> Option<(f64, f64)> {
     Some((mean, 2.0 * stats::normal_cdf(-z.abs())))
 }
 
+/// Values limited to five robust standard deviations, 1.4826 times the median absolute deviation, from the median.
 fn clip(values: &[f64]) -> Vec<f64> {
     let middle = stats::quantile(values, 0.5);
     let off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
@@ -167,18 +178,25 @@ fn clip(values: &[f64]) -> Vec<f64> {
     }
 }
 
+/// Correlation of successive values.
 fn lag_one(values: &[f64]) -> f64 {
     let squares: f64 = values.iter().map(|v| v * v).sum();
     values.windows(2).map(|w| w[0] * w[1]).sum::<f64>() / squares.max(f64::MIN_POSITIVE)
 }
 
-/// What the residuals of a fit still go with, over functions of all covariates that no candidate of the grammar need have,
-/// with an arbitrary response of each mode; the clearest.
+/// The most significant dependence of the residuals of a fit on a function of the covariates, including functions that no
+/// candidate has. The inner `None` means that there are no functions, the outer one that the structure has no frequencies.
+///
+/// Each function is tested with an arbitrary response of each mode, and along the target of each cause found, since a cause with
+/// the wrong law leaves a residual there. Twice the promised gain of the score test, times the share of independent rows, is
+/// compared with a χ² distribution.
+///
+/// Source: Rao (1948), for score tests.
 pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share: f64) -> Option<Option<Remainder>> {
     let views = study.view(rows, fit)?;
     let whitened = Whitened::new(study, rows, fit, &views)?;
     let modes = study.simulator.modes();
-    // Along the targets of the causes found, where a wrong law shows first; an oscillator has no such direction.
+    // Only targets with one size have one direction: an oscillator has two, an order of modes none.
     let mut targets: Vec<Target> = fit.effects.iter().map(|e| e.target.clone()).collect();
     targets.retain(|t| t.sizes() == 1);
     let directions = study.directions(rows, fit, &targets)?;
@@ -186,25 +204,25 @@ pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share
     let along: Vec<_> = (0..targets.len()).map(sums).collect();
     let of_modes = whitened.mode_sums(modes);
     let functions = functions(study.data, rows);
-    let looks = (functions.len() * (1 + targets.len())) as f64;
+    let tests = (functions.len() * (1 + targets.len())) as f64;
     let mut best: Option<(Remainder, f64)> = None;
     for (function, covariates, values) in functions {
         let range = stats::quantile(&values, 0.95) - stats::quantile(&values, 0.05);
         let values = DVector::from_vec(values);
         let free = whitened.free_score(&of_modes, &values);
-        let mut tests: Vec<(f64, usize, Vec<f64>)> =
+        let mut scores: Vec<(f64, usize, Vec<f64>)> =
             vec![(free.nats, free.numbers, free.psi.iter().map(|s| 100.0 * s * range).collect())];
         for (column, sums) in along.iter().enumerate() {
             let score = whitened.score(sums, &[&values]);
             let mean =
                 |mode: usize| directions.iter().map(|d| d[(mode, column)]).sum::<f64>() / directions.len() as f64;
             let sizes = (0..modes).map(|mode| 100.0 * score.psi[0] * range * mean(mode)).collect();
-            tests.push((score.nats, score.numbers, sizes));
+            scores.push((score.nats, score.numbers, sizes));
         }
-        for (nats, numbers, size_percent) in tests.into_iter().filter(|t| t.1 > 0) {
+        for (nats, numbers, size_percent) in scores.into_iter().filter(|t| t.1 > 0) {
             let chi = ChiSquared::new(numbers as f64).ok()?;
-            let p_value = (chi.sf(2.0 * nats * independent_share) * looks).min(1.0);
-            // Probabilities below 1e-308 are all 0: the statistic goes on.
+            let p_value = (chi.sf(2.0 * nats * independent_share) * tests).min(1.0);
+            // p-values below 1e-308 are all 0: the statistic then decides.
             let strength = nats - 0.5 * numbers as f64 * nats.max(1.0).ln();
             let clearer = |(b, other): &(Remainder, f64)| {
                 p_value < b.p_value
@@ -219,7 +237,7 @@ pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share
     Some(best.map(|(remainder, _)| remainder))
 }
 
-/// What follows a covariate with play: it stays until the covariate has moved by `width` from where it turned.
+/// The play operator of hysteresis: the result stays constant while the covariate remains within `width` of it.
 fn play(values: &[f64], width: f64) -> Vec<f64> {
     let mut state = values.first().copied().unwrap_or(0.0);
     let follow = |value: &f64| {
@@ -229,11 +247,15 @@ fn play(values: &[f64], width: f64) -> Vec<f64> {
     values.iter().map(follow).collect()
 }
 
-/// Functions of the covariates: powers, kinks, products of two, differences to a lag, categories and their products.
-fn functions(data: &Data, rows: &[usize]) -> Vec<(String, Vec<String>, Vec<f64>)> {
+/// A function of covariates at each row.
+type CovariateFunction = (String, Vec<String>, Vec<f64>);
+
+/// Name, covariates and values, `[rows]`, of the functions that a remainder is sought in: powers, kinks, hysteresis and rates of a
+/// number, indicators of categories, and products of two.
+fn functions(data: &Data, rows: &[usize]) -> Vec<CovariateFunction> {
     let mut numeric: Vec<(String, Vec<f64>)> = Vec::new();
     let mut categories: Vec<(String, String, Vec<f64>)> = Vec::new();
-    let mut found: Vec<(String, Vec<String>, Vec<f64>)> = Vec::new();
+    let mut found: Vec<CovariateFunction> = Vec::new();
     for column in &data.columns {
         match &column.values {
             Values::Numbers(values) => {
@@ -241,40 +263,13 @@ fn functions(data: &Data, rows: &[usize]) -> Vec<(String, Vec<String>, Vec<f64>)
                 if unit.is_empty() {
                     continue;
                 }
-                let name = &column.name;
-                let mut add = |label: String, values: Vec<f64>| found.push((label, vec![name.clone()], values));
-                add(name.clone(), unit.clone());
-                add(format!("{name}²"), unit.iter().map(|u| u * u - 1.0).collect());
-                add(format!("{name}³"), unit.iter().map(|u| u.powi(3) - 3.0 * u).collect());
-                for level in [0.15, 0.85] {
-                    let knee = stats::quantile(&unit, level);
-                    let beyond = |u: &f64| if level < 0.5 { (knee - u).max(0.0) } else { (u - knee).max(0.0) };
-                    add(
-                        format!("{name} beyond its {:.0} % quantile", 100.0 * level),
-                        unit.iter().map(beyond).collect(),
-                    );
-                }
-                if *name != TIME {
-                    for width in [0.3, 0.6, 1.0] {
-                        let play = standardised(&play(&unit, width));
-                        if !play.is_empty() {
-                            add(format!("play of {name} (hysteresis)"), play);
-                        }
-                    }
-                    let span = data.times_days.last().copied().unwrap_or(0.0).max(1e-6);
-                    for divisor in [300.0, 60.0, 15.0] {
-                        let followed = lagged(&data.times_days, values, span / divisor);
-                        let difference: Vec<f64> = rows.iter().map(|r| values[*r] - followed[*r].0).collect();
-                        let difference = standardised(&difference);
-                        if !difference.is_empty() {
-                            let days = span / divisor;
-                            let signed = difference.iter().map(|d| d.signum()).collect();
-                            add(format!("rise or fall of {name} within {days:.1} days"), difference);
-                            add(format!("direction of {name} over {days:.1} days"), signed);
-                        }
-                    }
-                }
-                numeric.push((name.clone(), unit));
+                let of_one = shapes(&column.name, &unit).into_iter().chain(if column.name == TIME {
+                    Vec::new()
+                } else {
+                    histories(data, rows, &column.name, values, &unit)
+                });
+                found.extend(of_one.map(|(label, values)| (label, vec![column.name.clone()], values)));
+                numeric.push((column.name.clone(), unit));
             }
             Values::Categories(names, indices) => {
                 for (level, name) in names.iter().enumerate() {
@@ -299,4 +294,45 @@ fn functions(data: &Data, rows: &[usize]) -> Vec<(String, Vec<String>, Vec<f64>)
         }
     }
     found
+}
+
+/// Powers and kinks of a standardised covariate.
+fn shapes(name: &str, unit: &[f64]) -> Vec<(String, Vec<f64>)> {
+    let mut all = vec![
+        (name.to_owned(), unit.to_vec()),
+        (format!("{name}²"), unit.iter().map(|u| u * u - 1.0).collect()),
+        (format!("{name}³"), unit.iter().map(|u| u.powi(3) - 3.0 * u).collect()),
+    ];
+    for level in [0.15, 0.85] {
+        let knee = stats::quantile(unit, level);
+        let beyond = |u: &f64| if level < 0.5 { (knee - u).max(0.0) } else { (u - knee).max(0.0) };
+        let side = if level < 0.5 { "below" } else { "above" };
+        let label = format!("{name} {side} its {:.0} % quantile", 100.0 * level);
+        all.push((label, unit.iter().map(beyond).collect()));
+    }
+    all
+}
+
+/// Functions of a covariate that depend on its past: hysteresis, and differences to the lagged covariate.
+fn histories(data: &Data, rows: &[usize], name: &str, values: &[f64], unit: &[f64]) -> Vec<(String, Vec<f64>)> {
+    let mut all = Vec::new();
+    for width in [0.3, 0.6, 1.0] {
+        let play = standardised(&play(unit, width));
+        if !play.is_empty() {
+            all.push((format!("hysteresis of {name}"), play));
+        }
+    }
+    let span = data.times_days.last().copied().unwrap_or(0.0).max(1e-6);
+    for divisor in [300.0, 60.0, 15.0] {
+        let days = span / divisor;
+        let followed = lagged(&data.times_days, values, days);
+        let difference: Vec<f64> = rows.iter().map(|r| values[*r] - followed[*r].0).collect();
+        let difference = standardised(&difference);
+        if !difference.is_empty() {
+            let signed = difference.iter().map(|d| d.signum()).collect();
+            all.push((format!("rise or fall of {name} within {days:.1} days"), difference));
+            all.push((format!("direction of change of {name} over {days:.1} days"), signed));
+        }
+    }
+    all
 }

@@ -1,9 +1,9 @@
-//! Frequencies and slopes of many rows that differ in a few numbers.
+//! Frequencies and their derivatives for many rows that differ in a few numbers.
 //!
-//! Rows differ in the sizes of effects and in settings, and in each smoothly. So the eigenproblem is solved at Chebyshev
-//! nodes of those numbers and interpolated between them; numbers with few different values (categories, steps) are met
-//! exactly. What moves all frequencies by one share, and what the instrument does to them, needs no eigenproblem and is
-//! applied afterwards. Where interpolation would save nothing, every different row is solved.
+//! Rows differ in the sizes of effects and in settings, and the frequencies depend smoothly on both. The eigenproblem is
+//! therefore solved only at Chebyshev nodes of these numbers, between which the results are interpolated. Numbers with few
+//! different values (categories, steps) are used exactly. Effects that multiply all frequencies by one factor, and effects of the
+//! instrument, need no eigenproblem and are applied afterwards. If interpolation saves nothing, every different row is solved.
 
 use std::collections::HashMap;
 
@@ -12,40 +12,43 @@ use nalgebra::DMatrix;
 use crate::physics::effect::Target;
 use crate::simulator::Simulator;
 
-/// Numbers with at most this many different values are met exactly.
+/// Numbers with at most this many different values are not interpolated.
 const FEW: usize = 12;
 
-/// Ranges, as a share of what they act on, up to which so many nodes do; beyond the last, the last number.
+/// Number of nodes for a range up to this fraction of the quantity that the number acts on.
 const NODES: [(f64, usize); 3] = [(0.02, 5), (0.2, 7), (f64::INFINITY, MOST_NODES)];
 
-/// The most of them.
+/// Greatest number of nodes of one dimension.
 const MOST_NODES: usize = 10;
 
-/// Most numbers to interpolate over.
+/// Greatest number of dimensions of the interpolation.
 const MOST_DIMENSIONS: usize = 3;
 
-/// Of each row: ln f, ∂ln f/∂x, ∂ln f/∂size.
+/// Responses of rows: ln f, ∂ln f/∂x and ∂ln f/∂size of each mode.
 pub struct Responses {
     modes: usize,
     parameters: usize,
+    /// Values of a mode: 1 + parameters + sizes.
     width: usize,
+    /// Blocks of `[modes][width]`.
     values: Vec<f64>,
+    /// Index of the first value of each row's block, `[rows]`.
     places: Vec<usize>,
 }
 
 impl Responses {
-    /// ln f of a mode, f in Hz.
+    /// ln f of a mode in a row, f in Hz.
     pub fn log_frequency(&self, row: usize, mode: usize) -> f64 {
         self.values[self.places[row] + mode * self.width]
     }
 
-    /// ∂ln f/∂x of a mode, one for each parameter.
+    /// ∂ln f/∂x of a mode in a row, `[parameters]`, per unit of each parameter.
     pub fn by_parameter(&self, row: usize, mode: usize) -> &[f64] {
         let first = self.places[row] + mode * self.width + 1;
         &self.values[first..first + self.parameters]
     }
 
-    /// ∂ln f/∂size of a mode, one for each size.
+    /// ∂ln f/∂size of a mode in a row, `[sizes]`, per unit of each size.
     pub fn by_size(&self, row: usize, mode: usize) -> &[f64] {
         let first = self.places[row] + mode * self.width;
         &self.values[first + 1 + self.parameters..first + self.width]
@@ -56,8 +59,8 @@ impl Responses {
         self.modes
     }
 
-    /// The responses at each row of parameters (`[d, rows]`) and sizes (`[sizes, rows]`); `None` where the structure has no
-    /// frequencies.
+    /// The responses for parameters `theta`, `[d, rows]`, and sizes of all targets in turn, `[sizes, rows]`; `None` if the
+    /// structure has no frequencies in some row.
     pub fn new(simulator: &Simulator, targets: &[Target], theta: &DMatrix<f64>, sizes: &DMatrix<f64>) -> Option<Self> {
         let after = Afterwards::new(simulator, targets);
         if after.steps.is_empty() {
@@ -70,6 +73,7 @@ impl Responses {
         after.apply(&inner, targets, sizes)
     }
 
+    /// As [`Self::new`], but solves the eigenproblem for all targets.
     fn structural(
         simulator: &Simulator,
         targets: &[Target],
@@ -98,7 +102,7 @@ impl Responses {
         let interpolated = !smooth.is_empty() && smooth.len() <= MOST_DIMENSIONS && 2 * corners < rows;
         let mut known = Known::default();
         let exact: Vec<usize> = (0..parameters + count).filter(|i| smooth.iter().all(|d| d.index != *i)).collect();
-        // Rows that agree in all that is not interpolated over share their corners.
+        // Rows with the same values of all numbers that are not interpolated share their nodes.
         let mut shared: HashMap<Vec<u64>, Vec<usize>> = HashMap::new();
         let (mut weights, mut further, mut key): (Vec<f64>, Vec<f64>, Vec<u64>) = Default::default();
         let mut point = Vec::with_capacity(parameters + count);
@@ -110,7 +114,7 @@ impl Responses {
                 found.places.push(place);
                 continue;
             }
-            // Weights of all corners: the product over the dimensions.
+            // The weight of a node is the product of its weights in each dimension.
             weights.clear();
             weights.push(1.0);
             for dimension in &smooth {
@@ -145,7 +149,7 @@ impl Responses {
         Some(found)
     }
 
-    /// Place of the response at a point, solved if it is new.
+    /// Index of the response at a point, which is solved if it is new.
     fn solved(&mut self, simulator: &Simulator, targets: &[Target], known: &mut Known, point: &[f64]) -> Option<usize> {
         known.key.clear();
         known.key.extend(point.iter().map(|v| v.to_bits()));
@@ -168,20 +172,20 @@ impl Responses {
     }
 }
 
-/// Points that were solved.
+/// Points that have been solved.
 #[derive(Default)]
 struct Known {
-    /// Place of the response by the bits of the point.
+    /// Index of the response by the bits of the point.
     places: HashMap<Vec<u64>, usize>,
-    /// The bits of the point that is looked up.
+    /// The bits of the point that is looked up, kept to avoid allocations.
     key: Vec<u64>,
 }
 
-/// Targets that act on frequencies which are known already.
+/// Targets that are applied after the eigenproblem is solved.
 struct Afterwards {
-    /// (index of the target, column of its size).
+    /// Index of each such target, and index of its size.
     steps: Vec<(usize, usize)>,
-    /// The others: (index of the target, column of its first size).
+    /// Index of each other target, and index of its first size.
     structural: Vec<(usize, usize)>,
 }
 
@@ -189,7 +193,7 @@ impl Afterwards {
     fn new(simulator: &Simulator, targets: &[Target]) -> Self {
         let springs = simulator.structure().map_or(0, |s| s.springs().len());
         let masses = simulator.structure().map_or(0, |s| s.masses().len());
-        // A share of all springs or masses passes through to the frequencies only where nothing is added beside them.
+        // A factor on all springs or masses is a factor on all frequencies only if no spring or mass is added.
         let added = |t: &Target| matches!(t, Target::AddedSpring(..) | Target::Oscillator(_));
         let alone = !targets.iter().any(added);
         let (mut steps, mut structural) = (Vec::new(), Vec::new());
@@ -207,6 +211,8 @@ impl Afterwards {
         Self { steps, structural }
     }
 
+    /// Applies the targets to the responses of the others; `None` if a frequency or a factor is not positive.
+    ///
     /// ```text
     ///  f' = f·Π s + Σ o;   s = 1 + g, √(1 + g) for all springs, 1/√(1 + g) for all masses
     ///  ∂ln f'/∂· = (f·Π s/f') ∂ln f/∂·,   ∂ln f'/∂g = (f·Π s/f') ∂ln s/∂g,   ∂ln f'/∂o = 1/f'
@@ -271,7 +277,7 @@ impl Afterwards {
     }
 }
 
-/// A number that is interpolated over.
+/// One dimension of the interpolation.
 struct Dimension {
     index: usize,
     nodes: Vec<f64>,
@@ -280,7 +286,7 @@ struct Dimension {
 }
 
 impl Dimension {
-    /// `None` for a number with few different values.
+    /// The nodes for these values; `None` for a number with few different values.
     fn new(
         index: usize,
         values: impl Iterator<Item = f64> + Clone,
@@ -308,7 +314,7 @@ impl Dimension {
                 scale(index - parameters, targets)
             };
         let count = NODES.iter().find(|(limit, _)| range <= *limit).map_or(MOST_NODES, |n| n.1);
-        // Chebyshev nodes of the first kind, whose barycentric weights are known.
+        // Chebyshev nodes of the first kind, which have closed-form barycentric weights.
         let angle = |i: usize| std::f64::consts::PI * (2 * i + 1) as f64 / (2 * count) as f64;
         let nodes = (0..count).map(|i| f64::midpoint(low, high) - 0.5 * (high - low) * angle(i).cos()).collect();
         let sign = |i: usize| if i.is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -316,14 +322,14 @@ impl Dimension {
         Some(Self { index, nodes, barycentric })
     }
 
-    /// Appends each of `before` times the weight of each node at a value.
+    /// Appends the products of each of `before` with the weight of each node at a value.
     fn weights(&self, value: f64, before: &[f64], products: &mut Vec<f64>) {
         let mut own = [0.0; MOST_NODES];
         let own = &mut own[..self.nodes.len()];
         for (weight, (node, barycentric)) in own.iter_mut().zip(self.nodes.iter().zip(&self.barycentric)) {
             *weight = barycentric / (value - node);
         }
-        // At a node it has all weight.
+        // A value at a node takes its result from that node alone.
         if let Some(at) = own.iter().position(|weight| weight.is_infinite()) {
             own.fill(0.0);
             own[at] = 1.0;
@@ -338,7 +344,8 @@ impl Dimension {
     }
 }
 
-/// What a size of 1 means as a share: 1 for relative targets; of others the most nodes are taken.
+/// The size that changes a target by its own value: 1 for relative targets. For other targets it is unknown, and a tiny number makes
+/// the relative range large, so that the greatest number of nodes is used.
 fn scale(size: usize, targets: &[Target]) -> f64 {
     let mut first = 0;
     for target in targets {
@@ -359,7 +366,7 @@ mod tests {
     use crate::physics::Node;
     use crate::simulator::definition::StructureDefinition;
 
-    /// Interpolated and afterwards-applied responses against one eigenproblem for each row.
+    /// Compares the responses with the solution of one eigenproblem for each row.
     #[test]
     fn responses_of_many_rows_are_those_of_each_row() {
         let text = include_str!("../../models/three-dof/structure.toml");
@@ -369,7 +376,7 @@ mod tests {
             vec![Target::Springs(vec![3]), Target::Springs(all), Target::FrequencyOffset(Some(1))],
             vec![Target::Masses(vec![1]), Target::FrequencyScale(None), Target::FrequencyScale(Some(2))],
             vec![
-                Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)),
+                Target::AddedSpring(Node::Dof(0), Node::Dof(2)),
                 Target::Masses(vec![0, 1, 2]),
                 Target::FrequencyOffset(None),
             ],
@@ -386,7 +393,7 @@ mod tests {
             for (place, sizes) in rows.iter().enumerate().step_by(7) {
                 let one = simulator.respond(&[4.0, 5.0, 6.0], 3, &targets, sizes).unwrap();
                 for (mode, f) in one.frequencies_hz.iter().enumerate() {
-                    // Noise is 1e-4 at the least: an error of 1e-6 says nothing about it.
+                    // The smallest noise is 1e-5, so that an error of 1e-6 in ln f is negligible.
                     assert!((many.log_frequency(place, mode) - f.ln()).abs() < 1e-6, "{targets:?}");
                     for k in 0..3 {
                         let exact = one.by_parameter[(mode, k)] / f;

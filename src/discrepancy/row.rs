@@ -1,17 +1,20 @@
-//! The density of one row, and what it adds to the gradient and information of a fit.
+//! The log density of one row, with its contribution to the gradient and information of a fit.
+//!
+//! Source: Lange, Little and Taylor (1989), JASA 84, for the t distribution and its information.
 
 use nalgebra::{DMatrix, DVector};
 use statrs::function::gamma::ln_gamma;
 
-/// Weights of tails that a fit chooses from.
+/// Degrees of freedom of the t distribution that a fit chooses from.
 const TAILS: [f64; 7] = [3.0, 4.0, 6.0, 10.0, 20.0, 50.0, f64::INFINITY];
 
-/// The one that a fit begins with.
+/// The value that a fit starts with.
 pub(super) const FIRST_TAILS: f64 = TAILS[2];
 
-/// One row over its noise, and what it adds to gradient and information.
+/// Workspace for one row: solves with its covariance and adds its part of the gradient and information.
 ///
-/// With everything over the noise of its mode, V = 1 + U Uᵀ: U the slopes by the parameters times their spreads, few columns.
+/// All quantities are divided by the noise of their mode, so that V = 1 + U Uᵀ, where U holds the derivatives by the parameters
+/// times their spreads, `[p, free]`. e: residual, `[p]`.
 ///
 /// ```text
 ///  C = 1 + UᵀU = L Lᵀ,   S = L⁻ᵀ,   T = U S:      V⁻¹ = 1 − T Tᵀ,   |V| = |L|²
@@ -22,13 +25,13 @@ pub(super) struct RowSums {
     free: usize,
     /// e, `[p]`.
     pub(super) residual: Vec<f64>,
-    /// Slopes of the mean, `[p][means]`.
+    /// Derivatives of the mean by the free means and ψ, `[p][means]`.
     pub(super) slopes: Vec<f64>,
     /// U, `[p][free]`.
     pub(super) spreads: Vec<f64>,
-    /// L, `[free][free]`, its lower triangle.
+    /// L, `[free][free]`, lower triangle.
     factor: Vec<f64>,
-    /// L⁻¹, S transposed, the same.
+    /// L⁻¹ = Sᵀ, `[free][free]`, lower triangle.
     inverse: Vec<f64>,
     /// T, `[p][free]`.
     absorbed: Vec<f64>,
@@ -36,15 +39,15 @@ pub(super) struct RowSums {
     along: Vec<f64>,
     /// z, `[p]`.
     solved: Vec<f64>,
-    /// Tᵀ of the slopes, `[free][means]`.
+    /// Tᵀ times the derivatives of the mean, `[free][means]`.
     slopes_absorbed: Vec<f64>,
-    /// GᵀV⁻¹e and GᵀV⁻¹G, G the columns of the square root (U, 1): by parameters, then by modes.
+    /// GᵀV⁻¹e, `[free + p]`, and GᵀV⁻¹G, `[free + p][free + p]`, for the square root G = (U, 1) of V.
     score: Vec<f64>,
     products: Vec<f64>,
 }
 
 impl RowSums {
-    /// For rows of at most `modes` modes.
+    /// A workspace for rows of at most `modes` modes.
     pub(super) fn new(means: usize, free: usize, modes: usize) -> Self {
         let (of_free, of_modes) = (vec![0.0; free * free], vec![0.0; modes * free]);
         let variances = free + modes;
@@ -65,7 +68,7 @@ impl RowSums {
         }
     }
 
-    /// Factors V and solves for the residual of `p` modes: eᵀV⁻¹e and ½ ln|V|.
+    /// Factors V and solves for the residual of `p` modes. Returns eᵀV⁻¹e and ½ ln|V|.
     pub(super) fn solve(&mut self, p: usize) -> (f64, f64) {
         let f = self.free;
         let mut volume = 1.0;
@@ -106,9 +109,15 @@ impl RowSums {
         (distance.max(0.0), volume.ln())
     }
 
-    /// Adds w Dᵀ V⁻¹ e and Dᵀ V⁻¹ D, D the slopes of the mean; and the score and information of the logarithms of the columns
-    /// of G: with h = Gᵀ V⁻¹ e and B = Gᵀ V⁻¹ G, w h_u² − B_uu and 2 B_uv², less what the tails take. Of the information, the
-    /// lower triangle.
+    /// Adds the gradient and the lower triangle of the expected information of this row.
+    ///
+    /// ```text
+    ///  means:       w Dᵀ V⁻¹ e,      a Dᵀ V⁻¹ D
+    ///  ln scales:   w h_u² − B_uu,   2a B_uv² − b B_uu B_vv,    h = Gᵀ V⁻¹ e,   B = Gᵀ V⁻¹ G
+    ///  w = (ν + p)/(ν + eᵀ V⁻¹ e),   a = (ν + p)/(ν + p + 2),   b = 2/(ν + p + 2)
+    /// ```
+    ///
+    /// D: derivatives of the mean; G = (U, 1); the ln scales are those of the columns of G: spreads, then noise factors.
     pub(super) fn add(
         &mut self,
         present: &[usize],
@@ -171,7 +180,7 @@ impl RowSums {
         for u in 0..count {
             let own = self.products[u * count + u];
             gradient[place(u)] += weight * self.score[u] * self.score[u] - own;
-            // Modes ascend: what stands below the diagonal here stands below it there.
+            // The modes present ascend, so that the lower triangle here maps into the lower triangle there.
             let (flat, deep) = (2.0 * flat, deep * own);
             for v in 0..=u {
                 let shared = self.products[u * count + v];
@@ -181,7 +190,7 @@ impl RowSums {
     }
 }
 
-/// Share of a normal row's weight that a row at `distance` has.
+/// Weight w of a row with squared Mahalanobis distance `distance`, relative to a normal distribution: (ν + p)/(ν + distance).
 pub(super) fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
     if tails.is_finite() {
         (tails + modes as f64) / (tails + distance)
@@ -190,8 +199,8 @@ pub(super) fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
     }
 }
 
-/// (ν + p)/(ν + p + 2) and 2/(ν + p + 2), what the tails leave of a normal row's information and what they take; 1 and 0 for a
-/// normal distribution.
+/// Factors of the expected information of a t distribution: a = (ν + p)/(ν + p + 2) and b = 2/(ν + p + 2); 1 and 0 for a normal
+/// distribution.
 fn information_shares(modes: usize, tails: f64) -> (f64, f64) {
     if tails.is_finite() {
         let total = tails + modes as f64;
@@ -201,15 +210,19 @@ fn information_shares(modes: usize, tails: f64) -> (f64, f64) {
     }
 }
 
-/// The density of a multivariate t, or normal, distribution.
+/// Log density of a multivariate t distribution, normal for ν = ∞.
+///
+/// ```text
+///  ln p = ln Γ((ν + p)/2) − ln Γ(ν/2) − p/2 ln(νπ) − ½ ln|V| − (ν + p)/2 ln(1 + q/ν),    q = eᵀ V⁻¹ e
+/// ```
 pub(super) struct Density {
     tails: f64,
-    /// Logarithm of what depends on the number of modes alone, `[modes + 1]`.
+    /// The terms that depend only on the number of modes p, `[modes + 1]`.
     constants: Vec<f64>,
 }
 
 impl Density {
-    /// Of at most `most` modes.
+    /// The density of rows with at most `most` modes.
     pub(super) fn new(tails: f64, most: usize) -> Self {
         let constant = |modes: usize| {
             let m = modes as f64;
@@ -222,6 +235,7 @@ impl Density {
         Self { tails, constants: (0..=most).map(constant).collect() }
     }
 
+    /// Log density of one row, nats; `distance` is q, `half_log_det` is ½ ln|V|.
     pub(super) fn log(&self, distance: f64, modes: usize, half_log_det: f64) -> f64 {
         let of_distance = if self.tails.is_finite() {
             0.5 * (self.tails + modes as f64) * (distance / self.tails).ln_1p()
@@ -231,9 +245,9 @@ impl Density {
         self.constants[modes] - half_log_det - of_distance
     }
 
-    /// Sum over rows: Mahalanobis distance, number of modes, ½ ln|V| of each.
+    /// Sum of the log densities of rows, given as q, number of modes and ½ ln|V|.
     pub(super) fn total(&self, rows: &[(f64, usize, f64)]) -> f64 {
-        // One logarithm for many rows: the product of what stands in it, for each number of modes.
+        // Logarithms are slow: for each number of modes, their arguments are multiplied first.
         let mut products = vec![1.0; self.constants.len()];
         let mut sum = 0.0;
         for (distance, modes, half_log_det) in rows {
@@ -257,7 +271,7 @@ impl Density {
     }
 }
 
-/// The tails that make the rows most probable; distances are those of the present scale.
+/// The degrees of freedom with the largest likelihood, for rows given as q, number of modes and ½ ln|V|.
 pub(super) fn best_tails(distances: &[(f64, usize, f64)]) -> f64 {
     let most = distances.iter().map(|(_, modes, _)| *modes).max().unwrap_or(0);
     let total = |tails: f64| Density::new(tails, most).total(distances);
@@ -271,7 +285,7 @@ mod tests {
     use super::*;
     use crate::stats;
 
-    /// A row's distance, ½ ln|V|, score and information against dense matrices.
+    /// Compares distance, ½ ln|V|, score and information of a row with dense matrices.
     #[test]
     fn a_row_is_that_of_dense_matrices() {
         for (p, f, means, tails) in [(4, 2, 3, 5.0), (3, 3, 5, f64::INFINITY), (2, 4, 4, 3.0), (3, 0, 2, 10.0)] {
@@ -279,7 +293,7 @@ mod tests {
             let mut random =
                 |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| stream.random_range(-1.0..1.0));
             let (e, d, u) = (random(p, 1), random(p, means), random(p, f));
-            // Of six modes these are present.
+            // The modes present, out of six.
             let present: Vec<usize> = (0..p).map(|i| i + usize::from(i > 0)).collect();
             let mut row = RowSums::new(means, f, 6);
             row.residual[..p].copy_from_slice(e.as_slice());

@@ -1,88 +1,93 @@
-//! Score tests: what each candidate promises, without fitting it.
+//! Score tests: the gain in log likelihood that each candidate promises, without fitting it.
 //!
-//! With e the residual of the present fit, D the slope of its mean by the numbers of a candidate at size 0, N that by what
-//! is fitted already, and ⟨a, b⟩ = Σ_j w_j aᵀ V_j⁻¹ b:
+//! e: residual of the present fit; D: derivative of the mean by the numbers ψ of a candidate, at size 0; N: derivative by the
+//! numbers that are fitted already; w: weight of a row; V: covariance of its residual; ⟨a, b⟩ = Σ_j w_j aᵀ V_j⁻¹ b:
 //!
 //! ```text
 //!  S = ⟨D, e⟩,   I = ⟨D, D⟩ − ⟨D, N⟩⟨N, N⟩⁻¹⟨N, D⟩,    promised gain = ½ Sᵀ I⁻¹ S  nats,    first guess ψ = I⁻¹ S
 //! ```
+//!
+//! Source: Rao (1948), Proc. Cambridge Phil. Soc. 44.
 
 use nalgebra::{DMatrix, DVector, Dyn};
 use rayon::prelude::*;
 
 use super::data::{Data, Values};
-use super::grammar::Candidate;
-use super::model::{Fit, RowView, Study};
+use super::fit::Fit;
+use super::grammar::{spread, Candidate};
+use super::model::RowView;
+use super::study::Study;
 use crate::physics::effect::Target;
 use crate::simulator::law::{lagged, LawKind};
 use crate::stats;
 
-/// Share of a direction that must be left when what is fitted already is taken out of it.
+/// Share of the information about a number that must remain after projecting out the numbers that are fitted already.
 const IDENTIFIABLE: f64 = 1e-5;
 
-/// Added to the unit diagonal of ⟨N, N⟩: directions without any information would make it singular.
+/// Added to the unit diagonal of ⟨N, N⟩, which directions without information would make singular.
 const RIDGE: f64 = 1e-10;
 
-/// What a candidate promises under one law.
+/// The result of the score test of one candidate under one law.
 #[derive(Debug, Clone)]
 pub struct Promise {
-    /// Index among the candidates.
+    /// Index of the candidate.
     pub candidate: usize,
     /// The law.
     pub law: LawKind,
-    /// Whether the law gets a level of its own.
+    /// Whether the law has a level.
     pub with_level: bool,
     /// Promised gain, nats.
     pub nats: f64,
-    /// Number of linear numbers behind it.
+    /// Number of linear numbers that are identifiable.
     pub numbers: usize,
-    /// First guess of the law's numbers, in its order.
+    /// First guess of all numbers of the law, in its order.
     pub psi: Vec<f64>,
     /// Time of a step, days.
     pub step_days: f64,
 }
 
-/// The present fit, whitened row by row.
+/// Residuals and derivatives of a fit, whitened row by row with V = L Lᵀ.
 pub struct Whitened {
-    /// L⁻¹e √w, `[n]`.
+    /// √w L⁻¹ e of each row, `[present]`.
     pub residual: Vec<DVector<f64>>,
-    /// L⁻¹N √w, `[n]`.
+    /// √w L⁻¹ N of each row, `[present, N]`.
     pub nuisance: Vec<DMatrix<f64>>,
-    /// ⟨N, N⟩ with what the priors know, inverted.
+    /// Inverse of ⟨N, N⟩ plus the prior information, `[N, N]`.
     inverse: DMatrix<f64>,
+    /// L⁻¹, the modes present and √w of each row.
     factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
 }
 
-/// Products of one direction T, row by row: TᵀV⁻¹e, TᵀV⁻¹T, TᵀV⁻¹N.
+/// Products of one direction T in each row: w TᵀV⁻¹e, w TᵀV⁻¹T, w TᵀV⁻¹N.
 pub struct Sums {
     along: DVector<f64>,
     square: DVector<f64>,
-    /// `[rows, columns of N]`
+    /// `[rows, N]`
     nuisance: DMatrix<f64>,
 }
 
-/// The same of the direction of each mode by itself.
+/// The same products for the unit direction of each mode.
 pub struct ModeSums {
     /// `[rows, modes]`
     along: DMatrix<f64>,
     /// `[rows, modes·modes]`
     square: DMatrix<f64>,
-    /// `[rows, columns of N·modes]`
+    /// `[rows, N·modes]`
     nuisance: DMatrix<f64>,
 }
 
-/// A score test.
+/// The result of a score test.
 pub struct Score {
-    /// Promised gain, nats; twice that is χ² with [`Self::numbers`] degrees of freedom.
+    /// Promised gain, nats; twice the gain has a χ² distribution with [`Self::numbers`] degrees of freedom by chance.
     pub nats: f64,
-    /// First guess of the numbers; 0 for those that cannot be told.
+    /// First guess of the numbers; 0 in directions that are not identifiable.
     pub psi: Vec<f64>,
-    /// Numbers that can be told.
+    /// Number of identifiable directions.
     pub numbers: usize,
 }
 
 impl Whitened {
-    /// Whitens the rows of a fit.
+    /// Whitens the rows of a fit; `None` if a covariance is singular or the structure has no frequencies in some row.
     pub fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, views: &[RowView]) -> Option<Self> {
         let slopes = study.nuisance(rows, fit)?;
         let mut factors = Vec::with_capacity(rows.len());
@@ -100,12 +105,12 @@ impl Whitened {
         for n in &nuisance {
             square += n.transpose() * n;
         }
-        // What the priors know: an exact effect of the structure takes nothing out of a residual.
+        // With the prior information: an effect of the structure that is known exactly cannot compensate for a residual.
         let known = study.prior_information(fit);
         for i in 0..size {
             square[(i, i)] += known[i];
         }
-        // Columns have different units: only their correlations say whether they are independent.
+        // Columns have different units and are scaled to a unit diagonal before the inversion.
         let scale: Vec<f64> =
             (0..size).map(|i| if square[(i, i)] > 0.0 { 1.0 / square[(i, i)].sqrt() } else { 1.0 }).collect();
         let shares = DMatrix::from_fn(size, size, |i, j| {
@@ -116,7 +121,7 @@ impl Whitened {
         Some(Self { residual, nuisance, inverse, factors })
     }
 
-    /// Products of a direction given row by row: `direction(place, mode)`.
+    /// Products of the direction `direction(index of the row, mode)`.
     pub fn sums(&self, direction: impl Fn(usize, usize) -> f64) -> Sums {
         let rows = self.factors.len();
         let mut sums = Sums {
@@ -144,7 +149,7 @@ impl Whitened {
         sums
     }
 
-    /// The score of numbers that act through one direction, with basis values `[q][n]`.
+    /// The score test of q numbers that act along one direction, each times a function of the row: `basis` is `[q][rows]`.
     pub fn score(&self, sums: &Sums, basis: &[&DVector<f64>]) -> Score {
         let q = basis.len();
         let mut score = DVector::zeros(q);
@@ -162,7 +167,7 @@ impl Whitened {
         self.solve(&score, &information, &cross)
     }
 
-    /// Products of the directions of the modes themselves.
+    /// Products of the unit direction of each mode.
     pub fn mode_sums(&self, modes: usize) -> ModeSums {
         let (rows, columns) = (self.factors.len(), self.inverse.nrows());
         let mut sums = ModeSums {
@@ -187,7 +192,7 @@ impl Whitened {
         sums
     }
 
-    /// The score of an arbitrary response of each mode to one function of the row, `[n]`.
+    /// The score test of an arbitrary response of each mode to one function of the row, `[rows]`.
     pub fn free_score(&self, sums: &ModeSums, function: &DVector<f64>) -> Score {
         let modes = sums.along.ncols();
         let score = sums.along.tr_mul(function);
@@ -197,10 +202,11 @@ impl Whitened {
         self.solve(&score, &information, &cross)
     }
 
+    /// The test with score S `[q]`, information ⟨D, D⟩ `[q, q]` and ⟨D, N⟩ `[q, N]`.
     fn solve(&self, score: &DVector<f64>, information: &DMatrix<f64>, cross: &DMatrix<f64>) -> Score {
         let q = score.len();
         let left = information - cross * &self.inverse * cross.transpose();
-        // In units of what each direction had before: what is left of it is a share then.
+        // Scaled by ⟨D, D⟩, so that the eigenvalues are shares of the information that remain.
         let scale: Vec<f64> = (0..q).map(|a| information[(a, a)].max(f64::MIN_POSITIVE).sqrt()).collect();
         let shares = DMatrix::from_fn(q, q, |a, b| left[(a, b)] / (scale[a] * scale[b]));
         let eigen = shares.symmetric_eigen();
@@ -220,7 +226,8 @@ impl Whitened {
     }
 }
 
-/// What every candidate promises under each of its laws; those that the fit cannot tell from itself are left out.
+/// The score tests of every candidate under each of its laws. Candidates that are not identifiable beside the fit are omitted, as
+/// are oscillators and orders of modes, which have no derivative at size 0. `None` if the structure has no frequencies.
 pub fn promises(
     study: &Study<'_>,
     rows: &[usize],
@@ -237,7 +244,7 @@ pub fn promises(
     }
     let owned: Vec<Target> = targets.iter().map(|t| (*t).clone()).collect();
     let directions = study.directions(rows, fit, &owned)?;
-    // The same for every target.
+    // The functions of the rows are the same for every target.
     let mut inputs: Vec<(Option<&str>, Option<&str>)> = Vec::new();
     for candidate in candidates {
         let input = candidate.input();
@@ -246,7 +253,7 @@ pub fn promises(
         }
     }
     let bases_of = |input: &(Option<&str>, Option<&str>)| {
-        let candidate = candidates.iter().find(|c| c.input() == *input).expect("inputs are those of candidates");
+        let candidate = candidates.iter().find(|c| c.input() == *input).expect("every input belongs to a candidate");
         bases(candidate, study.data, rows)
     };
     let bases: Vec<Vec<Basis>> = inputs.par_iter().map(bases_of).collect();
@@ -256,38 +263,13 @@ pub fn promises(
             let set = f64::from(u8::from(study.is_set(rows[place], target)));
             directions[place][(mode, column)] * set
         });
-        let told = whitened.score(&sums, &[&ones]).numbers == 1;
+        let level_identifiable = whitened.score(&sums, &[&ones]).numbers == 1;
         let mut found = Vec::new();
         for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| c.target == **target) {
-            let mut best: Vec<Promise> = Vec::new();
             let input = candidate.input();
-            let place = inputs.iter().position(|i| *i == input).expect("all inputs are there");
-            for Basis { law, values, further, step_days } in &bases[place] {
-                let levelled = told && law.has_level();
-                let level = levelled.then_some(&ones);
-                let basis: Vec<&DVector<f64>> = level.into_iter().chain(values).collect();
-                let score = whitened.score(&sums, &basis);
-                // Everything that the law can do must be more than what is fitted already.
-                if score.numbers == 0 || (score.numbers == 1 && levelled) {
-                    continue;
-                }
-                let psi = score.psi.iter().chain(further).copied().collect();
-                let promise = Promise {
-                    candidate: index,
-                    law: *law,
-                    with_level: levelled,
-                    nats: score.nats,
-                    numbers: score.numbers,
-                    psi,
-                    step_days: *step_days,
-                };
-                match best.iter_mut().find(|p| p.law == *law) {
-                    Some(known) if known.nats >= promise.nats => {}
-                    Some(known) => *known = promise,
-                    None => best.push(promise),
-                }
-            }
-            found.extend(best);
+            let place = inputs.iter().position(|i| *i == input).expect("the inputs of all candidates are listed");
+            let level = level_identifiable.then_some(&ones);
+            found.extend(best_of_each_law(whitened, &sums, index, &bases[place], level));
         }
         found
     };
@@ -295,12 +277,49 @@ pub fn promises(
     Some(found.into_iter().flatten().collect())
 }
 
-/// A way in which a law can act at small sizes.
+/// The best test of each law of one candidate; `level`: ones, if a constant along the direction is identifiable.
+fn best_of_each_law(
+    whitened: &Whitened,
+    sums: &Sums,
+    candidate: usize,
+    bases: &[Basis],
+    level: Option<&DVector<f64>>,
+) -> Vec<Promise> {
+    let mut best: Vec<Promise> = Vec::new();
+    for Basis { law, values, further, step_days } in bases {
+        let level = level.filter(|_| law.has_level());
+        let with_level = level.is_some();
+        let basis: Vec<&DVector<f64>> = level.into_iter().chain(values).collect();
+        let score = whitened.score(sums, &basis);
+        // A law of which only the level is identifiable adds nothing to a constant effect.
+        if score.numbers == 0 || (score.numbers == 1 && with_level) {
+            continue;
+        }
+        let psi = score.psi.iter().chain(further).copied().collect();
+        let promise = Promise {
+            candidate,
+            law: *law,
+            with_level,
+            nats: score.nats,
+            numbers: score.numbers,
+            psi,
+            step_days: *step_days,
+        };
+        match best.iter_mut().find(|p| p.law == *law) {
+            Some(known) if known.nats >= promise.nats => {}
+            Some(known) => *known = promise,
+            None => best.push(promise),
+        }
+    }
+    best
+}
+
+/// Functions of the row that a law consists of for small sizes, at fixed values of its nonlinear numbers.
 struct Basis {
     law: LawKind,
-    /// Values at each row, `[q][n]`.
+    /// Values at each row, `[q][rows]`.
     values: Vec<DVector<f64>>,
-    /// Numbers of the law beyond the linear ones.
+    /// The nonlinear numbers of the law.
     further: Vec<f64>,
     /// Time of a step, days.
     step_days: f64,
@@ -312,6 +331,7 @@ impl Basis {
     }
 }
 
+/// The bases of all laws of a candidate, at several values of their nonlinear numbers.
 fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
     let Some(column) = candidate.covariate.as_deref().and_then(|name| data.column(name)) else {
         return vec![Basis::new(LawKind::Constant, vec![vec![1.0; rows.len()]], Vec::new())];
@@ -329,7 +349,7 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
         Values::Numbers(values) => values,
     };
     let numbers = column.numbers(rows);
-    let (mean, std) = (stats::mean(&numbers), super::grammar::spread(column, rows));
+    let (mean, std) = (stats::mean(&numbers), spread(column, rows));
     let at = |function: &dyn Fn(f64) -> f64| -> Vec<f64> {
         rows.iter().map(|row| if values[*row].is_finite() { function(values[*row]) } else { 0.0 }).collect()
     };

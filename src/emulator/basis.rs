@@ -1,41 +1,41 @@
-//! Products of orthonormal Legendre polynomials, and which of them are candidates.
+//! Products of orthonormal Legendre polynomials, and the sets of them that are candidates for an expansion.
 
 use std::collections::BTreeMap;
 
 use nalgebra::DMatrix;
 
-/// Most candidates of one set: all of degree 3 in 20 parameters are 1,771.
+/// Largest number of candidates in one set: there are 1,771 terms up to degree 3 in 20 parameters.
 const CANDIDATES: usize = 2_000;
 
-/// Candidates per run beyond which a search finds terms by chance.
+/// Largest number of candidates per run: with more, a search selects terms by chance.
 const CANDIDATES_PER_RUN: usize = 10;
 
-/// Exponents of the hyperbolic truncation: 1 keeps all interactions, 0.5 little more than main effects.
+/// Exponents q of the hyperbolic truncation: 1 keeps all interactions, 0.5 keeps little more than main effects.
 const TRUNCATIONS: [f64; 3] = [1.0, 0.75, 0.5];
 
-/// Highest degree tried with few runs, and with as many as `MANY`.
+/// Highest degree for fewer than `MANY` runs, and for more.
 const DEGREE_OF_FEW: usize = 14;
 const DEGREE: usize = 20;
 const MANY: usize = 500;
 
-/// A set larger than `LARGE` is worth a search only if it is this many times as large as the one before it.
+/// A set larger than `LARGE` is tried only if it is this many times as large as the one before it.
 const GROWTH: f64 = 1.25;
 const LARGE: usize = 500;
 
 /// A product of Legendre polynomials: its factors of degree 1 or more, as (parameter, degree), parameters ascending.
 pub(super) type Term = Vec<(usize, usize)>;
 
-/// All candidate terms, and the nested sets of them that are tried.
+/// The candidate terms, and the nested sets of them that are tried.
 #[derive(Debug)]
 pub(super) struct Candidates {
-    /// Every term of any set.
+    /// The terms of all sets.
     pub terms: Vec<Term>,
-    /// For each truncation, sets of ascending degree, as indices of `terms`; the constant comes first in each.
+    /// For each truncation, sets of ascending degree as indices of `terms`. Each set begins with the constant.
     pub ladders: Vec<Vec<Vec<usize>>>,
 }
 
 impl Candidates {
-    /// The terms of total degree p under hyperbolic truncation, for as many p as `runs` runs carry.
+    /// The terms α of degree p under hyperbolic truncation, up to the largest p that `runs` runs allow.
     ///
     /// ```text
     ///  ‖α‖_q = (Σ α_j^q)^(1/q) ≤ p
@@ -51,7 +51,7 @@ impl Candidates {
         for q in TRUNCATIONS {
             let mut ladder: Vec<Vec<usize>> = Vec::new();
             for degree in 1..=highest {
-                // The margin admits terms that lie exactly on the limit, such as (1, 1) of degree 4 for q = 0.5.
+                // The margin includes terms that are exactly on the limit, such as (1, 1) of degree 4 for q = 0.5.
                 let mut set = Vec::new();
                 let budget = (degree as f64).powf(q) + 1e-9;
                 if !enumerate(parameters, q, budget, 0, &mut Vec::new(), &mut set, limit) {
@@ -69,7 +69,7 @@ impl Candidates {
                 });
                 ladder.push(set.collect());
             }
-            // With one parameter all truncations are the same.
+            // With a single parameter all truncations are equal.
             if !ladders.contains(&ladder) {
                 ladders.push(ladder);
             }
@@ -77,7 +77,7 @@ impl Candidates {
         Self { terms, ladders }
     }
 
-    /// Every term at every run, `[n, terms]`; `x`: `[n, d]`, scaled to [−1, 1].
+    /// Values of all terms at the runs `x` (`[n, d]`, scaled to [−1, 1]), `[n, terms]`.
     pub fn design(&self, x: &DMatrix<f64>) -> DMatrix<f64> {
         let runs = x.nrows();
         let mut design = DMatrix::from_element(runs, self.terms.len(), 1.0);
@@ -97,12 +97,12 @@ impl Candidates {
     }
 }
 
-/// √Π(2α_j + 1), which makes a product of Legendre polynomials orthonormal for independent uniform parameters.
+/// Factor √Π(2α_j + 1), by which products of Legendre polynomials are orthonormal for independent uniform parameters.
 pub(super) fn norm(term: &[(usize, usize)]) -> f64 {
     term.iter().map(|(_, degree)| (2 * degree + 1) as f64).product::<f64>().sqrt()
 }
 
-/// P_0(x), P_1(x), …, as many as `values` holds.
+/// Legendre polynomials P_0(x), P_1(x), …, as many as `values` has entries.
 ///
 /// ```text
 ///  (k + 1) P_(k+1) = (2k + 1) x P_k − k P_(k−1)
@@ -116,7 +116,7 @@ pub(super) fn legendre(x: f64, values: &mut [f64]) {
     }
 }
 
-/// P'_0(x), P'_1(x), … from the polynomials themselves.
+/// Derivatives P'_0(x), P'_1(x), … of the Legendre polynomials, from the values of the polynomials.
 ///
 /// ```text
 ///  P'_(k+1) = P'_(k−1) + (2k + 1) P_k
@@ -129,7 +129,8 @@ pub(super) fn legendre_slopes(values: &[f64], slopes: &mut [f64]) {
     }
 }
 
-/// Appends to `set` all terms that begin with `term` and go on with parameters from `first`; false where they are too many.
+/// Appends to `set` all terms that begin with `term` and continue with parameters from `first` on; false if there are more than
+/// `limit`.
 fn enumerate(
     parameters: usize,
     q: f64,

@@ -8,15 +8,15 @@ use super::expansion::Expansion;
 use super::select::Fit;
 use crate::stats;
 
-/// A smallest gap above this many standard deviations of the gap over the runs cannot close between them.
+/// A pair is not examined if its smallest gap exceeds this many standard deviations of the gap over the runs.
 const FAR: f64 = 1.0;
 
-/// Neighbouring modes that come so close that a crossing or a sharp veering between the runs is likely.
+/// Neighbouring modes that come so close that they probably cross or veer sharply between the runs.
 ///
-/// Frequencies in ascending order have a kink at a crossing, where they have no derivative and the mode shapes change places.
+/// At a crossing, frequencies in ascending order are not differentiable, and the two mode shapes swap.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Crossing {
-    /// The lower one of the two modes, from 0.
+    /// The lower of the two modes, from 0.
     pub lower_mode: usize,
     /// The run where the two come closest, from 0.
     pub run: usize,
@@ -24,20 +24,20 @@ pub struct Crossing {
     pub gap: f64,
 }
 
-/// The gap of two neighbouring modes that may meet.
+/// The gap of two neighbouring modes that may cross.
 #[derive(Debug)]
 pub(super) struct Gap {
-    /// The lower one of the two modes, from 0.
+    /// The lower of the two modes, from 0.
     pub lower_mode: usize,
-    /// The run where it is least.
+    /// The run with the smallest gap.
     closest: usize,
-    /// There, ln f_upper − ln f_lower.
+    /// ln f_upper − ln f_lower in that run.
     least: f64,
     /// D = (ln f_upper − ln f_lower)² of each run, `[n]`.
     pub squared: Vec<f64>,
 }
 
-/// Pairs of neighbouring modes whose least gap is small against what their gap varies by; `ln_frequencies`: `[m][n]`.
+/// Pairs of neighbouring modes whose smallest gap is small compared with the variation of the gap; `ln_frequencies`: `[m][n]`.
 pub(super) fn near(ln_frequencies: &[Vec<f64>]) -> Vec<Gap> {
     let gap = |(lower_mode, pair): (usize, &[Vec<f64>])| {
         let gap: Vec<f64> = pair[1].iter().zip(&pair[0]).map(|(upper, lower)| upper - lower).collect();
@@ -49,19 +49,19 @@ pub(super) fn near(ln_frequencies: &[Vec<f64>]) -> Vec<Gap> {
     ln_frequencies.windows(2).enumerate().filter_map(gap).collect()
 }
 
-/// Those of the pairs whose gap closes within the distance between runs.
+/// The pairs whose gap probably closes between the runs.
 ///
 /// ```text
 ///  t = 2D/‖∇D‖
 /// ```
 ///
-/// D is smooth where the two cross, unlike the gap itself, so that an expansion of D has a gradient to be trusted. Where
-/// the gap changes linearly, t is the distance, against the gradient, at which it closes. Where two modes veer apart with
-/// a least gap g, t is nowhere below 2g over the rate at which the gap opens. A pair is reported if at any run t is below
-/// the spacing of the runs and the point at that distance is inside their box: a gap that closes beyond the box, or that
-/// opens again as slowly as the runs can follow, is none.
+/// D is the squared gap. It is smooth where the two modes cross, unlike the gap itself, so that the gradient of its expansion is
+/// reliable. Where the gap changes linearly, t is the distance in the direction opposite to the gradient at which it closes.
+/// Where two modes veer with a smallest gap g, t is nowhere below 2g divided by the rate at which the gap opens. A pair is
+/// reported if, at any run, t is below the spacing of the runs and the point at that distance is inside their box. A gap that
+/// closes outside the box, or that varies slowly enough for the runs to resolve it, is not reported.
 ///
-/// `fits`: the expansion of D of each pair; `x`: `[n, d]`, scaled to [−1, 1].
+/// `fits` holds the expansion of D of each pair; `x` holds the runs, `[n, d]`, scaled to [−1, 1].
 pub(super) fn crossings<'a>(
     candidates: &Candidates,
     x: &DMatrix<f64>,
@@ -87,12 +87,12 @@ pub(super) fn crossings<'a>(
     gaps.iter().zip(fits).filter(closes).map(crossing).collect()
 }
 
-/// Distance between neighbouring runs along one direction: their median distance over √d.
+/// Distance between neighbouring runs along one direction: their median distance divided by √d.
 fn spacing(x: &DMatrix<f64>) -> f64 {
     let (n, d) = x.shape();
     let points: Vec<Vec<f64>> = x.row_iter().map(|row| row.iter().copied().collect()).collect();
     let distance = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-    // A run done twice has itself as a neighbour, which tells nothing.
+    // Duplicate runs have distance 0 and are ignored.
     let nearest = |run: &Vec<f64>| {
         points.iter().map(|other| distance(run, other)).filter(|d| *d > 0.0).fold(f64::INFINITY, f64::min)
     };

@@ -1,4 +1,4 @@
-//! Several expansions that share their terms, evaluated with their gradients.
+//! Several expansions that share their terms, evaluated together with their gradients.
 
 use std::collections::BTreeMap;
 
@@ -11,11 +11,11 @@ use super::select::Fit;
 #[derive(Debug, Clone, Copy)]
 struct Factor {
     parameter: u32,
-    /// Where the table of polynomials has it.
+    /// Index in the table of polynomial values.
     entry: u32,
 }
 
-/// Share of a term in one expansion.
+/// A term of one expansion with its coefficient.
 #[derive(Debug, Clone, Copy)]
 struct Weight {
     term: u32,
@@ -26,7 +26,7 @@ struct Weight {
 #[derive(Debug, Clone)]
 pub(super) struct Expansion {
     parameters: usize,
-    /// Polynomials per parameter in the table: the highest degree and 1.
+    /// Number of polynomials per parameter in the table: the highest degree plus 1.
     orders: usize,
     factors: Vec<Factor>,
     /// Term t has the factors `ends[t]..ends[t + 1]`.
@@ -35,7 +35,8 @@ pub(super) struct Expansion {
 }
 
 impl Expansion {
-    /// Terms that several fits have are evaluated once.
+    /// The expansions of several fits over `parameters` parameters. Only terms that a fit uses are kept, and a term that several
+    /// fits use is evaluated once.
     pub fn new<'a>(candidates: &Candidates, parameters: usize, fits: impl Iterator<Item = &'a Fit> + Clone) -> Self {
         let used: BTreeMap<usize, u32> = {
             let mut used: Vec<usize> = fits.clone().flat_map(|fit| fit.terms.iter().copied()).collect();
@@ -55,7 +56,7 @@ impl Expansion {
             ends.push(factors.len() as u32);
         }
         let weights = |fit: &Fit| {
-            // The table holds plain Legendre polynomials: their norms go into the coefficients.
+            // The table contains Legendre polynomials that are not normalised: the coefficients include the norms.
             let weight = |(term, coefficient): (&usize, &f64)| Weight {
                 term: used[term],
                 coefficient: coefficient * norm(&candidates.terms[*term]),
@@ -65,7 +66,7 @@ impl Expansion {
         Self { parameters, orders, factors, ends, weights: fits.map(weights).collect() }
     }
 
-    /// Values of all expansions, `[m]`; `x` gives the scaled parameter of an index.
+    /// Values of all expansions, `[m]`; `x(j)` is parameter j, scaled to [−1, 1].
     pub fn values(&self, x: impl Fn(usize) -> f64) -> Vec<f64> {
         let terms = self.ends.len() - 1;
         let entries = self.parameters * self.orders;
@@ -82,7 +83,7 @@ impl Expansion {
         self.weights.iter().map(value).collect()
     }
 
-    /// Values of all expansions, `[m]`, and their derivatives with respect to x, `[m, d]`.
+    /// Values of all expansions, `[m]`, and their derivatives with respect to the scaled parameters, `[m, d]`.
     pub fn values_and_gradients(&self, x: impl Fn(usize) -> f64) -> (Vec<f64>, DMatrix<f64>) {
         let terms = self.ends.len() - 1;
         let entries = self.parameters * self.orders;
@@ -100,7 +101,7 @@ impl Expansion {
         for (product, range) in products.iter_mut().zip(self.ends.windows(2)) {
             let range = range[0] as usize..range[1] as usize;
             let (factors, slopes) = (&self.factors[range.clone()], &mut slopes[range]);
-            // Products of what stands before each factor, then of what stands after it: no division by a zero factor.
+            // The product of the factors before each factor, then that of the factors after it, avoids dividing by a zero factor.
             let mut before = 1.0;
             for (slope, factor) in slopes.iter_mut().zip(factors) {
                 *slope = before * slope_table[factor.entry as usize];
@@ -129,7 +130,7 @@ impl Expansion {
         (values, gradients)
     }
 
-    /// Terms of an expansion.
+    /// Number of terms of an expansion.
     pub fn terms(&self, mode: usize) -> usize {
         self.weights[mode].len()
     }

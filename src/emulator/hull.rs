@@ -1,39 +1,41 @@
-//! How far the runs reach: where the emulator would extrapolate.
+//! The region covered by the runs, outside which the emulator would extrapolate.
 
 use nalgebra::DMatrix;
 
 use super::regression::{dot, Regression};
 
-/// Runs per term from which the leverage is that of a quadratic function; below, of a linear one.
+/// The leverage is that of a quadratic function if there are at least this many runs per term, otherwise of a linear one.
 const RUNS_PER_TERM: usize = 10;
 
-/// Excess over the box or over the greatest leverage that is rounding.
+/// Tolerance for rounding errors of the box and of the largest leverage.
 const ROUNDING: f64 = 1e-9;
 
-/// The box of the runs, and within it the region that their leverages tell.
+/// The region covered by the runs: their box, restricted to points of small leverage h.
 ///
 /// ```text
 ///  h(x) = φ(x)ᵀ (ΦᵀΦ)⁻¹ φ(x) ≤ max_i h_i/(1 − h_i)
 /// ```
 ///
-/// φ is quadratic where there are ten runs per term of it, and linear otherwise: with few runs per term all leverages come
-/// near 1 and say nothing. h_i/(1 − h_i) is the leverage run i has on a table without it, as a fresh point has; the source
-/// compares with max h_i itself, which many runs make the same, and which with two runs per term lies below most points
-/// between the runs.
+/// φ is quadratic if there are ten runs per term, and otherwise linear: with few runs per term all leverages are near 1 and
+/// contain no information. h_i/(1 − h_i) is the leverage of run i in a table without it, which is comparable to that of a new
+/// point. The source compares with max h_i instead. For many runs both are the same, but with two runs per term most points
+/// between the runs exceed max h_i.
 ///
 /// Source: Montgomery, Peck & Vining (2012), §3.8, the regressor variable hull.
 #[derive(Debug, Clone)]
 pub(super) struct Hull {
     quadratic: bool,
-    /// Which entries of φ are independent at the runs: the square of a parameter run at two values is not.
+    /// Indices of the entries of φ that are linearly independent at the runs. The square of a parameter that has only two values,
+    /// for example, is not.
     kept: Vec<usize>,
-    /// Columns of R⁻¹, Φ = QR.
+    /// Columns of R⁻¹, where Φ = QR.
     inverse: Vec<Vec<f64>>,
+    /// max h_i/(1 − h_i).
     greatest: f64,
 }
 
 impl Hull {
-    /// `x`: the runs, `[n, d]`, scaled to [−1, 1].
+    /// The region covered by the runs `x`, `[n, d]`, scaled to [−1, 1].
     pub fn new(x: &DMatrix<f64>) -> Self {
         let (runs, d) = x.shape();
         let quadratic = runs >= RUNS_PER_TERM * (d + 1) * (d + 2) / 2;
@@ -50,7 +52,7 @@ impl Hull {
         Self { quadratic, kept, inverse: regression.into_inverse(), greatest }
     }
 
-    /// Whether a point, `[d]`, scaled to [−1, 1], lies outside; one that is not a number does.
+    /// Whether a point `x`, `[d]`, scaled to [−1, 1], is outside; a point with NaN is.
     pub fn is_outside(&self, x: &[f64]) -> bool {
         let in_box = x.iter().all(|x| x.abs() <= 1.0 + ROUNDING);
         if !in_box {

@@ -1,4 +1,5 @@
-//! A polynomial chaos emulator: a table of finite-element runs becomes a smooth function with derivatives and a told error.
+//! A polynomial chaos emulator: approximates a table of finite-element runs by a smooth function with derivatives and an
+//! estimate of its error.
 //!
 //! Each ln f_i is expanded in products of orthonormal Legendre polynomials of the parameters, scaled to [−1, 1] by the runs:
 //!
@@ -6,10 +7,10 @@
 //!  ln f_i(θ) ≈ Σ_α c_iα Π_j √(2α_j + 1) P_(α_j)(x_j),    x_j = (2θ_j − lower_j − upper_j)/(upper_j − lower_j)
 //! ```
 //!
-//! Which α there are, all of a degree or a selection, is decided by the error at runs left out.
+//! The terms α are either all up to a degree or a selection, whichever has the smaller error at runs left out.
 //!
-//! Two neighbouring modes that veer or cross have bends or kinks, which polynomials follow badly. Of such a pair the mean of
-//! the two ln f and the square of their difference are expanded instead, if that does better.
+//! Neighbouring modes that veer or cross have sharp bends or kinks, which polynomials approximate poorly. For such a pair the
+//! mean of the two ln f and the square of their difference are expanded instead, if that has a smaller error.
 //!
 //! Source: Blatman & Sudret (2011), doi:10.1016/j.jcp.2010.12.021; Le Gratiet, Marelli & Sudret (2017),
 //! doi:10.1007/978-3-319-12385-1_38.
@@ -22,6 +23,7 @@ mod pair;
 mod path;
 mod regression;
 mod runs;
+mod search;
 mod select;
 
 use nalgebra::DMatrix;
@@ -32,7 +34,8 @@ use basis::Candidates;
 use expansion::Expansion;
 use hull::Hull;
 use pair::{Pair, PairFit};
-use select::{Fit, Search};
+use search::Search;
+use select::Fit;
 
 pub use crossing::Crossing;
 pub use runs::{FitError, Runs};
@@ -43,23 +46,23 @@ pub struct Emulator {
     /// Parameter values at x = −1 and x = 1, `[d]`.
     lower: Vec<f64>,
     upper: Vec<f64>,
-    /// ln f of each mode; of a pair, mean and squared gap instead.
+    /// ln f of each mode; for a pair of modes the mean and the squared gap instead.
     expansion: Expansion,
     pairs: Vec<Pair>,
     hull: Hull,
-    /// ln f of each run less what is foretold without it, `[m][n]`.
+    /// ln f of each run minus its prediction without the run, `[m][n]`.
     held_out: Vec<Vec<f64>>,
-    /// Root mean square error of ln f told, `[m]`.
+    /// Estimated root mean square error of ln f, `[m]`.
     relative_error: Vec<f64>,
     r_squared: Vec<f64>,
     crossings: Vec<Crossing>,
 }
 
 impl Emulator {
-    /// Expands the frequencies of the runs. The same runs give the same emulator, on however many threads.
+    /// Fits an emulator to runs. The same runs give the same emulator on any number of threads.
     ///
     /// # Errors
-    /// [`FitError`].
+    /// [`FitError`] for a table that is too short or has invalid values.
     pub fn fit(runs: &Runs) -> Result<Self, FitError> {
         runs.check()?;
         let lower: Vec<f64> = runs.parameters.column_iter().map(|column| column.min()).collect();
@@ -98,7 +101,7 @@ impl Emulator {
         })
     }
 
-    /// ln f of each mode, f in Hz, `[m]`; `theta`: `[d]`, parameter units.
+    /// ln f of each mode (f in Hz), `[m]`, at parameters `theta` (`[d]`, parameter units).
     pub fn ln_frequencies(&self, theta: &[f64]) -> Vec<f64> {
         let mut values = self.expansion.values(|j| scaled(theta[j], self.lower[j], self.upper[j]));
         for pair in &self.pairs {
@@ -107,9 +110,9 @@ impl Emulator {
         values
     }
 
-    /// Natural frequencies, Hz, `[m]`; `theta`: `[d]`, parameter units.
+    /// Natural frequencies, Hz, `[m]`, at parameters `theta` (`[d]`, parameter units).
     ///
-    /// Modes that were not emulated as a pair may be out of order, by their errors, where they come close.
+    /// Where modes that were not emulated as a pair come closer than their errors, they may not be in ascending order.
     pub fn frequencies_hz(&self, theta: &[f64]) -> Vec<f64> {
         let mut frequencies = self.ln_frequencies(theta);
         for f in &mut frequencies {
@@ -118,7 +121,7 @@ impl Emulator {
         frequencies
     }
 
-    /// Natural frequencies, Hz, `[m]`, and their derivatives, Hz per parameter unit, `[m, d]`; `theta`: `[d]`.
+    /// Natural frequencies, Hz, `[m]`, and their derivatives, Hz per parameter unit, `[m, d]`, at parameters `theta` (`[d]`).
     ///
     /// ```text
     ///  ∂f_i/∂θ_j = f_i · ∂ln f_i/∂x_j · 2/(upper_j − lower_j)
@@ -140,7 +143,7 @@ impl Emulator {
         (frequencies, jacobian)
     }
 
-    /// Least and greatest value of each parameter in the runs, `[d]`.
+    /// Smallest and largest value of each parameter in the runs, `[d]`.
     pub fn ranges(&self) -> impl Iterator<Item = [f64; 2]> + '_ {
         self.lower.iter().zip(&self.upper).map(|(lower, upper)| [*lower, *upper])
     }
@@ -155,42 +158,43 @@ impl Emulator {
         self.lower.len()
     }
 
-    /// Terms that a mode, from 0, is made of.
+    /// Number of terms of the expansion of a mode (counted from 0).
     pub fn terms(&self, mode: usize) -> usize {
         let pair = self.pairs.iter().find(|pair| pair.lower == mode || pair.lower + 1 == mode);
         pair.map_or(self.expansion.terms(mode), |p| self.expansion.terms(p.lower) + self.expansion.terms(p.lower + 1))
     }
 
-    /// Root mean square error of ln f of a mode, from 0, to be expected at a new point: the relative error of its frequency.
+    /// Expected root mean square error of ln f of a mode (counted from 0) at a new point, which is the relative error of its
+    /// frequency.
     ///
-    /// It is the corrected leave-one-out error of an expansion that has all terms of a degree, and the cross-validation error
-    /// of one whose terms were selected, and holds for points that come about as the runs did and are not outside. Noise of
-    /// the table counts as error.
+    /// This is the corrected leave-one-out error of an expansion with all terms up to a degree, and the cross-validation error of
+    /// one with selected terms. It is valid for points that have the same distribution as the runs and are not outside. Noise in
+    /// the table is included.
     pub fn relative_error(&self, mode: usize) -> f64 {
         self.relative_error[mode]
     }
 
-    /// ln f of each run less what is foretold without it, `[m][n]`.
+    /// ln f of each run minus its prediction without the run, `[m][n]`.
     ///
-    /// Without that run alone, e_i/(1 − h_i), where the expansion has all terms of a degree; without the tenth or fifth of
-    /// the runs it was drawn together with where terms were selected.
+    /// For an expansion with all terms up to a degree, the prediction is fitted to all other runs, which gives e_i/(1 − h_i). For
+    /// selected terms it is fitted without the whole fold of the run, which is a tenth or a fifth of all runs.
     pub fn held_out_residuals(&self) -> &[Vec<f64>] {
         &self.held_out
     }
 
-    /// Share of the variance of ln f over the runs that the expansion of a mode, from 0, foretells.
+    /// Share of the variance of ln f over the runs that the expansion of a mode (counted from 0) explains in cross-validation.
     ///
     /// ```text
     ///  R² = 1 − ε / var(ln f)
     /// ```
     ///
-    /// ε is the squared [`Self::relative_error`]. A frequency that is the same in all runs has 1.
+    /// ε is the squared [`Self::relative_error`]. For a frequency that is the same in all runs, R² is 1.
     pub fn r_squared(&self, mode: usize) -> f64 {
         self.r_squared[mode]
     }
 
-    /// Whether the emulator extrapolates at `theta`, `[d]`: beyond the range of the runs in any parameter, or in a corner of
-    /// it without runs, as told by the leverage. No run is outside.
+    /// Whether the emulator extrapolates at parameters `theta` (`[d]`): outside the range of the runs in any parameter, or in a
+    /// corner of that range without runs, which the leverage shows. No run itself is outside.
     pub fn is_outside(&self, theta: &[f64]) -> bool {
         let x: Vec<f64> = theta
             .iter()
@@ -206,15 +210,16 @@ impl Emulator {
     }
 }
 
-/// To [−1, 1]; from the middle, which keeps the digits of a narrow range far from 0.
+/// A parameter scaled to [−1, 1]. The form of the formula keeps the digits of a narrow range far from 0.
 fn scaled(theta: f64, lower: f64, upper: f64) -> f64 {
     ((theta - lower) - (upper - theta)) / (upper - lower)
 }
 
+/// Coefficient of determination for a mean square error.
 fn r_squared(y: &[f64], error: f64) -> f64 {
     let centre = stats::mean(y);
     let variance = y.iter().map(|y| (y - centre).powi(2)).sum::<f64>() / y.len() as f64;
-    // Rounding varies too.
+    // A variance of the size of rounding errors counts as none.
     if variance.sqrt() <= f64::EPSILON * centre.abs() {
         return 1.0;
     }

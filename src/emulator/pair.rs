@@ -1,34 +1,35 @@
-//! Two neighbouring modes that veer or cross, emulated through what is smooth about them.
+//! Pairs of neighbouring modes that veer or cross, emulated by their mean and squared gap, which are smooth.
 
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::crossing::Gap;
-use super::select::{Fit, Search};
+use super::search::Search;
+use super::select::Fit;
 
 /// A pair whose mean and squared gap are expanded instead of its two modes.
 #[derive(Debug, Clone)]
 pub(super) struct Pair {
     /// The lower one of the two modes, from 0.
     pub lower: usize,
-    /// Least squared gap: the root mean square error of the squared gap, below which it says nothing.
+    /// Smallest squared gap: its root mean square error.
     floor: f64,
 }
 
-/// Expansions of mean and squared gap of a pair, and what they tell of its two modes.
+/// Expansions of the mean and the squared gap of a pair, and the resulting errors of its two modes.
 #[derive(Debug)]
 pub(super) struct PairFit {
     pub pair: Pair,
     pub mean: Fit,
     pub squared_gap: Fit,
-    /// ln f of each run less what is foretold without it, lower and upper mode, `[n]` each.
+    /// ln f minus its prediction without the run, for the lower and the upper mode, `[n]` each.
     pub held_out: [Vec<f64>; 2],
-    /// Mean square error to be expected at a new point, lower and upper mode.
+    /// Expected mean square error at a new point, for the lower and the upper mode.
     pub errors: [f64; 2],
 }
 
 impl Pair {
-    /// Turns mean and squared gap, where the values of the two modes belong, into these.
+    /// Replaces the mean and the squared gap D of the pair in `values` by ln f of its two modes.
     ///
     /// ```text
     ///  ln f = mean ∓ √D / 2
@@ -39,10 +40,10 @@ impl Pair {
         values[self.lower + 1] = mean + half;
     }
 
-    /// The same for the gradients, `[m, d]`; `values` are not separated yet.
+    /// [`Self::separate`] for the gradients, `[m, d]`; `values` still contains the mean and the squared gap.
     pub fn separate_gradients(&self, values: &[f64], gradients: &mut DMatrix<f64>) {
         let squared_gap = values[self.lower + 1];
-        // d(√D/2) = dD/(4√D), and none where D is at its floor.
+        // d(√D/2) = dD/(4√D), and 0 where D is at its floor.
         let rate = if squared_gap > self.floor { 0.125 / self.half_gap(squared_gap) } else { 0.0 };
         for mut column in gradients.column_iter_mut() {
             let (mean, half) = (column[self.lower], rate * column[self.lower + 1]);
@@ -58,9 +59,9 @@ impl Pair {
 
 /// Expands the mean and the squared gap of the pairs in `gaps`; `ln_frequencies`: `[m][n]`.
 ///
-/// Where two modes interact with each other alone, their eigenvalues are the roots of a quadratic equation with smooth
-/// coefficients. Each root has a kink where they cross and a bend where they veer; their sum and the square of their
-/// difference have neither, nor have those of their logarithms.
+/// Where two modes interact only with each other, their eigenvalues are the roots of a quadratic equation with smooth
+/// coefficients. Each root has a kink where the modes cross and a sharp bend where they veer, but their sum and the square of
+/// their difference are smooth, and so are those of their logarithms.
 pub(super) fn fit_pairs(search: &Search, gaps: &[Gap], ln_frequencies: &[Vec<f64>]) -> Vec<PairFit> {
     let fit = |gap: &Gap| {
         let modes = [&ln_frequencies[gap.lower_mode], &ln_frequencies[gap.lower_mode + 1]];
@@ -71,11 +72,11 @@ pub(super) fn fit_pairs(search: &Search, gaps: &[Gap], ln_frequencies: &[Vec<f64
             gap.squared.iter().zip(&gap_fit.held_out).map(|(d, missed)| pair.half_gap(d - missed)).collect();
         let held_out = [-1.0, 1.0].map(|sign| {
             let truth = if sign < 0.0 { modes[0] } else { modes[1] };
-            let foretold =
+            let predicted =
                 mean.iter().zip(&mean_fit.held_out).zip(&half_gaps).map(|((m, r), half)| m - r + sign * half);
-            truth.iter().zip(foretold).map(|(y, foretold)| y - foretold).collect::<Vec<f64>>()
+            truth.iter().zip(predicted).map(|(y, predicted)| y - predicted).collect::<Vec<f64>>()
         });
-        // A correction that either expansion has for its size is theirs together.
+        // The larger correction for the number of terms applies to both modes.
         let correction = correction(&mean_fit).max(correction(&gap_fit));
         let errors = [0, 1].map(|mode| correction * mean_square(&held_out[mode]));
         PairFit { pair, mean: mean_fit, squared_gap: gap_fit, held_out, errors }
@@ -83,7 +84,7 @@ pub(super) fn fit_pairs(search: &Search, gaps: &[Gap], ln_frequencies: &[Vec<f64
     gaps.par_iter().map(fit).collect()
 }
 
-/// Those pairs, of which no two share a mode, that do better than their modes alone; by ascending mode.
+/// The pairs with a smaller error than their two modes expanded separately, by ascending mode. No two of them share a mode.
 pub(super) fn choose(mut pairs: Vec<PairFit>, alone: &[Fit]) -> Vec<PairFit> {
     let gain = |pair: &PairFit| {
         let lower = pair.pair.lower;
@@ -101,9 +102,10 @@ pub(super) fn choose(mut pairs: Vec<PairFit>, alone: &[Fit]) -> Vec<PairFit> {
     chosen
 }
 
+/// Ratio of the expected error of a fit to the mean square of its held-out residuals, at least 1.
 fn correction(fit: &Fit) -> f64 {
     let plain = mean_square(&fit.held_out);
-    // An expansion without any error has none to correct.
+    // An exact expansion needs no correction.
     if plain > 0.0 {
         (fit.error / plain).max(1.0)
     } else {

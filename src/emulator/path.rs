@@ -1,21 +1,21 @@
-//! Forward selection, one term at a time.
+//! Forward selection of terms, one at a time.
 
 use std::ops::Range;
 
 use super::regression::{dot, subtract_multiples, Regression};
-use super::select::Search;
+use super::search::Search;
 
-/// A candidate that keeps less than this share of its squared length beyond the chosen ones is not chosen.
+/// A candidate is no longer chosen if less than this share of its squared length is orthogonal to the chosen terms.
 const SPENT: f64 = 1e-6;
 
-/// A forward selection on its way: each step takes the candidate that lowers the residual most.
+/// State of a forward selection. Each step takes the candidate that reduces the residual e most.
 ///
 /// ```text
 ///  maximise (φ_jᵀ e)² / ‖φ_j − QQᵀφ_j‖²
 /// ```
 ///
-/// Products of the candidates with the orthonormal columns follow from the Gram matrix, so that a step costs no pass over
-/// candidates × runs. Their rounding can only change which term is chosen.
+/// Products of the candidates with the orthonormal columns Q are computed from the Gram matrix, so that a step needs no pass over
+/// candidates × runs. Their rounding errors can only affect which term is chosen.
 ///
 /// Source: Chen, Billings & Luo (1989), orthogonal least squares.
 #[derive(Debug)]
@@ -26,9 +26,11 @@ pub(super) struct Path<'a> {
     regression: Regression,
     /// φ_jᵀe of each candidate.
     correlation: Vec<f64>,
-    /// ‖φ_j‖² and what of it is beyond the chosen ones.
+    /// ‖φ_j‖² of each candidate.
     length: Vec<f64>,
+    /// ‖φ_j − QQᵀφ_j‖² of each candidate.
     left: Vec<f64>,
+    /// Whether each candidate can still be chosen.
     open: Vec<bool>,
     /// Φᵀq of each chosen term, one after the other.
     products: Vec<f64>,
@@ -36,7 +38,8 @@ pub(super) struct Path<'a> {
 }
 
 impl<'a> Path<'a> {
-    /// No term yet. `set` begins with the constant, which is the first; `correlations`: φ_jᵀy of all candidates, all runs.
+    /// A selection from `set` without any term yet, fitted to all runs except `held_out`. `set` begins with the constant, which is
+    /// chosen first; `correlations` holds φ_jᵀy of all candidates over all runs.
     pub fn new(
         search: &'a Search<'a>,
         set: &'a [usize],
@@ -61,7 +64,7 @@ impl<'a> Path<'a> {
         }
     }
 
-    /// Takes one more term; false where none is left that would help.
+    /// Adds one term; false if no term is left that reduces the residual.
     pub fn advance(&mut self) -> bool {
         while let Some(chosen) = self.next() {
             self.open[chosen] = false;
@@ -76,7 +79,7 @@ impl<'a> Path<'a> {
         false
     }
 
-    /// y less the fit at the runs held out.
+    /// y minus the prediction at the runs held out.
     pub fn held_out_residual(&self) -> &[f64] {
         self.regression.held_out_residual()
     }
@@ -86,6 +89,7 @@ impl<'a> Path<'a> {
         self.terms
     }
 
+    /// Index in the set of the best candidate.
     fn next(&self) -> Option<usize> {
         if self.terms.is_empty() {
             return Some(0);
@@ -101,7 +105,7 @@ impl<'a> Path<'a> {
         next
     }
 
-    /// Takes the new orthonormal column out of all candidates; `upper` is the column of R that made it.
+    /// Removes the component along the new orthonormal column from all candidates; `upper` is the new column of R.
     fn update(&mut self, term: usize, upper: &[f64]) {
         let gram = self.search.gram.column(term);
         let held_out = &self.search.column(term)[self.held_out.clone()];

@@ -1,20 +1,20 @@
-//! Least squares that grows by one column at a time and knows its error at runs left out at every size.
+//! Least squares regression that grows by one column at a time and gives its error at runs left out at every size.
 
 use std::ops::Range;
 
-/// A column that keeps less than this share of its length beyond those before it depends on them.
+/// A column is linearly dependent if less than this share of its length is orthogonal to the columns before it.
 const DEPENDENT: f64 = 1e-7;
 
-/// A column that keeps less than this share of its squared length is made orthogonal a second time.
+/// A column is orthogonalised a second time if less than this share of its squared length remains.
 const CANCELLED: f64 = 0.5;
 
-/// 1 − h below which a run decides alone about a coefficient: it cannot be left out.
+/// If 1 − h is below this, the run alone determines a coefficient and cannot be left out.
 const DECISIVE: f64 = 1e-9;
 
 /// y = Φβ + e by Gram–Schmidt, Φ = QR, with the diagonal h of the hat matrix QQᵀ.
 #[derive(Debug)]
 pub(super) struct Regression {
-    /// Rows that take no part in the fit, only in its predictions.
+    /// Rows that are predicted but not fitted.
     held_out: Range<usize>,
     /// Columns of Q, one after the other.
     orthonormal: Vec<f64>,
@@ -29,12 +29,12 @@ pub(super) struct Regression {
 }
 
 impl Regression {
-    /// No columns yet; `y`: `[n]`.
+    /// A regression of `y`, `[n]`, without columns yet.
     pub fn new(y: &[f64]) -> Self {
         Self::without(y, 0..0)
     }
 
-    /// The same, fitted without some of the runs, which the columns are carried on to all the same.
+    /// [`Self::new`] fitted without the runs `held_out`, which are only predicted.
     pub fn without(y: &[f64], held_out: Range<usize>) -> Self {
         Self {
             held_out,
@@ -47,10 +47,10 @@ impl Regression {
         }
     }
 
-    /// Adds a column of Φ, `[n]`; `products` are Qᵀ times it, where they are known already. Returns the new column of R,
-    /// or `None` if the column depends on those before it and stays out.
+    /// Adds a column of Φ, `[n]`. `products` is Qᵀ times this column, if it is known already. Returns the new column of R, or
+    /// `None` if the column is linearly dependent on those before it, in which case it is not added.
     ///
-    /// Gram–Schmidt is repeated where it cancels, after which Q is orthogonal to rounding.
+    /// Gram–Schmidt is repeated where digits cancel, so that Q is orthogonal to rounding error.
     ///
     /// Source: Daniel, Gragg, Kaufman & Stewart (1976).
     pub fn push(&mut self, column: &[f64], products: Option<Vec<f64>>) -> Option<Vec<f64>> {
@@ -68,7 +68,7 @@ impl Regression {
             upper.iter_mut().zip(&again).for_each(|(r, correction)| *r += correction);
             left = self.fitted_dot(&q, &q);
         }
-        // Not `<=`: NaN must stay out too.
+        // Written so that NaN is not added either.
         let independent = left > DEPENDENT * DEPENDENT * length;
         if !independent {
             return None;
@@ -89,7 +89,7 @@ impl Regression {
         Some(upper)
     }
 
-    /// Columns so far.
+    /// Number of columns.
     pub fn terms(&self) -> usize {
         self.projections.len()
     }
@@ -110,12 +110,12 @@ impl Regression {
         coefficients
     }
 
-    /// y less the fit at the runs held out.
+    /// y minus the prediction at the runs held out.
     pub fn held_out_residual(&self) -> &[f64] {
         &self.residual[self.held_out.clone()]
     }
 
-    /// What each run misses the fit to all the others by: e_i/(1 − h_i), `[n]`; infinite where the others cannot tell.
+    /// Residual of each run in a fit to all other runs, e_i/(1 − h_i), `[n]`; infinite if the other runs do not determine the fit.
     pub fn leave_one_out(&self) -> Vec<f64> {
         let one = |(e, h): (&f64, &f64)| if 1.0 - h > DECISIVE { e / (1.0 - h) } else { f64::INFINITY };
         self.residual.iter().zip(&self.leverage).map(one).collect()
@@ -127,7 +127,7 @@ impl Regression {
     ///  ε = T · 1/n Σ (e_i/(1 − h_i))²,    T = n/(n − P) · (1 + tr (ΦᵀΦ)⁻¹)
     /// ```
     ///
-    /// T, from Chapelle, Vapnik & Bengio (2002), makes up for having chosen the P terms with the same runs.
+    /// The factor T of Chapelle, Vapnik & Bengio (2002) corrects for choosing the P terms with the same runs.
     ///
     /// Source: Blatman & Sudret (2011), eqs. 15–17, where the trace is that of (ΦᵀΦ/n)⁻¹, divided by n.
     pub fn corrected_error(&self) -> f64 {
@@ -146,12 +146,12 @@ impl Regression {
         sum / (n - terms) as f64 * (1.0 + self.inverse_trace)
     }
 
-    /// h of each run, `[n]`.
+    /// Leverage h of each run, `[n]`.
     pub fn leverage(&self) -> &[f64] {
         &self.leverage
     }
 
-    /// Columns of R⁻¹, each down to the diagonal.
+    /// Columns of R⁻¹, each from its first row to the diagonal.
     pub fn into_inverse(self) -> Vec<Vec<f64>> {
         self.inverse
     }
@@ -167,7 +167,7 @@ impl Regression {
         subtract_multiples(column, &self.orthonormal, products);
     }
 
-    /// R⁻¹ of the matrix with one column (`upper`, `diagonal`) more.
+    /// Extends R⁻¹ by the column that belongs to a new column (`upper`, `diagonal`) of R.
     fn extend_inverse(&mut self, upper: &[f64], diagonal: f64) {
         let mut next = vec![0.0; upper.len() + 1];
         for (column, r) in self.inverse.iter().zip(upper) {
@@ -179,7 +179,7 @@ impl Regression {
     }
 }
 
-/// Four sums side by side: the processor need not wait for each addition.
+/// Scalar product by four independent partial sums, so that the processor does not wait for each addition.
 pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let (a_four, b_four) = (a.chunks_exact(4), b.chunks_exact(4));
     let rest: f64 = a_four.remainder().iter().zip(b_four.remainder()).map(|(a, b)| a * b).sum();
@@ -192,7 +192,7 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     rest + (sums[0] + sums[1]) + (sums[2] + sums[3])
 }
 
-/// `a` less each column of `columns` times its factor; four columns at a time, which spares reading `a` as often.
+/// Subtracts from `a` each column of `columns` times its factor, four columns at a time, to read `a` less often.
 pub(super) fn subtract_multiples(a: &mut [f64], columns: &[f64], factors: &[f64]) {
     let n = a.len();
     let (fours, rest) = (columns.chunks_exact(4 * n), columns.chunks_exact(4 * n).remainder());

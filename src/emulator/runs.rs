@@ -1,20 +1,20 @@
-//! The table of finite-element runs, and what makes a table unfit for an emulator.
+//! Tables of finite-element runs and their checks.
 
 use nalgebra::DMatrix;
 
-/// Finite-element runs: the parameters each was run with, the natural frequencies it gave.
+/// Finite-element runs: their parameters and the natural frequencies that they gave.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Runs {
-    /// One row per run, `[n, d]`, parameter units.
+    /// Parameters, one row per run, `[n, d]`, parameter units.
     pub parameters: DMatrix<f64>,
-    /// One row per run, `[n, m]`, Hz, ascending within a row.
+    /// Natural frequencies, one row per run, `[n, m]`, Hz, ascending within a row.
     pub frequencies_hz: DMatrix<f64>,
 }
 
-/// Why no emulator can be made of a table of runs. Runs, parameters and modes are counted from 1.
+/// Why an emulator cannot be fitted to a table of runs. Runs, parameters and modes are counted from 1.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum FitError {
-    /// No parameter column or no frequency column.
+    /// There is no parameter column or no frequency column.
     #[error("the table has {parameters} parameters and {modes} frequencies: it needs at least one of each")]
     Empty {
         /// Parameter columns.
@@ -22,15 +22,15 @@ pub enum FitError {
         /// Frequency columns.
         modes: usize,
     },
-    /// The two tables differ in length.
-    #[error("there are parameters of {parameters} runs, but frequencies of {frequencies}")]
+    /// Parameters and frequencies have different numbers of runs.
+    #[error("there are parameters of {parameters} runs, but frequencies of {frequencies}: both need the same runs")]
     Lengths {
         /// Rows of the parameters.
         parameters: usize,
         /// Rows of the frequencies.
         frequencies: usize,
     },
-    /// Fewer runs than twice the terms of a linear function.
+    /// There are fewer than two runs for each term of a linear function.
     #[error("{runs} runs are too few for {parameters} parameters: at least {needed} are needed")]
     TooFewRuns {
         /// Runs in the table.
@@ -40,7 +40,7 @@ pub enum FitError {
         /// Runs needed: 2(d + 1).
         needed: usize,
     },
-    /// A parameter that is infinite or not a number.
+    /// A parameter is infinite or not a number.
     #[error("run {run}, parameter {parameter}: {value} is not a finite number")]
     ParameterNotFinite {
         /// The run.
@@ -50,16 +50,16 @@ pub enum FitError {
         /// The value.
         value: f64,
     },
-    /// A parameter that has the same value in all runs.
-    #[error("parameter {parameter} is {value} in every run: leave its column out, or vary it")]
+    /// A parameter has the same value in all runs.
+    #[error("parameter {parameter} is {value} in every run: remove its column, or vary it")]
     Constant {
         /// The parameter column.
         parameter: usize,
         /// Its only value.
         value: f64,
     },
-    /// A frequency that is not a positive, finite number.
-    #[error("run {run}, mode {mode}: the frequency {hz} Hz is not positive and finite")]
+    /// A frequency is not a positive, finite number.
+    #[error("run {run}, mode {mode}: the frequency {hz} Hz must be positive and finite")]
     NotPositive {
         /// The run.
         run: usize,
@@ -68,7 +68,7 @@ pub enum FitError {
         /// The frequency, Hz.
         hz: f64,
     },
-    /// A frequency below that of the mode before it.
+    /// A frequency is below that of the mode before it.
     #[error("run {run}: mode {mode} has {hz} Hz, the mode before it {before_hz} Hz: frequencies must ascend")]
     NotAscending {
         /// The run.
@@ -83,8 +83,10 @@ pub enum FitError {
 }
 
 impl Runs {
+    /// Checks that an emulator can be fitted.
+    ///
     /// # Errors
-    /// [`FitError`].
+    /// [`FitError`] for the first mistake found.
     pub(super) fn check(&self) -> Result<(), FitError> {
         let ((runs, parameters), modes) = (self.parameters.shape(), self.frequencies_hz.ncols());
         if parameters == 0 || modes == 0 {
@@ -101,7 +103,7 @@ impl Runs {
             self.check_run(run)?;
         }
         for (parameter, column) in self.parameters.column_iter().enumerate() {
-            // A width that overflows would scale all values to zero: it is as useless as none.
+            // A width that overflows would scale all values to zero.
             let width = column.max() - column.min();
             if width <= 0.0 || !width.is_finite() {
                 return Err(FitError::Constant { parameter: parameter + 1, value: column[0] });
@@ -119,7 +121,7 @@ impl Runs {
             if !(hz.is_finite() && hz > 0.0) {
                 return Err(FitError::NotPositive { run: run + 1, mode: mode + 1, hz });
             }
-            // Equal ones are a repeated eigenvalue, which a symmetric structure has.
+            // Equal frequencies are allowed: a symmetric structure has repeated eigenvalues.
             if hz < before_hz {
                 return Err(FitError::NotAscending { run: run + 1, mode: mode + 1, hz, before_hz });
             }

@@ -1,23 +1,23 @@
-//! The activation of all hidden layers, as one pass over memory each way.
+//! The activation of all hidden layers, with one pass over memory forward and one backward.
 //!
-//! candle composes the derivative of SiLU from six operations and calls the C library for each exponential; here both are
-//! one loop that the compiler turns into vector instructions. It halves the time of a training step.
+//! candle composes the derivative of SiLU from six operations and calls the C library for each exponential. Here each
+//! direction is one vectorised loop, which halves the time of a training step.
 
 use candle_core::{bail, CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor};
 
 use super::kernel::sigmoid;
 
-/// silu(x) = x / (1 + exp(−x)), by element.
+/// silu(x) = x / (1 + exp(−x)), element by element; a tensor of the same shape.
 ///
 /// # Errors
-/// A candle error when `x` is neither f32 nor f64, or does not lie contiguous in the memory of the CPU.
+/// A candle error when `x` is neither f32 nor f64, or is not contiguous in the memory of the CPU.
 pub fn silu(x: &Tensor) -> Result<Tensor> {
     x.apply_op1(Silu)
 }
 
 struct Silu;
 
-/// Derivative of [`Silu`] times the gradient of its result.
+/// Derivative of [`Silu`] times the gradient with respect to its result.
 struct SiluGradient;
 
 impl CustomOp1 for Silu {
@@ -67,7 +67,7 @@ impl CustomOp2 for SiluGradient {
 fn contiguous<'a, T>(values: &'a [T], layout: &Layout) -> Result<&'a [T]> {
     match layout.contiguous_offsets() {
         Some((start, end)) => Ok(&values[start..end]),
-        None => bail!("silu takes tensors that lie contiguous in memory"),
+        None => bail!("silu takes contiguous tensors"),
     }
 }
 
@@ -119,8 +119,8 @@ mod tests {
             let sigmoid = 1.0 / (1.0 + (-x).exp());
             let expected = [x * sigmoid, sigmoid * (1.0 + x * (1.0 - sigmoid))];
             for (found, expected) in [f64::from(y), f64::from(slope)].into_iter().zip(expected) {
-                // f32 has 6e-8, which x·(1 − sigmoid) multiplies by x; the slope crosses zero, where only the absolute
-                // error counts.
+                // The rounding error of f32 is 6e-8, which x·(1 − sigmoid) multiplies by x. The slope crosses zero, where
+                // only the absolute error is meaningful.
                 let tolerance = 4e-7 * (1.0 + expected.abs()) + 1.2e-7 * x.abs();
                 assert!((found - expected).abs() < tolerance, "at {x}: {found}, expected {expected}");
             }

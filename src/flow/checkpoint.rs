@@ -1,4 +1,4 @@
-//! Weights to and from safetensors.
+//! Writing and reading weights in the safetensors format.
 
 use std::collections::HashMap;
 
@@ -6,25 +6,26 @@ use candle_core::{DType, Device, Tensor};
 use candle_nn::VarBuilder;
 use safetensors::{Dtype, SafeTensors, View};
 
-use super::weights::Weights;
-use super::{Architecture, Flow};
+use super::architecture::Architecture;
+use super::model::Flow;
+use super::weights::{untrained_flow, Weights};
 
-/// Largest weight file that is read, bytes: a wrong file is refused before it fills the memory.
+/// Largest weight file that is accepted, bytes. A larger file is refused before it fills the memory.
 pub const LARGEST_FILE_BYTES: usize = 256 << 20;
 
 /// Why a weight file is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Not safetensors, or cut short.
-    #[error("not a whole safetensors file: {0}")]
+    /// The file is not in the safetensors format, or is truncated.
+    #[error("not a complete safetensors file: {0}")]
     Format(#[from] safetensors::SafeTensorError),
-    /// Too large to be one of ours.
-    #[error("the file has {bytes} bytes, more than the {LARGEST_FILE_BYTES} that are read")]
+    /// The file is larger than any weight file.
+    #[error("the file has {bytes} bytes, more than the {LARGEST_FILE_BYTES} that are accepted")]
     TooLarge {
         /// Size of the file.
         bytes: usize,
     },
-    /// A weight that is not f32.
+    /// A weight is not stored as f32.
     #[error("weight {name} is stored as {found:?}, expected F32")]
     Precision {
         /// Name of the weight.
@@ -32,26 +33,26 @@ pub enum Error {
         /// Type found.
         found: Dtype,
     },
-    /// A weight that is NaN or infinite.
-    #[error("weight {name} has a value that is not finite at place {place}")]
+    /// A weight contains NaN or an infinite value.
+    #[error("weight {name} has a value that is not finite at index {index}")]
     NotFinite {
         /// Name of the weight.
         name: String,
         /// Index in row-major order.
-        place: usize,
+        index: usize,
     },
-    /// A weight that the architecture does not have.
+    /// The architecture has no weight of this name.
     #[error("weight {name} does not belong to this architecture")]
     Foreign {
         /// Name of the weight.
         name: String,
     },
-    /// A weight missing or of another shape.
+    /// A weight is missing or has the wrong shape.
     #[error("the weights do not fit the architecture: {0}")]
     Misfit(#[from] candle_core::Error),
 }
 
-/// The weights as a safetensors file, f32; equal weights give equal bytes.
+/// The contents of a safetensors file with the weights, f32. Equal weights give equal bytes.
 ///
 /// # Errors
 /// [`Error::Format`], which would be a bug.
@@ -65,10 +66,10 @@ pub fn to_bytes(weights: &Weights) -> Result<Vec<u8>, Error> {
     Ok(safetensors::serialize(views, None)?)
 }
 
-/// The flow of a safetensors file, in the wanted precision.
+/// Reads a flow from the contents of a safetensors file, in the requested precision.
 ///
 /// # Errors
-/// One variant of [`Error`] for each way a file can be wrong: cut, foreign, of other shapes, not finite.
+/// [`Error`], with one variant for each way a file can be wrong: truncated, of another architecture, not finite.
 pub fn from_bytes(bytes: &[u8], architecture: &Architecture, dtype: DType) -> Result<Flow, Error> {
     if bytes.len() > LARGEST_FILE_BYTES {
         return Err(Error::TooLarge { bytes: bytes.len() });
@@ -81,22 +82,23 @@ pub fn from_bytes(bytes: &[u8], architecture: &Architecture, dtype: DType) -> Re
         }
         let values: Vec<f32> =
             view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
-        if let Some(place) = values.iter().position(|v| !v.is_finite()) {
-            return Err(Error::NotFinite { name, place });
+        if let Some(index) = values.iter().position(|v| !v.is_finite()) {
+            return Err(Error::NotFinite { name, index });
         }
         tensors.insert(name, Tensor::from_vec(values, view.shape(), &Device::Cpu)?.to_dtype(dtype)?);
     }
     let names: Vec<String> = tensors.keys().cloned().collect();
-    // First the flow: an architecture that claims to be gigantic does not fit the file, and is not built to be compared with it.
+    // The flow is built from the file first: a damaged architecture of enormous size fails here, before its weights are
+    // drawn.
     let flow = Flow::new(architecture, &VarBuilder::from_tensors(tensors, dtype, &Device::Cpu))?;
-    let (_, expected) = super::weights::untrained_flow(architecture, DType::F32, 0)?;
+    let (_, expected) = untrained_flow(architecture, DType::F32, 0)?;
     if let Some(name) = names.into_iter().find(|name| !expected.contains_key(name)) {
         return Err(Error::Foreign { name });
     }
     Ok(flow)
 }
 
-/// One tensor's bytes for the writer.
+/// Shape and bytes of one tensor, for the writer.
 struct FloatView {
     shape: Vec<usize>,
     bytes: Vec<u8>,

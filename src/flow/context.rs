@@ -1,25 +1,25 @@
-//! The conditional network: a 1-D convolutional network over the observation vector.
+//! The context network: a 1-D convolutional network over the observation.
 
 use candle_core::{Result, Tensor, D};
 use candle_nn::VarBuilder;
 
 use super::activation::silu;
+use super::architecture::Architecture;
 use super::dense::Dense;
-use super::Architecture;
 
-/// Reach of a convolution: each mode sees itself and its two neighbours.
+/// Width of the convolution kernels: each mode is combined with its two neighbours.
 pub(super) const KERNEL: usize = 3;
 
-/// Two 1-D convolutions along the modes and a dense layer; the observation itself is passed beside the features.
+/// Two 1-D convolutions along the modes and a dense layer. The observation itself is passed on in addition to the features.
 ///
 /// ```text
 ///  h = silu(conv₂(silu(conv₁(y)))),    S(y) = [ silu(W·flatten(h) + b), flatten(y) ]
 /// ```
 ///
 /// Source: Wang et al. (2025), §3.2.2 and §5.2 (a 1-D CNN as conditional network). The shortcut of y is not in the
-/// paper: without it the narrow posteriors of noise-free data would have to pass through the features.
+/// paper: without it, the features would have to represent the narrow posteriors of noise-free data.
 ///
-/// With `architecture.fixed_context` there is no network: what is known of a measurement comes ready, S(y) = y.
+/// With `architecture.fixed_context` there is no network, and S(y) = y.
 pub struct ContextNetwork {
     layers: Option<Layers>,
     width: usize,
@@ -32,10 +32,10 @@ struct Layers {
 }
 
 impl ContextNetwork {
-    /// A network for observations `[n, channels, modes]`.
+    /// Builds the network for observations `[n, channels, modes]` from the weights of `vb`.
     ///
     /// # Errors
-    /// A candle error when a weight is missing or of another shape.
+    /// A candle error when a weight is missing or has the wrong shape.
     pub fn new(architecture: &Architecture, vb: &VarBuilder<'_>) -> Result<Self> {
         if architecture.fixed_context > 0 {
             return Ok(Self { layers: None, width: architecture.fixed_context });
@@ -55,15 +55,15 @@ impl ContextNetwork {
         self.width
     }
 
-    /// Numbers of [`Self::shortcut`].
+    /// Number of entries of [`Self::shortcut`].
     pub fn shortcut_width(&self) -> usize {
         self.width - self.layers.as_ref().map_or(0, |layers| layers.features.outputs())
     }
 
-    /// `y`: `[n, channels, modes]`, or `[n, fixed_context]` without a network; returns S(y) `[n, width]`.
+    /// Computes S(y) `[n, width]`. `y`: `[n, channels, modes]`, or `[n, fixed_context]` without a network.
     ///
     /// # Errors
-    /// A candle error when the shape of `y` is another.
+    /// A candle error when the shape of `y` is wrong.
     pub fn forward(&self, y: &Tensor) -> Result<Tensor> {
         let Some(layers) = &self.layers else { return Ok(y.clone()) };
         let by_mode = y.transpose(1, 2)?.contiguous()?;
@@ -73,10 +73,11 @@ impl ContextNetwork {
         Tensor::cat(&[features, self.shortcut(y)?], 1)
     }
 
-    /// What is passed beside the features, `[n, shortcut]`: no weight is in it. Without a network it is all there is.
+    /// The flattened observation, `[n, shortcut]`, which is passed on in addition to the features and does not depend on
+    /// weights. Without a network it is all of S(y).
     ///
     /// # Errors
-    /// A candle error when the shape of `y` is another.
+    /// A candle error when the shape of `y` is wrong.
     pub fn shortcut(&self, y: &Tensor) -> Result<Tensor> {
         y.flatten_from(1)?.contiguous()
     }
@@ -84,8 +85,8 @@ impl ContextNetwork {
 
 /// 1-D convolution with zero padding, as one matrix product over the unfolded input.
 ///
-/// candle's own `conv1d` copies to another layout and back for each call; for a handful of modes the unfolding below
-/// is faster forward and backward and gives the same numbers.
+/// candle's `conv1d` copies to another layout and back in each call. For a handful of modes the unfolding below is faster,
+/// forward and backward, and gives the same numbers.
 struct Convolution {
     weights: Dense,
 }

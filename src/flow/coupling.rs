@@ -1,23 +1,24 @@
-//! Conditional affine coupling: one half is scaled and shifted by functions of the other half and of the context.
+//! Conditional affine coupling: each half of x is scaled and shifted by functions of the other half and of the context.
 
 use candle_core::{Result, Tensor, D};
 use candle_nn::VarBuilder;
 
 use super::activation::silu;
+use super::architecture::Architecture;
 use super::dense::Dense;
-use super::Architecture;
 
-/// Conditional affine coupling unit (cACL): two affine couplings, so that both halves of x are transformed.
+/// Conditional affine coupling unit (cACL): two affine couplings, so that both halves of x = (x₁, x₂) are transformed.
 ///
 /// ```text
 ///  z₂ = x₂ ⊙ exp s₁(x₁, c) + t₁(x₁, c)
 ///  z₁ = x₁ ⊙ exp s₂(z₂, c) + t₂(z₂, c)
-///  log|det ∂z/∂x| = Σ s₁ + Σ s₂
+///  ln|det ∂z/∂x| = Σ s₁ + Σ s₂
 /// ```
 ///
 /// With one parameter the first half is empty and only the second is transformed.
 ///
-/// Source: Wang et al. (2025), Eq. 11 and 12. The soft clamp of the log-scales is not in the paper.
+/// Source: Wang et al. (2025), Eq. 11 and 12; L. Dinh, J. Sohl-Dickstein, S. Bengio (2017), Density estimation using Real
+/// NVP, ICLR. The soft clamp of the log-scales is not in the paper.
 pub struct CouplingUnit {
     first: usize,
     second: usize,
@@ -26,10 +27,10 @@ pub struct CouplingUnit {
 }
 
 impl CouplingUnit {
-    /// A unit for `architecture.parameters` columns and `context` context features.
+    /// Builds a unit for `architecture.parameters` columns and `context` context features from the weights of `vb`.
     ///
     /// # Errors
-    /// A candle error when a weight is missing or of another shape.
+    /// A candle error when a weight is missing or has the wrong shape.
     pub fn new(architecture: &Architecture, context: usize, vb: &VarBuilder<'_>) -> Result<Self> {
         let first = architecture.parameters / 2;
         let second = architecture.parameters - first;
@@ -42,10 +43,10 @@ impl CouplingUnit {
         Ok(Self { first, second, on_second, on_first })
     }
 
-    /// x to z. `x`: `[n, d]`, `context`: `[n, context]`. Returns z `[n, d]` and log|det ∂z/∂x| `[n]`.
+    /// Maps x to z. `x`: `[n, d]`; `context`: `[n, context]`. Returns z `[n, d]` and ln|det ∂z/∂x| `[n]`.
     ///
     /// # Errors
-    /// A candle error when shapes do not fit.
+    /// A candle error when the shapes do not fit together.
     pub fn forward(&self, x: &Tensor, context: &Tensor) -> Result<(Tensor, Tensor)> {
         let Some(on_first) = &self.on_first else {
             let (s, t) = self.on_second.scale_and_shift(context)?;
@@ -60,10 +61,10 @@ impl CouplingUnit {
         Ok((Tensor::cat(&[&z1, &z2], 1)?, log_det))
     }
 
-    /// z to x, the inverse of [`Self::forward`], and the log|det ∂z/∂x| that goes with it, `[n]`.
+    /// Maps z back to x; the inverse of [`Self::forward`]. Returns x `[n, d]` and ln|det ∂z/∂x| `[n]`.
     ///
     /// # Errors
-    /// A candle error when shapes do not fit.
+    /// A candle error when the shapes do not fit together.
     pub fn inverse(&self, z: &Tensor, context: &Tensor) -> Result<(Tensor, Tensor)> {
         let Some(on_first) = &self.on_first else {
             let (s, t) = self.on_second.scale_and_shift(context)?;
@@ -78,12 +79,12 @@ impl CouplingUnit {
         Ok((Tensor::cat(&[&x1, &x2], 1)?, log_det))
     }
 
-    /// What scales and shifts the second half.
+    /// The network that scales and shifts the second half.
     pub(super) fn on_second(&self) -> &Subnet {
         &self.on_second
     }
 
-    /// What scales and shifts the first half, if it is not empty.
+    /// The network that scales and shifts the first half; `None` where that is empty.
     pub(super) fn on_first(&self) -> Option<&Subnet> {
         self.on_first.as_ref()
     }
@@ -93,14 +94,14 @@ impl CouplingUnit {
     }
 }
 
-/// Three-layer network that gives log-scale and shift of one half.
+/// Three-layer network that computes log-scale s and shift t of one half.
 ///
 /// ```text
 ///  (s̃, t) = W₃ silu(W₂ silu(W₁ u + b₁) + b₂) + b₃,    s = α·tanh(s̃/α)
 /// ```
 ///
-/// The clamp α bounds each scale to exp(±α), so that early training cannot overflow and far-off conditions cannot
-/// throw samples to infinity. W₃ and b₃ begin at 0: an untrained unit is the identity.
+/// The clamp α bounds each scale to exp(±α), which prevents overflow early in training and for conditions far from the
+/// training set. W₃ and b₃ are 0 at first, so that an untrained unit is the identity.
 pub(super) struct Subnet {
     input: Dense,
     hidden: Dense,

@@ -1,29 +1,29 @@
-//! A dense layer.
+//! Fully connected layers.
 
 use candle_core::{Result, Tensor};
 use candle_nn::{init, Init, VarBuilder};
 
-/// y = x·Wᵀ + 1·bᵀ.
+/// A fully connected layer, y = x·Wᵀ + 1·bᵀ.
 ///
-/// The bias enters as a product with a column of ones rather than by broadcasting: its gradient is then a matrix product
-/// too, where candle's sum over the rows of a broadcast took a fifth of a training step.
+/// The bias is added as a product with a column of ones instead of by broadcasting: its gradient is then a matrix product,
+/// whereas candle's sum over the rows of a broadcast took a fifth of a training step.
 pub struct Dense {
     weight: Tensor,
     bias: Tensor,
 }
 
 impl Dense {
-    /// A layer with the first weights of candle's own: uniform within ±1/√inputs.
+    /// A layer with candle's default initialisation: normal weights (Kaiming) and biases uniform within ±1/√inputs.
     ///
     /// # Errors
-    /// A candle error when a weight is missing or of another shape.
+    /// A candle error when a weight is missing or has the wrong shape.
     pub fn new(inputs: usize, outputs: usize, vb: &VarBuilder<'_>) -> Result<Self> {
         let bound = 1.0 / (inputs as f64).sqrt();
         let uniform = Init::Uniform { lo: -bound, up: bound };
         Self::with_init(inputs, outputs, init::DEFAULT_KAIMING_NORMAL, uniform, vb)
     }
 
-    /// A layer whose weights and biases begin at 0.
+    /// A layer whose weights and biases are initialised to 0.
     ///
     /// # Errors
     /// As [`Self::new`].
@@ -52,10 +52,10 @@ impl Dense {
         &self.bias
     }
 
-    /// `x`: `[n, inputs]`; returns `[n, outputs]`.
+    /// Applies the layer. `x`: `[n, inputs]`; returns `[n, outputs]`.
     ///
     /// # Errors
-    /// A candle error when the shape of `x` is another.
+    /// A candle error when the shape of `x` is wrong.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let ones = Tensor::ones((x.dim(0)?, 1), x.dtype(), x.device())?;
         x.matmul(&self.weight.t()?)? + ones.matmul(&self.bias.unsqueeze(0)?)?

@@ -1,4 +1,4 @@
-//! Fixed permutations between the units, so that each unit splits the parameters differently.
+//! Fixed permutations between the units, so that each unit splits the parameters into different halves.
 
 use candle_core::{Device, Result, Tensor, D};
 use rand::seq::SliceRandom as _;
@@ -12,45 +12,46 @@ pub fn random_order(count: usize, stream: &mut Stream) -> Vec<u32> {
     order
 }
 
-/// A fixed reordering of columns; its log-determinant is 0.
+/// A fixed permutation of columns; ln|det| = 0.
 pub struct Permutation {
     order: Tensor,
     inverse_order: Tensor,
 }
 
 impl Permutation {
-    /// From the order of source columns, a permutation of `0..order.len()`.
+    /// Builds the permutation from the order of source columns.
     ///
     /// # Errors
-    /// A candle error when `order` is no permutation.
+    /// A candle error when `order` is not a permutation of `0..order.len()`.
     pub fn new(order: &[u32], device: &Device) -> Result<Self> {
         let mut inverse = vec![u32::MAX; order.len()];
         for (to, &from) in order.iter().enumerate() {
-            *inverse.get_mut(from as usize).ok_or_else(|| candle_core::Error::Msg(no_permutation(order)))? = to as u32;
+            *inverse.get_mut(from as usize).ok_or_else(|| candle_core::Error::Msg(not_a_permutation(order)))? =
+                to as u32;
         }
         if inverse.contains(&u32::MAX) {
-            return Err(candle_core::Error::Msg(no_permutation(order)));
+            return Err(candle_core::Error::Msg(not_a_permutation(order)));
         }
         Ok(Self { order: Tensor::new(order, device)?, inverse_order: Tensor::new(inverse, device)? })
     }
 
-    /// Column j of the result is column `order[j]` of `x`: `[n, d]`.
+    /// Permutes the columns of `x` `[n, d]`: column j of the result is column `order[j]` of `x`.
     ///
     /// # Errors
-    /// A candle error when the number of columns is another.
+    /// A candle error when the number of columns is wrong.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         x.index_select(&self.order, D::Minus1)
     }
 
-    /// Undoes [`Self::forward`].
+    /// The inverse of [`Self::forward`].
     ///
     /// # Errors
-    /// A candle error when the number of columns is another.
+    /// A candle error when the number of columns is wrong.
     pub fn inverse(&self, x: &Tensor) -> Result<Tensor> {
         x.index_select(&self.inverse_order, D::Minus1)
     }
 }
 
-fn no_permutation(order: &[u32]) -> String {
-    format!("{order:?} is no permutation of 0..{}", order.len())
+fn not_a_permutation(order: &[u32]) -> String {
+    format!("{order:?} is not a permutation of 0..{}", order.len())
 }

@@ -1,39 +1,43 @@
-//! Draws on the CPU without candle: the inverse of a single-precision flow in tiles that stay in the cache, on all threads.
+//! Sampling on the CPU without candle: the inverse of a single-precision flow, in tiles that stay in the cache, on all
+//! threads.
 //!
-//! candle makes a tensor of every step, and concatenates the condition to every draw. Here each tile of draws passes all
-//! units in a few buffers of its own, and what a first layer makes of the condition is computed once for each measurement.
-//! [`Flow::inverse`] remains the readable form; both agree to single precision.
+//! candle allocates a tensor for every operation and concatenates the condition to every draw. Here each tile of draws
+//! passes through all units in a few reused buffers, and the product of the first layer with the condition is computed once
+//! per measurement. [`Flow::inverse`] remains the readable form; both agree to single precision.
 
 use std::ops::Range;
 
 use candle_core::{DType, Device, Result, Tensor};
 use faer::MatRef;
+use rand::Rng as _;
+use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
-use super::coupling::Subnet;
+use super::coupling::{CouplingUnit, Subnet};
 use super::dense::Dense;
 use super::kernel::{add_bias_and_silu, bounded_scales, Layer};
-use super::{log_density, standard_normal, Flow};
+use super::model::{log_density, Flow};
+use super::permutation::Permutation;
 use crate::stats::Stream;
 
-/// Draws that pass the flow together: with width 64, the buffers of a tile fill half of a core's first-level cache.
+/// Draws per tile: with width 64, the buffers of a tile fill half of a core's first-level cache.
 const TILE: usize = 64;
 
-/// The weights of a flow as plain numbers: of one that is not trained any more.
+/// The weights of a trained flow as plain numbers, for sampling.
 pub struct Sampler {
     dimensions: usize,
     units: Vec<Unit>,
 }
 
-/// A coupling unit with the permutation in front of it.
+/// A coupling unit with the permutation before it.
 struct Unit {
     /// Column j of the unit's input is parameter `order[j]`.
     order: Vec<usize>,
-    /// In the order in which the inverse undoes them.
+    /// In the order in which the inverse applies them.
     nets: Vec<Net>,
 }
 
-/// A [`Subnet`] and the rows of the state it reads and moves.
+/// A [`Subnet`] with the rows of the state that it reads (`passive`) and transforms (`active`).
 struct Net {
     passive: Range<usize>,
     active: Range<usize>,
@@ -43,13 +47,13 @@ struct Net {
     clamp: f32,
 }
 
-/// Weight, column by column, and bias of a layer.
+/// Weight (column-major) and bias of a layer.
 struct Plain {
     weight: Vec<f32>,
     bias: Vec<f32>,
 }
 
-/// What a tile writes on its way.
+/// Buffers for one tile.
 struct Buffers {
     of_context: Vec<f32>,
     passive: Vec<f32>,
@@ -60,17 +64,43 @@ struct Buffers {
     factors: Vec<f32>,
 }
 
-impl Sampler {
-    /// The weights of `flow`; `None` where its numbers are not single precision.
+impl Flow {
+    /// Draws `draws` samples of x for each row of `context`, S(y) `[n, context]`. Returns x `[n·draws, d]` in the order of
+    /// the rows, and the log-density of each sample, nats, `[n·draws]`.
+    ///
+    /// Each call reads all weights; a [`Sampler`] that is kept gives the same samples without.
     ///
     /// # Errors
-    /// A candle error when weights lie on a device that cannot be read.
+    /// A candle error when the shape of `context` is wrong.
+    pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<(Tensor, Tensor)> {
+        if let Some(sampler) = Sampler::new(self)? {
+            return sampler.sample(context, draws, stream);
+        }
+        let (rows, features) = context.dims2()?;
+        let z = standard_normal(rows * draws, self.architecture().parameters, stream).to_dtype(self.dtype())?;
+        let repeated = context.unsqueeze(1)?.expand((rows, draws, features))?;
+        let (x, log_det) = self.inverse(&z, &repeated.reshape((rows * draws, features))?)?;
+        Ok((x, log_density(&z, &log_det)?))
+    }
+}
+
+/// Standard normal draws, f64 `[rows, columns]`, from a seeded stream (candle's generator cannot be seeded on the CPU).
+fn standard_normal(rows: usize, columns: usize, stream: &mut Stream) -> Tensor {
+    let draws: Vec<f64> = (0..rows * columns).map(|_| stream.sample(StandardNormal)).collect();
+    Tensor::from_vec(draws, (rows, columns), &Device::Cpu).expect("the number of draws is that of the shape")
+}
+
+impl Sampler {
+    /// Reads the weights of `flow`; `None` where they are not single precision.
+    ///
+    /// # Errors
+    /// A candle error when the weights are on a device that cannot be read.
     pub fn new(flow: &Flow) -> Result<Option<Self>> {
-        if flow.dtype != DType::F32 {
+        if flow.dtype() != DType::F32 {
             return Ok(None);
         }
-        let dimensions = flow.architecture.parameters;
-        let unit = |(order, (_, unit)): (&Vec<u32>, &(_, super::coupling::CouplingUnit))| {
+        let dimensions = flow.architecture().parameters;
+        let unit = |(order, (_, unit)): (&Vec<u32>, &(Permutation, CouplingUnit))| {
             let first = dimensions / 2;
             let on_first = unit.on_first().map(|net| Net::new(net, first..dimensions, 0..first));
             let on_second = Net::new(unit.on_second(), 0..first, first..dimensions);
@@ -79,14 +109,14 @@ impl Sampler {
                 nets: on_first.into_iter().chain([on_second]).collect::<Result<_>>()?,
             })
         };
-        let units = flow.architecture.permutations.iter().zip(&flow.units).map(unit).collect::<Result<_>>()?;
+        let units = flow.architecture().permutations.iter().zip(flow.units()).map(unit).collect::<Result<_>>()?;
         Ok(Some(Self { dimensions, units }))
     }
 
     /// As [`Flow::sample`].
     ///
     /// # Errors
-    /// A candle error when the shape of `context` is another.
+    /// A candle error when the shape of `context` is wrong.
     pub fn sample(&self, context: &Tensor, draws: usize, stream: &mut Stream) -> Result<(Tensor, Tensor)> {
         let (rows, features) = context.dims2()?;
         let z = standard_normal(rows * draws, self.dimensions, stream).to_dtype(DType::F32)?;
@@ -97,15 +127,15 @@ impl Sampler {
         Ok((x, log_density(&z, &log_det)?))
     }
 
-    /// z to x in place, and log|det ∂z/∂x| of each draw.
+    /// Maps z to x in place. Returns ln|det ∂z/∂x| of each draw.
     ///
-    /// `values`: the d numbers of each draw one after another; `context`: S(y) of each measurement one after another, each
-    /// `features` numbers; the draws of a measurement lie one after another, as many for each.
+    /// `values`: the d numbers of each draw in sequence, the draws of a measurement contiguous and the same number for
+    /// each; `context`: S(y) of each measurement in sequence, `features` numbers each.
     pub fn inverse(&self, values: &mut [f32], context: &[f32], features: usize) -> Vec<f32> {
         let d = self.dimensions;
         let draws = values.len() / d / (context.len() / features).max(1);
         let mut log_det = vec![0.0; values.len() / d];
-        // Tiles of one size, whatever the number of threads: the same bits on each machine of a kind.
+        // The size of the tiles does not depend on the number of threads, and so neither do the bits of the result.
         let tiles = values.par_chunks_mut(TILE * d).zip(log_det.par_chunks_mut(TILE)).enumerate();
         tiles.for_each_init(
             || self.buffers(),
@@ -156,8 +186,8 @@ impl Net {
         })
     }
 
-    /// active ← (active − t)·exp(−s) in each column of `state`; s and t are made of the passive rows and of the column of
-    /// `context` that `owner` names.
+    /// active ← (active − t)·exp(−s) in each column of `state`, where s and t are computed from the passive rows and from
+    /// the column of `context` with the index `owner(column)`. Adds Σ s of each column to `log_det`.
     fn inverse(
         &self,
         state: &mut [f32],

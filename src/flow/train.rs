@@ -2,27 +2,28 @@
 
 use std::collections::BTreeMap;
 
-use candle_core::{DType, Device, Tensor, D};
+use candle_core::{DType, Device, Tensor};
 use candle_nn::{AdamW, Optimizer as _, ParamsAdamW};
 use rand::seq::SliceRandom as _;
 use serde::{Deserialize, Serialize};
 
 use super::fused::{Fused, Rows};
+use super::model::Flow;
+use super::pairs::{mean_loss, Pairs};
 use super::weights::Weights;
-use super::Flow;
 use crate::stats;
 
-/// How long and how fast to train.
+/// Training schedule.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainSettings {
     /// Passes over the training set.
     pub epochs: usize,
-    /// Rows of one step.
+    /// Pairs per step.
     pub batch: usize,
-    /// Learning rate of the first step; it falls to 0 along a cosine.
+    /// Learning rate of the first step. It falls to 0 along a half cosine.
     pub learning_rate: f64,
-    /// Seed of weights, permutations and shuffles.
+    /// Seed of the weights, the permutations and the order of the pairs.
     pub seed: u64,
 }
 
@@ -32,19 +33,10 @@ impl Default for TrainSettings {
     }
 }
 
-/// Pairs of x on the real line and whitened y.
-#[derive(Debug, Clone)]
-pub struct Pairs {
-    /// `[n, d]`.
-    pub x: Tensor,
-    /// `[n, channels, modes]`.
-    pub y: Tensor,
-}
-
 /// State of the training after one epoch.
 #[derive(Debug, Clone, Copy)]
 pub struct EpochReport {
-    /// Epochs done, from 1.
+    /// Number of the epoch, counted from 1.
     pub epoch: usize,
     /// Mean loss over the steps of this epoch, nats.
     pub loss: f64,
@@ -56,30 +48,30 @@ pub struct EpochReport {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "reason")]
 pub enum Stopped {
-    /// All epochs were done.
+    /// All epochs were completed.
     Completed,
-    /// The loss was not finite in this epoch; the best weights before it are kept.
+    /// The loss was not finite in this epoch. The best weights before it are kept.
     Diverged {
-        /// Epoch, from 1.
+        /// Epoch, counted from 1.
         epoch: usize,
     },
 }
 
-/// What a training gave; the flow holds the best weights.
+/// Result of a training. The flow holds the best weights.
 #[derive(Debug, Clone)]
 pub struct TrainOutcome {
-    /// Epoch of the best validation loss, from 1.
+    /// Epoch with the lowest validation loss, counted from 1.
     pub best_epoch: usize,
-    /// The best validation loss, nats.
+    /// The lowest validation loss, nats.
     pub best_validation_loss: f64,
-    /// Why it ended.
+    /// Why the training ended.
     pub stopped: Stopped,
 }
 
 /// Why a training gave no flow.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The loss was never finite.
+    /// The loss was not finite in the first epoch.
     #[error("the loss was not finite in the first epoch (learning rate {learning_rate}): try a smaller one")]
     DivergedAtOnce {
         /// Learning rate of the first step.
@@ -90,15 +82,16 @@ pub enum Error {
     Tensor(#[from] candle_core::Error),
 }
 
-/// Trains `flow`, whose variables are `weights`, and leaves in it the weights of the best validation loss.
+/// Trains `flow`, whose variables are `weights`, by maximum likelihood, and leaves the weights with the lowest validation
+/// loss in it.
 ///
-/// `training` gives the pairs of an epoch (from 1), always `rows` of them: the same ones, or with noise drawn afresh.
+/// `training` returns the pairs of an epoch (counted from 1), always `rows` of them; they may differ in their noise.
 ///
 /// ```text
-///  loss = 1/M Σ ( ½|z|² − log|det ∂z/∂x| ),   AdamW, learning rate falling to 0 along a half cosine
+///  loss = 1/M Σ ( ½|z|² − ln|det ∂z/∂x| ),   AdamW without weight decay, learning rate falling to 0 along a half cosine
 /// ```
 ///
-/// Source: Wang et al. (2025), Eq. 20. Schedule and choice of the best epoch are ours.
+/// Source: Wang et al. (2025), Eq. 20. The schedule and the choice of the best epoch are ours.
 ///
 /// # Errors
 /// [`Error::DivergedAtOnce`] when no epoch had a finite loss.
@@ -111,27 +104,27 @@ pub fn train(
     settings: &TrainSettings,
     on_epoch: impl FnMut(EpochReport),
 ) -> Result<TrainOutcome, Error> {
-    // The one place that chooses: by hand in single precision on the CPU, by candle for all else.
+    // Single precision on the CPU uses the fused implementation, everything else candle.
     match Fused::new(flow, weights)? {
-        Some(fused) => run(ByHand { flow, weights, fused }, rows, training, validation, settings, on_epoch),
+        Some(fused) => run(ByFused { flow, weights, fused }, rows, training, validation, settings, on_epoch),
         None => run(ByCandle::new(flow, weights)?, rows, training, validation, settings, on_epoch),
     }
 }
 
-/// A way to lower the loss.
+/// An implementation of gradient descent on the loss.
 trait Descent {
-    /// Pairs as this way reads them.
+    /// Pairs in the form that this implementation uses.
     type Data;
     /// A copy of all weights.
     type Copy;
 
     fn read(&self, pairs: &Pairs) -> Result<Self::Data, candle_core::Error>;
-    /// One step on the `chosen` rows; returns their mean loss before it. A loss that is not finite changes nothing.
+    /// Makes one step on the `chosen` rows and returns their mean loss before it. If that is not finite, no step is made.
     fn step(&mut self, data: &Self::Data, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error>;
     /// Mean loss of all rows.
     fn loss(&mut self, data: &Self::Data) -> Result<f64, candle_core::Error>;
     fn copy(&self) -> Result<Self::Copy, candle_core::Error>;
-    /// Leaves the weights of `copy` in the flow.
+    /// Writes the weights of `copy` to the flow.
     fn finish(self, copy: &Self::Copy) -> Result<(), candle_core::Error>;
 }
 
@@ -181,14 +174,14 @@ fn run<D: Descent>(
     Ok(TrainOutcome { best_epoch, best_validation_loss, stopped })
 }
 
-/// By [`Fused`].
-struct ByHand<'a> {
+/// Gradient descent by [`Fused`].
+struct ByFused<'a> {
     flow: &'a Flow,
     weights: &'a Weights,
     fused: Fused,
 }
 
-impl Descent for ByHand<'_> {
+impl Descent for ByFused<'_> {
     type Data = Rows;
     type Copy = Vec<f32>;
 
@@ -213,7 +206,7 @@ impl Descent for ByHand<'_> {
     }
 }
 
-/// By candle's gradients and its AdamW.
+/// Gradient descent by candle's gradients and its AdamW.
 struct ByCandle<'a> {
     flow: &'a Flow,
     weights: &'a Weights,
@@ -222,7 +215,7 @@ struct ByCandle<'a> {
 
 impl<'a> ByCandle<'a> {
     fn new(flow: &'a Flow, weights: &'a Weights) -> Result<Self, candle_core::Error> {
-        // Sorted by name, so that the optimiser meets the weights in the same order in every run.
+        // The map is sorted by name, so that the optimiser processes the weights in the same order in every run.
         let params = ParamsAdamW { weight_decay: 0.0, ..ParamsAdamW::default() };
         Ok(Self { flow, weights, optimiser: AdamW::new(weights.values().cloned().collect(), params)? })
     }
@@ -258,15 +251,6 @@ impl Descent for ByCandle<'_> {
     fn finish(self, copy: &Self::Copy) -> Result<(), candle_core::Error> {
         copy.iter().try_for_each(|(name, copy)| self.weights[name].set(copy))
     }
-}
-
-/// Mean of ½|z|² − log|det ∂z/∂x| over the rows, nats, with candle's gradient: the reference of [`super::fused`].
-///
-/// # Errors
-/// A candle error when shapes do not fit.
-pub fn mean_loss(flow: &Flow, x: &Tensor, y: &Tensor) -> Result<Tensor, candle_core::Error> {
-    let (z, log_det) = flow.forward(x, &flow.summarise(y)?)?;
-    ((z.sqr()?.sum(D::Minus1)? * 0.5)? - log_det)?.mean(0)
 }
 
 fn scalar(tensor: &Tensor) -> Result<f64, candle_core::Error> {

@@ -1,4 +1,4 @@
-//! First weights of a flow, drawn from our own streams.
+//! Initial weights of a flow, drawn from seeded streams.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -10,22 +10,24 @@ use candle_nn::{Init, VarBuilder};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
-use super::{Architecture, Flow};
+use super::architecture::Architecture;
+use super::model::Flow;
 use crate::stats;
 
 /// The trainable weights of a flow by name, in alphabetical order.
 pub type Weights = BTreeMap<String, Var>;
 
-/// Draws the weights a flow asks for, each from a stream of its own name, and remembers them as variables.
+/// Draws the weights that a flow requests and keeps them as variables. Each weight has its own random stream, named after
+/// it.
 ///
-/// candle's generator cannot be seeded on the CPU (0.11). A stream for each name makes the weights independent of the
-/// order in which layers are built.
+/// candle's generator cannot be seeded on the CPU (0.11). Separate streams make the weights independent of the order in
+/// which the layers are built.
 pub struct SeededWeights<'a> {
     seed: u64,
     drawn: &'a Mutex<Weights>,
 }
 
-/// A new flow whose weights come from `seed`, and those weights.
+/// A new flow with weights drawn from `seed`, and these weights as variables.
 ///
 /// # Errors
 /// A candle error, which would be a bug: all shapes come from `architecture`.

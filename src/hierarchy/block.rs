@@ -1,28 +1,28 @@
-//! Which measurement stands in which lanes: sixteen side by side, one in each, and those left over in several lanes each, so that
-//! few of the vectors' numbers stand for nothing.
+//! Assignment of measurements to SIMD lanes: sixteen measurements with one lane each, and the remaining ones with several
+//! lanes each, so that few lanes are unused.
 
 use std::iter::StepBy;
 use std::ops::Range;
 
 use super::kernel::{count_before, Lanes, Weighed, LANES};
 
-/// Measurements side by side.
+/// Up to sixteen measurements that are processed in one vector.
 #[derive(Debug, Clone)]
 pub(super) struct Block {
     pub measurements: Range<usize>,
-    /// Where their samples stand.
+    /// Range of places that their samples occupy. A place is one entry of all lanes.
     pub places: Range<usize>,
-    /// Lanes from one of a measurement to its next; sixteen where it has but one.
+    /// Distance between the lanes of a measurement; sixteen where it has only one.
     pub width: usize,
 }
 
 impl Block {
-    /// The blocks of so many measurements with so many samples each.
+    /// The blocks for `measurements` measurements with `draws` samples each.
     pub fn all(measurements: usize, draws: usize) -> Vec<Self> {
         let mut places = 0;
         let one = |first: usize| {
             let own = first..(first + LANES).min(measurements);
-            // Each has as many lanes as there is room for and as share its samples evenly.
+            // As many lanes per measurement as fit into the vector and divide its samples evenly.
             let mut parts = 1;
             while 2 * parts * own.len() <= LANES && draws.is_multiple_of(2 * parts) {
                 parts *= 2;
@@ -34,21 +34,21 @@ impl Block {
         (0..measurements).step_by(LANES).map(one).collect()
     }
 
-    /// The measurements with their lanes.
+    /// Each measurement with its lanes.
     pub fn lanes(&self) -> impl Iterator<Item = (usize, StepBy<Range<usize>>)> {
         let width = self.width;
         let lanes = move |(first, measurement): (usize, usize)| (measurement, (first..LANES).step_by(width));
         self.measurements.clone().enumerate().map(lanes)
     }
 
-    /// Place and lane of a sample of one of the measurements.
+    /// Place and lane of a sample.
     pub fn place(&self, measurement: usize, draw: usize) -> (usize, usize) {
         let each = self.places.len();
         (self.places.start + draw % each, measurement - self.measurements.start + draw / each * self.width)
     }
 
-    /// A sample of each measurement by its weight (`values`, `[place]`): `share`, from 0 to below 1, tells for one after the
-    /// other how much of all weight comes before it. Appends place and lane of each.
+    /// Selects one sample of each measurement with probability proportional to its weight (`values`, `[place]`), by
+    /// inversion of the cumulative weight at `share()`, a number in [0, 1). Appends place and lane of each.
     pub fn choose(
         &self,
         values: &[Lanes],
@@ -68,7 +68,7 @@ impl Block {
         let draws = self.places.len() * LANES / self.width;
         for (measurement, lanes) in self.lanes() {
             let before: usize = lanes.map(|lane| counts[lane] as usize).sum();
-            // Rounding may leave nothing behind the target.
+            // With rounding errors the target can exceed the sum of all weights.
             chosen.push(self.place(measurement, before.min(draws - 1)));
         }
     }
@@ -85,7 +85,7 @@ mod tests {
     const SIZES: [(usize, usize); 8] = [(1, 64), (3, 10), (4, 64), (5, 7), (9, 64), (16, 64), (20, 64), (50, 16)];
 
     #[test]
-    fn every_sample_has_a_place_of_its_own() {
+    fn every_sample_has_its_own_place() {
         for (measurements, draws) in SIZES {
             let mut seen = BTreeSet::new();
             let blocks = Block::all(measurements, draws);
@@ -102,12 +102,12 @@ mod tests {
             assert_eq!(seen.len(), measurements * draws);
             assert_eq!(blocks.last().unwrap().measurements.end, measurements);
         }
-        // Four are left over of twenty: they take a quarter of the steps.
+        // Four of twenty remain for the second block, which takes a quarter of the steps.
         assert_eq!(Block::all(20, 64).last().unwrap().places, 64..80);
     }
 
     #[test]
-    fn samples_are_chosen_by_their_weight_in_however_many_lanes() {
+    fn samples_are_selected_by_their_weight_for_any_number_of_lanes() {
         for (measurements, draws) in SIZES {
             let exponent = |measurement: usize, draw: usize| (draw as f64 * 1.3 - measurement as f64).cos() * 2.0;
             for block in Block::all(measurements, draws) {
@@ -118,7 +118,7 @@ mod tests {
                         offsets[place].0[lane] = (exponent(measurement, draw) * LOG2_E) as f32;
                     }
                 }
-                // All samples at their centre: the weights are those that they have by themselves.
+                // All samples are at their centre, so that only their own weights matter.
                 let (centred, mut values) = ([vec![Lanes::ZERO; block.places.end]], offsets.clone());
                 let (places, linears) = (block.places.clone(), [Lanes::ZERO]);
                 let (own, offsets) = (&mut values[places.clone()], &offsets[places.clone()]);
@@ -138,13 +138,13 @@ mod tests {
                 for (measurement, lanes) in block.lanes() {
                     let all: f64 = (0..draws).map(|draw| exponent(measurement, draw).exp()).sum();
                     let largest = (0..draws).map(|draw| exponent(measurement, draw)).fold(f64::NEG_INFINITY, f64::max);
-                    // Single precision: 6e-8, some operations, and the sum of up to 64.
+                    // Single precision: 6e-8 times several operations, and a sum of up to 64.
                     let (found, expected) = (weighed.sum.of(lanes), all / largest.exp());
                     assert!((found / expected - 1.0).abs() < 1e-5, "{measurements}: {found}, expected {expected}");
                     for draw in 0..draws {
                         let (place, lane) = block.place(measurement, draw);
                         let expected = exponent(measurement, draw).exp() / all * f64::from(shares);
-                        // Through all shares each comes as often as it weighs, to within one at both of its ends.
+                        // Over all shares each sample is selected in proportion to its weight, to within one at both ends.
                         assert!((counts[place][lane] - expected).abs() < 2.5, "{measurement}, {draw}: {expected}");
                     }
                 }

@@ -1,34 +1,37 @@
-//! Draws of (μ, σ) by a Markov chain: for populations whose posterior is far from a normal distribution.
+//! Draws of (μ, σ) by Markov chains, for populations whose posterior is far from a normal distribution.
 
 use rand::Rng as _;
 use rand_distr::{Gamma, StandardNormal};
 use rayon::prelude::*;
 
 use super::kernel::exponentials;
-use super::problem::{Problem, State, Weights};
-use super::{DRAWS, WIDEST};
+use super::population::DRAWS;
+use super::problem::{Problem, State, Weights, WIDEST};
 use crate::stats::{self, Stream};
 
-/// Markov chains, side by side.
+/// Number of Markov chains, which run in parallel.
 const CHAINS: usize = 2;
 
-/// Sweeps of each before the first draw that is kept. All after them are: intervals of every eighth cover no better.
+/// Sweeps of each chain before the first draw that is kept. All later draws are kept: thinning does not improve the
+/// coverage of the intervals.
 const BURN_IN: usize = 40;
 
-/// Fewest measurements for which σ is drawn from its gamma distribution; below, its tail is cut off too often.
+/// Fewest measurements for which 1/σ² is drawn from a gamma distribution. With fewer, too many draws fall outside the
+/// limits.
 const GAMMA_FROM: f64 = 5.0;
 
-/// Points of the grid of ln σ that σ is drawn from else.
+/// Points of the grid of ln σ that is used otherwise.
 const GRID: usize = 64;
 
-/// [`DRAWS`] states of chains that begin at `point`.
+/// [`DRAWS`] states of Gibbs samplers that start at `point`.
 ///
 /// ```text
 ///  s_j ~ w_j·,   σ | s ∝ σ^{1−n} exp(−Σ_j (x_j − x̄)²/2σ²),   μ | σ, s ~ N(x̄, σ²/n)
 /// ```
 ///
-/// Where noise hides much of the spread, the chosen samples hold σ where it is and the sampler hardly moves; there a Metropolis
-/// step on L(μ, σ) itself, one such parameter after the other, goes with every second sweep.
+/// For noise-dominated parameters the selected samples s_j determine σ almost completely, so that the sampler hardly moves.
+/// Every second sweep is therefore followed by a Metropolis step on L(μ, σ) for each of these parameters, with the samples
+/// summed out.
 pub(super) fn draws(problem: &Problem, point: &State, seed: u64) -> Vec<State> {
     let chain = |chain: usize| {
         let stream = stats::stream(seed, &format!("population draws {chain}"));
@@ -38,9 +41,9 @@ pub(super) fn draws(problem: &Problem, point: &State, seed: u64) -> Vec<State> {
 }
 
 impl Problem {
-    /// `draws` states of a Markov chain that begins at `point`.
+    /// `draws` states of a Markov chain that starts at `point`.
     fn chain(&self, point: &State, draws: usize, mut stream: Stream) -> Vec<State> {
-        let (mut state, mut weights, mut others) = (point.clone(), self.room(), self.room());
+        let (mut state, mut weights, mut others) = (point.clone(), self.buffers(), self.buffers());
         let mut kept = Vec::with_capacity(draws);
         self.weigh(&state, &mut weights);
         for sweep in 0..BURN_IN + draws {
@@ -56,12 +59,12 @@ impl Problem {
         kept
     }
 
-    /// One Metropolis step for each noisy parameter on the likelihood with all samples in it. `weights` are those under the state, and
-    /// stay so; `others` are room for those under another.
+    /// One Metropolis step on L(μ, σ) for each noise-dominated parameter. `weights` are those under the state, before and
+    /// after; `others` is a buffer for those under a proposed state.
     fn collapsed(&self, state: &mut State, weights: &mut Weights, others: &mut Weights, stream: &mut Stream) {
         let mut current = self.log_likelihood(state, weights);
         for &k in &self.noisy {
-            // Steps of several sizes: how wide the likelihood is depends on how much the noise hides.
+            // Steps of several sizes, since the width of the likelihood depends on the noise.
             let size = [0.3, 1.0, 2.0][stream.random_range(0..3)];
             let spread = ((state.std[k].powi(2) + self.within[k].powi(2)) / self.measurements as f64).sqrt();
             let mut next = state.clone();
@@ -75,7 +78,7 @@ impl Problem {
             }
             self.weigh_changed(k, (state, weights), &next, others);
             let likelihood = self.log_likelihood(&next, others);
-            // The step is symmetric in ln σ but its size depends on σ, and σ is uniform a priori.
+            // The step is symmetric in ln σ, but its size depends on σ; and σ is uniform a priori.
             let back = size * (1.0 + self.within[k] / next.std[k]).min(4.0) / (2.0 * self.measurements as f64).sqrt();
             let moved = (next.std[k] / state.std[k]).ln();
             let sizes = (ln_step / back).ln() + 0.5 * moved * moved * (ln_step.powi(-2) - back.powi(-2));
@@ -91,10 +94,10 @@ impl Problem {
         }
     }
 
-    /// One sweep of the Gibbs sampler; `weights` are those under the state.
+    /// One sweep of the Gibbs sampler. `weights`: those under the state.
     fn sweep(&self, state: &mut State, weights: &Weights, stream: &mut Stream) {
         let n = self.measurements as f64;
-        // Place and lane of the sample of each measurement.
+        // Place and lane of the selected sample of each measurement.
         let mut chosen = Vec::with_capacity(self.measurements);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
             block.choose(&weights.values, weighed, || stream.random(), &mut chosen);
@@ -115,13 +118,13 @@ impl Problem {
     }
 }
 
-/// Draws σ given the sum of squares about the mean of n values, μ integrated out.
+/// Draws σ given the sum of squares SS about the mean of n values, with μ integrated out.
 ///
 /// ```text
-///  p(ln σ) ∝ σ · σ^{1−n} · exp(−SS/2σ²)   between the floor and the widest
+///  p(ln σ) ∝ σ · σ^{1−n} · exp(−SS/2σ²)   between the floor and WIDEST
 /// ```
 fn draw_std(squares: f64, n: f64, floor: f64, stream: &mut Stream) -> f64 {
-    // Without the ends it is a gamma distribution of 1/σ², which nearly always falls between them.
+    // Without the limits, 1/σ² has a gamma distribution, whose draws nearly always fall between them.
     if n >= GAMMA_FROM && squares > 0.0 {
         let gamma = Gamma::new(0.5 * (n - 2.0), 2.0 / squares).expect("shape and scale are positive");
         let draws = (0..8).map(|_| 1.0 / stream.sample(gamma).sqrt());
@@ -129,15 +132,15 @@ fn draw_std(squares: f64, n: f64, floor: f64, stream: &mut Stream) -> f64 {
             return std;
         }
     }
-    // The bulk lies within a few widths 1/√(2n) about the mode; the grid covers it and no more, to stay fine.
+    // The mass lies within a few widths 1/√(2n) of the mode. The grid covers no more than that, to remain fine.
     let mode = if n > 2.0 { (squares / (n - 2.0)).sqrt() } else { WIDEST };
     let reach = (8.0 / (2.0 * n).sqrt()).max(0.5);
     let low = if n > 2.0 { (mode.clamp(floor, WIDEST).ln() - reach).max(floor.ln()) } else { floor.ln() };
-    // With few values the tail towards wide spreads is long.
+    // With few values the upper tail is long.
     let high = if n < 12.0 { WIDEST.ln() } else { (mode.clamp(floor, WIDEST).ln() + 1.5 * reach).min(WIDEST.ln()) };
     let step = (high - low).max(1e-12) / GRID as f64;
     let mut densities = [0.0; GRID];
-    // 1/σ² of the cells is a geometric sequence.
+    // The values of 1/σ² at the cells form a geometric sequence.
     let (mut precision, ratio) = ((-2.0 * (low + 0.5 * step)).exp(), (-2.0 * step).exp());
     for (i, density) in densities.iter_mut().enumerate() {
         *density = (2.0 - n) * (low + (i as f64 + 0.5) * step) - 0.5 * squares * precision;
@@ -148,6 +151,6 @@ fn draw_std(squares: f64, n: f64, floor: f64, stream: &mut Stream) -> f64 {
         left -= density;
         left < 0.0
     });
-    let place = cell.unwrap_or(GRID - 1) as f64 + stream.random::<f64>();
-    (low + place * step).exp().clamp(floor, WIDEST)
+    let position = cell.unwrap_or(GRID - 1) as f64 + stream.random::<f64>();
+    (low + position * step).exp().clamp(floor, WIDEST)
 }

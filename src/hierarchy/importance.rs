@@ -1,36 +1,39 @@
-//! Draws of (μ, σ) by importance: points of a normal distribution about the most probable population, weighed by the likelihood.
+//! Draws of (μ, σ) by importance sampling: points of a normal distribution about the most probable population, weighted by
+//! the likelihood.
 //!
-//! Each point is independent of all others and asks for the likelihood once, where a Markov chain takes several steps from one
-//! draw to the next that tells more. Where the posterior is far from normal the weights say so, and the chain
-//! ([`super::gibbs`]) takes over.
+//! The points are independent and need one evaluation of the likelihood each, whereas a Markov chain needs several steps
+//! per independent draw. Where the posterior is far from normal, the effective sample size is small and the Markov chain
+//! (`gibbs`) is used instead.
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
+use super::population::DRAWS;
 use super::problem::{Problem, State, Weights};
 use super::widths::Widths;
-use super::DRAWS;
 use crate::stats;
 
-/// Points that are weighed.
+/// Number of weighted points.
 const POINTS: usize = 512;
 
-/// Points of one task.
-const AT_A_TIME: usize = 64;
+/// Fewest points per task.
+const LEAST_PER_TASK: usize = 64;
 
-/// Widths that the points have, and the turns that eight points take among them.
+/// Widths of the components of the proposal mixture, and the component of each of eight consecutive points.
 const WIDTHS: [f64; 2] = [1.1, 2.5];
 const TURNS: [usize; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
 
-/// Share of the points that the weights must leave effective: the chain's 400 draws of a parameter that noise hides are worth fewer.
+/// Smallest accepted effective sample size, as a share of the points. For a noise-dominated parameter the 400 correlated
+/// draws of the chain are worth less than that.
 const EFFECTIVE: f64 = 0.3;
 
-/// Fewest measurements: of fewer, σ has tails that no normal distribution of ln σ reaches, and the weights need not show it.
+/// Fewest measurements. With fewer, the tails of σ are heavier than those of the mixture, which the weights need not
+/// reveal.
 const FEWEST: usize = 8;
 
-/// [`DRAWS`] states about `point`, the most probable one; `None` where the posterior is too far from normal.
+/// [`DRAWS`] states near `point`, the most probable one; `None` where the posterior is too far from normal.
 ///
 /// ```text
 ///  θ = ((μ_k − μ̂_k)/σ̂_k, ln σ_k/σ̂_k),    θ_i ~ Σ_w share_w N(θ̂, w² H⁻¹),    weight_i = L(θ_i) Π σ_ik / r(θ_i),
@@ -40,7 +43,7 @@ pub(super) fn draws(problem: &Problem, point: &State, seed: u64) -> Option<Vec<S
     if problem.measurements < FEWEST {
         return None;
     }
-    let mut at_point = problem.room();
+    let mut at_point = problem.buffers();
     problem.weigh(point, &mut at_point);
     let (gradient, information) = derivatives(problem, point, &at_point);
     let d = point.mean.len();
@@ -58,35 +61,38 @@ pub(super) fn draws(problem: &Problem, point: &State, seed: u64) -> Option<Vec<S
         let std = (d..2 * d).map(|row| point.std[row - d] * (centre[row] + theta[row]).exp());
         State { mean: mean.collect(), std: std.collect() }
     };
-    let log_weight = |room: &mut Weights, place: usize| {
+    let log_weight = |weights: &mut Weights, place: usize| {
         let state = state(place);
         if !(0..d).all(|k| problem.is_possible(&state, k)) {
             return f64::NEG_INFINITY;
         }
         let log_density = widths.log_density(z.column(place).norm_squared());
-        // From the same divisors whichever point was weighed before: the same bits however many threads there are.
-        room.blocks.clone_from(&at_point.blocks);
-        problem.weigh(&state, room);
-        // σ, the weight's last factor.
-        problem.log_likelihood(&state, room) + theta.column(place).rows(d, d).sum() - log_density
+        // The same initial divisors for every point, so that the bits do not depend on the number of threads.
+        weights.blocks.clone_from(&at_point.blocks);
+        problem.weigh(&state, weights);
+        // The last sum is the factor Π σ of the weight.
+        problem.log_likelihood(&state, weights) + theta.column(place).rows(d, d).sum() - log_density
     };
-    let all = (0..POINTS).into_par_iter().with_min_len(AT_A_TIME);
-    let log_weights: Vec<f64> = all.map_init(|| problem.room(), log_weight).collect();
+    let all = (0..POINTS).into_par_iter().with_min_len(LEAST_PER_TASK);
+    let log_weights: Vec<f64> = all.map_init(|| problem.buffers(), log_weight).collect();
     let weights = stats::weights(&log_weights, EFFECTIVE)?;
     Some(stats::systematic(&weights, DRAWS, &mut stream).into_iter().map(state).collect())
 }
 
-/// Gradient of ln L and its information −∇∇ᵀ ln L, in (μ_k/σ̂_k, ln σ_k) at `point`, the means first; `weights` are those there.
+/// Gradient of ln L, `[2d]`, and observed information −∇∇ᵀ ln L, `[2d, 2d]`, with respect to (μ_k/σ̂_k, ln σ_k) at `point`,
+/// the means first. `weights`: those at `point`.
 ///
 /// ```text
 ///  ∇ ln L = Σ_j E_j c,    H = Σ_j E_j [I_c] − Cov_j c,    c = (z_k, z_k² − 1),    I_c: 1, 2 z_k; 2 z_k, 2 z_k² of each k
 /// ```
 ///
-/// z_k = (x_k − μ_k)/σ_k, E_j over the weighed samples of measurement j. Source: T. A. Louis (1982), Finding the observed
-/// information matrix when using the EM algorithm, J. R. Stat. Soc. B 44, 226–233.
+/// with z_k = (x_k − μ_k)/σ_k and E_j the mean over the weighted samples of measurement j.
+///
+/// Source: T. A. Louis (1982), Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 44,
+/// 226–233.
 fn derivatives(problem: &Problem, point: &State, weights: &Weights) -> (DVector<f64>, DMatrix<f64>) {
     let d = point.mean.len();
-    // √w c of each sample.
+    // √w·c of each sample, one column each.
     let mut scores = DMatrix::zeros(2 * d, problem.measurements * problem.draws);
     let (mut gradient, mut information) = (DVector::zeros(2 * d), DMatrix::zeros(2 * d, 2 * d));
     let mut mean = DVector::zeros(2 * d);
@@ -113,7 +119,7 @@ fn derivatives(problem: &Problem, point: &State, weights: &Weights) -> (DVector<
     }
     information -= &scores * scores.transpose();
     for k in 0..d {
-        // Σ_j E_j z and Σ_j E_j z² are in the gradient.
+        // The gradient contains Σ_j E_j z and Σ_j E_j z².
         let (first, second) = (gradient[k], gradient[d + k] + problem.measurements as f64);
         information[(k, k)] += problem.measurements as f64;
         information[(d + k, d + k)] += 2.0 * second;
@@ -130,7 +136,8 @@ mod tests {
     use crate::parameter::{DamageDirection, Parameter, ParameterSpace};
     use crate::posterior::PosteriorSamples;
 
-    /// Normal posteriors of three parameters, so wide as each of `within`, of a population with the spread `std`.
+    /// Normal posteriors of three parameters with standard deviations `within`, from a population with standard deviation
+    /// `std`.
     fn problem(measurements: usize, within: [f64; 3], std: f64) -> Problem {
         let parameter = |name: &str| Parameter {
             name: name.to_owned(),
@@ -166,36 +173,36 @@ mod tests {
                     state.std[k] *= step.exp();
                 }
             }
-            let mut room = problem.room();
-            problem.weigh(&state, &mut room);
-            problem.log_likelihood(&state, &room)
+            let mut weights = problem.buffers();
+            problem.weigh(&state, &mut weights);
+            problem.log_likelihood(&state, &weights)
         };
-        let mut weights = problem.room();
+        let mut weights = problem.buffers();
         problem.weigh(&point, &mut weights);
         let (gradient, information) = derivatives(&problem, &point, &weights);
         let step = 0.05;
         for row in 0..6 {
             let slope = (likelihood(&[(row, step)]) - likelihood(&[(row, -step)])) / (2.0 * step);
-            // Likelihoods in single precision, some 1e-5; third derivatives of 8·20 at most: h²/6 of them.
+            // Single precision gives errors of about 1e-5; third derivatives are at most 8·20, and enter with h²/6.
             assert!((gradient[row] - slope).abs() < 0.1, "{row}: {}, by differences {slope}", gradient[row]);
             for column in 0..6 {
                 let both = |a: f64, b: f64| likelihood(&[(row, a * step), (column, b * step)]);
                 let bend = both(1.0, 1.0) - both(1.0, -1.0) - both(-1.0, 1.0) + both(-1.0, -1.0);
                 let (found, expected) = (information[(row, column)], -bend / (4.0 * step * step));
-                // Fourth derivatives of 16·20 at most: h²/3 of them, where row and column are one.
+                // Fourth derivatives are at most 16·20, and enter with h²/3 where row and column are equal.
                 assert!((found - expected).abs() < 0.4, "{row}, {column}: {found}, by differences {expected}");
             }
         }
     }
 
     #[test]
-    fn draws_are_of_the_same_distribution_as_those_of_the_chain() {
+    fn draws_have_the_same_distribution_as_those_of_the_chain() {
         const SEEDS: u64 = 25;
         for (measurements, within) in [(20, [0.001, 0.02, 0.04]), (50, [0.01, 0.03, 0.05]), (50, [0.03, 0.1, 0.04])] {
             let problem = problem(measurements, within, 0.05);
             let point = problem.maximise();
             let numbers = |state: &State| [0, 1, 2].map(|k| [state.mean[k], state.std[k].ln()]).concat();
-            let by_weights = (0..SEEDS).flat_map(|seed| draws(&problem, &point, seed).expect("it is near to normal"));
+            let by_weights = (0..SEEDS).flat_map(|seed| draws(&problem, &point, seed).expect("it is close to normal"));
             let by_weights: Vec<Vec<f64>> = by_weights.map(|state| numbers(&state)).collect();
             let by_chain = (0..SEEDS).flat_map(|seed| gibbs::draws(&problem, &point, seed));
             let by_chain: Vec<Vec<f64>> = by_chain.map(|state| numbers(&state)).collect();
@@ -204,14 +211,14 @@ mod tests {
                 let (own, chain) = (column(&by_weights), column(&by_chain));
                 let std = stats::sample_std(&chain).unwrap();
                 let shift = (stats::mean(&own) - stats::mean(&chain)) / std;
-                // 10,000 draws each; those of the chain tell at worst as much as 1,000 independent ones, the weighed ones as 5,000:
-                // 0.035 for a mean, 0.025 for a spread; three and a half times that.
+                // 10,000 draws each; the chain has an effective sample size of at least 1,000, the weighted points of
+                // 5,000. The standard errors are 0.035 for a mean and 0.025 for a spread; the bounds are 3.5 times that.
                 assert!(shift.abs() < 0.12, "{measurements}, {number}: {shift} standard deviations apart");
                 let ratio = stats::sample_std(&own).unwrap() / std;
                 assert!((ratio - 1.0).abs() < 0.09, "{measurements}, {number}: spreads differ by {ratio}");
                 for level in [0.05, 0.95] {
                     let apart = (stats::quantile(&own, level) - stats::quantile(&chain, level)) / std;
-                    // A quantile there is twice as noisy as the mean.
+                    // The standard error of these quantiles is twice that of the mean.
                     assert!(apart.abs() < 0.24, "{measurements}, {number}: {apart} at {level}");
                 }
             }
@@ -219,8 +226,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_far_from_normal_is_left_to_the_chain() {
-        // Noise of ten times the spread: any spread from nothing up to some of the noise is as likely.
+    fn posteriors_far_from_normal_are_left_to_the_chain() {
+        // With noise of ten times the spread, any spread from zero up to a part of the noise is equally likely.
         let hidden = problem(20, [0.2, 0.2, 0.2], 0.02);
         assert!(draws(&hidden, &hidden.maximise(), 1).is_none());
         let few = problem(FEWEST - 1, [0.001, 0.02, 0.04], 0.05);

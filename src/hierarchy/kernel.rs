@@ -1,19 +1,19 @@
-//! Loops over the samples of sixteen measurements at a time, one in each lane, or of fewer, each of which has several lanes;
-//! compiled once for each width of vectors (`pulp::with_simd`).
+//! Loops over the samples of up to sixteen measurements at a time, with one or several lanes per measurement; compiled once
+//! for each vector width (`pulp::with_simd`).
 //!
-//! Single precision, about the centre of each measurement's own samples: what is lost is lost of differences between samples of
-//! one posterior, however far away the population lies. Lanes are summed one by one, so that the bits are the same on every
-//! processor.
+//! Samples are stored in single precision relative to the mean of their measurement, so that the rounding error is relative
+//! to the width of one posterior, however far away the population lies. Lanes are summed one by one, so that the bits are
+//! the same on every processor.
 
 use std::f64::consts::LOG2_E;
 use std::ops::Range;
 
-use crate::stats::exp_f32;
+use crate::simd;
 
-/// Measurements side by side: the numbers of the widest vector.
+/// Number of lanes: that of the widest vector.
 pub(super) const LANES: usize = 16;
 
-/// A number of each of the measurements side by side; on a line of the cache, which half of all loads would straddle else.
+/// One number per lane, aligned to a cache line: half of all loads would straddle two lines otherwise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C, align(64))]
 pub(super) struct Lanes(pub [f32; LANES]);
@@ -21,48 +21,48 @@ pub(super) struct Lanes(pub [f32; LANES]);
 impl Lanes {
     pub const ZERO: Self = Self([0.0; LANES]);
 
-    /// The sum of some.
+    /// The sum of some lanes.
     pub fn of(&self, lanes: impl Iterator<Item = usize>) -> f64 {
         lanes.map(|lane| f64::from(self.0[lane])).sum()
     }
 }
 
-/// Weights of the samples of some measurements under a normal population.
+/// Divisor and sum of the weights of a block under a normal population.
 #[derive(Clone, Copy)]
 pub(super) struct Weighed {
-    /// Logarithm to base 2 of what the weights were divided by, the same in all lanes of a measurement: that of the greatest, or
-    /// of what it was before.
+    /// Logarithm to base 2 of the divisor of the weights, the same in all lanes of a measurement: the largest weight, or
+    /// the previous divisor.
     pub divisor: Lanes,
     /// Sum of the weights of each lane.
     pub sum: Lanes,
 }
 
 /// Parameters whose terms are added in one pass.
-const TOGETHER: usize = 4;
+const PER_PASS: usize = 4;
 
-/// Sums of weights for which an old divisor is near enough: far from what single precision cannot hold.
+/// Sums of weights for which the previous divisor is kept: far from overflow and underflow in single precision.
 const NEAR_ENOUGH: std::ops::RangeInclusive<f32> = 1e-12..=1e12;
 
-/// What the logarithms of weights are made of.
+/// Terms of the logarithms of the weights.
 ///
 /// ```text
 ///  log₂ w_s = to_s + Σ_k x_sk (x_sk square_k + linear_k)
 /// ```
 pub(super) struct Terms<'a> {
-    /// Logarithms to base 2 that the terms are added to, one entry a sample.
+    /// Logarithms to base 2 that the terms are added to, one entry per place.
     pub to: &'a [Lanes],
-    /// x of each parameter, one entry a sample.
+    /// x of each parameter, one entry per place.
     pub deviations: &'a [Vec<Lanes>],
-    /// Where the samples stand among those of all blocks.
+    /// Places of the block among those of all blocks.
     pub places: Range<usize>,
-    /// Of each parameter: −1/2σ², times log₂ e.
+    /// −1/2σ² · log₂ e of each parameter.
     pub squares: &'a [f32],
-    /// Of each parameter: (μ − c)/σ², c the centre, times log₂ e.
+    /// (μ − c)/σ² · log₂ e of each parameter, with the centre c.
     pub linears: &'a [Lanes],
 }
 
-/// `weights` and their logarithms, one entry a sample. A measurement has every lane `width` further. What they are divided by is
-/// `divisor` where it is near enough to the greatest.
+/// Computes `weights` and their logarithms, one entry per place. The lanes of a measurement are `width` apart. The weights
+/// are divided by `divisor`, or by the largest weight where `divisor` is too far from it.
 #[pulp::with_simd(weigh = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn weigh_simd<S: pulp::Simd>(
@@ -73,8 +73,8 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
     width: usize,
     divisor: &Lanes,
 ) -> Weighed {
-    for (k, some) in terms.deviations.chunks(TOGETHER).enumerate() {
-        let (squares, linears) = (&terms.squares[TOGETHER * k..], &terms.linears[TOGETHER * k..]);
+    for (k, some) in terms.deviations.chunks(PER_PASS).enumerate() {
+        let (squares, linears) = (&terms.squares[PER_PASS * k..], &terms.linears[PER_PASS * k..]);
         let (to, places) = ((k == 0).then_some(terms.to), &terms.places);
         match some {
             [a] => add_terms(simd, logarithms, to, [a], places, squares, linears),
@@ -104,16 +104,16 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
     Weighed { divisor, sum: powers(weights, logarithms, &divisor) }
 }
 
-/// Weights of these logarithms, divided; the sum of each lane.
+/// Computes the weights from their logarithms and the divisor. Returns the sum of each lane.
 #[inline(always)]
 fn powers(weights: &mut [Lanes], logarithms: &[Lanes], divisor: &Lanes) -> Lanes {
     let logarithms = &logarithms[..weights.len()];
-    // Four sums that do not wait for each other.
+    // Four independent sums, for instruction-level parallelism.
     let mut sums = [Lanes::ZERO; 4];
     let add_power = |weights: &mut Lanes, logarithms: &Lanes, sum: &mut Lanes| {
         let all = weights.0.iter_mut().zip(&logarithms.0).zip(divisor.0.iter().zip(&mut sum.0));
         for ((weight, logarithm), (divisor, sum)) in all {
-            *weight = power_of_two(*logarithm - divisor);
+            *weight = simd::exp2(*logarithm - divisor);
             *sum += *weight;
         }
     };
@@ -132,9 +132,9 @@ fn powers(weights: &mut [Lanes], logarithms: &[Lanes], divisor: &Lanes) -> Lanes
     Lanes(std::array::from_fn(|lane| (sums[0].0[lane] + sums[1].0[lane]) + (sums[2].0[lane] + sums[3].0[lane])))
 }
 
-/// Adds the terms of K parameters to the logarithms `to`, or else to those that stand in `logarithms` already.
+/// Adds the terms of K parameters to the logarithms `to`, or without these to the previous values of `logarithms`.
 ///
-/// Spelt out: left to itself the compiler makes vectors of samples instead, and gathers and scatters them.
+/// Vector instructions are written out: the compiler would vectorise over samples instead, with gather and scatter.
 #[inline(always)]
 fn add_terms<S: pulp::Simd, const K: usize>(
     simd: S,
@@ -145,7 +145,7 @@ fn add_terms<S: pulp::Simd, const K: usize>(
     squares: &[f32],
     linears: &[Lanes],
 ) {
-    // One length for all: what is read in the loop is known to be there.
+    // Equal lengths, so that bounds checks in the loop are removed.
     let deviations = deviations.map(|x| &x[places.clone()][..logarithms.len()]);
     let to = to.map(|to| &to[..logarithms.len()]);
     for first in (0..LANES).step_by(S::F32_LANES) {
@@ -164,26 +164,7 @@ fn add_terms<S: pulp::Simd, const K: usize>(
     }
 }
 
-/// 2ˣ for x from −100 to 100, with a relative error below 3e-7; 2⁻¹⁰⁰ for all below: nothing beside a weight of 1, and still far
-/// from numbers that processors take long over, also times squares of deviations.
-///
-/// The nearest whole number goes into the exponent, the rest by a polynomial for |r| ≤ ½.
-#[inline(always)]
-fn power_of_two(x: f32) -> f32 {
-    // Adding 1.5·2²³ rounds to the nearest whole number and leaves it in the lowest bits.
-    const ROUND: f32 = 12_582_912.0;
-    let x = x.clamp(-100.0, 100.0);
-    let shifted = x + ROUND;
-    let r = x - (shifted - ROUND);
-    let polynomial = r.mul_add(1.326_472_7e-3, 9.671_513e-3);
-    let polynomial = r.mul_add(polynomial, 5.550_733_6e-2);
-    let polynomial = r.mul_add(polynomial, 2.402_224_2e-1);
-    let polynomial = r.mul_add(polynomial, std::f32::consts::LN_2);
-    let polynomial = r.mul_add(polynomial, 1.0);
-    polynomial * f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
-}
-
-/// The lanes `part` of all entries combined, in four rows that do not wait for each other.
+/// Combines the lanes `part` of all entries, in four independent rows for instruction-level parallelism.
 #[inline(always)]
 fn in_fours<S: pulp::Simd>(
     simd: S,
@@ -206,9 +187,9 @@ fn in_fours<S: pulp::Simd>(
     combine(combine(rows[0], rows[1]), combine(rows[2], rows[3]))
 }
 
-/// (μ − c)/σ² · log₂ e of each lane into `linear`; returns ((μ − c)/σ)² of each.
+/// Writes (μ − c)/σ² · log₂ e of each lane to `linear`; returns ((μ − c)/σ)² of each lane.
 ///
-/// `centres`: c of each lane; `precision`: 1/σ².
+/// `centres`: c of each lane; `mean`: μ; `precision`: 1/σ².
 #[pulp::with_simd(off_centre = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn off_centre_simd<S: pulp::Simd>(
@@ -227,11 +208,11 @@ pub(super) fn off_centre_simd<S: pulp::Simd>(
     squared
 }
 
-/// How many samples of each lane come before as much weight as `targets`.
+/// Number of samples of each lane whose cumulative weight is at most `targets`.
 #[pulp::with_simd(count_before = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn count_before_simd<S: pulp::Simd>(simd: S, weights: &[Lanes], targets: &Lanes) -> [f32; LANES] {
-    // Counting what ends before the target leaves the processor nothing to guess.
+    // Counting avoids unpredictable branches.
     let mut counts = Lanes::ZERO;
     let (one, none) = (simd.splat_f32s(1.0), simd.splat_f32s(0.0));
     for first in (0..LANES).step_by(S::F32_LANES) {
@@ -262,13 +243,13 @@ pub(super) fn moments_simd<S: pulp::Simd>(_: S, weights: &[Lanes], x: &[Lanes]) 
     (first, second)
 }
 
-/// w ← exp(w − max w); returns their sum.
+/// w ← exp(w − max w); returns the sum.
 #[pulp::with_simd(exponentials = pulp::Arch::new())]
 #[inline(always)]
 pub(super) fn exponentials_simd<S: pulp::Simd>(_: S, weights: &mut [f64]) -> f64 {
     let largest = weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     for weight in weights.iter_mut() {
-        *weight = f64::from(exp_f32((*weight - largest) as f32));
+        *weight = f64::from(simd::exp((*weight - largest) as f32));
     }
     weights.iter().sum()
 }
@@ -278,9 +259,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_lane_is_a_measurement_of_its_own() {
+    fn lanes_are_independent_measurements() {
         for count in [1_usize, 15, 64, 100] {
-            // The population lies up to twenty of its own standard deviations away from the centre, another way in each lane.
+            // The population is up to twenty of its standard deviations away from the centre, in a different direction in
+            // each lane.
             let std = 0.4_f64;
             let off = |lane: usize| 8.0 * (lane as f64 * 0.9).cos();
             let x = |sample: usize, lane: usize| (sample as f64 * 0.7 + lane as f64).sin();
@@ -295,7 +277,7 @@ mod tests {
             let columns = [deviations];
             let terms =
                 Terms { to: &offsets, deviations: &columns, places: 0..count, squares: &[square], linears: &[linear] };
-            // From a divisor that is far from near enough.
+            // The initial divisor is too far from the largest weight.
             let found = weigh(&mut weights, &mut logarithms, &terms, LANES, &Lanes([1e4; LANES]));
             let moments = moments(&weights, &columns[0]);
             let shares = 20_000_u32;
@@ -311,7 +293,7 @@ mod tests {
                 let exponent = |s: usize| offset(s, lane) - 0.5 * ((x(s, lane) - off(lane)) / std).powi(2);
                 let largest = (0..count).map(exponent).fold(f64::NEG_INFINITY, f64::max);
                 let expected: Vec<f64> = (0..count).map(|s| (exponent(s) - largest).exp()).collect();
-                // Exponents of some two hundred in single precision: 200 · 6e-8 · some operations.
+                // Exponents of about 200 in single precision: 200 · 6e-8 times several operations.
                 for (sample, expected) in expected.iter().enumerate() {
                     let found = f64::from(weights[sample].0[lane]);
                     assert!((found - expected).abs() < 1e-4, "{count}: {found}, expected {expected}");
@@ -323,7 +305,7 @@ mod tests {
                 let direct = |power: i32| -> f64 { (0..count).map(|s| expected[s] * x(s, lane).powi(power)).sum() };
                 assert!((f64::from(moments.0 .0[lane]) - direct(1)).abs() < 1e-4 * sum, "{count}");
                 assert!((f64::from(moments.1 .0[lane]) - direct(2)).abs() < 1e-4 * sum, "{count}");
-                // Through all shares each sample comes as often as it weighs.
+                // Over all shares each sample is selected in proportion to its weight.
                 for sample in 0..count {
                     let expected =
                         f64::from(weights[sample].0[lane]) / f64::from(found.sum.0[lane]) * f64::from(shares);
@@ -334,17 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn powers_of_two_are_right_to_single_precision() {
-        for i in 0..=2_000_000_u32 {
-            let x = 100.0 - 200.0 * (f64::from(i) / 2e6) as f32;
-            let relative = f64::from(power_of_two(x)) / f64::from(x).exp2() - 1.0;
-            assert!(relative.abs() < 3e-7, "2^{x}: {relative}");
-        }
-        assert!(power_of_two(f32::NEG_INFINITY) < 1e-30 && power_of_two(-1e9) < 1e-30);
-    }
-
-    #[test]
-    fn as_many_parameters_as_there_are_add_their_terms() {
+    fn terms_of_any_number_of_parameters_are_added() {
         for parameters in 1..=9_usize {
             let x = |k: usize, sample: usize, lane: usize| ((k + 2 * sample + 5 * lane) as f64).sin();
             let (square, linear) =
@@ -354,13 +326,13 @@ mod tests {
             let columns: Vec<Vec<Lanes>> = (0..parameters).map(column).collect();
             let squares: Vec<f32> = (0..parameters).map(|k| square(k) as f32).collect();
             let linears: Vec<Lanes> = (0..parameters).map(|k| lanes(&|lane| linear(k, lane))).collect();
-            // Two lanes each: eight measurements.
+            // Eight measurements with two lanes each.
             let (mut weights, offsets) = (vec![Lanes::ZERO; 7], vec![Lanes::ZERO; 7]);
             let terms =
                 Terms { to: &offsets, deviations: &columns, places: 0..7, squares: &squares, linears: &linears };
             let mut logarithms = weights.clone();
             let found = weigh(&mut weights, &mut logarithms, &terms, 8, &Lanes([-100.0; LANES]));
-            // Another divisor that is near enough stays, and divides.
+            // Another divisor that is close enough is kept.
             let (others, near) = (&mut weights.clone(), Lanes(std::array::from_fn(|lane| found.divisor.0[lane] + 3.0)));
             let again = weigh(others, &mut logarithms, &terms, 8, &near);
             assert_eq!(again.divisor, near);
@@ -383,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn exponentials_are_relative_to_the_greatest() {
+    fn exponentials_are_relative_to_the_largest() {
         let logarithms: Vec<f64> = (0..37).map(|i| f64::from(i).sin() * 5.0 - 400.0).collect();
         let largest = logarithms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let mut weights = logarithms.clone();

@@ -1,17 +1,21 @@
-//! The likelihood of a normal population of all parameters, and where it is greatest.
+//! The likelihood of a normal population of all parameters, and its maximum.
 
 use std::f64::consts::{LN_2, LOG2_E};
 
 use super::block::Block;
 use super::kernel::{moments, off_centre, weigh, Lanes, Terms, Weighed, LANES};
-use super::WIDEST;
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::posterior::PosteriorSamples;
 use crate::stats;
 
-/// Share of the spread between measurements that the posterior of one must have for the noise to matter.
+/// Largest standard deviation considered, as a share of the prior's width. A uniform distribution over the prior has 0.29.
+pub(super) const WIDEST: f64 = 0.5;
+
+/// A parameter is noise-dominated where the posterior of one measurement is wider than this share of the spread between
+/// measurements.
 const NOISY: f64 = 0.3;
 
+/// Most iterations of expectation–maximisation.
 const EM_ITERATIONS: usize = 200;
 
 /// μ and σ of every parameter in the unit box.
@@ -21,44 +25,46 @@ pub(super) struct State {
     pub std: Vec<f64>,
 }
 
-/// Samples in the unit box, those of several measurements side by side.
+/// Posterior samples in the unit box of the prior, arranged in SIMD lanes; see [`Block`].
 pub(super) struct Problem {
     /// Mean of the samples of each measurement, `[measurement·parameters + parameter]`.
     pub centres: Vec<f64>,
     /// The same in the lanes of each block, `[block·parameters + parameter]`.
     pub lane_centres: Vec<[f64; LANES]>,
-    /// What each sample lies off that, `[parameter][place]`; what is left over of the last block is 0.
+    /// Deviation of each sample from that mean, `[parameter][place]`; 0 in unused lanes of the last block.
     pub deviations: Vec<Vec<Lanes>>,
-    /// Logarithms to base 2 of the weights that the samples have by themselves, the greatest of each measurement 0, `[place]`.
+    /// Logarithms to base 2 of the samples' own weights, scaled so that the largest of each measurement is 0, `[place]`.
     pub offsets: Vec<Lanes>,
     pub blocks: Vec<Block>,
     pub measurements: usize,
     pub draws: usize,
-    /// Least σ of each column that the samples can resolve.
+    /// Smallest σ of each column that the samples can resolve.
     pub floor: Vec<f64>,
-    /// Mean posterior standard deviation of one measurement, for each column.
+    /// Root mean posterior variance of one measurement, for each column.
     pub within: Vec<f64>,
-    /// Columns of whose spread that is much.
+    /// Noise-dominated columns.
     pub noisy: Vec<usize>,
 }
 
-/// Weights of all samples under a population, and room for what they are made of.
+/// Weights of all samples under a population, with buffers for their computation.
 pub(super) struct Weights {
-    /// `[place]`
+    /// Weights, `[place]`.
     pub values: Vec<Lanes>,
-    /// Their logarithms to base 2, not divided, `[place]`.
+    /// Logarithms to base 2 of the weights before division, `[place]`.
     pub logarithms: Vec<Lanes>,
-    /// `[block]`
+    /// Divisors and sums, `[block]`.
     pub blocks: Vec<Weighed>,
     /// Σ ((c − μ)/σ)² over the measurements, `[parameter]`.
     pub of_centres: Vec<f64>,
     /// 1/σ², `[parameter]`.
     pub precisions: Vec<f64>,
+    /// As in [`Terms`].
     pub squares: Vec<f32>,
+    /// As in [`Terms`].
     pub linears: Vec<Lanes>,
 }
 
-/// The samples of each parameter in the unit box.
+/// The samples of each parameter in the unit box, `[parameter][sample]`.
 pub(super) fn unit_columns(samples: &PosteriorSamples, space: &ParameterSpace) -> Vec<Vec<f64>> {
     let unit = |(column, p): (usize, &Parameter)| -> Vec<f64> {
         samples.theta().column(column).iter().map(|x| p.to_unit(*x)).collect()
@@ -66,7 +72,7 @@ pub(super) fn unit_columns(samples: &PosteriorSamples, space: &ParameterSpace) -
     space.iter().enumerate().map(unit).collect()
 }
 
-/// Mean posterior standard deviation of one measurement, for each column.
+/// Root mean posterior variance of one measurement, for each column.
 pub(super) fn within(columns: &[Vec<f64>], draws: usize) -> Vec<f64> {
     let variance = |chunk: &[f64]| {
         let centre = stats::mean(chunk);
@@ -86,17 +92,18 @@ impl Problem {
         let within = within(&columns, draws);
         let means = |column: &Vec<f64>| -> Vec<f64> { column.chunks(draws).map(stats::mean).collect() };
         let means: Vec<Vec<f64>> = columns.iter().map(means).collect();
-        let hides = |(means, within): &(&Vec<f64>, &f64)| {
+        let dominates = |(means, within): &(&Vec<f64>, &f64)| {
             stats::sample_std(means).is_none_or(|spread| **within > NOISY * spread)
         };
-        let noisy = means.iter().zip(&within).enumerate().filter(|(_, column)| hides(column));
+        let noisy = means.iter().zip(&within).enumerate().filter(|(_, column)| dominates(column));
         let noisy = noisy.map(|(column, _)| column).collect();
-        // A spread far below what one measurement leaves open cannot be told from none: the floor keeps it above zero.
+        // A spread far below the posterior width of one measurement cannot be distinguished from zero: the floor keeps it
+        // positive.
         let floor = within.iter().map(|within| (0.25 * within).clamp(1e-7, 0.1 * WIDEST)).collect();
         let blocks = Block::all(measurements, draws);
         let places = blocks.last().map_or(0, |block| block.places.end);
-        // Each value less that of its measurement, times a factor.
-        let side_by_side = |values: &[f64], centres: &[f64], factor: f64| {
+        // The deviation of each value from the centre of its measurement, times a factor, in lanes.
+        let deviations_in_lanes = |values: &[f64], centres: &[f64], factor: f64| {
             let mut all = vec![Lanes::ZERO; places];
             for block in &blocks {
                 for measurement in block.measurements.clone() {
@@ -109,12 +116,12 @@ impl Problem {
             }
             all
         };
-        let off_centre = |(column, means): (&Vec<f64>, &Vec<f64>)| side_by_side(column, means, 1.0);
+        let off_centre = |(column, means): (&Vec<f64>, &Vec<f64>)| deviations_in_lanes(column, means, 1.0);
         let deviations: Vec<Vec<Lanes>> = columns.iter().zip(&means).map(off_centre).collect();
         let relative = |weights: &[f64]| {
             let largest: Vec<f64> =
                 weights.chunks(draws).map(|own| own.iter().copied().fold(f64::NEG_INFINITY, f64::max)).collect();
-            side_by_side(weights, &largest, LOG2_E)
+            deviations_in_lanes(weights, &largest, LOG2_E)
         };
         let offsets = log_weights.map_or_else(|| vec![Lanes::ZERO; places], relative);
         let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
@@ -134,12 +141,13 @@ impl Problem {
         &self.centres[measurement * d..(measurement + 1) * d]
     }
 
-    /// Whether the prior and what the samples can resolve allow the population of parameter k.
+    /// Whether μ and σ of parameter k are within the prior, and σ is not below what the samples can resolve.
     pub(super) fn is_possible(&self, state: &State, k: usize) -> bool {
         (0.0..=1.0).contains(&state.mean[k]) && (self.floor[k]..=WIDEST).contains(&state.std[k])
     }
 
-    pub(super) fn room(&self) -> Weights {
+    /// Buffers for the weights.
+    pub(super) fn buffers(&self) -> Weights {
         let d = self.deviations.len();
         Weights {
             values: vec![Lanes::ZERO; self.offsets.len()],
@@ -152,7 +160,7 @@ impl Problem {
         }
     }
 
-    /// Weights of all samples under a population.
+    /// Computes the weights of all samples under a population.
     ///
     /// ```text
     ///  ln w_s = offset_s − Σ_k ½((x_sk − μ_k)/σ_k)² + ½((c_k − μ_k)/σ_k)²
@@ -178,7 +186,8 @@ impl Problem {
         }
     }
 
-    /// As [`Self::weigh`] under `next`, which differs from `state` in parameter k only; `weights` are those under `state`.
+    /// Computes the weights under `next`, which differs from `state` only in parameter k, from `weights`, those under
+    /// `state`.
     pub(super) fn weigh_changed(
         &self,
         k: usize,
@@ -205,6 +214,7 @@ impl Problem {
         }
     }
 
+    /// The most probable population, by expectation–maximisation; see `populations`.
     pub(super) fn maximise(&self) -> State {
         let (n, d) = (self.measurements as f64, self.deviations.len());
         let start = |k: usize| {
@@ -214,7 +224,7 @@ impl Problem {
         };
         let (mean, std) = (0..d).map(start).unzip();
         let mut state = State { mean, std };
-        let mut weights = self.room();
+        let mut weights = self.buffers();
         for _ in 0..EM_ITERATIONS {
             let mut sums = vec![(0.0, 0.0, 0.0); d];
             self.weigh(&state, &mut weights);
@@ -225,7 +235,8 @@ impl Problem {
                     for (measurement, lanes) in block.lanes() {
                         let sum = weighed.sum.of(lanes.clone());
                         let (first, second) = (first.of(lanes.clone()) / sum, second.of(lanes) / sum);
-                        // About the last mean: differences of large squares would lose a small spread.
+                        // Moments about the previous mean: differences of large squares would lose the digits of a small
+                        // spread.
                         let off = self.centres(measurement)[k] - state.mean[k];
                         sums.0 += off + first;
                         sums.1 += second + 2.0 * off * first + off * off;
@@ -251,8 +262,9 @@ impl Problem {
         state
     }
 
+    /// Effective sample size (Σw)²/Σw² under a population, averaged over the measurements.
     pub(super) fn effective_sample_size(&self, state: &State) -> f64 {
-        let (mut weights, mut all) = (self.room(), 0.0);
+        let (mut weights, mut all) = (self.buffers(), 0.0);
         self.weigh(state, &mut weights);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
             let values = &weights.values[block.places.clone()];
@@ -265,9 +277,9 @@ impl Problem {
         all / self.measurements as f64
     }
 
-    /// ln L(μ, σ) up to a constant; `weights` under the same population.
+    /// ln L(μ, σ) up to a constant. `weights`: those under the same population.
     pub(super) fn log_likelihood(&self, state: &State, weights: &Weights) -> f64 {
-        // One logarithm for many measurements: the product of their sums.
+        // The sums of many measurements are multiplied, so that few logarithms are needed.
         let (mut likelihood, mut product) = (-0.5 * weights.of_centres.iter().sum::<f64>(), 1.0_f64);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
             for (first, (_, lanes)) in block.lanes().enumerate() {
@@ -292,7 +304,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_likelihood_is_the_same_whichever_way_a_population_was_reached() {
+    fn the_likelihood_does_not_depend_on_how_the_weights_were_computed() {
         let parameter = |name: &str| crate::parameter::Parameter {
             name: name.to_owned(),
             unit: "N/m".to_owned(),
@@ -320,14 +332,14 @@ mod tests {
             (0..measurements).map(|j| (j * draws..(j + 1) * draws).map(density).sum::<f64>().ln()).sum()
         };
         let start = state([0.5, 0.5, 0.5], [0.05, 0.1, 0.03]);
-        let (mut weights, mut others) = (problem.room(), problem.room());
+        let (mut weights, mut others) = (problem.buffers(), problem.buffers());
         problem.weigh(&start, &mut weights);
         let of_start = problem.log_likelihood(&start, &weights);
-        // A small step, and one so large that what the weights were divided by is of no use any more.
+        // A small step, and one so large that the previous divisor of the weights cannot be reused.
         for (k, next) in [(1, state([0.5, 0.48, 0.5], [0.05, 0.07, 0.03])), (2, state([0.5; 3], [0.05, 0.1, 0.001]))] {
             problem.weigh_changed(k, (&start, &weights), &next, &mut others);
             let changed = problem.log_likelihood(&next, &others) - of_start;
-            let mut anew = problem.room();
+            let mut anew = problem.buffers();
             problem.weigh(&next, &mut anew);
             let weighed = problem.log_likelihood(&next, &anew) - of_start;
             let expected = direct(&next) - direct(&start);

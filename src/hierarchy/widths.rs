@@ -1,16 +1,17 @@
-//! Normal distributions about one centre that draws come from in turn: wide ones reach what a posterior has beyond its moments.
+//! Mixtures of normal distributions with a common centre and several widths. The wide components cover the tails of a
+//! posterior that is not normal.
 
-/// A mixture of standard normal distributions stretched by a few widths, and how often each of them comes.
+/// A mixture of standard normal distributions stretched by several widths, which the draws take in turn.
 pub(super) struct Widths<const COUNT: usize> {
     widths: [f64; COUNT],
     /// Index of the width of each of eight draws in a row.
     turns: [usize; 8],
-    /// Share of the draws that have each width, over its volume.
+    /// Share of the draws of each width, divided by widthᵈ.
     densities: [f64; COUNT],
 }
 
 impl<const COUNT: usize> Widths<COUNT> {
-    /// For so many draws in so many dimensions.
+    /// A mixture for `draws` draws in `dimensions` dimensions.
     pub fn new(widths: [f64; COUNT], turns: [usize; 8], draws: usize, dimensions: usize) -> Self {
         let density = |own: usize| {
             let count = (0..draws).filter(|draw| turns[draw % turns.len()] == own).count();
@@ -19,15 +20,15 @@ impl<const COUNT: usize> Widths<COUNT> {
         Self { widths, turns, densities: std::array::from_fn(density) }
     }
 
-    /// What a draw is stretched by.
+    /// Width of a draw.
     pub fn of(&self, draw: usize) -> f64 {
         self.widths[self.turns[draw % self.turns.len()]]
     }
 
-    /// Logarithm of the density of a stretched draw, up to a constant.
+    /// Log-density of a stretched draw z, up to a constant. `squared`: |z|².
     ///
     /// ```text
-    ///  ln Σ_w share_w w^−d exp(−|z|²/2w²)      `squared`: |z|²
+    ///  ln Σ_w share_w w^−d exp(−|z|²/2w²)
     /// ```
     pub fn log_density(&self, squared: f64) -> f64 {
         let all = self.widths.iter().zip(&self.densities);

@@ -13,7 +13,7 @@ use super::error::ApiError;
 use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
-use crate::baseline::identifiability::ParameterIdentifiability;
+use crate::baseline::manifest::ParameterIdentifiability;
 use crate::monitor::stored::{Acknowledgement, Episode, MaintenanceWindow};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
 

@@ -12,6 +12,7 @@ mod diagnoses;
 mod docs;
 mod error;
 mod events;
+mod explorer;
 mod export;
 mod history;
 mod observe;

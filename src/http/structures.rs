@@ -57,8 +57,8 @@ struct ModelBody {
     program_version: String,
     training_samples: usize,
     validation: crate::baseline::manifest::ValidationRecord,
-    conditions: crate::baseline::manifest::Conditions,
-    calibration: crate::baseline::calibration::CalibrationRecord,
+    conditions: crate::baseline::conditions::Conditions,
+    calibration: crate::baseline::manifest::CalibrationRecord,
 }
 
 /// All structures.

@@ -33,7 +33,7 @@ async fn a_panic_is_a_500_with_the_requests_id_and_the_next_request_is_served() 
     let running = tokio::spawn(async move {
         server::run(listener, routes, &settings, async { drop(stopped.await) }).await;
     });
-    let client = reqwest::Client::builder().timeout(Duration::from_secs(20)).build().unwrap();
+    let client = crate::notify::client_builder().timeout(Duration::from_secs(20)).build().unwrap();
     let row = |second: u32| {
         let time = format!("2026-01-01T00:00:{second:02}Z");
         json!({ "measurements": [{ "measured_at": time, "frequencies_hz": [0.49, 0.67, 0.92] }] })

@@ -1,50 +1,50 @@
-//! A batch as JSON: the body of a post, and of a message from a broker.
+//! Batches as JSON: the body of a POST request, and of a message from a broker.
 
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use utoipa::ToSchema;
 
-use super::check::{Place, RawMeasurement};
+use super::check::{FieldPath, RawMeasurement};
 use super::json::{read_object, JsonError};
 use super::CovariateValue;
 
-/// A batch as it came, of a structure named elsewhere.
+/// A batch as received. The URL or the topic names the structure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RawBatch {
-    /// The instrument, gateway or campaign, if it was named.
+    /// The instrument, gateway or campaign, if the client gave one.
     pub source: Option<String>,
-    /// The client's own key for the batch, if it gave one.
+    /// Idempotency key of the batch, if the client gave one.
     pub idempotency_key: Option<String>,
-    /// The measurements, unchecked.
+    /// The measurements, not checked yet.
     pub measurements: Vec<RawMeasurement>,
 }
 
 /// A batch as JSON.
 ///
-/// The client's own key for it is a header.
+/// The idempotency key of the batch is a header.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = BatchInput)]
 pub struct PostBody {
-    /// Instrument, gateway or campaign; with the time it names a measurement. `default` without.
+    /// Instrument, gateway or campaign, `default` if omitted. A measurement is identified by its source and its time.
     #[schema(min_length = 1, max_length = 64, pattern = "^[A-Za-z0-9_.:-]+$")]
     source: Option<String>,
     #[schema(min_items = 1)]
     measurements: Vec<MeasurementBody>,
 }
 
-/// A line of NDJSON, or a message: one batch.
+/// One batch as a line of NDJSON or a message.
 ///
-/// It has no headers: the key is a field.
+/// There are no headers, so that the idempotency key is a field.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 #[schema(as = BatchLine)]
 pub struct MessageBody {
-    /// Where the measurements come from; that of the query without.
+    /// Instrument, gateway or campaign; if omitted, that of the query.
     #[schema(min_length = 1, max_length = 64, pattern = "^[A-Za-z0-9_.:-]+$")]
     source: Option<String>,
-    /// The client's own key for this batch.
+    /// Idempotency key of this batch.
     #[schema(min_length = 1, max_length = 128, pattern = "^[!-~]+$")]
     idempotency_key: Option<String>,
     #[schema(min_items = 1)]
@@ -56,17 +56,17 @@ pub struct MessageBody {
 #[serde(deny_unknown_fields)]
 #[schema(as = MeasurementInput)]
 struct MeasurementBody {
-    /// When it was measured: RFC 3339 with an offset, at most five minutes ahead of the service's clock.
+    /// When it was measured: RFC 3339 with an offset, at most five minutes ahead of the clock of the service.
     #[schema(value_type = String, format = DateTime, required)]
     measured_at: Option<String>,
     /// One entry for each mode of the structure, Hz, from the lowest; `null` for a mode that was not identified.
     #[schema(min_items = 1)]
     frequencies_hz: Vec<Option<f64>>,
-    /// Standard deviation of each frequency, Hz, where it is known.
+    /// Standard deviation of each frequency, Hz; `null` if it is unknown.
     std_hz: Option<Vec<Option<f64>>>,
-    /// Mode shapes, where the structure has instrumented points: one entry for each mode, in the order of `frequencies_hz`; a
-    /// list with a number for each point of `mode_shapes.points` of the structure file, in that order, of any norm and sign;
-    /// `null` for a shape that was not identified. Modes are paired with those of the simulation by MAC and frequency.
+    /// Mode shapes, if the structure has instrumented points: one entry for each mode, in the order of `frequencies_hz`. Each is a
+    /// list with one number for each point of `mode_shapes.points` in the structure file, in that order and with any norm and
+    /// sign, or `null` for a shape that was not identified. Modes are paired with those of the simulation by MAC and frequency.
     mode_shapes: Option<Vec<Option<Vec<f64>>>>,
     /// Values of covariates that the structure declares, by name.
     #[serde(default)]
@@ -77,19 +77,19 @@ struct MeasurementBody {
 }
 
 impl RawBatch {
-    /// The body of a post, whose key came as a header.
+    /// Reads the body of a POST request, whose idempotency key is a header.
     ///
     /// # Errors
-    /// [`JsonError`].
+    /// [`JsonError`] for text that is not JSON or has another shape.
     pub fn of_post(bytes: &[u8], idempotency_key: Option<String>) -> Result<Self, JsonError> {
         let body: PostBody = read_object(bytes)?;
         Ok(Self { source: body.source, idempotency_key, measurements: raw(body.measurements) })
     }
 
-    /// A message: the body of a post, which may have `idempotency_key` too.
+    /// Reads a message, in which `idempotency_key` is a field.
     ///
     /// # Errors
-    /// [`JsonError`].
+    /// [`JsonError`] for text that is not JSON or has another shape.
     pub fn of_message(bytes: &[u8]) -> Result<Self, JsonError> {
         let MessageBody { source, idempotency_key, measurements } = read_object(bytes)?;
         Ok(Self { source, idempotency_key, measurements: raw(measurements) })
@@ -98,7 +98,7 @@ impl RawBatch {
 
 fn raw(measurements: Vec<MeasurementBody>) -> Vec<RawMeasurement> {
     let one = |(index, m): (usize, MeasurementBody)| RawMeasurement {
-        place: Place::Json { index },
+        path: FieldPath::Json { index },
         measured_at: m.measured_at,
         frequencies_hz: m.frequencies_hz,
         std_hz: m.std_hz,

@@ -1,4 +1,4 @@
-//! The rules a measurement must keep: raw values in, checked ones out, every mistake with its place.
+//! Checks raw measurements and locates every mistake in the input.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,86 +9,86 @@ use super::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use crate::parameter::ParameterSpace;
 use crate::quantity::{shown, Hertz, Timestamp};
 
-/// Problems reported of one batch; a table with the wrong separator would have thousands.
+/// Largest number of problems reported for one batch: a table with the wrong separator would have thousands.
 const MOST_PROBLEMS: usize = 20;
 
-/// A clock may run ahead of ours by this much, µs.
+/// A client's clock may be ahead of the clock of the service by this much, µs.
 const CLOCK_SKEW_MICROS: i64 = 5 * 60 * 1_000_000;
 
-/// Longest text of a category, characters.
+/// Largest length of the text of a category, characters.
 const LONGEST_CATEGORY: usize = 64;
 
-/// Where a measurement stood.
+/// Where a measurement is in the input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Place {
+pub enum FieldPath {
     /// In the list `measurements` of a JSON body.
     Json {
-        /// From 0.
+        /// Index in the list, from 0.
         index: usize,
     },
-    /// In a table.
+    /// In a CSV table.
     Csv {
         /// Line of the file, from 1.
         line: u64,
     },
 }
 
-/// A measurement as it came.
+/// A measurement as received, not checked yet.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RawMeasurement {
-    /// Where it stood.
-    pub place: Place,
-    /// RFC 3339 with an offset.
+    /// Where the measurement is in the input.
+    pub path: FieldPath,
+    /// Time of the measurement, RFC 3339 with an offset.
     pub measured_at: Option<String>,
-    /// Hz, `None` for a mode that was not identified.
+    /// Frequency of each mode, Hz; `None` for a mode that was not identified.
     pub frequencies_hz: Vec<Option<f64>>,
     /// Standard deviation of each frequency, Hz.
     pub std_hz: Option<Vec<Option<f64>>>,
-    /// Shape of each mode.
+    /// Shape of each mode at the instrumented points.
     pub mode_shapes: Option<Vec<Option<Vec<f64>>>>,
     /// Values of covariates.
     pub covariates: BTreeMap<String, CovariateValue>,
-    /// Parameters the experimenter set.
+    /// Values of parameters that the experimenter set.
     pub settings: BTreeMap<String, f64>,
 }
 
-/// A mistake in the input and its place.
+/// A mistake in the input.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
 #[schema(as = InputProblem)]
 pub struct Problem {
     /// JSON pointer, or line and column of a table.
     pub pointer: String,
-    /// What is wrong and what would be right.
+    /// What is wrong, and what would be right.
     pub message: String,
 }
 
 impl Problem {
-    /// A mistake at a place.
+    /// A mistake at a JSON pointer, or at a line and column.
     pub fn new(pointer: impl Into<String>, message: impl Into<String>) -> Self {
         Self { pointer: pointer.into(), message: message.into() }
     }
 }
 
-/// What the measurements of a structure must look like.
+/// What the measurements of a structure must satisfy.
 #[derive(Debug, Clone, Copy)]
 pub struct Expectation<'a> {
     /// Number of modes.
     pub modes: usize,
-    /// Frequencies outside these limits, Hz, are a mistake of unit or place.
+    /// Frequencies outside these limits, Hz, are a wrong unit or a wrong column.
     pub frequency_limits_hz: (f64, f64),
     /// Declared covariates.
     pub covariates: &'a [Covariate],
-    /// Points whose motion gives mode shapes; `None` where none are measured.
+    /// Instrumented points; `None` if mode shapes are not measured.
     pub instrumented: Option<&'a InstrumentedPoints>,
     /// Parameters, whose priors bound the settings.
     pub space: &'a ParameterSpace,
     /// The time now.
     pub now: Timestamp,
-    /// Most measurements of a batch.
+    /// Largest number of measurements in a batch.
     pub max_measurements: usize,
 }
 
-/// Part of a measurement, for its place in a message.
+/// Part of a measurement, for the pointer in a message.
 enum Field<'a> {
     Time,
     Frequencies,
@@ -101,12 +101,13 @@ enum Field<'a> {
     Setting(&'a str),
 }
 
-impl Place {
-    /// Where a covariate of this measurement stands, or should.
+impl FieldPath {
+    /// Pointer to a covariate of this measurement, whether it is present or missing.
     pub fn of_covariate(self, name: &str) -> String {
         self.of(&Field::Covariate(name))
     }
 
+    /// Pointer to a part of this measurement.
     fn of(self, field: &Field<'_>) -> String {
         match self {
             Self::Json { index } => {
@@ -135,12 +136,12 @@ impl Place {
     }
 }
 
-/// A name as a segment of a JSON pointer, cut to a readable length.
+/// A name as a segment of a JSON pointer, cut to 80 characters.
 fn escaped(name: &str) -> String {
     name.chars().take(80).collect::<String>().replace('~', "~0").replace('/', "~1")
 }
 
-/// The mistakes found so far; those beyond [`MOST_PROBLEMS`] are only counted.
+/// The mistakes found so far; those after the first [`MOST_PROBLEMS`] are only counted.
 struct Problems {
     found: Vec<Problem>,
     more: usize,
@@ -170,7 +171,7 @@ impl Problems {
 /// Checks the measurements of one batch.
 ///
 /// # Errors
-/// Every mistake with its place, at most 20 and the number of the others.
+/// The mistakes with their pointers: at most 20, and the number of further ones.
 pub fn check_measurements(
     raw: Vec<RawMeasurement>,
     expectation: &Expectation<'_>,
@@ -186,11 +187,12 @@ pub fn check_measurements(
     let mut times = BTreeSet::new();
     let mut checked = Vec::with_capacity(raw.len());
     for measurement in raw {
-        let place = measurement.place;
+        let path = measurement.path;
         let measured_at = check_time(&measurement, expectation.now, &mut problems);
         if measured_at.is_some_and(|time| !times.insert(time)) {
-            let message = "another measurement of this batch has the same time: a measurement is known by its time";
-            problems.add(place.of(&Field::Time), message);
+            let message =
+                "another measurement of this batch has the same time: a measurement is identified by its time";
+            problems.add(path.of(&Field::Time), message);
         }
         let frequencies_hz = check_frequencies(&measurement, expectation, &mut problems);
         check_std(&measurement, expectation.modes, &mut problems);
@@ -212,16 +214,16 @@ pub fn check_measurements(
 }
 
 fn check_time(raw: &RawMeasurement, now: Timestamp, problems: &mut Problems) -> Option<Timestamp> {
-    let pointer = || raw.place.of(&Field::Time);
+    let pointer = || raw.path.of(&Field::Time);
     let Some(text) = &raw.measured_at else {
         problems.add(pointer(), "measured_at is missing: RFC 3339 with an offset, such as 2026-03-01T12:00:00Z");
         return None;
     };
     match Timestamp::parse(text) {
         Err(error) => problems.add(pointer(), error.to_string()),
-        Ok(time) if time.micros() < 0 => problems.add(pointer(), format!("{time} is before 1970")),
+        Ok(time) if time.micros() < 0 => problems.add(pointer(), format!("{time} is before 1970: it must be later")),
         Ok(time) if time.micros() > now.micros() + CLOCK_SKEW_MICROS => {
-            problems.add(pointer(), format!("{time} is in the future: it is {now} here"));
+            problems.add(pointer(), format!("{time} is in the future: the clock of the service shows {now}"));
         }
         Ok(time) => return Some(time),
     }
@@ -236,28 +238,28 @@ fn check_frequencies(
     let (modes, found) = (expectation.modes, raw.frequencies_hz.len());
     if found != modes {
         let message = format!("{found} frequencies, expected {modes}: send null for a mode that was not identified");
-        problems.add(raw.place.of(&Field::Frequencies), message);
+        problems.add(raw.path.of(&Field::Frequencies), message);
         return Vec::new();
     }
     let mut frequencies = Vec::with_capacity(modes);
     let (lowest, highest) = expectation.frequency_limits_hz;
     for (mode, value) in raw.frequencies_hz.iter().enumerate() {
-        let pointer = || raw.place.of(&Field::Frequency(mode));
+        let pointer = || raw.path.of(&Field::Frequency(mode));
         let hertz = value.map(Hertz::new).transpose().unwrap_or_else(|error| {
             problems.add(pointer(), error.to_string());
             None
         });
         if let Some(outside) = hertz.map(Hertz::get).filter(|f| !(lowest..=highest).contains(f)) {
-            let unit = if outside < lowest { "it looks like kHz" } else { "is it in Hz?" };
+            let unit = if outside < lowest { "it seems to be in kHz" } else { "it must be in Hz" };
             let message = format!(
-                "{outside} Hz is far from anything this structure has ({lowest:.3e} to {highest:.3e} Hz): {unit}"
+                "{outside} Hz is far outside the range of this structure ({lowest:.3e} to {highest:.3e} Hz): {unit}"
             );
             problems.add(pointer(), message);
         }
         frequencies.push(hertz);
     }
     if raw.frequencies_hz.iter().all(Option::is_none) {
-        problems.add(raw.place.of(&Field::Frequencies), "all modes are missing: leave the measurement out");
+        problems.add(raw.path.of(&Field::Frequencies), "all modes are missing: omit the measurement");
     }
     frequencies
 }
@@ -265,13 +267,13 @@ fn check_frequencies(
 fn check_std(raw: &RawMeasurement, modes: usize, problems: &mut Problems) {
     let Some(stds) = &raw.std_hz else { return };
     if stds.len() != modes {
-        let message = format!("{} standard deviations, expected {modes}, one for each mode or null", stds.len());
-        problems.add(raw.place.of(&Field::Stds), message);
+        let message = format!("{} standard deviations, expected {modes}: one for each mode, or null", stds.len());
+        problems.add(raw.path.of(&Field::Stds), message);
     }
     for (mode, std) in stds.iter().enumerate() {
         if let Some(std) = std.filter(|s| !(s.is_finite() && *s > 0.0)) {
             let message = format!("a standard deviation of {std} Hz: it must be finite and above 0");
-            problems.add(raw.place.of(&Field::Std(mode)), message);
+            problems.add(raw.path.of(&Field::Std(mode)), message);
         }
     }
 }
@@ -279,29 +281,30 @@ fn check_std(raw: &RawMeasurement, modes: usize, problems: &mut Problems) {
 fn check_shapes(raw: &RawMeasurement, expectation: &Expectation<'_>, problems: &mut Problems) {
     let Some(shapes) = &raw.mode_shapes else { return };
     let Some(instrumented) = expectation.instrumented else {
-        let message = "this structure has no instrumented points: declare mode_shapes in its file, or leave them out";
-        problems.add(raw.place.of(&Field::Shapes), message);
+        let message =
+            "this structure has no instrumented points: declare mode_shapes in its structure file, or omit them here";
+        problems.add(raw.path.of(&Field::Shapes), message);
         return;
     };
     if shapes.len() != expectation.modes {
         let (found, modes) = (shapes.len(), expectation.modes);
-        let message = format!("{found} shapes, expected {modes}, one for each mode or null");
-        problems.add(raw.place.of(&Field::Shapes), message);
+        let message = format!("{found} shapes, expected {modes}: one for each mode, or null");
+        problems.add(raw.path.of(&Field::Shapes), message);
     }
     for (mode, shape) in shapes.iter().enumerate() {
         let Some(shape) = shape else { continue };
         if let Some(mistake) = instrumented.mistake(shape) {
-            problems.add(raw.place.of(&Field::Shape(mode)), mistake);
+            problems.add(raw.path.of(&Field::Shape(mode)), mistake);
         } else if raw.frequencies_hz.get(mode).is_some_and(Option::is_none) {
-            let message = "a shape of a mode without a frequency: send its frequency too, or null for both";
-            problems.add(raw.place.of(&Field::Shape(mode)), message);
+            let message = "this mode has a shape but no frequency: send both, or null for both";
+            problems.add(raw.path.of(&Field::Shape(mode)), message);
         }
     }
 }
 
 fn check_covariates(raw: &RawMeasurement, declared: &[Covariate], problems: &mut Problems) {
     for (name, value) in &raw.covariates {
-        let mut add = |message: String| problems.add(raw.place.of(&Field::Covariate(name)), message);
+        let mut add = |message: String| problems.add(raw.path.of(&Field::Covariate(name)), message);
         let Some(covariate) = declared.iter().find(|c| c.name == *name) else {
             let names: Vec<&str> = declared.iter().map(|c| c.name.as_str()).collect();
             let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
@@ -310,10 +313,10 @@ fn check_covariates(raw: &RawMeasurement, declared: &[Covariate], problems: &mut
         };
         match (covariate.kind, value) {
             (CovariateKind::Number, CovariateValue::Number(number)) if !number.is_finite() => {
-                add(format!("{number} is not finite"));
+                add(format!("{name} is {number}: it must be finite"));
             }
             (CovariateKind::Number, CovariateValue::Category(text)) => {
-                add(format!("{} is no number, and {name} is declared as one", shown(text)));
+                add(format!("{} is text, and {name} is declared as a number: send a number", shown(text)));
             }
             (CovariateKind::Category, CovariateValue::Number(number)) => {
                 add(format!("{number} is a number, and {name} is declared as a category: send text"));
@@ -338,11 +341,11 @@ fn check_settings(raw: &RawMeasurement, space: &ParameterSpace, problems: &mut P
             }
             Some(_) => continue,
         };
-        problems.add(raw.place.of(&Field::Setting(name)), message);
+        problems.add(raw.path.of(&Field::Setting(name)), message);
     }
 }
 
-/// Checks the name of a source.
+/// Checks the name of the source of a batch.
 ///
 /// # Errors
 /// A [`Problem`] unless it is 1 to 64 of letters, digits, `-`, `_`, `.`, `:`.
@@ -353,7 +356,7 @@ pub fn check_source(source: &str) -> Result<(), Problem> {
     valid.then_some(()).ok_or_else(|| Problem::new("/source", message()))
 }
 
-/// Checks a client's key.
+/// Checks an idempotency key.
 ///
 /// # Errors
 /// A [`Problem`] unless it is 1 to 128 visible ASCII characters.

@@ -1,55 +1,56 @@
-//! Measurements as a table.
+//! Measurements as CSV tables.
 //!
-//! Columns: `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, declared covariates by name, `set_<parameter>`; an empty
-//! cell is a missing value. Separator `,`, `;` or tab, found from the header or from a first line `sep=;`; with `;` or tab a
-//! decimal comma is read. What spreadsheets add is taken: a byte order mark, CRLF, blanks about cells, empty lines, columns
-//! without a name and without a value.
+//! The columns are `measured_at`, `f1_hz` …, and optionally `std_f1_hz` …, the declared covariates by name, and
+//! `set_<parameter>`. An empty cell is a missing value. The separator is `,`, `;` or tab; it is detected from the header or read
+//! from a first line `sep=;`. With `;` or tab, decimal commas are accepted. Additions by spreadsheets are accepted: a byte order
+//! mark, CRLF, blanks around cells, empty lines, and columns with neither a name nor values.
 
 use std::collections::BTreeMap;
 
-use super::check::{Place, Problem, RawMeasurement};
+use super::check::{FieldPath, Problem, RawMeasurement};
 use super::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use crate::quantity::{shown, Hertz, Timestamp};
 
-/// What to do about times.
+/// How the times of measurements are found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Times {
-    /// The column `measured_at` must be there.
+    /// The column `measured_at` is required.
     Required,
-    /// Without it, row i (from 0) gets 1970-01-01T00:00:00Z plus i seconds: for files that never meet a clock.
+    /// Without a column `measured_at`, row i (from 0) gets the time 1970-01-01T00:00:00Z plus i seconds. This is for files whose
+    /// times do not matter.
     RowNumber,
 }
 
 /// How a table is read.
 #[derive(Debug, Clone)]
 pub struct CsvOptions {
-    /// What to do about times.
+    /// How times are found.
     pub times: Times,
     /// Columns that are not read.
     pub ignore: Vec<String>,
-    /// Column of the time, where it is not `measured_at`.
+    /// Name of the time column, if it is not `measured_at`.
     pub time_column: Option<String>,
 }
 
-/// A column that the structure does not declare, and what it seems to be.
+/// A column that the structure does not declare, and its probable meaning.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Offered {
     /// A covariate of this kind.
     Covariate(Covariate),
-    /// Text with so many different values that it says nothing.
+    /// Text with too many different values for a category.
     Ignored {
-        /// The column.
+        /// Name of the column.
         name: String,
-        /// Different values.
+        /// Number of different values.
         values: usize,
     },
 }
 
-/// What the undeclared columns of a table seem to be: numbers where every cell is one, categories where text has at most
-/// `most_categories` values.
+/// Guesses the kind of the columns that a structure does not declare: numbers if nearly all cells are numbers, categories if the
+/// text has at most `most_categories` different values.
 ///
 /// # Errors
-/// As [`read`] for a table that cannot be read at all.
+/// As [`read`], for text that is not a table.
 pub fn offered(
     bytes: &[u8],
     covariates: &[Covariate],
@@ -71,19 +72,19 @@ pub fn offered(
     let (mut numbers, mut others) = (vec![0; unknown.len()], vec![0; unknown.len()]);
     for record in records {
         let record = record.map_err(|e| problem(&e))?;
-        for (place, index) in unknown.iter().enumerate() {
+        for (position, index) in unknown.iter().enumerate() {
             let Some(cell) = record.get(*index).filter(|cell| !cell.is_empty()) else { continue };
             let counted = if number(cell, separator != b',').is_ok() { &mut numbers } else { &mut others };
-            counted[place] += 1;
-            if cells[place].len() <= most_categories {
-                cells[place].insert(cell.to_owned());
+            counted[position] += 1;
+            if cells[position].len() <= most_categories {
+                cells[position].insert(cell.to_owned());
             }
         }
     }
-    let offer = |(place, index): (usize, &usize)| {
-        let (name, values) = (header[*index].to_owned(), cells[place].len());
-        // A few cells that are no numbers do not make numbers text: reading names them with their line.
-        if numbers[place] >= 9 * others[place] {
+    let offer = |(position, index): (usize, &usize)| {
+        let (name, values) = (header[*index].to_owned(), cells[position].len());
+        // A few cells that are not numbers do not make the column text: `read` then reports them with their lines.
+        if numbers[position] >= 9 * others[position] {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Number })
         } else if values <= most_categories {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Category })
@@ -102,15 +103,15 @@ fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
     Ok(text.strip_prefix('\u{feff}').unwrap_or(text))
 }
 
-/// The separator that a first line `sep=;` names, as some spreadsheets write it.
+/// The separator in a first line such as `sep=;`, which some spreadsheets write.
 fn named_separator(text: &str) -> Option<u8> {
     let line = text.lines().next()?.trim_matches('"');
     let separator = line.get(..4).filter(|start| start.eq_ignore_ascii_case("sep=")).and(line.get(4..))?;
     [b',', b';', b'\t'].into_iter().find(|s| separator.as_bytes() == [*s])
 }
 
-/// Line of the file on which a record stands, from 1: the reader gives the place where it began to look for it, before the
-/// line ends and empty lines in front of it.
+/// Line of a record in the file, from 1. The position of the reader is where it started to look for the record, before line ends
+/// and empty lines that precede it.
 fn line_of(text: &str, record: &csv::StringRecord) -> u64 {
     let Some(position) = record.position() else { return 1 };
     let rest = text.as_bytes().get(position.byte() as usize..).unwrap_or_default();
@@ -127,11 +128,11 @@ fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
         .from_reader(text.as_bytes())
 }
 
-/// What a column holds.
+/// Meaning of a column.
 #[derive(Debug, Clone, PartialEq)]
 enum Column {
     Ignored,
-    /// Without a name: spreadsheets write such columns behind the last; a value in one has no meaning.
+    /// A column without a name, which spreadsheets append. It must not have values.
     Unnamed,
     Time,
     Frequency(usize),
@@ -143,7 +144,7 @@ enum Column {
 /// Reads a table of a structure with `modes` modes.
 ///
 /// # Errors
-/// The mistakes of the header, or those of the first row that has any, with line and column.
+/// The mistakes of the header, or those of the first wrong row, with line and column.
 pub fn read(
     bytes: &[u8],
     modes: usize,
@@ -163,7 +164,7 @@ pub fn read(
         }
     };
     let Some(header) = next()? else {
-        return Err(vec![Problem::new("line 1", "the table is empty: its first line names the columns")]);
+        return Err(vec![Problem::new("line 1", "the table is empty: its first line must name the columns")]);
     };
     let columns = columns(&header, line_of(text, &header), modes, covariates, options)?;
     let mut measurements = Vec::new();
@@ -177,7 +178,7 @@ pub fn read(
     Ok(measurements)
 }
 
-/// The separator that the table names, or else the one that is most frequent in its header.
+/// The separator that the table specifies, or else the most frequent one in its header.
 fn separator(text: &str) -> u8 {
     if let Some(named) = named_separator(text) {
         return named;
@@ -205,7 +206,7 @@ fn columns(
                 let known = if known.is_empty() { String::new() } else { format!(", {}", known.join(", ")) };
                 add(format!(
                     "unknown column {}: known are measured_at, f1_hz to f{modes}_hz, std_f1_hz to std_f{modes}_hz, \
-                     set_<parameter>{known}; a covariate must be declared in the structure, other columns ignored",
+                     set_<parameter>{known}; declare a covariate in the structure file, or ignore the column",
                     shown(name)
                 ));
             }
@@ -213,7 +214,7 @@ fn columns(
                 add(format!("column {}: the structure has {modes} modes", shown(name)));
             }
             Some(other) if ![Column::Ignored, Column::Unnamed].contains(other) && columns.contains(other) => {
-                add(format!("column {} is there twice", shown(name)));
+                add(format!("column {} appears twice: remove one", shown(name)));
             }
             Some(_) => {}
         }
@@ -260,7 +261,7 @@ fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<
     if let Some(mode) = lower.strip_prefix("std_").and_then(mode) {
         return Some(Column::Std(mode));
     }
-    // Names of parameters keep their case.
+    // The names of parameters are case-sensitive.
     lower.starts_with("set_").then(|| Column::Setting(name["set_".len()..].to_owned()))
 }
 
@@ -274,11 +275,11 @@ fn row(
     times: Times,
 ) -> Result<RawMeasurement, Vec<Problem>> {
     if record.len() != columns.len() {
-        let message = format!("{} cells, the header has {}", record.len(), columns.len());
+        let message = format!("{} cells, but the header has {}", record.len(), columns.len());
         return Err(vec![Problem::new(format!("line {line}"), message)]);
     }
     let mut raw = RawMeasurement {
-        place: Place::Csv { line },
+        path: FieldPath::Csv { line },
         measured_at: None,
         frequencies_hz: vec![None; modes],
         std_hz: columns.iter().any(|c| matches!(c, Column::Std(_))).then(|| vec![None; modes]),
@@ -294,7 +295,8 @@ fn row(
         match column {
             Column::Ignored => {}
             Column::Unnamed => {
-                let message = format!("{} stands in a column without a name: name it in the first line", shown(cell));
+                let message =
+                    format!("{} is in a column without a name: name the column in the first line", shown(cell));
                 return Err(vec![Problem::new(format!("line {line}"), message)]);
             }
             Column::Time => raw.measured_at = Some(cell.to_owned()),
@@ -314,7 +316,7 @@ fn row(
             }
         }
     }
-    // A row without any standard deviation says nothing about them.
+    // A row in which all standard deviations are missing has none.
     raw.std_hz = raw.std_hz.filter(|stds| stds.iter().any(Option::is_some));
     if times == Times::RowNumber && !columns.contains(&Column::Time) {
         let time =
@@ -328,18 +330,18 @@ fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {
     let text = if decimal_comma { cell.replace(',', ".") } else { cell.to_owned() };
     match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
-        Ok(_) => Err(format!("{} is not finite: leave the cell empty for a missing mode", shown(cell))),
+        Ok(_) => Err(format!("{} is not finite: leave the cell empty for a missing value", shown(cell))),
         Err(_) if !decimal_comma && cell.contains(',') => {
-            Err(format!("{} is no number: a decimal comma needs ';' or tab as separator", shown(cell)))
+            Err(format!("{} is not a number: a decimal comma needs ';' or tab as separator", shown(cell)))
         }
-        Err(_) => Err(format!("{} is no number", shown(cell))),
+        Err(_) => Err(format!("{} is not a number", shown(cell))),
     }
 }
 
-/// Measurements as a table that [`read`] gives back.
+/// Writes measurements as a table from which [`read`] restores them.
 ///
 /// # Panics
-/// Never: measurements that exist have equal numbers of modes, and memory can be written.
+/// Never, because all measurements have the same number of modes and writing to memory cannot fail.
 pub fn write(measurements: &[ModalMeasurement]) -> String {
     let modes = measurements.iter().map(|m| m.frequencies_hz.len()).max().unwrap_or_default();
     let with_std = measurements.iter().any(|m| m.std_hz.is_some());

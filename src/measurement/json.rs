@@ -1,25 +1,25 @@
-//! JSON objects from outside, whoever brings them: what is no JSON, and what is JSON of another shape.
+//! Reads JSON objects from clients, and distinguishes text that is not JSON from JSON of another shape.
 
 use serde::de::DeserializeOwned;
 
 use super::check::Problem;
 use crate::quantity::json_pointer;
 
-/// Why a text is not the JSON object that was asked for.
+/// Why a text is not the expected JSON object.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum JsonError {
-    /// It is no JSON; the sentence has line and column.
+    /// It is not JSON. The message contains line and column.
     Malformed(String),
-    /// It is JSON of another shape, or has a number that JSON or f64 cannot hold.
+    /// It is JSON of another shape, or contains a number that JSON or f64 cannot represent.
     Shape(Problem),
 }
 
 /// Reads a JSON object.
 ///
 /// # Errors
-/// [`JsonError`] with line and column, or with a pointer.
+/// [`JsonError`] with line and column, or with a JSON pointer.
 pub fn read_object<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, JsonError> {
-    // serde would also read an object's fields from a list, by position.
+    // serde would also accept a list and read the fields of the object from it by position.
     if !begins_as_object(bytes) && serde_json::from_slice::<serde::de::IgnoredAny>(bytes).is_ok() {
         return Err(JsonError::Shape(Problem::new("/", "the body must be a JSON object")));
     }
@@ -35,14 +35,14 @@ pub fn read_object<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, JsonError> {
 fn json_error(bytes: &[u8], pointer: String, error: &serde_json::Error) -> JsonError {
     let not_a_number = not_a_number_at(bytes, error.line(), error.column());
     let message = match not_a_number {
-        Some(word) => format!("{word} is no JSON number: send null for a mode that was not identified"),
+        Some(word) => format!("{word} is not a JSON number: send null for a mode that was not identified"),
         None => error.to_string(),
     };
     let malformed = |message: &str| JsonError::Malformed(format!("the body is no JSON: {message}"));
     if !begins_as_object(bytes) {
         return malformed(&message);
     }
-    // serde_json counts a number beyond f64 as a syntax error; for the client it is a wrong value.
+    // serde_json reports a number outside the range of f64 as a syntax error; for the client it is a wrong value.
     let wrong_value = error.is_data() || not_a_number.is_some() || message.starts_with("number out of range");
     if wrong_value {
         let pointer = if pointer.is_empty() { "/".to_owned() } else { pointer };
@@ -55,10 +55,10 @@ fn begins_as_object(bytes: &[u8]) -> bool {
     bytes.iter().find(|b| !b.is_ascii_whitespace()) == Some(&b'{')
 }
 
-/// `NaN` or `Infinity` at the place where the parser stopped.
+/// `NaN` or `Infinity` at the position where the parser stopped.
 fn not_a_number_at(bytes: &[u8], line: usize, column: usize) -> Option<&'static str> {
     let line = bytes.split(|b| *b == b'\n').nth(line.checked_sub(1)?)?;
-    // The parser stops at or just behind the first character it cannot use.
+    // The parser stops at or just after the first character that it cannot use.
     let around = &line[column.saturating_sub(2).min(line.len())..];
     let around = &around[..around.len().min(12)];
     ["-Infinity", "Infinity", "NaN"]

@@ -1,6 +1,6 @@
-//! What arrives: measured natural frequencies, already checked. Values of these types are valid.
+//! Measured natural frequencies. Values of these types have been checked.
 //!
-//! [`check`] turns raw values into these types, [`body`] reads them from JSON, [`csv`] reads and writes them as tables.
+//! [`body`] reads raw measurements from JSON, [`csv`] reads and writes them as tables, and [`check`] checks them.
 
 pub mod body;
 pub mod check;
@@ -18,23 +18,23 @@ use crate::quantity::{Digest, Hertz, OutOfRange, StructureId, Timestamp};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CovariateKind {
-    /// A finite number, in the unit of the covariate's name.
+    /// A finite number, in the unit that the name of the covariate contains.
     #[default]
     Number,
     /// A label such as an operator or a laboratory.
     Category,
 }
 
-/// A declared covariate of a structure.
+/// A covariate that a structure declares.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Covariate {
-    /// Name with its unit, such as `temperature_c`.
+    /// Name that includes the unit, such as `temperature_c`.
     pub name: String,
     /// Kind of its values.
     pub kind: CovariateKind,
 }
 
-/// Value of a covariate at one measurement.
+/// Value of a covariate in one measurement.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(untagged)]
 pub enum CovariateValue {
@@ -44,17 +44,17 @@ pub enum CovariateValue {
     Category(String),
 }
 
-/// The natural frequencies identified from one record, mode by mode.
+/// The modal parameters identified from one record.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct ModalMeasurement {
-    /// When it was measured.
+    /// Time of the measurement.
     pub measured_at: Timestamp,
-    /// One entry a mode of the structure, Hz; `None` where the mode was not identified. At least one is present.
+    /// Frequency of each mode, Hz; `None` for a mode that was not identified. At least one is present.
     pub frequencies_hz: Vec<Option<Hertz>>,
-    /// Standard deviation of each frequency, Hz, where the identification gives it.
+    /// Standard deviation of each frequency, Hz, if the identification gives it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub std_hz: Option<Vec<Option<f64>>>,
-    /// Shape of each mode at the instrumented points of the structure, of any norm and sign; `None` for one that was not
+    /// Shape of each mode at the instrumented points of the structure, with any norm and sign; `None` for a shape that was not
     /// identified.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mode_shapes: Option<Vec<Option<Vec<f64>>>>,
@@ -67,27 +67,27 @@ pub struct ModalMeasurement {
 }
 
 impl ModalMeasurement {
-    /// All frequencies in Hz, or `None` when a mode is missing.
+    /// All frequencies, Hz; `None` if a mode is missing.
     pub fn complete_hz(&self) -> Option<Vec<f64>> {
         self.frequencies_hz.iter().map(|f| f.map(Hertz::get)).collect()
     }
 }
 
-/// Measurements of one structure taken in one state, in the order they came; never empty.
+/// Measurements of one structure in one state, in the order in which they were received; never empty.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeasurementBatch {
-    /// The structure measured.
+    /// The measured structure.
     pub structure: StructureId,
-    /// The instrument, gateway or campaign they come from; a measurement is known by (structure, source, time).
+    /// The instrument, gateway or campaign. A measurement is identified by structure, source and time.
     pub source: String,
-    /// The client's own key for this batch, if it gave one.
+    /// Idempotency key of this batch, if the client gave one.
     pub idempotency_key: Option<String>,
-    /// The measurements; times are distinct.
+    /// The measurements, whose times differ.
     pub measurements: Vec<ModalMeasurement>,
 }
 
 impl MeasurementBatch {
-    /// Digest of everything that was measured; the same whether it came as JSON or CSV, and whatever its key.
+    /// Digest of structure, source and measurements. It does not depend on the format (JSON or CSV) or on the idempotency key.
     pub fn content_digest(&self) -> Digest {
         let measurements = serde_json::to_vec(&self.measurements).expect("checked measurements are plain data");
         Digest::of(&[self.structure.as_str().as_bytes(), self.source.as_bytes(), &measurements])
@@ -101,10 +101,11 @@ impl MeasurementBatch {
     }
 }
 
-/// Complete measurements at equal intervals, with a standard deviation as a share of each frequency, if one is given.
+/// Complete measurements at equal intervals. `rows` holds the frequencies, Hz, `[n][m]`; `relative_std` is their standard deviation
+/// as a share of each frequency.
 ///
 /// # Errors
-/// [`OutOfRange`] for a frequency or time that is none.
+/// [`OutOfRange`] for a frequency that is not positive or a time outside the calendar.
 pub fn at_intervals(
     rows: &[Vec<f64>],
     start: Timestamp,

@@ -1,58 +1,59 @@
-//! Measured mode shapes: what they must look like, and which mode of a structure they resemble.
+//! Checks of measured mode shapes, by their resemblance to the modes of a structure.
 
 use crate::stats::squared_cosine;
 
-/// Least MAC of a measured shape with some mode of the nominal structure: below, it is another structure's, or its numbers
-/// stand in another order.
+/// A measured shape must have at least this MAC with some mode of the nominal structure. Otherwise it belongs to another structure,
+/// or its components are in another order.
 const LEAST_MAC: f64 = 0.1;
 
-/// Names of points that are told in a message.
-const TOLD: usize = 3;
+/// Largest number of point names in a message.
+const MOST_NAMES: usize = 3;
 
-/// The points of a structure whose motion gives the mode shapes.
+/// The instrumented points of a structure, at which mode shapes are measured.
 #[derive(Debug, Clone, PartialEq)]
 pub struct InstrumentedPoints {
-    /// Their names, in the order of the numbers of a shape.
+    /// Names of the points, in the order of the components of a shape.
     pub names: Vec<String>,
-    /// Shape of each mode of the nominal structure, of unit norm.
+    /// Shape of each mode of the nominal structure, with unit norm, `[modes][points]`.
     pub nominal: Vec<Vec<f64>>,
 }
 
 impl InstrumentedPoints {
-    /// The mode of the nominal structure that a shape resembles most, from 0, and their modal assurance criterion.
+    /// The mode of the nominal structure (from 0) with the highest modal assurance criterion (MAC), and that MAC. Source: Allemang
+    /// & Brown (1982).
     pub fn nearest(&self, shape: &[f64]) -> Option<(usize, f64)> {
         let alike = self.nominal.iter().map(|own| squared_cosine(own, shape)).enumerate();
         alike.max_by(|a, b| a.1.total_cmp(&b.1))
     }
 
-    /// What is wrong with a measured shape and what would be right; `None` where nothing is.
+    /// What is wrong with a measured shape, and what would be right; `None` if the shape is valid.
     pub fn mistake(&self, shape: &[f64]) -> Option<String> {
         let points = self.names.len();
-        let some = self.names.iter().take(TOLD).cloned().collect::<Vec<_>>().join(", ");
-        let names = format!("{some}{}", if points > TOLD { ", …" } else { "" });
+        let some = self.names.iter().take(MOST_NAMES).cloned().collect::<Vec<_>>().join(", ");
+        let names = format!("{some}{}", if points > MOST_NAMES { ", …" } else { "" });
         if shape.len() != points {
             return Some(format!("{} numbers, expected {points}: one for each of {names}", shape.len()));
         }
-        if let Some((place, value)) = shape.iter().enumerate().find(|(_, x)| !x.is_finite()) {
-            return Some(format!("{value} at place {place} is not finite"));
+        if let Some((position, value)) = shape.iter().enumerate().find(|(_, x)| !x.is_finite()) {
+            return Some(format!("{value} at position {position} (from 0) is not finite: send a number"));
         }
         if unit_shape(shape).is_none() {
             return Some(
-                "its numbers are all 0, or too large: send null for a shape that was not identified".to_owned(),
+                "all components are 0, or they are too large: send null for a shape that was not identified".to_owned(),
             );
         }
         let (mode, alike) = self.nearest(shape)?;
         (alike < LEAST_MAC).then(|| {
             format!(
-                "it resembles no mode of this structure: its MAC is at most {alike:.3}, with mode {}, and at least \
-                 {LEAST_MAC} is expected; are its numbers those of {names}, in this order?",
+                "the shape resembles no mode of this structure: its highest MAC is {alike:.3}, with mode {}, and at least \
+                 {LEAST_MAC} is expected; check that its numbers are those of {names}, in this order",
                 mode + 1
             )
         })
     }
 }
 
-/// A shape of unit norm; `None` where it has none that is a number above 0.
+/// A shape scaled to unit norm; `None` if its norm is 0 or not finite.
 pub fn unit_shape(shape: &[f64]) -> Option<Vec<f64>> {
     let norm = shape.iter().map(|x| x * x).sum::<f64>().sqrt();
     (norm > 0.0 && norm.is_finite()).then(|| shape.iter().map(|x| x / norm).collect())

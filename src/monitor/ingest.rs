@@ -7,7 +7,7 @@ use tokio::sync::oneshot;
 use tracing::Instrument as _;
 
 use super::assessor::{Assessor, Computed, Finished, Task};
-use super::compute::{Place as QueuePlace, QueueFull};
+use super::compute::{Place, QueueFull};
 use super::error::{Error, IngestError};
 use super::records::{BatchView, Records};
 use super::replay::Replay;
@@ -15,7 +15,7 @@ use super::settings::MissingCovariate;
 use super::structures::ActiveStructure;
 use crate::assessment::BatchState;
 use crate::measurement::body::RawBatch;
-use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, Place, Problem};
+use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, FieldPath, Problem};
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{BatchRecord, InsertBatch};
@@ -37,7 +37,7 @@ pub struct Ingested {
 /// The computation for a batch while it was being stored.
 enum Begun {
     Computed(Box<Computed>),
-    Not(QueuePlace),
+    Not(Place),
 }
 
 /// Takes batches: checks, stores and assesses them.
@@ -62,12 +62,12 @@ impl Ingest {
         let source = source.unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
         check_source(&source).map_err(|problem| vec![problem])?;
         idempotency_key.as_deref().map_or(Ok(()), check_idempotency_key).map_err(|problem| vec![problem])?;
-        let places: Vec<Place> = raw.iter().map(|r| r.place).collect();
+        let paths: Vec<FieldPath> = raw.iter().map(|r| r.path).collect();
         let settings = &self.assessor.settings;
         let expectation = active.simulator.expectation(Timestamp::now(), settings.max_measurements);
         let measurements = check_measurements(raw, &expectation)?;
         if settings.missing_covariate == MissingCovariate::Refuse {
-            let missing = measurements.iter().zip(&places).flat_map(|(m, place)| missing_covariates(active, m, *place));
+            let missing = measurements.iter().zip(&paths).flat_map(|(m, path)| missing_covariates(active, m, *path));
             let problems: Vec<Problem> = missing.take(MOST_MISSING).collect();
             if !problems.is_empty() {
                 return Err(problems);
@@ -106,7 +106,7 @@ impl Ingest {
     }
 
     /// Runs in a task of its own, so that a client that goes away does not interrupt it.
-    async fn take_with(&self, batch: MeasurementBatch, place: QueuePlace) -> Result<Ingested, IngestError> {
+    async fn take_with(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let (ingest, structure) = (self.clone(), batch.structure.clone());
         let task = tokio::spawn(async move { ingest.take_here(batch, place).await }.in_current_span());
         task.await.unwrap_or_else(|_| {
@@ -116,7 +116,7 @@ impl Ingest {
         })
     }
 
-    async fn take_here(&self, batch: MeasurementBatch, place: QueuePlace) -> Result<Ingested, IngestError> {
+    async fn take_here(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
@@ -198,11 +198,11 @@ impl Ingest {
     }
 }
 
-fn missing_covariates(active: &ActiveStructure, measurement: &ModalMeasurement, place: Place) -> Vec<Problem> {
+fn missing_covariates(active: &ActiveStructure, measurement: &ModalMeasurement, path: FieldPath) -> Vec<Problem> {
     let missing = active.simulator.effect_sizes(&measurement.covariates).missing;
     let problem = |name: String| {
         let message = format!("{name} is missing: the simulation of this structure depends on it");
-        Problem::new(place.of_covariate(&name), message)
+        Problem::new(path.of_covariate(&name), message)
     };
     missing.into_iter().map(problem).collect()
 }

@@ -13,5 +13,5 @@ mod notifier;
 mod settings;
 
 pub use message::EVENT_KINDS;
-pub use notifier::{client_builder, new_secret, Attempt, Notifier};
+pub use notifier::{client_builder, install_tls_provider, new_secret, Attempt, Notifier};
 pub use settings::NotifySettings;

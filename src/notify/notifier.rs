@@ -144,9 +144,18 @@ impl Notifier {
     }
 }
 
+/// Makes `ring` the TLS implementation of this process. Calls after the first change nothing.
+///
+/// An HTTP client that is built before the first call panics.
+pub fn install_tls_provider() {
+    // An error means that a provider is installed already.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+}
+
 /// A builder of HTTP clients that trust the certificates of the system and of Mozilla. Small container images have no
 /// certificates, and without any no client can be built, not even for http.
 pub fn client_builder() -> ClientBuilder {
+    install_tls_provider();
     let certificates = webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter();
     Client::builder().tls_certs_merge(certificates.filter_map(|der| Certificate::from_der(der).ok()))
 }

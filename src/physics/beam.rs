@@ -1,19 +1,19 @@
-//! Euler–Bernoulli beams: spans of cubic finite elements.
+//! Euler–Bernoulli beams made of finite elements with cubic shape functions.
 //!
-//! Each node of a beam has two degrees of freedom, its deflection w (m) and its rotation w' (rad); either may be held by a
-//! support. Deflection within an element is the cubic that the four of its ends fix, and the mass matrix is the consistent
-//! one, so that frequencies converge from above with the fourth power of the element's length.
+//! Each node of a beam has two degrees of freedom: its deflection w (m) and its rotation w' (rad). A support can fix either.
+//! The deflection within an element is the cubic polynomial given by the four degrees of freedom at its ends, and the mass
+//! matrix is the consistent one, so that frequencies converge from above with the fourth power of the element length.
 
-/// An element: a stretch of beam between two nodes.
+/// A finite element between two nodes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Element {
-    /// Degrees of freedom w_1, w'_1, w_2, w'_2; `None` where a support holds them.
-    pub freedoms: [Option<usize>; 4],
+    /// Degrees of freedom w_1, w'_1, w_2, w'_2; `None` where a support fixes them.
+    pub dofs: [Option<usize>; 4],
     /// Length, m.
     pub length_m: f64,
 }
 
-/// Elements of one bending stiffness and one mass per length.
+/// Elements with the same bending stiffness and the same mass per length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Span {
     /// The elements, from one end to the other.
@@ -26,7 +26,7 @@ impl Span {
         self.elements.iter().map(|e| e.length_m).sum()
     }
 
-    /// Entries of the stiffness matrix for EI = 1 N·m².
+    /// Calls `entry(row, column, value)` with the contributions to the stiffness matrix for EI = 1 N·m².
     ///
     /// ```text
     ///  EI/L³ [ 12  6L  −12  6L;  6L  4L²  −6L  2L²;  −12  −6L  12  −6L;  6L  2L²  −6L  4L² ]
@@ -41,11 +41,11 @@ impl Span {
                 [-12.0, -6.0 * l, 12.0, -6.0 * l],
                 [6.0 * l, 2.0 * l * l, -6.0 * l, 4.0 * l * l],
             ];
-            element.place(&matrix, scale, &mut entry);
+            element.add(&matrix, scale, &mut entry);
         }
     }
 
-    /// Entries of the mass matrix for a span of 1 kg.
+    /// Calls `entry(row, column, value)` with the contributions to the mass matrix for a span of 1 kg.
     ///
     /// ```text
     ///  m_e/420 [ 156  22L  54  −13L;  22L  4L²  13L  −3L²;  54  13L  156  −22L;  −13L  −3L²  −22L  4L² ],
@@ -62,15 +62,16 @@ impl Span {
                 [54.0, 13.0 * l, 156.0, -22.0 * l],
                 [-13.0 * l, -3.0 * l * l, -22.0 * l, 4.0 * l * l],
             ];
-            element.place(&matrix, scale, &mut entry);
+            element.add(&matrix, scale, &mut entry);
         }
     }
 }
 
 impl Element {
-    fn place(&self, matrix: &[[f64; 4]; 4], scale: f64, entry: &mut impl FnMut(usize, usize, f64)) {
-        for (row, values) in self.freedoms.iter().zip(matrix) {
-            for (column, value) in self.freedoms.iter().zip(values) {
+    /// Passes `scale`·`matrix` on to the degrees of freedom that are not fixed.
+    fn add(&self, matrix: &[[f64; 4]; 4], scale: f64, entry: &mut impl FnMut(usize, usize, f64)) {
+        for (row, values) in self.dofs.iter().zip(matrix) {
+            for (column, value) in self.dofs.iter().zip(values) {
                 if let (Some(row), Some(column)) = (row, column) {
                     entry(*row, *column, scale * value);
                 }

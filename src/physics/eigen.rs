@@ -1,20 +1,20 @@
-//! The symmetric eigenproblem and products of matrices: nalgebra for a handful of degrees of freedom, faer for many.
+//! Symmetric eigenproblems and matrix products: nalgebra for small matrices, faer for large ones.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, MatMut, MatRef, Par, Side};
 use nalgebra::{DMatrix, Matrix2, Matrix3, Matrix4, Matrix5, Matrix6, SymmetricEigen};
 
-/// Degrees of freedom from which faer is faster; `cargo bench --bench size -- --eigen` measures both.
+/// Number of degrees of freedom from which faer is faster; `cargo bench --bench size -- --eigen` measures both.
 const MANY: usize = 32;
 
-/// Eigenvalues of a symmetric matrix, ascending; NaN where the iteration does not converge.
+/// Eigenvalues of a symmetric matrix `[n, n]`, ascending, `[n]`; all NaN if the iteration does not converge.
 pub fn eigenvalues(symmetric: &DMatrix<f64>) -> Vec<f64> {
     let n = symmetric.nrows();
     if n >= MANY {
         let found = view(symmetric).self_adjoint_eigenvalues(Side::Lower);
         return found.unwrap_or_else(|_| vec![f64::NAN; n]);
     }
-    // Matrices of a known size need no memory from the allocator, and their loops are unrolled.
+    // Matrices of a size known at compile time need no heap memory, and their loops are unrolled.
     macro_rules! of_size {
         ($matrix:ty) => {
             <$matrix>::from_column_slice(symmetric.as_slice()).symmetric_eigenvalues().as_slice().to_vec()
@@ -28,12 +28,13 @@ pub fn eigenvalues(symmetric: &DMatrix<f64>) -> Vec<f64> {
         6 => of_size!(Matrix6<f64>),
         _ => symmetric.symmetric_eigenvalues().as_slice().to_vec(),
     };
-    // nalgebra gives them unsorted.
+    // nalgebra returns them unsorted.
     values.sort_by(f64::total_cmp);
     values
 }
 
-/// Eigenvalues of a symmetric matrix, ascending, and its eigenvectors by columns in the same order; NaN as above.
+/// Eigenvalues of a symmetric matrix `[n, n]`, ascending, and its eigenvectors as columns in the same order, `[n, n]`. The
+/// eigenvalues are NaN if the iteration does not converge.
 pub fn eigen(symmetric: DMatrix<f64>) -> (Vec<f64>, DMatrix<f64>) {
     let n = symmetric.nrows();
     if n >= MANY {

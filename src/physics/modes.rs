@@ -6,22 +6,22 @@ use nalgebra::{DMatrix, DVector};
 
 use super::assembly::{mass_matrix, stiffness_matrix_with};
 use super::eigen::{eigen, eigenvalues};
-use super::{Error, Form, Structure};
+use super::structure::{Error, Form, Structure};
 
-/// Below this share of the largest eigenvalue, the smallest is rounding: the structure is a mechanism.
+/// If the smallest eigenvalue is below this share of the largest, it is rounding error: the structure is a mechanism.
 pub(super) const SINGULAR: f64 = 1e-12;
 
-/// Relative gap below which two eigenvalues count as one: rounding moves them by some 1e-13.
+/// Relative gap below which two eigenvalues are treated as repeated: rounding errors are about 1e-13.
 pub(super) const REPEATED: f64 = 1e-8;
 
-/// All modes of a structure; `count` of them were asked for.
+/// Modes of a structure, of which the lowest were asked for.
 #[derive(Debug, Clone)]
 pub struct Modes {
-    /// Natural frequencies asked for, Hz, ascending.
+    /// Natural frequencies of the modes asked for, Hz, ascending, `[modes]`.
     pub frequencies_hz: Vec<f64>,
-    /// All eigenvalues λ = (2πf)², rad²/s², ascending.
+    /// All eigenvalues λ = (2πf)², rad²/s², ascending, `[n]`.
     pub(super) eigenvalues: Vec<f64>,
-    /// All mode shapes by columns, mass-normalised: φᵀMφ = 1, kg^-½.
+    /// All mode shapes as columns, mass-normalised (φᵀMφ = 1), kg^-½, `[n, n]`.
     pub(super) all_shapes: DMatrix<f64>,
 }
 
@@ -32,7 +32,7 @@ impl Modes {
     }
 }
 
-/// ∂f/∂k and ∂f/∂m of each mode.
+/// Derivatives ∂f/∂k and ∂f/∂m of each mode.
 #[derive(Debug, Clone)]
 pub struct FrequencySensitivity {
     /// Hz per N/m (or per unit of another stiffness), `[modes, springs]`.
@@ -41,20 +41,20 @@ pub struct FrequencySensitivity {
     pub by_mass: DMatrix<f64>,
 }
 
-/// The lowest `count` natural frequencies, Hz, ascending.
+/// The lowest `count` natural frequencies, Hz, ascending, `[count]`.
 ///
 /// ```text
 ///  K φ = λ M φ,    f = √λ / 2π
 /// ```
 ///
 /// # Errors
-/// [`Error::TooFewModes`], [`Error::NearMechanism`].
+/// [`Error::TooFewModes`], [`Error::NearMechanism`], [`Error::Massless`].
 pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec<f64>, Error> {
     natural_frequencies_with(structure, &[], count)
 }
 
-/// The same with other stiffnesses, given as (index of the spring, N/m), without a copy of the structure: for the many
-/// millions of runs of a stochastic updating.
+/// [`natural_frequencies_hz`] with some stiffnesses replaced, given as (index of the spring, value). The structure is not
+/// copied, because stochastic model updating calls this millions of times.
 ///
 /// # Errors
 /// As [`natural_frequencies_hz`], and [`Error::Stiffness`].
@@ -71,7 +71,7 @@ pub fn natural_frequencies_with(
 /// The lowest `count` modes with their shapes.
 ///
 /// # Errors
-/// [`Error::TooFewModes`], [`Error::NearMechanism`].
+/// As [`natural_frequencies_hz`].
 pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
     let Scaled { stiffness, mass_root } = Scaled::new(structure, &[])?;
     let (eigenvalues, eigenvectors) = eigen(stiffness);
@@ -79,17 +79,18 @@ pub fn modes(structure: &Structure, count: usize) -> Result<Modes, Error> {
     Ok(Modes { frequencies_hz: frequencies(&eigenvalues, count)?, eigenvalues, all_shapes })
 }
 
-/// Derivatives of the frequencies with respect to every spring and every mass.
+/// Derivatives of the natural frequencies with respect to every stiffness and every mass.
 ///
 /// ```text
-///  ∂λ_i/∂k = φ_iᵀ A φ_i,    ∂λ_i/∂m = −λ_i φ_iᵀ B φ_i      A, B: the matrices of a unit of stiffness, of mass
+///  ∂λ_i/∂k = φ_iᵀ A φ_i,    ∂λ_i/∂m = −λ_i φ_iᵀ B φ_i      A, B: ∂K/∂k, ∂M/∂m
 ///  ∂f_i = ∂λ_i / (8π² f_i)
 /// ```
 ///
-/// Repeated eigenvalues: the shapes of a cluster are not unique, and the formula above would depend on the choice. For
-/// each single parameter the derivatives are then the eigenvalues of the r × r matrix Φᵀ(∂K − λ∂M)Φ over the cluster,
-/// here in ascending order: the right-hand derivatives of the frequencies in their ascending order (the left-hand ones
-/// are the same in descending order). In several parameters at once, sorted frequencies have no gradient there.
+/// The mode shapes of r repeated eigenvalues are not unique, and the formula above would depend on their choice. The
+/// derivatives with respect to a single parameter are then the eigenvalues of the r × r matrix Φᵀ(∂K − λ∂M)Φ over these
+/// modes. They are returned in ascending order, which gives the right-hand derivatives of the ascending frequencies (the
+/// left-hand ones are the same in descending order). With respect to several parameters at once, sorted frequencies are not
+/// differentiable there.
 ///
 /// Source: Nelson (1976) for single, Ojalvo (1988) for repeated eigenvalues.
 pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencySensitivity {
@@ -128,13 +129,13 @@ pub fn frequency_sensitivity(structure: &Structure, modes: &Modes) -> FrequencyS
     }
 }
 
-/// A = R⁻¹ K R⁻ᵀ with M = R Rᵀ, whose eigenvalues are those of K φ = λ M φ; φ = R⁻ᵀ v.
+/// The standard eigenproblem A v = λ v with A = R⁻¹ K R⁻ᵀ and M = R Rᵀ, which is equivalent to K φ = λ M φ with φ = R⁻ᵀ v.
 pub(super) struct Scaled {
     pub stiffness: DMatrix<f64>,
     mass_root: MassRoot,
 }
 
-/// R⁻¹: by its diagonal for bodies, by the Cholesky factor R where masses are coupled.
+/// The factor of M = R Rᵀ: the diagonal of R⁻¹ if M is diagonal, otherwise the Cholesky factor R.
 enum MassRoot {
     InverseDiagonal(DVector<f64>),
     Lower(DMatrix<f64>),
@@ -159,13 +160,14 @@ impl Scaled {
         let solvable = "a Cholesky factor has no zero on its diagonal";
         let left = lower.solve_lower_triangular(&stiffness).expect(solvable);
         let scaled = lower.solve_lower_triangular(&left.transpose()).expect(solvable);
-        // Rounding leaves it slightly asymmetric.
+        // Rounding errors leave it slightly asymmetric.
         let symmetric = 0.5 * (&scaled + scaled.transpose());
         Ok(Self { stiffness: symmetric, mass_root: MassRoot::Lower(lower) })
     }
 }
 
 impl MassRoot {
+    /// φ = R⁻ᵀ v of each column v.
     fn shapes(&self, eigenvectors: &DMatrix<f64>) -> DMatrix<f64> {
         match self {
             Self::InverseDiagonal(inverse) => {
@@ -178,13 +180,14 @@ impl MassRoot {
     }
 }
 
+/// f = √λ/2π of the lowest `count` eigenvalues, Hz.
 fn frequencies(sorted_eigenvalues: &[f64], count: usize) -> Result<Vec<f64>, Error> {
     let available = sorted_eigenvalues.len();
     if count > available {
         return Err(Error::TooFewModes { asked: count, available });
     }
     let (smallest, largest) = (sorted_eigenvalues[0], sorted_eigenvalues[available - 1]);
-    // Not `<=`: NaN must fail too.
+    // Written so that NaN fails too.
     let positive = smallest > SINGULAR * largest && largest.is_finite();
     if !positive {
         return Err(Error::NearMechanism { smallest, largest });
@@ -192,7 +195,7 @@ fn frequencies(sorted_eigenvalues: &[f64], count: usize) -> Result<Vec<f64>, Err
     Ok(sorted_eigenvalues[..count].iter().map(|lambda| lambda.sqrt() / (2.0 * PI)).collect())
 }
 
-/// Runs of eigenvalues that count as one, as half-open ranges.
+/// Groups of repeated eigenvalues as half-open index ranges; a simple eigenvalue is a group of one.
 fn clusters(sorted: &[f64]) -> Vec<(usize, usize)> {
     let mut clusters = Vec::new();
     let mut start = 0;

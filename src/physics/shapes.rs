@@ -4,11 +4,11 @@ use nalgebra::DMatrix;
 
 use super::eigen::product;
 use super::modes::{Modes, REPEATED};
-use super::Structure;
+use super::structure::Structure;
 use crate::stats::squared_cosine;
 
-/// Shapes of the modes asked for at `points`, `[points, modes]`, each of unit norm over the points; the sign of each is
-/// arbitrary. A mode that does not move any of the points has a shape of zeros.
+/// Shapes of the modes asked for at the degrees of freedom `points`, `[points, modes]`. Each has unit norm over the points
+/// and an arbitrary sign. A mode that does not move any of the points has a shape of zeros.
 pub fn shapes_at(modes: &Modes, points: &[usize]) -> DMatrix<f64> {
     let mut shapes = DMatrix::from_fn(points.len(), modes.frequencies_hz.len(), |point, mode| {
         modes.all_shapes[(points[point], mode)]
@@ -22,14 +22,17 @@ pub fn shapes_at(modes: &Modes, points: &[usize]) -> DMatrix<f64> {
     shapes
 }
 
-/// Derivatives of [`shapes_at`] with respect to the stiffnesses of `springs`, per N/m: one matrix `[points, springs]` a mode.
+/// Derivatives of [`shapes_at`] with respect to the stiffnesses of `springs`, per N/m: one matrix `[points, springs]` for each
+/// mode.
 ///
 /// ```text
 ///  ∂φ_i = Σ_{j≠i} φ_j (φ_jᵀ A φ_i)/(λ_i − λ_j),    u = φ/|φ|:   ∂u = (1 − u uᵀ) ∂φ/|φ|      over the points
 /// ```
 ///
-/// A: the matrix of a unit of the stiffness. Pairs of repeated eigenvalues are left out of the sum: their shapes may be any of
-/// a plane. Source: Fox & Kapoor (1968), Rates of change of eigenvalues and eigenvectors, AIAA Journal 6, 2426–2429.
+/// A is the matrix of a unit of the stiffness. Modes whose eigenvalue repeats λ_i are left out of the sum, because their shapes
+/// are not unique.
+///
+/// Source: Fox & Kapoor (1968), Rates of change of eigenvalues and eigenvectors, AIAA Journal 6, 2426–2429.
 pub fn shape_sensitivity(
     structure: &Structure,
     modes: &Modes,
@@ -52,7 +55,7 @@ pub fn shape_sensitivity(
         };
         let weights: Vec<f64> = (0..n).map(weight).collect();
         let weighted = DMatrix::from_fn(points.len(), n, |point, other| at_points[(point, other)] * weights[other]);
-        // What a unit of force at each degree of freedom moves the points by, without the mode itself.
+        // Displacement of the points under a unit force at each degree of freedom, without the contribution of the mode itself.
         let receptance = product(&weighted, &transposed);
         let mut slopes = DMatrix::zeros(points.len(), springs.len());
         for (mut slope, &spring) in slopes.column_iter_mut().zip(springs) {
@@ -76,16 +79,18 @@ pub fn shape_sensitivity(
     (0..modes.frequencies_hz.len()).map(of_mode).collect()
 }
 
-/// The simulated mode of each measured one, no mode twice: greedily by the greatest score.
+/// Pairs each measured mode with a different simulated mode: repeatedly takes the pair with the highest score.
 ///
 /// ```text
 ///  score = MAC − |ln f_measured/f_simulated|
 /// ```
 ///
-/// Shapes decide; frequencies decide where few points cannot tell shapes apart. A measured mode without a shape goes by its
-/// frequency alone, after the others.
+/// The modal assurance criterion (MAC) of the shapes dominates; the frequencies decide where the shapes at few points are too
+/// similar. Measured modes without a shape are paired last, by their frequency alone.
 ///
-/// `measured`: frequency in Hz and, where it is known, shape of each mode.
+/// `measured` holds the frequency (Hz) and, if identified, the shape `[points]` of each mode; `simulated` holds the shapes
+/// `[points, modes]`. Returns the index of the simulated mode of each measured mode. Source of the MAC: Allemang & Brown
+/// (1982).
 pub fn pair_modes(measured: &[(f64, Option<&[f64]>)], simulated_hz: &[f64], simulated: &DMatrix<f64>) -> Vec<usize> {
     let mut scores = Vec::with_capacity(measured.len() * simulated_hz.len());
     for (row, (hz, shape)) in measured.iter().enumerate() {

@@ -1,18 +1,22 @@
-//! How samples are spread: histograms and smooth densities, both of area one.
+//! Densities of samples: histograms and kernel estimates, both of area one.
 
 use std::f64::consts::PI;
 
 use crate::stats;
 
-/// Fewest and most bars of a histogram.
+/// Smallest and greatest number of bars of a histogram.
 const BARS: [usize; 2] = [6, 60];
 
-/// Points of a curve.
+/// Number of points of a curve.
 const POINTS: usize = 161;
 
-/// Bars of a histogram: lower edge, upper edge and density.
+/// Bars of a histogram: lower edge, upper edge and density (one over the unit of the values).
 ///
-/// Their width is that of Freedman and Diaconis (1981), 2·IQR/∛n. Empty without two different values.
+/// ```text
+///  width = 2·IQR/∛n
+/// ```
+///
+/// Empty without two different values. Source: Freedman and Diaconis (1981).
 pub fn histogram(values: &[f64]) -> Vec<(f64, f64, f64)> {
     let Some(Spread { values, low, high, quartiles, .. }) = Spread::of(values) else { return Vec::new() };
     let wanted = 2.0 * quartiles / (values.len() as f64).cbrt();
@@ -30,7 +34,8 @@ pub fn histogram(values: &[f64]) -> Vec<(f64, f64, f64)> {
     counts.iter().enumerate().map(bar).collect()
 }
 
-/// Bars about each of the values that occur, halfway to the next: for values set to a few positions.
+/// Bars around each value that occurs, with edges halfway to the next: for values that take only a few positions. Lower edge,
+/// upper edge and density.
 pub fn columns(values: &[f64]) -> Vec<(f64, f64, f64)> {
     let mut places: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
     let total = places.len() as f64;
@@ -55,7 +60,8 @@ pub fn columns(values: &[f64]) -> Vec<(f64, f64, f64)> {
     counted.iter().enumerate().map(bar).collect()
 }
 
-/// Density of the samples by Gaussian kernels, over their range and three bandwidths beyond.
+/// Kernel estimate of the density with Gaussian kernels, from three bandwidths below to three above the samples: `[161]` points
+/// (x, p), p in one over the unit of x.
 ///
 /// ```text
 ///  p(x) = 1/(n·h) Σ φ((x − xᵢ)/h),    h = 0.9·min(s, IQR/1.34)·n^(−1/5)
@@ -69,7 +75,7 @@ pub fn kernel(values: &[f64]) -> Vec<(f64, f64)> {
     grid(low - 3.0 * h, high + 3.0 * h).map(|x| (x, density(x))).collect()
 }
 
-/// The density of [`kernel`] at places of one's own; `None` without two different values.
+/// The density of [`kernel`] at given positions, `[places]`; `None` without two different values.
 pub fn kernel_at(values: &[f64], places: &[f64]) -> Option<Vec<f64>> {
     let density = kernel_density(Spread::of(values)?);
     Some(places.iter().map(|x| density(*x)).collect())
@@ -86,7 +92,8 @@ fn kernel_density(mut spread: Spread) -> impl Fn(f64) -> f64 {
     }
 }
 
-/// The density of a normal distribution over four standard deviations to both sides.
+/// The density of a normal distribution within four standard deviations of its mean, `[161]` points; empty without a positive
+/// standard deviation.
 pub fn normal_curve(mean: f64, std: f64) -> Vec<(f64, f64)> {
     if !(mean.is_finite() && std.is_finite() && std > 0.0) {
         return Vec::new();
@@ -94,17 +101,17 @@ pub fn normal_curve(mean: f64, std: f64) -> Vec<(f64, f64)> {
     grid(mean - 4.0 * std, mean + 4.0 * std).map(|x| (x, normal(x, mean, std))).collect()
 }
 
-/// Density of a normal distribution at `x`.
+/// Density of a normal distribution at `x`, exp(−½((x − mean)/std)²)/(std·√(2π)).
 pub fn normal(x: f64, mean: f64, std: f64) -> f64 {
     (-0.5 * ((x - mean) / std).powi(2)).exp() / (std * (2.0 * PI).sqrt())
 }
 
-/// Evenly spaced points from `low` to `high`.
+/// Evenly spaced points from `low` to `high`, `[161]`.
 pub fn grid(low: f64, high: f64) -> impl Iterator<Item = f64> {
     (0..POINTS).map(move |i| low + (high - low) * i as f64 / (POINTS - 1) as f64)
 }
 
-/// The finite values, their ends, the distance of their quartiles and their standard deviation.
+/// The finite values with their range, interquartile range and standard deviation.
 struct Spread {
     values: Vec<f64>,
     low: f64,
@@ -114,9 +121,9 @@ struct Spread {
 }
 
 impl Spread {
-    /// Bandwidth of Gaussian kernels.
+    /// Bandwidth h of Gaussian kernels.
     fn bandwidth(&self) -> f64 {
-        // Where half of the values are the same, their quartiles say nothing of a width.
+        // If half of the values are equal, the interquartile range is 0 and cannot give the width.
         let scale = if self.quartiles > 0.0 { self.std.min(self.quartiles / 1.34) } else { self.std };
         0.9 * scale * (self.values.len() as f64).powf(-0.2)
     }
@@ -125,7 +132,7 @@ impl Spread {
         let values: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
         let std = stats::sample_std(&values)?;
         let (low, high) = (stats::quantile(&values, 0.0), stats::quantile(&values, 1.0));
-        // Values that differ by rounding alone have no shape.
+        // Values that differ by rounding only are equal.
         let different = high - low > 1e-12 * low.abs().max(high.abs());
         let quartiles = stats::quantile(&values, 0.75) - stats::quantile(&values, 0.25);
         different.then_some(Self { values, low, high, quartiles, std })
@@ -136,7 +143,7 @@ impl Spread {
 mod tests {
     use super::*;
 
-    /// Middles of the quantiles of a standard normal distribution.
+    /// 400 evenly spaced quantiles of a standard normal distribution.
     fn sample() -> Vec<f64> {
         (0..400).map(|i| stats::normal_quantile((f64::from(i) + 0.5) / 400.0)).collect()
     }

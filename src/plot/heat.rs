@@ -10,20 +10,20 @@ const LEFT: i32 = 26;
 const TOP: i32 = 26;
 const CELL_HEIGHT: i32 = 38;
 
-/// A share of one, dark enough for white numbers; smaller ones let more of the page through.
+/// Colour of a share of 1, dark enough for white numbers; the colour of smaller shares is more transparent.
 const FULL: RGBColor = RGBColor(0, 90, 156);
 const RULE: RGBColor = RGBColor(225, 225, 225);
 
-/// Shares from 0 to 1 in the cells of a grid: the darker, the more.
+/// Shares from 0 to 1 in the cells of a grid; a larger share has a darker cell.
 #[derive(Debug, Clone, Default)]
 pub struct Heat {
-    /// What it shows, for who cannot see it.
+    /// Description of the figure for screen readers.
     pub title: String,
     /// Names above the columns.
     pub columns: Vec<String>,
     /// Names beside the rows.
     pub rows: Vec<String>,
-    /// A list of shares for each row; a cell without one stays empty.
+    /// Shares, `[rows][columns]`; a cell without a share stays empty.
     pub cells: Vec<Vec<Option<f64>>>,
 }
 
@@ -56,7 +56,7 @@ impl Heat {
                 let frame = [(left, top), (left + width, top + CELL_HEIGHT)];
                 root.draw(&Rectangle::new(frame, FULL.mix(share).filled()))?;
                 root.draw(&Rectangle::new(frame, RULE))?;
-                // On paler cells, the text colour of the page: they let its ground through.
+                // Paler cells show the background of the page, so their numbers have its text colour.
                 let ink = if share > 0.75 { RGBColor(255, 255, 255) } else { BLACK };
                 // Adding 0 turns −0 into 0.
                 let number = format!("{:.2}", (value * 100.0).round() / 100.0 + 0.0).replace('-', "−");

@@ -1,27 +1,28 @@
-//! Small plots that stand side by side, one below the other on a phone; text and colours follow the scheme of the page.
+//! Small plots that are shown side by side, or below each other on a phone, in the light or dark colours of the page.
 
 use plotters::coord::ranged1d::{KeyPointHint, Ranged};
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::FontFamily;
 
+use super::colours::COLOURS;
+use super::html::escaped;
 use super::ticks::Ticks;
-use super::{escaped, COLOURS};
 
-/// Width, px: what a phone has room for, so that text is never scaled down.
+/// Width, px: narrow enough for a phone, so that text is never scaled down.
 pub(super) const WIDTH: u32 = 340;
 const HEIGHT: u32 = 250;
 const SQUARE: u32 = 330;
 
-/// Plotters writes text in 1/1.24 of the size asked for.
+/// Font sizes, px. Plotters writes text in 1/1.24 of the requested size.
 pub(super) const SMALL: f64 = 14.5;
 const MIDDLE: f64 = 15.5;
 const LARGE: f64 = 16.5;
 
-/// Most points of a cloud that are drawn.
+/// Greatest number of points of a cloud that are drawn.
 const MOST_DRAWN: usize = 1200;
 
-/// Small plots in the text colour of the page; in the dark, data in lighter shades of the same colours.
+/// Style sheet of small plots: text in the colour of the page, and on a dark page data in lighter shades of the same colours.
 pub(super) const STYLE: &str =
     "figure.small{background:none;color:inherit;border:0;border-radius:0;padding:0;margin:1rem 0 2rem}\
      figure.small figcaption{font-size:.95rem;padding:.35rem 0;max-width:52rem}\
@@ -55,9 +56,9 @@ pub struct Bars {
 pub struct Curve {
     /// Index of its colour; the colour of text beyond the last.
     pub colour: usize,
-    /// Broken.
+    /// Whether the curve is dashed.
     pub dashed: bool,
-    /// The area below it is tinted up to this x.
+    /// The area below the curve is tinted up to this x.
     pub filled_to: Option<f64>,
     /// Its points, in the order of x.
     pub points: Vec<(f64, f64)>,
@@ -68,7 +69,7 @@ pub struct Curve {
 pub struct Cloud {
     /// Index of its colour; the colour of text beyond the last.
     pub colour: usize,
-    /// Crosses instead of dots.
+    /// Whether points are crosses instead of dots.
     pub crosses: bool,
     /// Radius, px.
     pub radius: u32,
@@ -85,28 +86,28 @@ pub struct Panel {
     pub x_label: String,
     /// Label of the y axis, with its unit.
     pub y_label: String,
-    /// Histograms, behind everything else.
+    /// Histograms, drawn behind everything else.
     pub bars: Vec<Bars>,
     /// A grey band: lower and upper edge over x.
     pub band: Vec<(f64, f64, f64)>,
     /// Clouds of points.
     pub clouds: Vec<Cloud>,
-    /// Curves, before everything else.
+    /// Curves, drawn in front of everything else.
     pub curves: Vec<Curve>,
-    /// Vertical lines, with what stands beside their upper end.
+    /// Vertical lines, with the text beside their upper end.
     pub verticals: Vec<(f64, String)>,
-    /// Ends of x and y that the axes must reach, whatever is drawn.
+    /// Values of x and of y that the axes must include.
     pub reach: [Vec<f64>; 2],
-    /// As high as it is wide.
+    /// Whether the panel is as high as it is wide.
     pub square: bool,
 }
 
-/// What a key shows before a name.
+/// The symbol before a name in a legend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Swatch {
     /// A line.
     Line,
-    /// A broken line.
+    /// A dashed line.
     Dashed,
     /// A bar of a histogram, or a band.
     Bar,
@@ -114,20 +115,20 @@ pub enum Swatch {
     Dot,
     /// A cross.
     Cross,
-    /// A short upright line.
+    /// A short vertical line.
     Upright,
-    /// A broken upright line.
+    /// A dashed vertical line.
     Broken,
     /// A diamond.
     Diamond,
 }
 
-/// A colour by its index; black, which the page turns into the colour of its text, beyond the last.
+/// The colour with this index; beyond the last one black, which the page replaces by the colour of its text.
 fn colour(index: usize) -> RGBColor {
     COLOURS.get(index).copied().unwrap_or(BLACK)
 }
 
-/// An entry of the key of a figure.
+/// An entry of the legend of a figure, as HTML.
 pub fn key(swatch: Swatch, index: usize, name: &str) -> String {
     let RGBColor(r, g, b) = colour(index);
     let hex = format!("#{r:02X}{g:02X}{b:02X}");
@@ -149,7 +150,7 @@ pub fn key(swatch: Swatch, index: usize, name: &str) -> String {
     )
 }
 
-/// A figure of panels side by side; `keys` is HTML, `id` is linked to.
+/// A figure of panels side by side, as HTML. `id` is its anchor, `keys` its legend as HTML.
 pub fn figure(id: &str, panels: &[String], keys: &str, caption: &str) -> String {
     let keys = if keys.is_empty() { String::new() } else { format!("<p class=\"keys\">{keys}</p>") };
     format!(
@@ -160,7 +161,7 @@ pub fn figure(id: &str, panels: &[String], keys: &str, caption: &str) -> String 
     )
 }
 
-/// SVG that a screen reader can name and the page scales.
+/// The SVG with a description for screen readers, scaled by the page.
 pub(super) fn named(svg: &str, label: &str) -> String {
     let head = format!("<svg class=\"panel\" role=\"img\" aria-label=\"{}\" ", escaped(label));
     svg.replacen("<svg ", &head, 1)
@@ -174,7 +175,7 @@ struct Axis {
 }
 
 impl Axis {
-    /// `from_zero` for densities: their area stands on the axis.
+    /// An axis over all values with about `most` ticks; `from_zero` for densities, which start at 0.
     fn over(values: impl Iterator<Item = f64>, from_zero: bool, most: usize) -> Self {
         let ends = (f64::INFINITY, f64::NEG_INFINITY);
         let (low, high) = values.filter(|v| v.is_finite()).fold(ends, |(l, h), v| (l.min(v), h.max(v)));
@@ -217,7 +218,7 @@ impl Panel {
         named(&svg, &format!("{}: {} over {}", self.title, self.y_label, self.x_label))
     }
 
-    /// Ends of everything along x, then along y.
+    /// The axes of x and y, which include everything that is drawn.
     fn axes(&self) -> [Axis; 2] {
         let points = || {
             let curves = self.curves.iter().map(|c| &c.points);
@@ -227,7 +228,7 @@ impl Panel {
         let x = points().map(|p| p.0).chain(bars().flat_map(|b| [b.0, b.1])).chain(self.verticals.iter().map(|v| v.0));
         let y = points().map(|p| p.1).chain(bars().map(|b| b.2)).chain(self.band.iter().flat_map(|b| [b.1, b.2]));
         let density = self.clouds.is_empty() && self.band.is_empty();
-        // Room for what stands beside the upper end of vertical lines.
+        // Leaves room for the text beside the upper end of vertical lines.
         let top = y.clone().fold(0.0, f64::max) * if self.verticals.is_empty() { 1.0 } else { 1.1 };
         let reach = self.reach[1].iter().copied().chain(density.then_some(top));
         let most = if self.square { 6 } else { 5 };
@@ -298,7 +299,7 @@ impl Panel {
     }
 }
 
-/// Finite points, spread evenly over the list where there are too many.
+/// The finite points; evenly thinned if there are too many.
 fn thinned(points: &[(f64, f64)]) -> impl Iterator<Item = (f64, f64)> + '_ {
     let stride = points.len().div_ceil(MOST_DRAWN).max(1);
     points.iter().step_by(stride).copied().filter(|p| p.0.is_finite() && p.1.is_finite())

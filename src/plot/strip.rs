@@ -1,4 +1,4 @@
-//! A range in the cell of a table, with what it is held against.
+//! A range as a small figure in the cell of a table, with a target to compare it with.
 
 use std::fmt::Write as _;
 
@@ -7,9 +7,9 @@ use super::panel::{key, Swatch};
 const WIDTH: f64 = 140.0;
 const EDGE: f64 = 8.0;
 
-/// Low end, median and high end as a bar; a dashed line at the target, a diamond at another's value.
+/// Low end, median and high end as a bar; a dashed line at the target, a diamond at another value.
 ///
-/// The strip spans what it shows, but no less than `least`: what is nearly the same stays together.
+/// The strip spans all these values, but at least a range of `least`, so that nearly equal values are drawn close together.
 pub fn strip([low, median, high]: [f64; 3], target: f64, other: Option<f64>, least: f64) -> String {
     let all = || [low, median, high, target].into_iter().chain(other).filter(|v| v.is_finite());
     let (first, last) = all().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
@@ -43,7 +43,7 @@ pub fn strip([low, median, high]: [f64; 3], target: f64, other: Option<f64>, lea
     svg
 }
 
-/// The key of [`strip`], given the names of the range, the median, the target and the other's value.
+/// The legend of [`strip`], given the names of the range, the median, the target and the other value.
 pub fn strip_keys(names: [&str; 4]) -> String {
     let [range, median, target, other] = names;
     [

@@ -1,15 +1,15 @@
 //! Round numbers along an axis.
 
-/// Ticks of an axis and the decimals that tell them apart.
+/// Ticks of an axis, with as many decimals as are needed to distinguish them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ticks {
-    /// Where they stand.
+    /// Positions.
     pub at: Vec<f64>,
     decimals: usize,
 }
 
 impl Ticks {
-    /// At most `most` or so steps of 1, 2 or 5 times a power of ten between two ends.
+    /// About `most` steps of 1, 2 or 5 times a power of ten between `low` and `high`; no ticks for an empty range.
     pub fn between(low: f64, high: f64, most: usize) -> Self {
         let raw = (high - low) / most as f64;
         if !(raw.is_finite() && raw > 0.0) {
@@ -22,12 +22,12 @@ impl Ticks {
         Self { at: (first..=last).map(|i| i as f64 * step).collect(), decimals }
     }
 
-    /// Characters of the longest label.
+    /// Number of characters of the longest label.
     pub fn widest(&self) -> usize {
         self.at.iter().map(|tick| self.label(*tick).chars().count()).max().unwrap_or(0)
     }
 
-    /// A tick's number, the minus as wide as a plus.
+    /// The number of a tick, with a true minus sign.
     pub fn label(&self, tick: f64) -> String {
         // Adding 0 turns −0 into 0.
         format!("{:.*}", self.decimals, tick + 0.0).replace('-', "−")

@@ -1,23 +1,24 @@
-//! Case 1: three masses on springs, three stiffnesses unknown, measurements without noise.
+//! Case 1: three masses on springs with three unknown stiffnesses, and measurements without noise.
 
 use super::paper::{CASE_1, FIVE_HUNDRED, SCENARIOS, SECONDS, TARGET_1};
+use super::result::{Case, Method, MethodSamples, Settings};
 use super::trial::{accuracy, add, realised, state, times, Bench, Data, Entry, Found, Series, METHODS};
-use super::{Case, Method, MethodSamples, Settings};
 use crate::baseline::Baseline;
 use crate::simulator::population::Population;
 use crate::simulator::Simulator;
 use crate::stats;
 
-/// Measurements of a state (paper §5.2).
+/// Number of measurements of a state (paper §5.2).
 const MEASUREMENTS: usize = 50;
 
-/// Measurements of Table 5.
+/// Number of measurements of Table 5.
 const MANY: usize = 500;
 
-/// Everything of case 1, by a flow trained on its structure in `training_seconds`; `progress` hears of each step.
+/// Runs case 1 with a flow that was trained on its structure in `training_seconds`. `progress` is called with a description of each
+/// step.
 ///
 /// # Errors
-/// What a method says of its data.
+/// The error of a method.
 pub fn case1(
     baseline: &Baseline,
     training_seconds: f64,
@@ -38,7 +39,7 @@ pub fn case1(
             .map(|(name, left)| draw(simulator, name, left, MEASUREMENTS, seed))
             .collect::<anyhow::Result<_>>()?;
         let many = draw(simulator, FIVE_HUNDRED, &[1.0; 3], MANY, seed)?;
-        for (place, method) in METHODS.into_iter().enumerate() {
+        for (index, method) in METHODS.into_iter().enumerate() {
             progress(&format!("repetition {} of {}: {method:?}", repetition + 1, settings.repetitions));
             let reference = bench.find(method, &undamaged, seed)?;
             let found: Vec<Found> =
@@ -50,7 +51,7 @@ pub fn case1(
             let of_many = bench.find(method, &many, seed)?;
             let entry = Entry { data: &many, method, found: &of_many, undamaged: None, target_pod: None };
             add(&mut series, simulator, &entry);
-            seconds[place].push((of_many.seconds, of_many.model_runs));
+            seconds[index].push((of_many.seconds, of_many.model_runs));
             if repetition == 0 {
                 methods.push(MethodSamples { method, samples: of_many.samples });
                 if method == Method::Cinn {
@@ -83,31 +84,32 @@ pub fn case1(
 
 fn notes() -> Vec<String> {
     [
-        "The measurements are simulated from the distributions of the paper's Table 2, without noise. 50 draws of a \
-         distribution have themselves a mean and a spread that differ from those it was drawn with: the columns of errors \
-         set each method against the values that were drawn.",
-        "Samples of the cINN come as the service gives them: without noise the simulation moves each draw of the flow to a point that \
-         gives the measurement, which table 6 counts as model runs. Those of the paper are the flow's own draws.",
-        "At −10 % some 2 to 3 % of the population of k1 lie below 3 N/m, outside the prior box. The flow draws from the \
-         nearest point of the box for them, and the sensitivity method ends at its edge: both then miss some of the spread.",
-        "The probability of damage is the share of samples below δ of the same method's undamaged state; for TMCMC, which \
-         finds a mean and a spread, that of the normal distribution. Of k1 at −10 % it scatters by some ten percentage points \
-         from one set of 50 draws to the next, whatever the method.",
-        "The paper prints the same six figures of the cINN for 50 measurements (Table 3) and for 500 (Table 5). Its Bayesian \
-         figures are most probable points, ours means of the posterior.",
-        "TMCMC compares 128 simulated measurements, points of a Sobol' sequence, with those measured, under \
-         ln L = −4n·D_B: near the truth that is the likelihood of n normal observations. The paper does not print its ε.",
+        "The measurements are simulated from the distributions in Table 2 of the paper, without noise. The mean and the standard \
+         deviation of 50 draws differ from those of their distribution: the columns of errors therefore compare each method \
+         with the values that were drawn.",
+        "Samples of the cINN are those of the service: without noise, each draw of the flow is moved to parameters whose \
+         simulation gives the measurement, and table 6 counts these model runs. The samples in the paper are the draws of the \
+         flow themselves.",
+        "At −10 %, about 2 to 3 % of the population of k1 are below 3 N/m, outside the prior box. For these the flow draws at the \
+         nearest point of the box, and the sensitivity method ends at its bound: both then underestimate the spread.",
+        "The probability of damage is the share of samples below δ of the undamaged state found by the same method; for TMCMC, \
+         which finds a mean and a standard deviation, it is that of the normal distribution. For k1 at −10 % it varies by about \
+         ten percentage points from one set of 50 draws to the next, with every method.",
+        "The paper prints the same six values of the cINN for 50 measurements (Table 3) and for 500 (Table 5). Its Bayesian values \
+         are most probable points; ours are posterior means.",
+        "TMCMC compares 128 simulated measurements, which are points of a Sobol' sequence, with the measured ones by \
+         ln L = −4n·D_B: near the truth this is the likelihood of n normal observations. The paper does not state its ε.",
     ]
     .map(str::to_owned)
     .to_vec()
 }
 
-/// Measurements of a population whose means are `left` of those of the undamaged one.
+/// Measurements of a population whose means are those of the undamaged population multiplied by `left`.
 fn draw(simulator: &Simulator, name: &str, left: &[f64; 3], count: usize, seed: u64) -> anyhow::Result<Data> {
     let moments: Vec<(String, f64, f64)> =
         TARGET_1.iter().zip(left).map(|((k, mean, std), left)| ((*k).to_owned(), mean * left, *std)).collect();
     let population = Population::new(simulator.space(), &moments)?;
-    // Every state has draws of its own.
+    // Every state has its own draws.
     let own = rand::RngCore::next_u64(&mut stats::stream(seed, &format!("case 1, {name}")));
     let drawn = population.draw(simulator, count, 0.0, own)?;
     Ok(Data {
@@ -119,7 +121,7 @@ fn draw(simulator: &Simulator, name: &str, left: &[f64; 3], count: usize, seed: 
     })
 }
 
-/// P(k < δ) under the distributions themselves: 37.76 % for 10 % of k1.
+/// P(k < δ) for the exact distributions; for example 37.76 % for k1 at −10 %.
 fn target_pod(data: &Data) -> Vec<f64> {
     let one = |((mean, std), (_, undamaged, of)): (&(f64, f64), &(&str, f64, f64))| {
         stats::normal_cdf((undamaged - 1.645 * of - mean) / std)

@@ -1,12 +1,12 @@
-//! Case 2: the rig. The paper's 61 measured sets of frequencies are not published: here they are simulated with noise.
+//! Case 2: the rig. The 61 measured sets of frequencies of the paper are not published and are therefore simulated with noise.
 
 use nalgebra::DMatrix;
 
 use super::paper::{ALL_61, CASE_2, LAWS, SECONDS};
+use super::result::{Case, Configuration, LawFit, Method, MethodSamples, Rig, Settings};
 use super::trial::{
     accuracy, add, realised, share_below, state, thresholds, times, Bench, Data, Entry, Series, METHODS,
 };
-use super::{Case, Configuration, LawFit, Method, MethodSamples, Rig, Settings};
 use crate::baseline::Baseline;
 use crate::gsa::{self, sobol_indices, Input, Sensitivity};
 use crate::physics::{natural_frequencies_hz, Mass, Node, Spring, Structure};
@@ -15,14 +15,14 @@ use crate::stats;
 use crate::updating::chain::coupling_stiffness;
 use crate::updating::law::{fit_exponential, Weighting};
 
-/// Lowest and highest position of the links, m, and the positions of the grid between them.
+/// Lowest and highest position of the links, m, and the number of positions of the grid between them.
 const POSITIONS_M: ([f64; 2], usize) = ([0.02, 0.07], 6);
 
-/// Masses of the rig, kg, and stiffness of one ground spring at each, N/m; there are two of them at each mass.
+/// Masses of the rig, kg, and stiffness of one of the two ground springs at each mass, N/m.
 const MASSES_KG: [f64; 3] = [1.52, 2.30, 1.08];
 const GROUND_N_PER_M: f64 = 2477.0;
 
-/// What masses and ground springs vary by in the sensitivity analysis, as a share: the paper does not say.
+/// Relative range of masses and ground springs in the sensitivity analysis, which the paper does not state.
 const TOLERANCE: f64 = 0.01;
 
 /// The 61 configurations: 6 by 6 evenly spaced, and the 5 by 5 points between them.
@@ -38,10 +38,10 @@ pub fn configurations() -> Vec<Configuration> {
     grid(0.0, count).chain(grid(0.5, count - 1)).map(one).collect()
 }
 
-/// Everything of case 2, by a flow trained on the rig in `training_seconds`; `progress` hears of each step.
+/// Runs case 2 with a flow that was trained on the rig in `training_seconds`. `progress` is called with a description of each step.
 ///
 /// # Errors
-/// What a method says of its data.
+/// The error of a method.
 pub fn case2(
     baseline: &Baseline,
     training_seconds: f64,
@@ -63,7 +63,7 @@ pub fn case2(
         let damaged = of("damaged", &|c| c.damaged)?;
         let all = of(ALL_61, &|_| true)?;
         let drawn = realised(&undamaged);
-        for (place, method) in METHODS.into_iter().enumerate() {
+        for (index, method) in METHODS.into_iter().enumerate() {
             progress(&format!("repetition {} of {}: {method:?}", repetition + 1, settings.repetitions));
             let reference = bench.find(method, &undamaged, seed)?;
             let changed = bench.find(method, &damaged, seed)?;
@@ -78,7 +78,7 @@ pub fn case2(
                 simulator,
                 &Entry { data: &all, method, found: &found, undamaged: None, target_pod: None },
             );
-            seconds[place].push((found.seconds, found.model_runs));
+            seconds[index].push((found.seconds, found.model_runs));
             if repetition == 0 {
                 methods.push(MethodSamples { method, samples: found.samples });
                 if method == Method::Cinn {
@@ -113,43 +113,44 @@ fn notes(simulator: &Simulator) -> Vec<String> {
     let noise = 100.0 * simulator.noise().std_hz(1.0);
     vec![
         format!(
-            "The frequencies measured on the rig are not published. These are simulated at the paper's 61 configurations, \
-             with noise of {noise} % of each frequency, drawn afresh in every repetition; the positions are the same."
+            "The frequencies measured on the rig are not published. Here they are simulated at the 61 configurations of the paper \
+             with noise of {noise} % of each frequency. Every repetition has new noise and the same positions."
         ),
-        "All methods use all three frequencies. The paper gives its sensitivity and Bayesian methods the second and third \
-         alone; with these two a second pair of stiffnesses solves Eq. 24 as soon as p12 is above some 0.035 m, and only \
-         the first frequency tells it from the right one."
+        "All methods use all three frequencies. In the paper, the sensitivity and Bayesian methods use only the second and third; \
+         Eq. 24 then has a second solution if p12 is above about 0.035 m, and only the first frequency distinguishes it from \
+         the right one."
             .to_owned(),
         format!(
             "In the sensitivity analysis p12 and p23 are uniform from 0.02 to 0.07 m; masses and ground springs vary by \
              ± {} %, which the paper does not state.",
             100.0 * TOLERANCE
         ),
-        "Targets are the mean, the standard deviation and the share below δ of the positions that were set. The paper prints \
-         0.0116 m for the spread of the undamaged positions, which is that of a uniform distribution from 0.03 to 0.07 m; \
-         its 50 configurations have 0.0145 m, and its own results are 0.0137 and 0.0147 m. For all 61 it prints 0.0144 m, \
-         that of a uniform distribution (the configurations: 0.0161 m), and for the damaged ones it divides by n, not n − 1. \
-         It prints a PoD of 5 % for the undamaged state by the definition of δ; none of the 50 positions lies below δ."
+        "Targets are the mean, the standard deviation and the share below δ of the positions that were set. The paper prints a \
+         standard deviation of 0.0116 m for the undamaged positions, which is that of a uniform distribution from 0.03 to \
+         0.07 m; its 50 configurations have 0.0145 m, and its own results are 0.0137 and 0.0147 m. For all 61 configurations it \
+         prints 0.0144 m, again that of a uniform distribution (the configurations have 0.0161 m), and for the damaged ones it \
+         divides by n, not n − 1. It prints a PoD of 5 % for the undamaged state, by the definition of δ, although none of the \
+         50 positions is below δ."
             .to_owned(),
-        "The positions are the same in every repetition, and only the noise, which we assume, is drawn afresh: that a figure of \
-         the paper lies outside our range says that its rig is not exactly this simulation, or its noise another."
+        "The positions are the same in every repetition, and only the noise, whose size is assumed, is new. A value of the paper \
+         outside our range therefore shows that the rig differs from this simulation, or that its noise does."
             .to_owned(),
-        "The cINN's samples are those that the simulation keeps of twice as many (sampling, importance, resampling), which the \
-         paper does not do. Its sensitivity method takes 500 further frequencies from the prior, ours none; ours starts from \
-         many points, since two pairs of positions can have nearly the same frequencies."
+        "Samples of the cINN are obtained by sampling–importance resampling from twice as many draws, which the paper does not \
+         do. The sensitivity method of the paper uses 500 further frequencies from the prior, ours none; ours starts from many \
+         points, because two pairs of positions can have nearly the same frequencies."
             .to_owned(),
-        "Figure 21 sets the stiffnesses against a δ of their own. Positions spread evenly give stiffnesses with a long upper \
-         tail, and δ = μ − 1.645 σ of these falls below the softest coupling there is: by stiffness hardly anything counts as \
-         damaged that by position, in Table 8, does."
+        "Figure 21 compares the stiffnesses with their own δ. Uniformly distributed positions give stiffnesses with a long upper \
+         tail, and their δ = μ − 1.645 σ is below the softest coupling. Judged by stiffness, hardly any of the configurations is \
+         therefore damaged that are damaged judged by position (Table 8)."
             .to_owned(),
-        "TMCMC looks for independent normal distributions. Positions on a grid are no such thing, and least of all the \
-         damaged ones, where one link is at its lowest and the other anywhere: its means and spreads are off by what that \
-         assumption costs. The other two methods assume nothing about the population."
+        "TMCMC assumes independent normal distributions. Positions on a grid do not have them, least of all the damaged ones, \
+         where one link is at its lowest position and the other at any: this assumption causes the errors of its means and \
+         standard deviations. The other two methods assume nothing about the population."
             .to_owned(),
     ]
 }
 
-/// Frequencies at the configurations wanted, with the noise of the structure file.
+/// Simulated measurements at the configurations selected by `wanted`, with the noise of the structure file.
 fn measured(
     simulator: &Simulator,
     configurations: &[Configuration],
@@ -188,10 +189,9 @@ fn sensitivity(settings: &Settings) -> anyhow::Result<Sensitivity> {
         let masses = (0..3).map(|i| Mass::at(format!("m{}", i + 1), i, x[2 + i])).collect();
         let law = |k: usize| LAWS[k][0] * (LAWS[k][1] * x[k]).exp() + LAWS[k][2];
         let mut springs: Vec<Spring> = (0..3)
-            .map(|i| Spring::between(format!("kg{}", i + 1), Node::Ground, Node::Freedom(i), 2.0 * x[5 + i]))
+            .map(|i| Spring::between(format!("kg{}", i + 1), Node::Ground, Node::Dof(i), 2.0 * x[5 + i]))
             .collect();
-        springs
-            .extend((0..2).map(|k| Spring::between(format!("k{k}"), Node::Freedom(k), Node::Freedom(k + 1), law(k))));
+        springs.extend((0..2).map(|k| Spring::between(format!("k{k}"), Node::Dof(k), Node::Dof(k + 1), law(k))));
         natural_frequencies_hz(&Structure::new(masses, springs)?, 3)
     };
     let samples = if settings.quick { 512 } else { 4096 };
@@ -206,7 +206,7 @@ fn laws(simulator: &Simulator, all: &Data) -> anyhow::Result<Vec<LawFit>> {
     let mut stds: [Vec<f64>; 2] = Default::default();
     for (position, f) in all.theta.row_iter().zip(all.frequencies_hz.row_iter()) {
         let ground = [2.0 * GROUND_N_PER_M; 3];
-        // Noise can push the frequencies of a configuration beyond what any stiffnesses give.
+        // Because of noise, the frequencies of a configuration may not be possible for any stiffnesses.
         let Some(found) = coupling_stiffness(MASSES_KG, ground, Some(f[0]), f[1], f[2])?.into_iter().next() else {
             continue;
         };

@@ -1,13 +1,13 @@
-//! What the paper prints, to set ours beside.
+//! Values printed in the paper, for comparison.
 //!
 //! Source: Wang et al. (2025), Tables 2 to 10 and Eq. 26.
 
-use super::Method;
+use super::result::Method;
 
 /// Name, mean and standard deviation of the stiffnesses of case 1, N/m (Table 2).
 pub const TARGET_1: [(&str, f64, f64); 3] = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)];
 
-/// Damage scenarios of case 1: what is left of the mean of each stiffness (Table 1).
+/// Damage scenarios of case 1: remaining share of the mean of each stiffness (Table 1).
 pub const SCENARIOS: [(&str, [f64; 3]); 3] =
     [("scenario 1", [0.9, 1.0, 1.0]), ("scenario 2", [1.0, 0.9, 0.8]), ("scenario 3", [0.9, 0.9, 0.8])];
 
@@ -73,16 +73,16 @@ pub const CASE_2: &[Printed] = &[
     other(ALL_61, "p23", Method::Cinn, 0.0453, 0.0156),
 ];
 
-/// State of Table 5.
+/// Name of the state of Table 5.
 pub const FIVE_HUNDRED: &str = "500 measurements";
 
-/// State of Table 9.
+/// Name of the state of Table 9.
 pub const ALL_61: &str = "all 61";
 
-/// Wall clock of the paper, s: updating by sensitivity, by TMCMC, training and inference (Tables 6 and 10).
+/// Times in the paper, s: updating by the sensitivity method and by TMCMC, training and inference of the cINN (Tables 6 and 10).
 pub const SECONDS: [[f64; 4]; 2] = [[95.0, 3202.0, 433.0, 12.0], [77.0, 1587.0, 401.0, 8.0]];
 
-/// What the paper prints for a parameter in a state by a method.
+/// Values that the paper prints for a parameter in a state by a method, if there are any.
 pub fn printed(all: &'static [Printed], state: &str, parameter: &str, method: Method) -> Option<&'static Printed> {
     all.iter().find(|p| p.state == state && p.parameter == parameter && p.method == method)
 }

@@ -1,4 +1,4 @@
-//! One repetition: measurements of every state, and what each method makes of them; and many repetitions as rows.
+//! One repetition: what each method finds from the measurements of a state; and the summary of many repetitions as table rows.
 
 use std::time::Instant;
 
@@ -7,7 +7,7 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 use super::paper::{printed, Printed};
-use super::{Accuracy, Compared, Method, Row, Settings, Spread, State, Time};
+use super::result::{Accuracy, Compared, Method, Quantity, Row, Settings, Spread, State, Time};
 use crate::assessment::{self, Draws};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
@@ -19,55 +19,55 @@ use crate::stats;
 use crate::updating::sensitivity::{prior_lattice, update_all};
 use crate::updating::stochastic::{settings, simulated_for, Population};
 
-/// Posterior samples of each measurement (paper §5.2).
+/// Number of posterior samples of each measurement (paper §5.2).
 pub const DRAWS: usize = 10;
 
-/// When the simulated measurements begin, microseconds since 1970; nothing depends on it.
+/// Time of the first simulated measurement, microseconds since 1970; the results do not depend on it.
 const START_US: i64 = 1_700_000_000_000_000;
 
-/// Factor of Eq. 21.
+/// Factor of σ in the damage threshold, Eq. 21.
 const DELTA: f64 = 1.645;
 
-/// Held-out points of the prior in the figures of accuracy.
+/// Number of held-out points of the prior in the figures of accuracy.
 const HELD_OUT: usize = 1_000;
 
 /// All methods, in the order of the paper's tables.
 pub const METHODS: [Method; 3] = [Method::Sensitivity, Method::Tmcmc, Method::Cinn];
 
-/// Measurements of one state, with the values they were drawn with.
+/// Measurements of one state, and the parameters that they were simulated with.
 pub struct Data {
-    /// As in [`Row`].
+    /// Name of the state, as in [`Row`].
     pub state: String,
-    /// `[n, d]`.
+    /// Parameters, `[n, d]`.
     pub theta: DMatrix<f64>,
-    /// `[n, m]`, Hz.
+    /// Frequencies, Hz, `[n, m]`.
     pub frequencies_hz: DMatrix<f64>,
-    /// Mean and standard deviation of each parameter that it was drawn with, `[d]`.
+    /// Mean and standard deviation of the distribution of each parameter, `[d]`.
     pub target: Vec<(f64, f64)>,
-    /// Parameters that have changed.
+    /// Whether each parameter has changed, `[d]`.
     pub damaged: Vec<bool>,
 }
 
-/// What a method made of a state.
+/// What a method found for a state.
 #[derive(Clone)]
 pub struct Found {
-    /// Samples of the population of each parameter, `[d]`.
+    /// Samples of the population of each parameter, `[d][samples]`.
     pub samples: Vec<Vec<f64>>,
     /// Mean, `[d]`.
     pub mean: Vec<f64>,
     /// Standard deviation, `[d]`.
     pub std: Vec<f64>,
-    /// Wall clock, s.
+    /// Elapsed time, s.
     pub seconds: f64,
-    /// Runs of the model, where they were counted.
+    /// Number of model runs, if they were counted.
     pub model_runs: Option<usize>,
 }
 
-/// Everything a method needs.
+/// The trained flow and the settings that the methods use.
 pub struct Bench<'a> {
     /// The trained flow.
     pub baseline: &'a Baseline,
-    /// How much is run.
+    /// Number of repetitions and samples, and the seed.
     pub settings: &'a Settings,
 }
 
@@ -76,10 +76,10 @@ impl Bench<'_> {
         self.baseline.simulator()
     }
 
-    /// The hyperparameters of a state by a method.
+    /// Finds the population of a state by a method.
     ///
     /// # Errors
-    /// What the method says of these data.
+    /// The error of the method.
     pub fn find(&self, method: Method, data: &Data, seed: u64) -> anyhow::Result<Found> {
         let started = Instant::now();
         let mut found = match method {
@@ -144,12 +144,12 @@ fn of_samples(samples: Vec<Vec<f64>>, draws: usize, model_runs: Option<usize>) -
     Found { samples, mean, std, seconds: 0.0, model_runs }
 }
 
-/// δ of each parameter, for a loss (Eq. 21).
+/// Damage threshold δ = μ − 1.645 σ of each parameter, `[d]` (Eq. 21).
 pub fn thresholds(undamaged: &Found) -> Vec<f64> {
     undamaged.mean.iter().zip(&undamaged.std).map(|(mean, std)| mean - DELTA * std).collect()
 }
 
-/// P(x < δ) of a parameter: of the fitted normal distribution for TMCMC, which finds one, else the share of the samples.
+/// P(x < δ) of parameter k: for TMCMC that of the normal distribution which it fits, otherwise the share of samples below δ.
 pub fn probability_of_damage(method: Method, found: &Found, k: usize, threshold: f64) -> f64 {
     match method {
         Method::Tmcmc => stats::normal_cdf((threshold - found.mean[k]) / found.std[k]),
@@ -162,7 +162,7 @@ pub fn share_below(values: &[f64], threshold: f64) -> f64 {
     values.iter().filter(|x| **x < threshold).count() as f64 / values.len() as f64
 }
 
-/// The realised values as if a method had found them.
+/// The parameters that the measurements were simulated with, in the form of the result of a method.
 pub fn realised(data: &Data) -> Found {
     let samples = data.theta.column_iter().map(|column| column.iter().copied().collect()).collect();
     of_samples(samples, 1, None)
@@ -176,7 +176,7 @@ pub struct Series {
     pub parameter: usize,
     /// The method.
     pub method: Method,
-    /// It has changed in this state.
+    /// Whether the parameter has changed in this state.
     pub damaged: bool,
     target: (f64, f64),
     target_pod: Option<f64>,
@@ -189,7 +189,7 @@ pub struct Series {
     outside: Vec<f64>,
 }
 
-/// What one repetition adds.
+/// Result of one method for one state in one repetition.
 pub struct Entry<'a> {
     /// The state.
     pub data: &'a Data,
@@ -197,9 +197,9 @@ pub struct Entry<'a> {
     pub method: Method,
     /// What it found.
     pub found: &'a Found,
-    /// What it found of the undamaged state, and the realised undamaged state; none where nothing is compared.
+    /// What the method found for the undamaged state, and the realised undamaged state; `None` without a comparison.
     pub undamaged: Option<(&'a Found, &'a Found)>,
-    /// What the probability of damage should be, `[d]`.
+    /// True probability of damage, `[d]`.
     pub target_pod: Option<Vec<f64>>,
 }
 
@@ -209,7 +209,7 @@ pub fn add(all: &mut Vec<Series>, simulator: &Simulator, entry: &Entry<'_>) {
     let drawn = realised(data);
     for (k, parameter) in simulator.space().iter().enumerate() {
         let same = |s: &Series| s.state == data.state && s.parameter == k && s.method == *method;
-        let place = all.iter().position(same).unwrap_or_else(|| {
+        let index = all.iter().position(same).unwrap_or_else(|| {
             all.push(Series {
                 state: data.state.clone(),
                 parameter: k,
@@ -227,7 +227,7 @@ pub fn add(all: &mut Vec<Series>, simulator: &Simulator, entry: &Entry<'_>) {
             });
             all.len() - 1
         });
-        let series = &mut all[place];
+        let series = &mut all[index];
         series.mean.push(found.mean[k]);
         series.std.push(found.std[k]);
         series.mean_error.push((found.mean[k] - drawn.mean[k]).abs());
@@ -244,7 +244,7 @@ pub fn add(all: &mut Vec<Series>, simulator: &Simulator, entry: &Entry<'_>) {
 }
 
 impl Series {
-    /// The row of a table.
+    /// Summarises the repetitions as a row of a table; `all` are the values that the paper prints.
     pub fn row(&self, simulator: &Simulator, all: &'static [Printed]) -> Row {
         let parameter = &simulator.space().as_slice()[self.parameter];
         let paper = printed(all, &self.state, &parameter.name, self.method);
@@ -268,14 +268,14 @@ impl Series {
     }
 }
 
-/// Median and the quantiles about it.
+/// Median, 5 % and 95 % quantiles.
 pub fn spread(values: &[f64]) -> Spread {
     let at = |level| stats::quantile(values, level);
     Spread { median: at(0.5), low: at(0.05), high: at(0.95) }
 }
 
 fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
-    // Values as high count half: a probability of 1 is often met exactly.
+    // Equal values count half, because a probability of 1 often occurs exactly.
     let percentile = |paper: f64| {
         let below = values.iter().filter(|v| **v < paper).count() as f64;
         let same = values.iter().filter(|v| (**v - paper).abs() <= 1e-12).count() as f64;
@@ -284,8 +284,8 @@ fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
     Compared { ours: spread(values), target, paper, paper_percentile: paper.map(percentile) }
 }
 
-/// Times of the methods beside the paper's: seconds and simulated pairs of the training, and what each method took, in the
-/// order of [`METHODS`].
+/// Times of the methods and those of the paper. `training` is the duration (s) and the number of simulated samples of the training;
+/// `found` holds the duration (s) and the model runs of each method in each repetition, in the order of [`METHODS`].
 pub fn times(training: (f64, usize), found: &[Vec<(f64, Option<usize>)>; 3], paper: [f64; 4], note: &str) -> Vec<Time> {
     let median = |method: usize| stats::quantile(&found[method].iter().map(|f| f.0).collect::<Vec<_>>(), 0.5);
     let runs = |method: usize| found[method].first().and_then(|f| f.1);
@@ -313,10 +313,10 @@ pub fn times(training: (f64, usize), found: &[Vec<(f64, Option<usize>)>; 3], pap
     ]
 }
 
-/// One posterior sample at each held-out point of the prior.
+/// Compares one posterior sample with the truth at each held-out point of the prior.
 ///
 /// # Errors
-/// What the simulation or the flow says.
+/// The error of the simulation or of the flow.
 pub fn accuracy(baseline: &Baseline, seed: u64) -> anyhow::Result<Vec<Accuracy>> {
     let simulator = baseline.simulator();
     let held_out = simulator.pairs(simulator.space(), HELD_OUT, seed)?;
@@ -336,11 +336,12 @@ pub fn accuracy(baseline: &Baseline, seed: u64) -> anyhow::Result<Vec<Accuracy>>
     Ok(simulator.space().iter().enumerate().map(one).collect())
 }
 
-/// A state of the first repetition for the figures; `found` and `undamaged` by the flow.
+/// A state of the first repetition for the figures. The flow has found `found` and `undamaged`; `normal` says whether the
+/// parameters were drawn from normal distributions.
 pub fn state(simulator: &Simulator, data: &Data, found: &Found, undamaged: &Found, normal: bool) -> State {
     let drawn = realised(data);
     let delta = thresholds(undamaged);
-    let quantity = |(k, parameter): (usize, &crate::parameter::Parameter)| super::Quantity {
+    let quantity = |(k, parameter): (usize, &crate::parameter::Parameter)| Quantity {
         name: parameter.name.clone(),
         unit: parameter.unit.clone(),
         prior: Some([parameter.lower, parameter.upper]),
@@ -350,14 +351,14 @@ pub fn state(simulator: &Simulator, data: &Data, found: &Found, undamaged: &Foun
         threshold: delta[k],
         probability_of_damage: share_below(&found.samples[k], delta[k]),
     };
-    let mut quantities: Vec<super::Quantity> = simulator.space().iter().enumerate().map(quantity).collect();
+    let mut quantities: Vec<Quantity> = simulator.space().iter().enumerate().map(quantity).collect();
     for derived in simulator.derived_stiffnesses() {
         let image = |values: &Vec<f64>| values.iter().map(|p| derived.value(*p)).collect::<Vec<f64>>();
         let k = derived.parameter;
         let of_undamaged = Hyperparameters::from_pool(&image(&undamaged.samples[k]), DRAWS);
         let threshold = of_undamaged.mean - DELTA * of_undamaged.std.unwrap_or(f64::NAN);
         let samples = image(&found.samples[k]);
-        quantities.push(super::Quantity {
+        quantities.push(Quantity {
             name: derived.name.clone(),
             unit: "N/m".to_owned(),
             prior: None,

@@ -1,23 +1,63 @@
-//! A beam's definition to degrees of freedom.
+//! Checks the definition of a beam structure and numbers its degrees of freedom.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::check::{check_names, check_spring, Layout, Problems};
 use super::definition::{BeamDefinition, DefinitionProblem, StructureDefinition, Support};
+use super::layout::{check_kg, check_names, check_spring, Layout, Problems};
 use crate::physics::beam::{Element, Span};
-use crate::physics::{Form, Mass, Node, Place};
+use crate::physics::{AttachmentPoint, Form, Mass, Node};
 use crate::quantity::shown;
 
-/// Most finite elements: beyond, rounding in the lowest frequency grows with the fourth power of their number.
+/// Largest number of finite elements: the rounding error of the lowest frequency grows with the fourth power of their number.
 const MOST_ELEMENTS: usize = 200;
 
-/// Degrees of freedom of a node: deflection and rotation, where they are free.
-type Freedoms = [Option<usize>; 2];
+/// Degrees of freedom of a node, deflection and rotation; `None` where the support fixes them.
+type NodeDofs = [Option<usize>; 2];
 
-/// Degrees of freedom, masses and forms of a beam; `None` with problems.
+/// Degrees of freedom, masses and stiffness patterns of a beam structure; `None` if it has mistakes.
 pub(super) fn layout(definition: &StructureDefinition, problems: &mut Problems) -> Option<Layout> {
     let before = problems.len();
+    check_spans(definition, problems);
+    if problems.len() > before {
+        return None;
+    }
+    let mut dofs = 0;
+    let mut next = |free: bool| {
+        free.then(|| {
+            dofs += 1;
+            dofs - 1
+        })
+    };
+    let mut nodes: BTreeMap<&str, NodeDofs> = BTreeMap::new();
+    for node in &definition.nodes {
+        let deflects = matches!(node.support, Support::Free | Support::Guided);
+        let rotates = matches!(node.support, Support::Free | Support::Pinned);
+        nodes.insert(&node.name, [next(deflects), next(rotates)]);
+    }
+    let spans: Vec<Arc<Span>> =
+        definition.beams.iter().map(|beam| Arc::new(span(definition, beam, &nodes, &mut next))).collect();
+
+    let names = definition.nodes.iter().map(|node| &node.name);
+    let point = |name: &String| Some(AttachmentPoint { name: name.clone(), dof: nodes[name.as_str()][0]? });
+    let attachment_points = names.filter_map(point).collect();
+    let mut masses = bodies(definition, &nodes, problems);
+    for (beam, span) in definition.beams.iter().zip(&spans) {
+        let kg = beam.mass_kg_per_m * span.length_m();
+        masses.push(Mass { name: beam.name.clone(), kg, form: Form::Inertia(span.clone()) });
+    }
+    let mut forms = springs(definition, &nodes, problems);
+    forms.extend(spans.into_iter().map(Form::Bending));
+    let modes = definition.modes;
+    if modes > dofs {
+        let message = format!("{modes} modes of a beam with {dofs} degrees of freedom: give its spans more elements");
+        problems.push(DefinitionProblem::new("/modes", message));
+    }
+    (problems.len() == before).then_some(Layout { dofs, attachment_points, masses, forms })
+}
+
+/// Checks nodes, spans and names.
+fn check_spans(definition: &StructureDefinition, problems: &mut Problems) {
     check_nodes(definition, problems);
     for (index, beam) in definition.beams.iter().enumerate() {
         check_beam(definition, beam, index, problems);
@@ -27,93 +67,70 @@ pub(super) fn layout(definition: &StructureDefinition, problems: &mut Problems) 
     }
     let elements = definition.beams.iter().fold(0, |sum: usize, b| sum.saturating_add(b.elements));
     if elements > MOST_ELEMENTS {
-        let message = format!("{elements} elements: at most {MOST_ELEMENTS}, some three for each half-wave are plenty");
+        let message = format!(
+            "{elements} elements: at most {MOST_ELEMENTS} are allowed, and about three per half-wave are enough"
+        );
         problems.push(DefinitionProblem::new("/beam", message));
     }
     check_names("mass", definition.masses.iter().map(|m| &m.name), problems);
     check_names("spring", definition.springs.iter().map(|s| &s.name), problems);
     check_names("beam", definition.beams.iter().map(|b| &b.name), problems);
     for (index, beam) in definition.beams.iter().enumerate() {
-        let others = || definition.masses.iter().map(|m| &m.name).chain(definition.springs.iter().map(|s| &s.name));
-        if others().any(|name| *name == beam.name) {
-            // An effect could not tell one from the other.
-            let message = format!("beam {} has the name of a mass or a spring", shown(&beam.name));
+        let mut others = definition.masses.iter().map(|m| &m.name).chain(definition.springs.iter().map(|s| &s.name));
+        if others.any(|name| *name == beam.name) {
+            // A span is a mass and a stiffness at once: an effect could not say which of the two is meant.
+            let message = format!("beam {} has the name of a mass or a spring: rename one", shown(&beam.name));
             problems.push(DefinitionProblem::new(format!("/beam/{index}/name"), message));
         }
     }
-    if problems.len() > before {
-        return None;
-    }
-    let mut freedoms = 0;
-    let mut next = |free: bool| {
-        free.then(|| {
-            freedoms += 1;
-            freedoms - 1
-        })
-    };
-    let mut nodes: BTreeMap<&str, Freedoms> = BTreeMap::new();
-    for node in &definition.nodes {
-        let deflects = matches!(node.support, Support::Free | Support::Guided);
-        let rotates = matches!(node.support, Support::Free | Support::Pinned);
-        nodes.insert(&node.name, [next(deflects), next(rotates)]);
-    }
-    let spans: Vec<Arc<Span>> =
-        definition.beams.iter().map(|beam| Arc::new(span(definition, beam, &nodes, &mut next))).collect();
+}
 
-    let named = definition.nodes.iter().map(|node| &node.name);
-    let place = |name: &String| Some(Place { name: name.clone(), freedom: nodes[name.as_str()][0]? });
-    let places = named.filter_map(place).collect();
+/// Checks the rigid bodies and attaches them to their nodes.
+fn bodies(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, problems: &mut Problems) -> Vec<Mass> {
     let mut masses = Vec::new();
     for (index, mass) in definition.masses.iter().enumerate() {
         let at = mass.at.as_deref().unwrap_or_default();
-        match nodes.get(at).map(|freedoms| freedoms[0]) {
-            Some(Some(freedom)) => masses.push(Mass::at(&mass.name, freedom, mass.kg)),
+        match nodes.get(at).map(|dofs| dofs[0]) {
+            Some(Some(dof)) => masses.push(Mass::at(&mass.name, dof, mass.kg)),
             found => {
+                let name = shown(&mass.name);
                 let message = match found {
-                    None => format!("mass {} sits at {}, which is no node", shown(&mass.name), shown(at)),
-                    Some(_) => format!("mass {} sits on a support, where it does not move", shown(&mass.name)),
+                    None => format!("mass {name} is attached to {}, which is no node", shown(at)),
+                    Some(_) => {
+                        format!("mass {name} is attached to a support that does not move: attach it to a free node")
+                    }
                 };
                 problems.push(DefinitionProblem::new(format!("/mass/{index}/at"), message));
             }
         }
-        if !(mass.kg.is_finite() && mass.kg > 0.0) {
-            let message = format!("mass {} has {} kg: it must be finite and above 0", shown(&mass.name), mass.kg);
-            problems.push(DefinitionProblem::new(format!("/mass/{index}/kg"), message));
-        }
+        check_kg(&mass.name, mass.kg, index, problems);
     }
-    for (beam, span) in definition.beams.iter().zip(&spans) {
-        let kg = beam.mass_kg_per_m * span.length_m();
-        masses.push(Mass { name: beam.name.clone(), kg, form: Form::Inertia(span.clone()) });
-    }
-    let mut forms = springs(definition, &nodes, problems);
-    forms.extend(spans.into_iter().map(Form::Bending));
-    let modes = definition.modes;
-    if modes > freedoms {
-        let message =
-            format!("{modes} modes of a beam with {freedoms} degrees of freedom: give its spans more elements");
-        problems.push(DefinitionProblem::new("/modes", message));
-    }
-    (problems.len() == before).then_some(Layout { freedoms, places, masses, forms })
+    masses
 }
 
+/// Checks the nodes.
 fn check_nodes(definition: &StructureDefinition, problems: &mut Problems) {
     check_names("node", definition.nodes.iter().map(|n| &n.name), problems);
     for (index, node) in definition.nodes.iter().enumerate() {
         if node.name == "ground" {
-            let message = "no node can be called \"ground\": the name stands for the fixed end of springs";
+            let message = "a node cannot be called \"ground\": this name means the fixed end of springs";
             problems.push(DefinitionProblem::new(format!("/node/{index}/name"), message));
         }
         if !node.x_m.is_finite() {
-            problems.push(DefinitionProblem::new(format!("/node/{index}/x_m"), "a position must be finite"));
+            problems.push(DefinitionProblem::new(
+                format!("/node/{index}/x_m"),
+                format!("a position of {} m is not finite", node.x_m),
+            ));
         }
         let used = definition.beams.iter().any(|b| b.from == node.name || b.to == node.name);
         if !used {
-            let message = format!("node {} is on no beam", shown(&node.name));
+            let message = format!("node {} is not an end of any beam: connect it, or remove it", shown(&node.name));
             problems.push(DefinitionProblem::new(format!("/node/{index}/name"), message));
         }
     }
 }
 
+/// Checks one span.
 fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: usize, problems: &mut Problems) {
     let mut wrong = |key: &str, message: String| {
         problems.push(DefinitionProblem::new(format!("/beam/{index}/{key}"), message));
@@ -126,10 +143,10 @@ fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: us
         }
     }
     if let (Some(from), Some(to)) = (x_m(&beam.from), x_m(&beam.to)) {
-        // Compared by what holds: NaN must fail too.
+        // Written so that NaN fails too.
         let long = (to - from).abs() > 0.0;
         if !long {
-            wrong("to", format!("beam {name} has no length: both ends are at {from} m"));
+            wrong("to", format!("beam {name} has no length, because both ends are at {from} m: move one of its nodes"));
         }
     }
     if !(beam.mass_kg_per_m.is_finite() && beam.mass_kg_per_m > 0.0) {
@@ -144,28 +161,29 @@ fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: us
     }
 }
 
-/// Equal elements from one node to the other; the nodes between them are free.
+/// A span of equal elements between two nodes. Both degrees of freedom of its interior nodes are free; `next` numbers them.
 fn span(
     definition: &StructureDefinition,
     beam: &BeamDefinition,
-    nodes: &BTreeMap<&str, Freedoms>,
+    nodes: &BTreeMap<&str, NodeDofs>,
     next: &mut impl FnMut(bool) -> Option<usize>,
 ) -> Span {
     let x_m = |node: &str| definition.nodes.iter().find(|n| n.name == node).map_or(0.0, |n| n.x_m);
-    // Left to right, so that rotations of neighbouring spans have the same sign.
+    // From left to right, so that the rotations of neighbouring spans have the same sign.
     let (left, right) = if x_m(&beam.from) < x_m(&beam.to) { (&beam.from, &beam.to) } else { (&beam.to, &beam.from) };
     let length_m = (x_m(right) - x_m(left)) / beam.elements as f64;
     let mut start = nodes[left.as_str()];
     let elements = (1..=beam.elements).map(|element| {
         let end = if element == beam.elements { nodes[right.as_str()] } else { [next(true), next(true)] };
-        let freedoms = [start[0], start[1], end[0], end[1]];
+        let dofs = [start[0], start[1], end[0], end[1]];
         start = end;
-        Element { freedoms, length_m }
+        Element { dofs, length_m }
     });
     Span { elements: elements.collect() }
 }
 
-fn springs(definition: &StructureDefinition, nodes: &BTreeMap<&str, Freedoms>, problems: &mut Problems) -> Vec<Form> {
+/// Checks the springs; the pattern of each.
+fn springs(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, problems: &mut Problems) -> Vec<Form> {
     let mut forms = Vec::new();
     for (index, spring) in definition.springs.iter().enumerate() {
         let rotation = spring.n_m_per_rad.is_some();
@@ -173,21 +191,22 @@ fn springs(definition: &StructureDefinition, nodes: &BTreeMap<&str, Freedoms>, p
             if name == "ground" {
                 return Node::Ground;
             }
-            let held = match nodes.get(name) {
+            let wrong = match nodes.get(name) {
                 None => "which is no node and not \"ground\"",
-                Some(freedoms) => match freedoms[usize::from(rotation)] {
-                    Some(freedom) => return Node::Freedom(freedom),
-                    None => "whose support holds it already",
+                Some(dofs) => match dofs[usize::from(rotation)] {
+                    Some(dof) => return Node::Dof(dof),
+                    None => "but the support holds it already",
                 },
             };
-            let message = format!("spring {} goes to {}, {held}", shown(&spring.name), shown(name));
+            let message = format!("spring {} goes to {}, {wrong}", shown(&spring.name), shown(name));
             problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
             Node::Ground
         };
         forms.push(Form::Spring(node("from", &spring.from), node("to", &spring.to)));
         check_spring(spring, index, problems);
         if rotation && spring.n_per_m.is_some() {
-            let message = "a spring holds a deflection, n_per_m, or a rotation, n_m_per_rad: not both";
+            let message =
+                "a spring has either a translational stiffness, n_per_m, or a rotational one, n_m_per_rad: not both";
             problems.push(DefinitionProblem::new(format!("/spring/{index}/n_m_per_rad"), message));
         }
     }

@@ -1,36 +1,40 @@
-//! From a definition to checked parts: every mistake that is no mistake of form.
+//! Checks the contents of a structure definition, which is well-formed already, and builds the parts of a simulator.
 
 use std::collections::BTreeMap;
 
 use super::definition::{
-    DefinitionProblem, Law, MeasurementNoise, ParameterDefinition, Prior, Sets, SimulationKind, StructureDefinition,
+    DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Prior, Sets, SimulationKind,
+    StructureDefinition,
 };
-use super::effect::{self, Effect};
-use super::shapes::{self, Instrumented};
-use super::{beam, table, Binding, Model};
+use super::effect::{self, SimulationEffect};
+use super::instrumented::{self, Instrumented};
+use super::layout::{check_kg, check_names, check_spring, Layout, Problems};
+use super::model::{Binding, SimulationModel};
+use super::{beam, table};
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::{floating_mass, natural_frequencies_hz, Form, Mass, Node, Place, Spring, Structure};
+use crate::physics::{
+    self, floating_mass, natural_frequencies_hz, AttachmentPoint, Form, Mass, Node, Spring, Structure,
+};
 use crate::quantity::{shown, StructureId};
 
-/// Most degrees of freedom: a dense eigenproblem of this size takes some three seconds.
+/// Largest number of masses: a dense eigenproblem of this size takes about three seconds.
 const MOST_MASSES: usize = 2_000;
 
-/// The checked parts of a structure.
+/// The parts of a checked structure.
 #[derive(Debug, Clone)]
 pub(super) struct Checked {
     pub id: StructureId,
-    pub model: Model,
+    pub model: SimulationModel,
     pub nominal_frequencies_hz: Vec<f64>,
     pub space: ParameterSpace,
     pub covariates: Vec<Covariate>,
-    pub effects: Vec<Effect>,
+    pub effects: Vec<SimulationEffect>,
     pub instrumented: Option<Instrumented>,
 }
 
-pub(super) type Problems = Vec<DefinitionProblem>;
-
-/// Checks a definition; all mistakes of a stage are reported together, a later stage needs the earlier ones.
+/// Checks a definition in several stages. All mistakes of a stage are reported together; a stage runs only if the stages before
+/// it found none.
 pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problems> {
     let mut problems = Problems::new();
     let id =
@@ -47,37 +51,30 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
         None => {
             let emulated = table::emulate(definition, &space).map_err(|problem| vec![problem])?;
             let nominal = emulated.nominal_frequencies_hz(&space, definition.modes);
-            (Model::Table(emulated), nominal)
+            (SimulationModel::Table(emulated), nominal)
         }
         Some(layout) => {
             let structure = assemble(definition, layout, &bindings)?;
-            // Tied to the ground is not enough: values far apart can drown the lowest frequency in rounding.
+            // A structure that is connected to the ground can still be a mechanism numerically, if its values are far apart.
             let nominal = natural_frequencies_hz(&structure, definition.modes).map_err(|e| {
                 let message = format!("at the nominal stiffnesses: {e}");
                 vec![DefinitionProblem::new("/spring", message)]
             })?;
-            (Model::Matrices { structure, bindings }, nominal)
+            (SimulationModel::Matrices { structure, bindings }, nominal)
         }
     };
     let covariates: Vec<Covariate> =
         definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
-    let instrumented = shapes::check(definition, &model, &mut problems);
+    let instrumented = instrumented::check(definition, &model, &mut problems);
     if !problems.is_empty() {
         return Err(problems);
     }
     Ok(Checked { id, model, nominal_frequencies_hz, space, covariates, effects, instrumented })
 }
 
-/// Degrees of freedom, places and masses of a structure, and the forms of its stiffnesses: springs, then spans.
-pub(super) struct Layout {
-    pub freedoms: usize,
-    pub places: Vec<Place>,
-    pub masses: Vec<Mass>,
-    pub forms: Vec<Form>,
-}
-
+/// The parts of a structure; `None` for a table, which has none, or if a beam has mistakes.
 fn layout(definition: &StructureDefinition, problems: &mut Problems) -> Option<Layout> {
     match definition.simulation {
         SimulationKind::Table => None,
@@ -86,19 +83,18 @@ fn layout(definition: &StructureDefinition, problems: &mut Problems) -> Option<L
             let by_name = check_masses(definition, problems);
             let forms = check_springs(definition, &by_name, problems);
             let masses = definition.masses.iter().enumerate();
-            let place =
-                |(freedom, m): (usize, &super::definition::MassDefinition)| Place { name: m.name.clone(), freedom };
+            let point = |(dof, m): (usize, &MassDefinition)| AttachmentPoint { name: m.name.clone(), dof };
             Some(Layout {
-                freedoms: definition.masses.len(),
-                places: masses.clone().map(place).collect(),
-                masses: masses.map(|(freedom, m)| Mass::at(&m.name, freedom, m.kg)).collect(),
+                dofs: definition.masses.len(),
+                attachment_points: masses.clone().map(point).collect(),
+                masses: masses.map(|(dof, m)| Mass::at(&m.name, dof, m.kg)).collect(),
                 forms,
             })
         }
     }
 }
 
-/// The structure at its nominal stiffnesses, which holds together over the whole prior.
+/// The structure at its nominal stiffnesses. It must not become a mechanism anywhere in the prior.
 fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Binding]) -> Result<Structure, Problems> {
     let mut problems = Problems::new();
     let springs = springs(definition, layout.forms, bindings, &mut problems);
@@ -109,22 +105,25 @@ fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Bindin
     if !problems.is_empty() {
         return Err(problems);
     }
-    let failed = |e: crate::physics::Error| vec![DefinitionProblem::new("/spring", e.to_string())];
-    let Layout { freedoms, places, masses, .. } = layout;
+    let failed = |e: physics::Error| vec![DefinitionProblem::new("/spring", e.to_string())];
+    let Layout { dofs, attachment_points, masses, .. } = layout;
     if definition.simulation == SimulationKind::SpringMass {
         return Structure::new(masses, springs).map_err(failed);
     }
-    let structure = Structure::with_freedoms(freedoms, places, masses, springs).map_err(failed)?;
+    let structure = Structure::with_dofs(dofs, attachment_points, masses, springs).map_err(failed)?;
     let least: Vec<(usize, f64)> = weakest.iter().enumerate().map(|(i, s)| (i, s.n_per_m)).collect();
     let at_weakest = structure.with_stiffness(&least).and_then(|weak| natural_frequencies_hz(&weak, 1));
     at_weakest.map_err(|e| {
-        let message = format!("with every parameter at its softest: {e}; hold the beam with supports or springs, or, if it is held, give a short span fewer elements");
+        let message = format!(
+            "with every stiffness at its smallest value in the prior: {e}; hold the beam with supports or springs, or, if it \
+             is held already, give its short spans fewer elements"
+        );
         vec![DefinitionProblem::new("/node", message)]
     })?;
     Ok(structure)
 }
 
-/// Sections of another kind of simulation.
+/// Checks that there are no sections that belong to another kind of simulation.
 fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
     let d = definition;
     let (name, wrong): (_, &[(&str, bool)]) = match d.simulation {
@@ -144,21 +143,23 @@ fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
         ),
     };
     for (section, _) in wrong.iter().filter(|(_, present)| *present) {
-        let message = format!("a simulation \"{name}\" has no {section}: remove it, or say another simulation = \"…\"");
+        let message =
+            format!("a simulation \"{name}\" has no {section}: remove it, or choose another simulation = \"…\"");
         problems.push(DefinitionProblem::new(format!("/{section}"), message));
     }
     if d.simulation == SimulationKind::SpringMass {
         for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at.is_some()) {
-            let message = "only in a simulation \"beam\" a mass sits at a node";
+            let message = "a mass has a node only in a simulation \"beam\": remove at";
             problems.push(DefinitionProblem::new(format!("/mass/{index}/at"), message));
         }
         for (index, _) in d.springs.iter().enumerate().filter(|(_, s)| s.n_m_per_rad.is_some()) {
-            let message = "only in a simulation \"beam\" a spring holds a rotation: give n_per_m";
+            let message = "a spring has a rotational stiffness only in a simulation \"beam\": give n_per_m";
             problems.push(DefinitionProblem::new(format!("/spring/{index}/n_m_per_rad"), message));
         }
     }
 }
 
+/// Checks the number of masses and modes, the measurement noise, and that there is a parameter.
 fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
     let masses = definition.masses.len();
     let bodies = definition.simulation == SimulationKind::SpringMass;
@@ -166,9 +167,11 @@ fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
         let message = format!("{masses} masses: a structure has 1 to {MOST_MASSES} [[mass]]");
         problems.push(DefinitionProblem::new("/mass", message));
     } else if definition.modes == 0 || (bodies && definition.modes > masses) {
-        let most = if bodies { masses.to_string() } else { "as many as are measured".to_owned() };
-        let of = if bodies { format!("a structure of {masses} masses") } else { "a structure".to_owned() };
-        let message = format!("{} modes: {of} has 1 to {most}", definition.modes);
+        let message = if bodies {
+            format!("{} modes: a structure of {masses} masses has 1 to {masses}", definition.modes)
+        } else {
+            "0 modes: at least 1 must be measured".to_owned()
+        };
         problems.push(DefinitionProblem::new("/modes", message));
     }
     let (key, noise) = match definition.measurement_noise {
@@ -177,60 +180,42 @@ fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
     };
     if !(noise.is_finite() && noise >= 0.0) || (key == "relative" && noise >= 0.5) {
         let message =
-            format!("{noise} is no standard deviation: it must be finite, not negative, and relative below 0.5");
+            format!("a standard deviation of {noise} is not valid: it must be finite and not negative; a relative one must be below 0.5");
         problems.push(DefinitionProblem::new(format!("/measurement_noise/{key}"), message));
     }
     if definition.parameters.is_empty() {
-        problems.push(DefinitionProblem::new("/parameter", "no [[parameter]]: at least one unknown is needed"));
+        problems
+            .push(DefinitionProblem::new("/parameter", "no [[parameter]]: at least one unknown parameter is needed"));
     }
 }
 
-/// Names must be unique and usable as a column of a table.
-pub(super) fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a String>, problems: &mut Problems) {
-    let mut seen = BTreeMap::new();
-    for (index, name) in names.enumerate() {
-        let place = format!("/{section}/{index}/name");
-        let allowed = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
-        if name.is_empty() || name.len() > 64 || !name.chars().all(allowed) {
-            let message = format!("the name {} must be 1 to 64 of letters, digits, '_', '-', '.'", shown(name));
-            problems.push(DefinitionProblem::new(&place, message));
-        }
-        if let Some(first) = seen.insert(name, index) {
-            let message = format!("the {section} name {} is used already by /{section}/{first}", shown(name));
-            problems.push(DefinitionProblem::new(&place, message));
-        }
-    }
-}
-
+/// Checks the masses; index of each by its name.
 fn check_masses<'a>(definition: &'a StructureDefinition, problems: &mut Problems) -> BTreeMap<&'a str, usize> {
     check_names("mass", definition.masses.iter().map(|m| &m.name), problems);
     let mut by_name = BTreeMap::new();
     for (index, mass) in definition.masses.iter().enumerate() {
         if mass.name == "ground" {
-            let message = "no mass can be called \"ground\": the name stands for the fixed end of springs";
+            let message = "a mass cannot be called \"ground\": this name means the fixed end of springs";
             problems.push(DefinitionProblem::new(format!("/mass/{index}/name"), message));
         }
-        if !(mass.kg.is_finite() && mass.kg > 0.0) {
-            let message = format!("mass {} has {} kg: it must be finite and above 0", shown(&mass.name), mass.kg);
-            problems.push(DefinitionProblem::new(format!("/mass/{index}/kg"), message));
-        }
+        check_kg(&mass.name, mass.kg, index, problems);
         by_name.entry(mass.name.as_str()).or_insert(index);
     }
     by_name
 }
 
-/// Forms of the springs between named places.
+/// Checks the springs between masses; the pattern of each.
 fn check_springs(
     definition: &StructureDefinition,
-    places: &BTreeMap<&str, usize>,
+    masses: &BTreeMap<&str, usize>,
     problems: &mut Problems,
 ) -> Vec<Form> {
     check_names("spring", definition.springs.iter().map(|s| &s.name), problems);
     let mut forms = Vec::new();
     for (index, spring) in definition.springs.iter().enumerate() {
-        let mut node = |key: &str, name: &str| match places.get(name) {
+        let mut node = |key: &str, name: &str| match masses.get(name) {
             _ if name == "ground" => Node::Ground,
-            Some(freedom) => Node::Freedom(*freedom),
+            Some(dof) => Node::Dof(*dof),
             None => {
                 let spring = shown(&spring.name);
                 let message = format!("spring {spring} goes to {}, which is no mass and not \"ground\"", shown(name));
@@ -244,22 +229,7 @@ fn check_springs(
     forms
 }
 
-/// Ends that differ and a stiffness that is one.
-pub(super) fn check_spring(spring: &super::definition::SpringDefinition, index: usize, problems: &mut Problems) {
-    if spring.from == spring.to {
-        let message = format!("spring {} goes from {} to itself", shown(&spring.name), shown(&spring.from));
-        problems.push(DefinitionProblem::new(format!("/spring/{index}/to"), message));
-    }
-    for (key, unit, value) in [("n_per_m", "N/m", spring.n_per_m), ("n_m_per_rad", "N·m/rad", spring.n_m_per_rad)] {
-        if let Some(value) = value.filter(|k| !(k.is_finite() && *k >= 0.0)) {
-            let name = shown(&spring.name);
-            let message =
-                format!("spring {name} has a stiffness of {value} {unit}: it must be finite and not negative");
-            problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
-        }
-    }
-}
-
+/// Checks that no covariate has the name of another column of measurement tables.
 fn check_covariates(definition: &StructureDefinition, problems: &mut Problems) {
     check_names("covariate", definition.covariates.iter().map(|c| &c.name), problems);
     for (index, covariate) in definition.covariates.iter().enumerate() {
@@ -268,37 +238,45 @@ fn check_covariates(definition: &StructureDefinition, problems: &mut Problems) {
         let frequency = name.strip_prefix("std_").unwrap_or(&name);
         let frequency = frequency.strip_prefix('f').and_then(|n| n.strip_suffix("_hz")).is_some_and(digits);
         if frequency || name == "measured_at" || name == "source" || name.starts_with("set_") {
-            let message = format!("the covariate {} has the name of a column that is taken", shown(&covariate.name));
+            let message = format!(
+                "the covariate name {} is taken by another column of measurement tables: choose another name",
+                shown(&covariate.name)
+            );
             problems.push(DefinitionProblem::new(format!("/covariate/{index}/name"), message));
         }
     }
 }
 
+/// Checks the parameters; which of them sets which stiffness.
 fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -> Vec<Binding> {
     check_names("parameter", definition.parameters.iter().map(|p| &p.name), problems);
     let mut bindings: Vec<Binding> = Vec::new();
     for (index, parameter) in definition.parameters.iter().enumerate() {
         let Prior::Uniform([lower, upper]) = parameter.prior;
         if !(lower.is_finite() && upper.is_finite() && lower < upper) {
-            let message = format!("uniform = [{lower}, {upper}]: both must be finite, the first below the second");
+            let message =
+                format!("uniform = [{lower}, {upper}]: both bounds must be finite, the first below the second");
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/prior/uniform"), message));
         }
         let table = definition.simulation == SimulationKind::Table;
         if parameter.sets.is_empty() && !table {
             let what = if definition.simulation == SimulationKind::Beam { "a beam or a spring" } else { "a spring" };
-            let message = format!("parameter {} sets nothing: name {what}", shown(&parameter.name));
+            let message = format!("parameter {} sets nothing: name {what} in sets", shown(&parameter.name));
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/sets"), message));
         }
-        for (place, sets) in parameter.sets.iter().enumerate() {
+        for (position, sets) in parameter.sets.iter().enumerate() {
             let key = if sets.beam.is_some() { "beam" } else { "spring" };
-            // A single one may stand in the file as a table or as a list; a list of several has an index.
+            // A single entry may be written as a table or as a list; only entries of a longer list have an index.
             let pointer = match parameter.sets.len() {
                 1 => format!("/parameter/{index}/sets"),
-                _ => format!("/parameter/{index}/sets/{place}/{key}"),
+                _ => format!("/parameter/{index}/sets/{position}/{key}"),
             };
             let mut wrong = |message: String| problems.push(DefinitionProblem::new(&pointer, message));
             if table {
-                wrong("parameters of a table are columns of its runs: they set nothing".to_owned());
+                wrong(
+                    "the parameters of a simulation \"table\" are columns of its runs and set nothing: remove sets"
+                        .to_owned(),
+                );
                 continue;
             }
             let spring = match stiffness_index(definition, sets) {
@@ -316,7 +294,7 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
             }
             if let Some(Law::Exponential(e)) = sets.law {
                 if !(e.a.is_finite() && e.b.is_finite() && e.c.is_finite()) {
-                    wrong("the constants of a law must be finite".to_owned());
+                    wrong(format!("the constants of a law must be finite: a = {}, b = {}, c = {}", e.a, e.b, e.c));
                     continue;
                 }
             }
@@ -326,21 +304,22 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
     bindings
 }
 
-/// Index among the stiffnesses: springs first, then spans.
+/// Index of a stiffness: springs first, then beam spans.
 fn stiffness_index(definition: &StructureDefinition, sets: &Sets) -> Result<usize, String> {
     match (&sets.spring, &sets.beam) {
         (Some(name), None) => {
-            let place = definition.springs.iter().position(|s| s.name == *name);
-            place.ok_or_else(|| format!("there is no spring {}", shown(name)))
+            let index = definition.springs.iter().position(|s| s.name == *name);
+            index.ok_or_else(|| format!("there is no spring {}", shown(name)))
         }
         (None, Some(name)) => {
-            let place = definition.beams.iter().position(|b| b.name == *name);
-            place.map(|p| definition.springs.len() + p).ok_or_else(|| format!("there is no beam {}", shown(name)))
+            let index = definition.beams.iter().position(|b| b.name == *name);
+            index.map(|i| definition.springs.len() + i).ok_or_else(|| format!("there is no beam {}", shown(name)))
         }
-        _ => Err("name one spring or one beam".to_owned()),
+        _ => Err("name either one spring or one beam".to_owned()),
     }
 }
 
+/// The parameter of a checked definition, with the unit of the stiffness that it sets unless the file gives one.
 fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) -> Parameter {
     let Prior::Uniform([lower, upper]) = definition.prior;
     let plain = |sets: &Sets| sets.law.is_none();
@@ -358,7 +337,8 @@ fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) 
     Parameter { name: definition.name.clone(), unit, lower, upper, damage: definition.damage }
 }
 
-/// The stiffnesses at their nominal values.
+/// The stiffnesses at their nominal values: those of the file, or else at the middle of the prior of the parameter that sets
+/// them.
 fn springs(
     definition: &StructureDefinition,
     forms: Vec<Form>,
@@ -389,7 +369,7 @@ fn springs(
     springs.chain(spans).zip(forms).enumerate().map(nominal).collect()
 }
 
-/// No value of the prior may give a negative stiffness; the stiffnesses at their least.
+/// Checks that no value of the prior gives a negative stiffness; the stiffnesses at their smallest value in the prior.
 fn check_priors(
     definition: &StructureDefinition,
     springs: &[Spring],
@@ -399,16 +379,19 @@ fn check_priors(
     let mut weakest: Vec<Spring> = springs.to_vec();
     for binding in bindings {
         let Prior::Uniform([lower, upper]) = definition.parameters[binding.parameter].prior;
-        // Every law is monotone: its least value lies at an end of the prior.
+        // Every law is monotone, so that its smallest value is at a bound of the prior.
         let (at_lower, at_upper) = (binding.stiffness(lower), binding.stiffness(upper));
         let least = at_lower.min(at_upper);
         let pointer = format!("/parameter/{}/prior/uniform", binding.parameter);
         let name = shown(&springs[binding.spring].name);
         let kind = if binding.spring < definition.springs.len() { "spring" } else { "beam" };
-        // Each end by itself: `min` and `max` pass over NaN, which 0·exp(large) gives.
+        // Both bounds are checked, because `min` ignores NaN, which 0·exp(large) gives.
         if !(least >= 0.0 && at_lower.is_finite() && at_upper.is_finite()) {
             let unit = if kind == "beam" { "N·m²" } else { "N/m" };
-            let message = format!("the prior [{lower}, {upper}] lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must be finite and not negative");
+            let message = format!(
+                "the prior [{lower}, {upper}] lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must \
+                 be finite and not negative"
+            );
             problems.push(DefinitionProblem::new(pointer, message));
         }
         weakest[binding.spring].n_per_m = least;
@@ -416,7 +399,7 @@ fn check_priors(
     weakest
 }
 
-/// No value of the prior may cut a mass off from the ground.
+/// Checks that no value of the prior disconnects a mass from the ground.
 fn check_tied(
     definition: &StructureDefinition,
     springs: &[Spring],
@@ -428,14 +411,17 @@ fn check_tied(
     if let Some(mass) = floating_mass(masses, springs.iter().filter(|s| s.n_per_m > 0.0)) {
         let name = shown(&definition.masses[mass].name);
         let message = format!(
-            "mass {name} is not tied to the ground by springs of positive stiffness: the structure is a mechanism"
+            "mass {name} is not connected to the ground by springs of positive stiffness: the structure is a mechanism"
         );
         problems.push(DefinitionProblem::new("/spring", message));
     } else if let Some(mass) = floating_mass(masses, weakest.iter().filter(|s| s.n_per_m > 0.0)) {
         let name = shown(&definition.masses[mass].name);
         let to_zero = bindings.iter().find(|b| weakest[b.spring].n_per_m <= 0.0);
         let pointer = to_zero.map_or("/parameter".to_owned(), |b| format!("/parameter/{}/prior/uniform", b.parameter));
-        let message = format!("the prior allows a mechanism: with a stiffness of 0 mass {name} is not tied to the ground; let the prior begin above 0");
+        let message = format!(
+            "the prior allows a mechanism: with a stiffness of 0, mass {name} is not connected to the ground; let the prior \
+             begin above 0"
+        );
         problems.push(DefinitionProblem::new(pointer, message));
     }
 }

@@ -1,51 +1,48 @@
-//! The structure file: one TOML file or one JSON body, read strictly, every mistake named with its place.
+//! The structure file: the definition of a structure as TOML or JSON. Unknown keys are mistakes.
 //!
-//! `models/three-dof/structure.toml` is an example; README lists the keys.
+//! `models/three-dof/structure.toml` is an example.
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::ops::Range;
 
-use serde::de::{self, DeserializeOwned, MapAccess, SeqAccess, Visitor};
+use serde::de::{self, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use super::check;
 use super::law::LawKind;
-use super::shapes::ModeShapesDefinition;
 use crate::measurement::CovariateKind;
 use crate::parameter::DamageDirection;
-use crate::quantity::{json_pointer, shown, Digest};
+use crate::quantity::Digest;
 
-/// A structure as a file describes it; `simulator::Simulator` is the checked form.
+/// A structure as its file describes it; [`crate::simulator::Simulator`] is the checked form.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StructureDefinition {
     /// Name of the structure, see [`crate::quantity::StructureId`].
     pub id: String,
-    /// For people.
+    /// Free text for human readers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub description: Option<String>,
-    /// Number of modes measured, from the lowest.
+    /// Number of measured modes, counted from the lowest.
     pub modes: usize,
     /// Standard deviation of one measured frequency.
     #[serde(default)]
     pub measurement_noise: MeasurementNoise,
-    /// Where mode shapes are measured, if they are.
+    /// Instrumented points, if mode shapes are measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mode_shapes: Option<ModeShapesDefinition>,
-    /// What kind of simulation it is.
+    /// Kind of simulation.
     #[serde(default, skip_serializing_if = "is_default")]
     pub simulation: SimulationKind,
-    /// Places along a beam; only of a simulation `beam`.
+    /// Nodes along a beam; only in a simulation `beam`.
     #[serde(rename = "node", default, skip_serializing_if = "Vec::is_empty")]
     pub nodes: Vec<NodeDefinition>,
-    /// Spans between nodes; only of a simulation `beam`.
+    /// Beam spans between nodes; only in a simulation `beam`.
     #[serde(rename = "beam", default, skip_serializing_if = "Vec::is_empty")]
     pub beams: Vec<BeamDefinition>,
-    /// Runs of a finite-element model; only of a simulation `table`.
+    /// Runs of a finite-element model; only in a simulation `table`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub table: Option<TableDefinition>,
-    /// Masses.
+    /// Rigid bodies.
     #[serde(rename = "mass", default)]
     pub masses: Vec<MassDefinition>,
     /// Springs.
@@ -54,44 +51,53 @@ pub struct StructureDefinition {
     /// Unknown parameters.
     #[serde(rename = "parameter", default)]
     pub parameters: Vec<ParameterDefinition>,
-    /// What is measured beside the frequencies.
+    /// Quantities measured in addition to the frequencies.
     #[serde(rename = "covariate", default, skip_serializing_if = "Vec::is_empty")]
     pub covariates: Vec<CovariateDefinition>,
-    /// What acts on the structure beside its parameters.
+    /// Influences on the structure or the instrument besides the parameters.
     #[serde(rename = "effect", default, skip_serializing_if = "Vec::is_empty")]
     pub effects: Vec<EffectDefinition>,
-    /// Digest of the definition that this one extends.
+    /// Digest of the definition that this definition extends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parent: Option<String>,
 }
 
-/// An effect: target × law × covariate, with what is known of its numbers.
+/// The instrumented points, at which mode shapes are measured.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ModeShapesDefinition {
+    /// Names of masses, or of nodes in a simulation `beam`, in the order of the components of a shape.
+    pub points: Vec<String>,
+    /// Standard deviation of each component of a measured shape, as a share of the root mean square of the shape.
+    pub noise: f64,
+}
+
+/// An effect: its target, its law, its covariate and the coefficients of the law.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EffectDefinition {
     /// Unique name.
     pub name: String,
-    /// For people.
+    /// Free text for human readers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub description: Option<String>,
     /// What changes.
     pub target: TargetDefinition,
     /// Form of the law.
     pub law: LawKind,
-    /// Under which declared covariate; none for a constant.
+    /// Declared covariate that the size depends on; none for a constant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub covariate: Option<String>,
     /// Value of the covariate at which the effect has its `level`.
     #[serde(default)]
     pub reference: f64,
-    /// Numbers of the law by name: their means. A category has one for each category that is named.
+    /// Means of the coefficients of the law by name. A law by category has one for each category that has an effect.
     pub numbers: BTreeMap<String, f64>,
-    /// Their covariance, in the order of their names; none where they are exact.
+    /// Covariance of the coefficients, in alphabetical order of their names; none if they are exact.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub covariance: Vec<Vec<f64>>,
-    /// Values of a numeric covariate that the effect was learnt from: quantiles at equal steps from the least to the
-    /// greatest, at least two. Training draws between the ends; a measurement without the covariate is taken at all of
-    /// them.
+    /// Values of a numeric covariate that the effect was learnt from: at least two quantiles at equal steps, from the minimum to
+    /// the maximum. Training draws between the extremes; a measurement without the covariate is marginalised over all values.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub seen: Vec<f64>,
 }
@@ -100,66 +106,66 @@ pub struct EffectDefinition {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum TargetDefinition {
-    /// Stiffness of these springs, k(1 + g).
+    /// Stiffness of these springs: k(1 + g).
     Springs(Vec<String>),
-    /// Mass of these bodies, m(1 + g).
+    /// Mass of these bodies: m(1 + g).
     Masses(Vec<String>),
-    /// This parameter, p(1 + g).
+    /// This parameter: p(1 + g).
     Parameter(String),
-    /// Scale of the measured frequency of this mode, from 1; of all modes for 0: f(1 + g).
+    /// Scale of the measured frequency of this mode, counted from 1, or of all modes for 0: f(1 + g).
     FrequencyScale(usize),
-    /// Offset of the measured frequency of this mode, from 1; of all modes for 0: f + g, Hz.
+    /// Offset of the measured frequency of this mode, counted from 1, or of all modes for 0: f + g, Hz.
     FrequencyOffset(usize),
-    /// A spring of stiffness g, N/m, between two nodes.
+    /// An additional spring of stiffness g, N/m, between two nodes.
     AddedSpring([String; 2]),
-    /// A body of `size` kg on a spring tuned to `frequency_hz`, attached to this mass.
+    /// An additional body of `size` kg on a spring tuned to `frequency_hz`, attached to this mass or node.
     Oscillator(String),
-    /// Mode i of the data is this mode of the structure, from 1.
+    /// Mode i of the data is this mode of the structure, counted from 1.
     ModeOrder(Vec<usize>),
 }
 
-/// What computes the frequencies.
+/// Kind of simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SimulationKind {
-    /// Bodies on springs.
+    /// Rigid bodies on springs.
     #[default]
     SpringMass,
-    /// Euler–Bernoulli beams with bodies and springs.
+    /// Euler–Bernoulli beams with rigid bodies and springs.
     Beam,
     /// An emulator of the user's own finite-element runs.
     Table,
 }
 
-/// A place along a beam.
+/// A node of a beam.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NodeDefinition {
-    /// Unique name; `ground` is taken.
+    /// Unique name; `ground` is reserved.
     pub name: String,
     /// Position along the beam, m.
     pub x_m: f64,
-    /// What holds it.
+    /// Support at the node.
     #[serde(default, skip_serializing_if = "is_default")]
     pub support: Support,
 }
 
-/// What holds a node of a beam.
+/// Degrees of freedom of a node that its support fixes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Support {
-    /// Nothing.
+    /// None.
     #[default]
     Free,
-    /// Its deflection.
+    /// The deflection.
     Pinned,
-    /// Its rotation.
+    /// The rotation.
     Guided,
-    /// Both.
+    /// The deflection and the rotation.
     Clamped,
 }
 
-/// A span of constant cross-section between two nodes.
+/// A beam span of constant cross-section between two nodes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BeamDefinition {
@@ -169,25 +175,25 @@ pub struct BeamDefinition {
     pub from: String,
     /// Name of the node at the other end.
     pub to: String,
-    /// Nominal bending stiffness EI, N·m²; may be left out where a parameter sets it, whose middle then counts.
+    /// Nominal bending stiffness EI, N·m². If a parameter sets it, the default is its value in the middle of the prior.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bending_stiffness_n_m2: Option<f64>,
     /// Mass per length, kg/m.
     pub mass_kg_per_m: f64,
-    /// Finite elements of equal length; frequencies converge with the fourth power of their number.
-    #[serde(default = "usual_elements")]
+    /// Number of finite elements of equal length; the error of frequencies falls with its fourth power.
+    #[serde(default = "default_elements")]
     pub elements: usize,
 }
 
-fn usual_elements() -> usize {
+fn default_elements() -> usize {
     10
 }
 
-/// Runs of a finite-element model, one line each: a column for every parameter by its name, and `f1_hz`, `f2_hz`, ….
+/// Runs of a finite-element model, one per line, with a column for every parameter by its name and columns `f1_hz`, `f2_hz`, ….
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TableDefinition {
-    /// A CSV file, relative to the structure file; its text takes its place as soon as the file is read.
+    /// Path of a CSV file, relative to the structure file. It is replaced by the text of the file on reading.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<String>,
     /// The text of the CSV.
@@ -203,9 +209,9 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum MeasurementNoise {
-    /// As a share of the frequency.
+    /// As a share of the frequency (–).
     Relative(f64),
-    /// In Hz, the same for each mode.
+    /// In Hz, the same for all modes.
     Hz(f64),
 }
 
@@ -225,33 +231,33 @@ impl MeasurementNoise {
     }
 }
 
-/// A mass.
+/// A rigid body.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MassDefinition {
-    /// Unique name; `ground` is taken.
+    /// Unique name; `ground` is reserved.
     pub name: String,
     /// Mass, kg.
     pub kg: f64,
-    /// Node of a beam that it sits on.
+    /// Node of a beam to which it is attached.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at: Option<String>,
 }
 
-/// A spring between two masses or nodes, or one of them and the ground.
+/// A spring between two masses or nodes, or between one of them and the ground.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SpringDefinition {
     /// Unique name.
     pub name: String,
-    /// `ground` or the name of a mass, of a node in a simulation `beam`.
+    /// `ground` or the name of a mass (of a node in a simulation `beam`).
     pub from: String,
-    /// `ground` or the name of a mass, of a node in a simulation `beam`.
+    /// `ground` or the name of a mass (of a node in a simulation `beam`).
     pub to: String,
-    /// Nominal stiffness, N/m; may be left out where a parameter sets it, whose middle then counts.
+    /// Nominal stiffness, N/m. If a parameter sets it, the default is its value in the middle of the prior.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub n_per_m: Option<f64>,
-    /// Nominal stiffness of a spring that holds the rotation of nodes of a beam, N·m/rad.
+    /// Nominal stiffness of a rotational spring at nodes of a beam, N·m/rad, instead of `n_per_m`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub n_m_per_rad: Option<f64>,
 }
@@ -262,38 +268,38 @@ pub struct SpringDefinition {
 pub struct ParameterDefinition {
     /// Unique name.
     pub name: String,
-    /// Unit, for people; N/m where it sets springs plainly.
+    /// Unit, for display; by default that of the stiffness that the parameter sets without a law.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
-    /// What is known before measuring.
+    /// Prior distribution.
     pub prior: Prior,
-    /// The stiffnesses it sets: one table or a list of them; none in a simulation `table`.
+    /// The stiffnesses that the parameter sets: one table or a list of tables; none in a simulation `table`.
     #[serde(default, deserialize_with = "one_or_many", skip_serializing_if = "Vec::is_empty")]
     pub sets: Vec<Sets>,
-    /// Which change is damage.
+    /// Direction of change that is damage.
     #[serde(default)]
     pub damage: DamageDirection,
 }
 
-/// What is known of a parameter before measuring.
+/// Prior distribution of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Prior {
-    /// Equally probable between the two values.
+    /// Uniform between the two values.
     Uniform([f64; 2]),
 }
 
-/// A stiffness that a parameter sets: a spring or a span.
+/// A stiffness that a parameter sets: of a spring or of a beam span.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sets {
     /// Name of the spring.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub spring: Option<String>,
-    /// Or name of the span of a beam, whose bending stiffness it sets.
+    /// Name of the beam span whose bending stiffness it sets, instead of `spring`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beam: Option<String>,
-    /// How; without a law the parameter is the stiffness itself.
+    /// Stiffness as a function of the parameter; without a law the parameter is the stiffness itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub law: Option<Law>,
 }
@@ -319,24 +325,24 @@ pub struct Exponential {
 }
 
 impl Law {
-    /// Stiffness at a parameter value, N/m.
+    /// Stiffness k(p) at a parameter value, N/m.
     pub fn value(&self, p: f64) -> f64 {
         let Self::Exponential(e) = self;
         e.a * (e.b * p).exp() + e.c
     }
 
-    /// Its derivative, N/m per unit of the parameter.
+    /// Derivative dk/dp at a parameter value, N/m per unit of the parameter.
     pub fn slope(&self, p: f64) -> f64 {
         let Self::Exponential(e) = self;
         e.a * e.b * (e.b * p).exp()
     }
 }
 
-/// Something measured beside the frequencies.
+/// A quantity measured in addition to the frequencies.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CovariateDefinition {
-    /// Unique name with its unit, such as `temperature_c`.
+    /// Unique name that includes the unit, such as `temperature_c`.
     pub name: String,
     /// Kind of its values.
     #[serde(default)]
@@ -348,9 +354,9 @@ pub struct CovariateDefinition {
 pub struct DefinitionProblem {
     /// JSON pointer, such as `/spring/3/from`; empty for the whole file.
     pub pointer: String,
-    /// Line of a text file, from 1.
+    /// Line of a text file, counted from 1.
     pub line: Option<usize>,
-    /// What is wrong and what would be right.
+    /// What is wrong, and what would be right.
     pub message: String,
 }
 
@@ -372,10 +378,10 @@ impl fmt::Display for DefinitionProblem {
     }
 }
 
-/// All mistakes found in a structure file; never empty.
+/// All mistakes found in a structure file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct DefinitionError {
-    /// The mistakes, in the order of the file's sections.
+    /// The mistakes in the order of the sections of the file; never empty.
     pub problems: Vec<DefinitionProblem>,
 }
 
@@ -389,138 +395,18 @@ impl fmt::Display for DefinitionError {
 }
 
 impl StructureDefinition {
-    /// Reads and checks a TOML file.
-    ///
-    /// # Errors
-    /// [`DefinitionError`] with line and pointer of each mistake.
-    pub fn parse_toml(text: &str) -> Result<Self, DefinitionError> {
-        Self::from_toml(text)?.check(Some(text))
-    }
-
-    fn from_toml(text: &str) -> Result<Self, DefinitionError> {
-        let syntax = |error: &toml::de::Error, pointer: String| {
-            let line = error.span().map(|span| line_at(text, span.start));
-            DefinitionError { problems: vec![DefinitionProblem { pointer, line, message: one_line(error.message()) }] }
-        };
-        let document = toml::Deserializer::parse(text).map_err(|e| syntax(&e, String::new()))?;
-        serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), json_pointer(e.path())))
-    }
-
-    /// Reads and checks a TOML file whose table of runs is a file of its own, which `read` reads by its name.
-    ///
-    /// # Errors
-    /// [`DefinitionError`], as [`Self::parse_toml`].
-    pub fn parse_toml_beside(
-        text: &str,
-        read: impl Fn(&str) -> std::io::Result<String>,
-    ) -> Result<Self, DefinitionError> {
-        let mut definition = Self::from_toml(text)?;
-        definition.take_table(read)?;
-        definition.check(Some(text))
-    }
-
-    /// Reads and checks JSON.
-    ///
-    /// # Errors
-    /// [`DefinitionError`] with the pointer of each mistake.
-    pub fn parse_json(text: &str) -> Result<Self, DefinitionError> {
-        from_json::<Self>(text)?.check(None)
-    }
-
-    /// Reads and checks JSON whose table of runs is a file of its own, which `read` reads by its name.
-    ///
-    /// # Errors
-    /// [`DefinitionError`], as [`Self::parse_json`].
-    pub fn parse_json_beside(
-        text: &str,
-        read: impl Fn(&str) -> std::io::Result<String>,
-    ) -> Result<Self, DefinitionError> {
-        let mut definition: Self = from_json(text)?;
-        definition.take_table(read)?;
-        definition.check(None)
-    }
-
-    fn take_table(&mut self, read: impl Fn(&str) -> std::io::Result<String>) -> Result<(), DefinitionError> {
-        let Some(table) = &mut self.table else { return Ok(()) };
-        if let Some(file) = table.file.take_if(|_| table.csv.is_none()) {
-            let failed = |error: std::io::Error| DefinitionError {
-                problems: vec![DefinitionProblem::new(
-                    "/table/file",
-                    format!("{} cannot be read: {error}", shown(&file)),
-                )],
-            };
-            table.csv = Some(read(&file).map_err(failed)?);
-        }
-        Ok(())
-    }
-
-    /// The definition as JSON with its keys in a fixed order: equal definitions give equal text.
+    /// The definition as JSON with its keys in a fixed order, so that equal definitions give equal texts.
     pub fn canonical_json(&self) -> String {
         serde_json::to_string(self).expect("a definition is plain data")
     }
 
-    /// Digest of [`Self::canonical_json`]: the version of the structure.
+    /// Digest of [`Self::canonical_json`], which identifies the version of the structure.
     pub fn digest(&self) -> Digest {
         Digest::of(&[self.canonical_json().as_bytes()])
     }
-
-    /// With the line of each mistake where the text is TOML.
-    fn check(self, toml: Option<&str>) -> Result<Self, DefinitionError> {
-        match check::check(&self) {
-            Ok(_) => Ok(self),
-            Err(mut problems) => {
-                for problem in &mut problems {
-                    problem.line = toml.and_then(|text| toml_line(text, &problem.pointer));
-                }
-                Err(DefinitionError { problems })
-            }
-        }
-    }
 }
 
-fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, DefinitionError> {
-    let mut deserializer = serde_json::Deserializer::from_str(text);
-    let failed = |pointer: String, error: &serde_json::Error| DefinitionError {
-        problems: vec![DefinitionProblem { pointer, line: Some(error.line()), message: error.to_string() }],
-    };
-    let value =
-        serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(json_pointer(e.path()), e.inner()))?;
-    deserializer.end().map_err(|e| failed(String::new(), &e))?;
-    Ok(value)
-}
-
-fn one_line(message: &str) -> String {
-    message.split_whitespace().collect::<Vec<_>>().join(" ")
-}
-
-fn line_at(text: &str, offset: usize) -> usize {
-    text.as_bytes()[..offset.min(text.len())].split(|b| *b == b'\n').count()
-}
-
-/// Line of a pointer in a TOML text, or of the nearest thing above it that is there.
-fn toml_line(text: &str, pointer: &str) -> Option<usize> {
-    use toml::de::{DeTable, DeValue};
-    let document = DeTable::parse(text).ok()?;
-    let mut value = DeValue::Table(document.get_ref().clone());
-    let mut span: Range<usize> = document.span();
-    for segment in pointer.split('/').skip(1) {
-        let next = match &value {
-            DeValue::Table(table) => {
-                table.iter().find(|(key, _)| key.get_ref() == segment).map(|(key, value)| (key.span(), value.clone()))
-            }
-            DeValue::Array(items) => {
-                segment.parse::<usize>().ok().and_then(|i| items.get(i)).map(|item| (item.span(), item.clone()))
-            }
-            _ => None,
-        };
-        let Some((next_span, next_value)) = next else { break };
-        span = next_span;
-        value = next_value.into_inner();
-    }
-    Some(line_at(text, span.start))
-}
-
-/// One table or a list of tables, without losing the messages of either.
+/// Reads one table or a list of tables. Unlike an untagged enum, this keeps the error messages of both.
 fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<Sets>, D::Error> {
     struct OneOrMany;
     impl<'de> Visitor<'de> for OneOrMany {

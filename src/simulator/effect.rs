@@ -1,4 +1,4 @@
-//! Effects of a structure file: checked, and their sizes under measured covariates.
+//! Effects of a structure file: their checks, and their sizes under measured covariates.
 
 use std::collections::BTreeMap;
 
@@ -8,30 +8,32 @@ use rand_distr::StandardNormal;
 
 use super::definition::{DefinitionProblem, EffectDefinition, StructureDefinition, TargetDefinition};
 use super::law::{Input, Law, LawKind};
-use super::{Model, Simulator};
+use super::model::SimulationModel;
 use crate::measurement::{Covariate, CovariateKind, CovariateValue};
+use crate::parameter::ParameterSpace;
 use crate::physics::effect::Target;
 use crate::physics::{Node, Structure};
 use crate::quantity::shown;
 use crate::stats::Stream;
 
-/// A covariate may go beyond what the effect was learnt from by this share of the range before the reader is told.
+/// Share of the range of a covariate by which a value may lie outside the values that the effect was learnt from before it is
+/// reported and clamped.
 const BEYOND: f64 = 0.1;
 
-/// An effect of a structure, ready for use.
+/// A checked effect of a structure file.
 #[derive(Debug, Clone)]
-pub struct Effect {
-    /// Its name.
+pub struct SimulationEffect {
+    /// Its unique name.
     pub name: String,
     /// What changes.
     pub target: Target,
-    /// By how much.
+    /// Size of the change as a function of the covariate.
     pub law: Law,
-    /// Means of the numbers, in the order of the law; then the frequency of an oscillator.
+    /// Means of the coefficients ψ, in the order of the law; for an oscillator followed by its frequency, Hz.
     pub psi: Vec<f64>,
-    /// Lower factor of their covariance; `None` where they are exact.
+    /// Cholesky factor of the covariance of the coefficients; `None` if they are exact.
     factor: Option<DMatrix<f64>>,
-    /// Values of a numeric covariate that it was learnt from, ascending.
+    /// Values of a numeric covariate that the effect was learnt from, ascending.
     seen: Vec<f64>,
 }
 
@@ -40,25 +42,25 @@ pub struct Effect {
 pub struct Sizes {
     /// All sizes, those of the first effect first.
     pub values: Vec<f64>,
-    /// Covariates that an effect needs and the measurement lacks.
+    /// Covariates that an effect needs but that are missing in the measurement.
     pub missing: Vec<String>,
-    /// Covariates beyond what an effect was learnt from.
+    /// Covariates whose value lies outside the range that an effect was learnt from.
     pub beyond: Vec<String>,
 }
 
-impl Effect {
-    /// Whether it depends on a covariate, and so is a condition of a flow.
+impl SimulationEffect {
+    /// Whether the effect depends on a covariate, so that a flow must be conditioned on its size.
     pub fn varies(&self) -> bool {
         self.law.covariate.is_some()
     }
 
-    /// Standard deviation of each number; 0 where it is exact.
+    /// Standard deviation of each coefficient; 0 if it is exact.
     pub fn psi_std(&self) -> Vec<f64> {
         let of = |i: usize| self.factor.as_ref().map_or(0.0, |factor| factor.row(i).norm());
         (0..self.psi.len()).map(of).collect()
     }
 
-    /// Its sizes at one value of the covariate with the numbers `psi`.
+    /// Sizes at one value of the covariate with the coefficients `psi`.
     fn sizes_at(&self, input: Input, psi: &[f64]) -> Vec<f64> {
         match self.target {
             Target::ModeOrder(_) => Vec::new(),
@@ -67,12 +69,13 @@ impl Effect {
         }
     }
 
-    /// Its sizes at one value of the covariate.
+    /// Sizes at one value of the covariate with the mean coefficients.
     pub fn sizes(&self, input: Input) -> Vec<f64> {
         self.sizes_at(input, &self.psi)
     }
 
-    /// Inputs that stand for not knowing the covariate: what it was learnt from.
+    /// The values of the covariate over which the effect is marginalised if the covariate is missing: those that the effect was
+    /// learnt from.
     pub fn inputs_seen(&self) -> Vec<Input> {
         if self.law.covariate.is_none() {
             return vec![Input::Number(0.0)];
@@ -83,7 +86,7 @@ impl Effect {
         self.seen.iter().map(|v| Input::Number(*v)).collect()
     }
 
-    /// Its sizes at an input with numbers drawn from what is known of them.
+    /// Sizes at one value of the covariate with coefficients drawn from their normal distribution.
     pub fn draw_sizes(&self, input: Input, stream: &mut Stream) -> Vec<f64> {
         let Some(factor) = &self.factor else { return self.sizes(input) };
         let normal = DVector::from_fn(self.psi.len(), |_, _| stream.sample::<f64, _>(StandardNormal));
@@ -91,7 +94,8 @@ impl Effect {
         self.sizes_at(input, psi.as_slice())
     }
 
-    /// The covariate of a measurement as the law takes it, within what it was learnt from; whether it lies beyond.
+    /// The covariate of a measurement as an input of the law, clamped to the range that the effect was learnt from; and whether
+    /// it lies outside this range.
     fn input(&self, covariates: &BTreeMap<String, CovariateValue>) -> (Input, bool) {
         let Some(name) = &self.law.covariate else { return (Input::Number(0.0), false) };
         match covariates.get(name) {
@@ -102,7 +106,7 @@ impl Effect {
             Some(CovariateValue::Number(value)) => {
                 let (low, high) = (self.seen[0], self.seen[self.seen.len() - 1]);
                 let margin = BEYOND * (high - low);
-                // A sensor that sends 9999 must not become a structure without stiffness.
+                // A faulty sensor that reports 9999 must not lead to a structure without stiffness.
                 let within = value.clamp(low - margin, high + margin);
                 (Input::Number(within), !(low - margin..=high + margin).contains(value))
             }
@@ -110,9 +114,9 @@ impl Effect {
     }
 }
 
-/// Sizes of all effects under the covariates of a measurement; an effect whose covariate is missing has the mean of its
-/// sizes over what it was learnt from.
-pub fn sizes(effects: &[Effect], covariates: &BTreeMap<String, CovariateValue>) -> Sizes {
+/// Sizes of all effects under the covariates of a measurement. An effect whose covariate is missing has the mean of its sizes
+/// over the values that it was learnt from.
+pub fn sizes(effects: &[SimulationEffect], covariates: &BTreeMap<String, CovariateValue>) -> Sizes {
     let mut found = Sizes::default();
     for effect in effects {
         let name = || effect.law.covariate.clone().unwrap_or_default();
@@ -134,12 +138,16 @@ pub fn sizes(effects: &[Effect], covariates: &BTreeMap<String, CovariateValue>) 
     found
 }
 
-/// Sizes of all effects at each of the values that missing covariates may have.
-pub fn possible_sizes(effects: &[Effect], covariates: &BTreeMap<String, CovariateValue>) -> Vec<Vec<f64>> {
-    let missing = |e: &&Effect| e.law.covariate.as_ref().is_some_and(|name| !covariates.contains_key(name));
+/// Sizes of all effects, one entry `[sizes]` for each value that the missing covariates of a measurement can have. Empty if none
+/// is missing.
+pub fn marginalised_sizes(
+    effects: &[SimulationEffect],
+    covariates: &BTreeMap<String, CovariateValue>,
+) -> Vec<Vec<f64>> {
+    let missing = |e: &&SimulationEffect| e.law.covariate.as_ref().is_some_and(|name| !covariates.contains_key(name));
     let count = effects.iter().filter(missing).map(|e| e.inputs_seen().len()).max().unwrap_or(0);
     let at = |step: usize| -> Vec<f64> {
-        let one = |effect: &Effect| match effect.input(covariates) {
+        let one = |effect: &SimulationEffect| match effect.input(covariates) {
             (Input::Missing, _) => {
                 let inputs = effect.inputs_seen();
                 effect.sizes(inputs[step * inputs.len() / count])
@@ -151,9 +159,9 @@ pub fn possible_sizes(effects: &[Effect], covariates: &BTreeMap<String, Covariat
     (0..count).map(at).collect()
 }
 
-/// Values of all covariates that effects depend on, as training draws them: numbers anywhere in the range that was seen, with
-/// a margin, and each category alike, those without a number of their own as one.
-pub fn draw_covariates(effects: &[Effect], stream: &mut Stream) -> BTreeMap<String, CovariateValue> {
+/// Draws the values of all covariates that effects depend on, for training. Numbers are uniform in the range that the effects
+/// were learnt from, with a margin. Categories are equally probable; all categories without a coefficient count as one.
+pub fn draw_covariates(effects: &[SimulationEffect], stream: &mut Stream) -> BTreeMap<String, CovariateValue> {
     let mut names: Vec<&String> = effects.iter().filter_map(|e| e.law.covariate.as_ref()).collect();
     names.sort();
     names.dedup();
@@ -176,28 +184,33 @@ pub fn draw_covariates(effects: &[Effect], stream: &mut Stream) -> BTreeMap<Stri
     names.into_iter().map(draw).collect()
 }
 
-/// Sizes under covariates with numbers drawn from what is known of them.
-pub fn draw_sizes(effects: &[Effect], covariates: &BTreeMap<String, CovariateValue>, stream: &mut Stream) -> Vec<f64> {
+/// Sizes of all effects under given covariates, with coefficients drawn from their normal distributions.
+pub fn draw_sizes(
+    effects: &[SimulationEffect],
+    covariates: &BTreeMap<String, CovariateValue>,
+    stream: &mut Stream,
+) -> Vec<f64> {
     effects.iter().flat_map(|effect| effect.draw_sizes(effect.input(covariates).0, stream)).collect()
 }
 
-/// Sizes where nothing is known of the covariates.
-pub fn typical_sizes(effects: &[Effect]) -> Vec<f64> {
+/// Mean sizes of all effects over the covariate values that they were learnt from.
+pub fn typical_sizes(effects: &[SimulationEffect]) -> Vec<f64> {
     effects.iter().flat_map(mean_sizes).collect()
 }
 
-fn mean_sizes(effect: &Effect) -> Vec<f64> {
+/// Mean sizes of one effect over the covariate values that it was learnt from.
+fn mean_sizes(effect: &SimulationEffect) -> Vec<f64> {
     let all: Vec<Vec<f64>> = effect.inputs_seen().into_iter().map(|input| effect.sizes(input)).collect();
     (0..effect.target.sizes()).map(|i| all.iter().map(|s| s[i]).sum::<f64>() / all.len() as f64).collect()
 }
 
-/// Checks the effects of a definition whose other parts are right.
+/// Checks the effects of a definition whose other sections have no mistakes.
 pub(super) fn check(
     definition: &StructureDefinition,
-    model: &Model,
+    model: &SimulationModel,
     covariates: &[Covariate],
     problems: &mut Vec<DefinitionProblem>,
-) -> Vec<Effect> {
+) -> Vec<SimulationEffect> {
     let one = |(index, effect): (usize, &EffectDefinition)| {
         check_one(definition, effect, model, covariates)
             .map_err(|(key, message)| problems.push(DefinitionProblem::new(format!("/effect/{index}/{key}"), message)))
@@ -206,31 +219,32 @@ pub(super) fn check(
     definition.effects.iter().enumerate().filter_map(one).collect()
 }
 
+/// Key of the effect that is wrong, and the message.
 type Mistake = (&'static str, String);
 
 fn check_one(
     definition: &StructureDefinition,
     effect: &EffectDefinition,
-    model: &Model,
+    model: &SimulationModel,
     covariates: &[Covariate],
-) -> Result<Effect, Mistake> {
+) -> Result<SimulationEffect, Mistake> {
     let target = check_target(&effect.target, model, definition)?;
     let constant = matches!(effect.law, LawKind::Constant);
     if matches!(effect.law, LawKind::Step | LawKind::Lagged) {
         let message = format!(
-            "the law {} needs the history of what came before, which an assessment does not have: use another",
+            "the law {} needs the history of its covariate, which an assessment does not have: use another law",
             effect.law.name()
         );
         return Err(("law", message));
     }
     if !constant && matches!(target, Target::Oscillator(_) | Target::ModeOrder(_)) {
-        return Err(("law", "an oscillator and an order of modes are constant".to_owned()));
+        return Err(("law", "an oscillator and an order of modes need the law constant".to_owned()));
     }
     let covariate = effect.covariate.as_ref();
     let declared = covariate.map(|name| covariates.iter().find(|c| c.name == *name));
     match (constant, declared) {
         (true, None) => {}
-        (true, Some(_)) => return Err(("covariate", "a constant has no covariate".to_owned())),
+        (true, Some(_)) => return Err(("covariate", "the law constant takes no covariate: remove it".to_owned())),
         (false, None) => return Err(("covariate", format!("the law {} needs a covariate", effect.law.name()))),
         (false, Some(None)) => {
             let name = covariate.map_or_else(String::new, |name| shown(name));
@@ -241,7 +255,11 @@ fn check_one(
             if declared.kind != wanted {
                 return Err((
                     "covariate",
-                    format!("the law {} takes a covariate of the other kind", effect.law.name()),
+                    format!(
+                        "the law {} needs a covariate of kind {}",
+                        effect.law.name(),
+                        if effect.law == LawKind::Category { "category" } else { "number" }
+                    ),
                 ));
             }
         }
@@ -259,38 +277,43 @@ fn check_one(
     let mut sorted = wanted.clone();
     sorted.sort();
     if given != sorted.iter().collect::<Vec<_>>() || (category && given.is_empty()) {
-        let message = format!("the numbers of this effect are {}; \"level\" may be left out", wanted.join(", "));
+        let message = if category {
+            "a law by category needs one number for each category that has an effect".to_owned()
+        } else {
+            format!("the numbers of this effect must be {}; \"level\" is optional", wanted.join(", "))
+        };
         return Err(("numbers", message));
     }
     if let Some((name, value)) = effect.numbers.iter().find(|(_, v)| !v.is_finite()) {
         return Err(("numbers", format!("{name} is {value}: it must be finite")));
     }
     let seen = check_seen(effect, category || constant)?;
-    let place = |name: &String| given.iter().position(|g| *g == name).unwrap_or_default();
-    let factor = check_covariance(effect, &wanted.iter().map(place).collect::<Vec<_>>())?;
+    let position = |name: &String| given.iter().position(|g| *g == name).unwrap_or_default();
+    let factor = check_covariance(effect, &wanted.iter().map(position).collect::<Vec<_>>())?;
     let psi = wanted.iter().map(|name| effect.numbers[name]).collect();
     if !law.reference.is_finite() {
-        return Err(("reference", format!("{} must be finite", law.reference)));
+        return Err(("reference", format!("a reference of {} is not valid: it must be finite", law.reference)));
     }
-    Ok(Effect { name: effect.name.clone(), target, law, psi, factor, seen })
+    Ok(SimulationEffect { name: effect.name.clone(), target, law, psi, factor, seen })
 }
 
+/// Checks the covariate values that the effect was learnt from; `none` for a law that has none.
 fn check_seen(effect: &EffectDefinition, none: bool) -> Result<Vec<f64>, Mistake> {
     let seen = &effect.seen;
     if none {
-        let message = || "only a numeric covariate has values that were seen".to_owned();
+        let message = || "only an effect of a numeric covariate has seen: remove it".to_owned();
         return if seen.is_empty() { Ok(Vec::new()) } else { Err(("seen", message())) };
     }
     let ascending = seen.windows(2).all(|w| w[0] <= w[1]) && seen.iter().all(|v| v.is_finite());
     let wide = seen.len() >= 2 && seen[0] < seen[seen.len() - 1];
     if !(ascending && wide) {
-        let message = "at least two finite values of the covariate, ascending: what the effect was learnt from";
+        let message = "seen needs at least two finite values of the covariate in ascending order: those that the effect was learnt from";
         return Err(("seen", message.to_owned()));
     }
     Ok(seen.clone())
 }
 
-/// Lower factor of the covariance, reordered by `order`.
+/// Cholesky factor of the covariance of the coefficients, with its rows reordered by `order`; `None` without a covariance.
 fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option<DMatrix<f64>>, Mistake> {
     let rows = &effect.covariance;
     let n = order.len();
@@ -300,19 +323,19 @@ fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option
     let wrong = || {
         (
             "covariance",
-            format!("{n} rows of {n} finite numbers, positive semidefinite, in the order of the names of the numbers"),
+            format!("the covariance must have {n} rows of {n} finite numbers, ordered by the names of the numbers, and be positive semidefinite"),
         )
     };
     if rows.len() != n || rows.iter().any(|row| row.len() != n || row.iter().any(|v| !v.is_finite())) {
         return Err(wrong());
     }
     let matrix = DMatrix::from_fn(n, n, |i, j| rows[order[i]][order[j]]);
-    // A number of the law may be far smaller than another: what counts are correlations.
+    // The coefficients of a law can differ by orders of magnitude, so that correlations are factorised.
     let scale: Vec<f64> = (0..n).map(|i| matrix[(i, i)].max(0.0).sqrt()).collect();
     let share = DMatrix::from_fn(n, n, |i, j| {
         let product = scale[i] * scale[j];
         let correlation = if product > 0.0 { matrix[(i, j)] / product } else { 0.0 };
-        // A little on the diagonal: rounding in a file must not make a covariance negative.
+        // A small addition to the diagonal keeps the matrix positive definite despite the rounding of numbers in a file.
         correlation + f64::from(u8::from(i == j)) * 1e-9
     });
     let zero_diagonal = (0..n).any(|i| matrix[(i, i)] < 0.0);
@@ -320,24 +343,26 @@ fn check_covariance(effect: &EffectDefinition, order: &[usize]) -> Result<Option
     Ok(Some(DMatrix::from_fn(n, n, |i, j| scale[i] * factor[(i, j)])))
 }
 
-fn check_target(target: &TargetDefinition, model: &Model, definition: &StructureDefinition) -> Result<Target, Mistake> {
+/// Checks the target of an effect.
+fn check_target(
+    target: &TargetDefinition,
+    model: &SimulationModel,
+    definition: &StructureDefinition,
+) -> Result<Target, Mistake> {
     let modes = definition.modes;
     let wrong = |message: String| ("target", message);
     let one_mode = |mode: usize| match mode {
         0 => Ok(None),
         mode if mode <= modes => Ok(Some(mode - 1)),
-        _ => Err(wrong(format!("mode {mode}: the structure has {modes} modes; 0 stands for all"))),
+        _ => Err(wrong(format!("mode {mode}: the structure has {modes} modes; 0 means all of them"))),
     };
-    let available = match model {
-        Model::Matrices { structure, .. } => structure.freedoms(),
-        Model::Table(table) => table.emulator().modes(),
-    };
+    let available = model.available_modes();
     match target {
         TargetDefinition::FrequencyScale(mode) => Ok(Target::FrequencyScale(one_mode(*mode)?)),
         TargetDefinition::FrequencyOffset(mode) => Ok(Target::FrequencyOffset(one_mode(*mode)?)),
         TargetDefinition::Parameter(name) => {
-            let place = definition.parameters.iter().position(|p| p.name == *name);
-            place.map(Target::ParameterScale).ok_or_else(|| wrong(format!("there is no parameter {}", shown(name))))
+            let column = definition.parameters.iter().position(|p| p.name == *name);
+            column.map(Target::ParameterScale).ok_or_else(|| wrong(format!("there is no parameter {}", shown(name))))
         }
         TargetDefinition::ModeOrder(order) => {
             let mut sorted = order.clone();
@@ -346,33 +371,35 @@ fn check_target(target: &TargetDefinition, model: &Model, definition: &Structure
             let valid =
                 sorted.len() == modes && order.len() == modes && order.iter().all(|m| (1..=available).contains(m));
             if !valid {
-                return Err(wrong(format!("{modes} different modes from 1 to {available}")));
+                return Err(wrong(format!("mode_order must list {modes} different modes from 1 to {available}")));
             }
             Ok(Target::ModeOrder(order.iter().map(|m| m - 1).collect()))
         }
         _ => match model {
-            Model::Matrices { structure, .. } => check_part(target, structure).map_err(wrong),
-            Model::Table(_) => Err(wrong("a table has no springs and masses: name a parameter".to_owned())),
+            SimulationModel::Matrices { structure, .. } => check_part(target, structure).map_err(wrong),
+            SimulationModel::Table(_) => Err(wrong("a table has no springs or masses: name a parameter".to_owned())),
         },
     }
 }
 
-/// A target among the parts of a structure.
+/// Checks a target that is a part of a structure.
 fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target, String> {
     let mass = |name: &String| {
-        let place = structure.masses().iter().position(|m| m.name == *name);
-        place.ok_or_else(|| format!("there is no mass {}", shown(name)))
+        let index = structure.masses().iter().position(|m| m.name == *name);
+        index.ok_or_else(|| format!("there is no mass {}", shown(name)))
     };
     let spring = |name: &String| {
-        let place = structure.springs().iter().position(|s| s.name == *name);
-        place.ok_or_else(|| format!("there is no spring {}", shown(name)))
+        let index = structure.springs().iter().position(|s| s.name == *name);
+        index.ok_or_else(|| format!("there is no spring {}", shown(name)))
     };
-    let freedom = |name: &String| {
-        let place = structure.places().iter().find(|place| place.name == *name);
-        place.map(|place| place.freedom).ok_or_else(|| format!("there is nothing {} to attach to", shown(name)))
+    let dof = |name: &String| {
+        let point = structure.attachment_points().iter().find(|point| point.name == *name);
+        point
+            .map(|point| point.dof)
+            .ok_or_else(|| format!("there is no mass or free node {} to attach to", shown(name)))
     };
-    let node = |name: &String| if name == "ground" { Ok(Node::Ground) } else { freedom(name).map(Node::Freedom) };
-    let some = |count: usize| if count > 0 { Ok(()) } else { Err("name at least one".to_owned()) };
+    let node = |name: &String| if name == "ground" { Ok(Node::Ground) } else { dof(name).map(Node::Dof) };
+    let some = |count: usize| if count > 0 { Ok(()) } else { Err("name at least one spring or mass".to_owned()) };
     match target {
         TargetDefinition::Springs(names) => {
             some(names.len())?;
@@ -382,24 +409,34 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
             some(names.len())?;
             Ok(Target::Masses(names.iter().map(mass).collect::<Result<_, _>>()?))
         }
-        TargetDefinition::AddedSpring([a, b]) if a == b => Err("a spring from a node to itself".to_owned()),
+        TargetDefinition::AddedSpring([a, b]) if a == b => {
+            Err("the added spring goes from a node to itself: name two different nodes".to_owned())
+        }
         TargetDefinition::AddedSpring([a, b]) => Ok(Target::AddedSpring(node(a)?, node(b)?)),
-        TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(freedom(host)?)),
+        TargetDefinition::Oscillator(host) => Ok(Target::Oscillator(dof(host)?)),
         TargetDefinition::FrequencyScale(_)
         | TargetDefinition::FrequencyOffset(_)
         | TargetDefinition::Parameter(_)
-        | TargetDefinition::ModeOrder(_) => unreachable!("no part of a structure"),
+        | TargetDefinition::ModeOrder(_) => {
+            unreachable!("check_target handles targets that are not parts of a structure")
+        }
     }
 }
 
-/// A target as a structure file writes it; `None` for a setting, which acts on what the experimenter says, not on the
-/// structure.
-pub fn target_definition(target: &Target, simulator: &Simulator) -> Option<TargetDefinition> {
-    let structure = || simulator.structure().expect("only a structure has parts to name");
+/// A target as it is written in a structure file. `None` for a setting, which is not part of the structure.
+///
+/// # Panics
+/// If the target acts on a part and `structure` is `None`, as for a table: a bug of the caller.
+pub fn target_definition(
+    target: &Target,
+    structure: Option<&Structure>,
+    space: &ParameterSpace,
+) -> Option<TargetDefinition> {
+    let structure = || structure.expect("only a structure has parts");
     let springs = |indices: &[usize]| indices.iter().map(|i| structure().springs()[*i].name.clone()).collect();
     let masses = |indices: &[usize]| indices.iter().map(|i| structure().masses()[*i].name.clone()).collect();
     let node = |node: Node| structure().node_name(node).to_owned();
-    let parameter = |column: usize| simulator.space().as_slice()[column].name.clone();
+    let parameter = |column: usize| space.as_slice()[column].name.clone();
     let mode = |mode: &Option<usize>| mode.map_or(0, |m| m + 1);
     match target {
         Target::Springs(indices) => Some(TargetDefinition::Springs(springs(indices))),
@@ -407,7 +444,7 @@ pub fn target_definition(target: &Target, simulator: &Simulator) -> Option<Targe
         Target::FrequencyScale(m) => Some(TargetDefinition::FrequencyScale(mode(m))),
         Target::FrequencyOffset(m) => Some(TargetDefinition::FrequencyOffset(mode(m))),
         Target::AddedSpring(a, b) => Some(TargetDefinition::AddedSpring([node(*a), node(*b)])),
-        Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Freedom(*host)))),
+        Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Dof(*host)))),
         Target::ModeOrder(order) => Some(TargetDefinition::ModeOrder(order.iter().map(|m| m + 1).collect())),
         Target::ParameterScale(column) => Some(TargetDefinition::Parameter(parameter(*column))),
         Target::SettingOffset(_) | Target::SettingScale(_) => None,

@@ -1,11 +1,11 @@
-//! Laws of effects: the size of an effect as a function of a covariate.
+//! Laws: the size g of an effect as a function of a covariate c.
 
 use serde::{Deserialize, Serialize};
 
-/// Rate times distance below which an exponential is taken by its series.
+/// Value of |rate·u| below which the exponential law is computed from its Taylor series.
 const SERIES: f64 = 1e-4;
 
-/// Form of a law. u = c − reference.
+/// Form of a law, with u = c − reference.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LawKind {
@@ -19,44 +19,44 @@ pub enum LawKind {
     Quadratic,
     /// g = level + slope·(exp(rate·u) − 1)/rate.
     Exponential,
-    /// g = the number of the category; 0 for categories that are not named.
+    /// g = the coefficient of the category; 0 for a category without a coefficient.
     Category,
-    /// g = size from the time `reference` on.
+    /// g = size from the time `reference` on, 0 before.
     Step,
-    /// g = level + slope·(c̃ − reference), c̃ the covariate after a first-order lag: dc̃/dt = (c − c̃)/lag.
+    /// g = level + slope·(c̃ − reference), where c̃ is the covariate after a first-order lag: dc̃/dt = (c − c̃)/lag.
     Lagged,
 }
 
-/// A law with what is not fitted: its covariate, its reference, its categories.
+/// A law with everything except its coefficients ψ.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
-    /// Its form.
+    /// Form of the law.
     pub kind: LawKind,
-    /// Name of the covariate; `None` for a constant, `time` for a step.
+    /// Name of the covariate: `None` for a constant, `time` for a step.
     pub covariate: Option<String>,
-    /// Value of the covariate at which g = level; for a step the time in days.
+    /// Value of the covariate at which g = level; for a step its time in days.
     pub reference: f64,
-    /// Whether the law has a level of its own, or it is 0.
+    /// Whether the level is a coefficient; otherwise it is 0.
     pub with_level: bool,
-    /// Categories that have a number, for [`LawKind::Category`].
+    /// Categories that have a coefficient, for [`LawKind::Category`].
     pub levels: Vec<String>,
 }
 
-/// One value of a covariate, as a law takes it.
+/// One value of a covariate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Input {
-    /// A number; days for time.
+    /// A number; for time in days.
     Number(f64),
-    /// A number after its lag, and its derivative by the lag, per day.
+    /// A number after a first-order lag, and its derivative with respect to the lag, per day.
     Lagged(f64, f64),
-    /// Index in the law's `levels`, or none of them.
+    /// Index of a category in [`Law::levels`]; `None` for a category without a coefficient.
     Level(Option<usize>),
-    /// Not known: only the level acts then.
+    /// Unknown: the effect then consists of its level alone.
     Missing,
 }
 
 impl LawKind {
-    /// As in files.
+    /// Name in structure files.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Constant => "constant",
@@ -70,7 +70,7 @@ impl LawKind {
         }
     }
 
-    /// Names of its numbers, the level first; a category has one of each level instead.
+    /// Names of the coefficients, the level first; empty for a law by category, whose coefficients are named after the categories.
     pub const fn numbers(self) -> &'static [&'static str] {
         match self {
             Self::Constant | Self::Step => &["size"],
@@ -83,14 +83,14 @@ impl LawKind {
         }
     }
 
-    /// Whether it can have a level.
+    /// Whether the law can have a level.
     pub fn has_level(self) -> bool {
         self.numbers().first() == Some(&"level")
     }
 }
 
 impl Law {
-    /// Names of the numbers ψ that it takes, in order.
+    /// Names of the coefficients ψ, in order.
     pub fn numbers(&self) -> Vec<String> {
         if self.kind == LawKind::Category {
             return self.levels.clone();
@@ -99,14 +99,15 @@ impl Law {
         self.kind.numbers()[skipped..].iter().map(ToString::to_string).collect()
     }
 
-    /// Size g of the effect and its derivatives ∂g/∂ψ, at one value of the covariate.
+    /// Returns the size g of the effect at one value of the covariate for the coefficients `psi`, and writes its derivatives ∂g/∂ψ
+    /// to `slopes`. Both slices are as long as [`Self::numbers`]. The formulas are those of [`LawKind`].
     ///
     /// # Panics
-    /// When `psi` or `slopes` is not as long as [`Self::numbers`].
+    /// If `psi` or `slopes` is too short.
     pub fn size(&self, input: Input, psi: &[f64], slopes: &mut [f64]) -> f64 {
         slopes.fill(0.0);
         let c = match input {
-            // The level needs no covariate.
+            // The level does not depend on the covariate.
             Input::Missing if self.with_level && self.kind.has_level() => {
                 slopes[0] = 1.0;
                 return psi[0];
@@ -156,7 +157,7 @@ impl Law {
                 }
                 LawKind::Exponential => {
                     let x = psi[1] * u;
-                    // (eˣ − 1)/x and its derivative by x.
+                    // (eˣ − 1)/x and its derivative with respect to x.
                     let (shape, slope) = if x.abs() < SERIES {
                         (1.0 + x / 2.0 + x * x / 6.0, 0.5 + x / 3.0)
                     } else {
@@ -177,8 +178,8 @@ impl Law {
     }
 }
 
-/// A covariate after a first-order lag, and its derivative by the lag, at increasing times; values that are missing (NaN)
-/// leave it where it was.
+/// A covariate after a first-order lag τ, and its derivative with respect to τ (per day), at ascending times. Missing values
+/// (NaN) leave both unchanged. All slices are `[n]`.
 ///
 /// ```text
 ///  c̃_j = c̃_{j−1} + (1 − e^{−Δ/τ}) (c_j − c̃_{j−1}),    c̃_0 = c_0

@@ -1,48 +1,48 @@
-//! Populations to simulate measurements from: a normal distribution for each parameter.
+//! Populations from which measurements are simulated: an independent normal distribution for each parameter.
 
 use nalgebra::DMatrix;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
-use super::{Error as SimulationError, Simulator};
+use super::simulate::{Error as SimulationError, Simulator};
 use crate::parameter::ParameterSpace;
 use crate::quantity::shown;
 use crate::stats;
 
-/// Mean and standard deviation of each parameter, independent and normal.
+/// Independent normal distributions of the parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Population {
     mean: Vec<f64>,
     std: Vec<f64>,
 }
 
-/// Measurements of a population, and the parameters behind them.
+/// Simulated measurements of a population, and the parameters that they were simulated with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SimulatedMeasurements {
-    /// Parameters of each measurement, `[n, d]`.
+    /// Parameters of each measurement, `[n, d]`, parameter units.
     pub theta: DMatrix<f64>,
     /// Measured frequencies, Hz, `[n, m]`.
     pub frequencies_hz: DMatrix<f64>,
 }
 
-/// Why there is no population.
+/// Why a population is not valid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// A name that is no parameter.
+    /// A name is not that of a parameter.
     #[error("{} is no parameter: the parameters are {known}", shown(.name))]
     Unknown {
         /// The name given.
         name: String,
-        /// The names there are.
+        /// Names of the parameters.
         known: String,
     },
-    /// A parameter given twice.
+    /// A parameter is given twice.
     #[error("parameter {0} is given twice")]
     Repeated(String),
-    /// A parameter not given.
+    /// A parameter is not given.
     #[error("parameter {0} is not given: a population needs mean and std of every parameter")]
     Missing(String),
-    /// Moments that are none.
+    /// A mean or standard deviation is not valid.
     #[error("parameter {name} has mean {mean} and std {std}: both must be finite, std not negative")]
     Moments {
         /// Name of the parameter.
@@ -55,10 +55,10 @@ pub enum Error {
 }
 
 impl Population {
-    /// From (name, mean, std) of every parameter, in any order, in parameter units.
+    /// Builds a population from (name, mean, standard deviation) of every parameter, in any order, in parameter units.
     ///
     /// # Errors
-    /// [`Error`] naming the parameter.
+    /// [`Error`] with the name of the parameter.
     pub fn new(space: &ParameterSpace, moments: &[(String, f64, f64)]) -> Result<Self, Error> {
         let mut given: Vec<Option<(f64, f64)>> = vec![None; space.len()];
         for (name, mean, std) in moments {
@@ -80,12 +80,12 @@ impl Population {
         Ok(Self { mean, std })
     }
 
-    /// Draws measurements with `noise_multiple` times the structure's measurement noise; 0 makes them exact.
-    ///
-    /// The draws are not cut off at the prior: a population may leave it, as a damaged one does.
+    /// Draws `measurements` measurements with `noise_multiple` times the measurement noise of the structure; 0 gives exact
+    /// frequencies. The draws are not truncated at the prior, because a damaged population can leave it.
     ///
     /// # Errors
-    /// [`SimulationError`] for a draw that gives a negative stiffness or a mechanism.
+    /// [`SimulationError`] for a draw that gives a negative stiffness or a mechanism, and for noise that leaves no positive
+    /// frequency.
     pub fn draw(
         &self,
         simulator: &Simulator,

@@ -1,4 +1,4 @@
-//! The user's own finite-element runs as a simulation.
+//! Simulation by an emulator of the user's own finite-element runs.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,23 +10,22 @@ use crate::emulator::{Emulator, FitError, Runs};
 use crate::parameter::ParameterSpace;
 use crate::quantity::{shown, Digest};
 
-/// How far beyond the runs a prior may reach, as a share of their range: a Latin hypercube leaves that much of its edges
-/// empty.
+/// Share of the range of the runs by which a prior may extend beyond them: a Latin hypercube does not sample its edges.
 const BEYOND: f64 = 0.02;
 
-/// Most runs, and most parameters and modes: fitting grows with the products.
+/// Largest number of runs, and of parameters and modes: the time for fitting grows with their product.
 const MOST_RUNS: usize = 5_000;
 const MOST_COLUMNS: usize = 50;
 
-/// Column that may stand beside parameters and frequencies, to number the runs.
+/// Optional column that numbers the runs.
 const RUN_COLUMN: &str = "run";
 
-/// Emulators kept in memory: a definition is read several times, and fitting thousands of runs takes a while.
-const MOST_KEPT: usize = 16;
+/// Largest number of emulators in the cache. A definition is read several times, and fitting thousands of runs takes long.
+const MOST_CACHED: usize = 16;
 
-static KEPT: Mutex<BTreeMap<String, Arc<Emulator>>> = Mutex::new(BTreeMap::new());
+static CACHE: Mutex<BTreeMap<String, Arc<Emulator>>> = Mutex::new(BTreeMap::new());
 
-/// An emulator of all frequencies in a table, of which a structure measures the first few.
+/// An emulator of all frequencies in a table, of which the lowest are measured.
 #[derive(Debug, Clone)]
 pub struct Table {
     emulator: Arc<Emulator>,
@@ -39,14 +38,15 @@ impl Table {
         &self.emulator
     }
 
-    /// Number of runs it was made of.
+    /// Number of runs that it was fitted to.
     pub fn runs(&self) -> usize {
         self.runs
     }
 
-    /// All frequencies of the table at `theta`, Hz.
+    /// All frequencies of the table at parameters `theta` (`[d]`), Hz, `[modes]`.
     ///
-    /// Polynomials run wild beyond the points they were fitted to: beyond the runs' range ln f goes on as a straight line.
+    /// Polynomials diverge outside the points that they were fitted to. Outside the range of the runs, ln f is therefore
+    /// extrapolated linearly from the nearest point of that range.
     pub fn frequencies_hz(&self, theta: &[f64]) -> Vec<f64> {
         if self.within(theta) {
             return self.emulator.frequencies_hz(theta);
@@ -54,7 +54,7 @@ impl Table {
         self.frequencies_and_jacobian(theta).0
     }
 
-    /// The same with derivatives, Hz per parameter unit, `[m, d]`.
+    /// [`Self::frequencies_hz`] and their derivatives, Hz per parameter unit, `[modes, d]`.
     pub fn frequencies_and_jacobian(&self, theta: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
         if self.within(theta) {
             return self.emulator.frequencies_and_jacobian(theta);
@@ -70,8 +70,8 @@ impl Table {
         (frequencies, jacobian)
     }
 
-    /// Whether there are no runs at `theta`: beyond their range by more than a Latin hypercube leaves empty, or in a corner
-    /// without any.
+    /// Whether there are no runs near parameters `theta` (`[d]`): outside their range by more than a Latin hypercube leaves
+    /// unsampled, or outside their convex hull by more than the emulator allows.
     pub fn is_outside(&self, theta: &[f64]) -> bool {
         let ranges = || theta.iter().zip(self.emulator.ranges());
         let beyond = |(x, [low, high]): (&f64, [f64; 2])| {
@@ -82,11 +82,12 @@ impl Table {
         ranges().any(beyond) || self.emulator.is_outside(&edge)
     }
 
+    /// Whether the parameters are inside the range of the runs.
     fn within(&self, theta: &[f64]) -> bool {
         theta.iter().zip(self.emulator.ranges()).all(|(x, [low, high])| (low..=high).contains(x))
     }
 
-    /// Frequencies in the middle of the prior, Hz.
+    /// Frequencies in the middle of the prior, Hz, `[modes]`.
     pub(super) fn nominal_frequencies_hz(&self, space: &ParameterSpace, modes: usize) -> Vec<f64> {
         let middle: Vec<f64> = space.iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
         let mut frequencies = self.frequencies_hz(&middle);
@@ -94,13 +95,13 @@ impl Table {
         frequencies
     }
 
-    /// What a user should know of it before relying on it.
+    /// Warnings about crossing modes and about modes that the emulator predicts poorly.
     pub(super) fn warnings(&self, modes: usize) -> Vec<String> {
         let emulator = &self.emulator;
         let crossing = |c: &crate::emulator::Crossing| {
             format!(
-                "modes {} and {} of the runs cross or veer: {:.2} % apart in run {}; the emulator is least sure there, and a \
-                 measurement can have the two the other way round",
+                "modes {} and {} of the runs cross or veer: they are {:.2} % apart in run {}; the emulator is least accurate \
+                 there, and a measurement can have the two modes in the opposite order",
                 c.lower_mode + 1,
                 c.lower_mode + 2,
                 100.0 * c.gap,
@@ -110,8 +111,8 @@ impl Table {
         let crossings = emulator.crossings().iter().filter(|c| c.lower_mode < modes).map(crossing);
         let poor = (0..modes).filter(|mode| emulator.r_squared(*mode) < 0.9).map(|mode| {
             format!(
-                "mode {}: the emulator foretells only {:.0} % of what a run left out varies by (error {:.2} %): take more \
-                 runs, or fewer parameters",
+                "mode {}: in cross-validation the emulator explains only {:.0} % of the variance of the runs (error {:.2} %): \
+                 add runs, or use fewer parameters",
                 mode + 1,
                 100.0 * emulator.r_squared(mode).max(0.0),
                 100.0 * emulator.relative_error(mode)
@@ -121,14 +122,14 @@ impl Table {
     }
 }
 
-/// The emulator of a definition's table.
+/// The emulator of the table of a definition.
 pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) -> Result<Table, DefinitionProblem> {
     let wrong = |pointer: &str, message: String| DefinitionProblem::new(pointer, message);
     let Some(table) = &definition.table else {
-        return Err(wrong("/table", "a simulation \"table\" needs its runs: [table] with file or csv".to_owned()));
+        return Err(wrong("/table", "a simulation \"table\" needs runs: add [table] with file or csv".to_owned()));
     };
     let Some(csv) = &table.csv else {
-        let message = "a file is read beside a structure file on disk only: send its text as csv";
+        let message = "a file can only be read next to a structure file on disk: otherwise send its text as csv";
         return Err(wrong("/table/file", message.to_owned()));
     };
     if table.file.is_some() {
@@ -137,14 +138,14 @@ pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) 
     let runs = read_runs(csv, space, definition.modes).map_err(|message| wrong("/table/csv", message))?;
     let names: Vec<&str> = space.iter().map(|p| p.name.as_str()).collect();
     let key = Digest::of(&[csv.as_bytes(), names.join("\n").as_bytes()]).to_string();
-    let emulator = kept_or_fitted(key, &runs).map_err(|e| wrong("/table/csv", e.to_string()))?;
+    let emulator = cached_or_fitted(key, &runs).map_err(|e| wrong("/table/csv", e.to_string()))?;
     let count = runs.parameters.nrows();
     for (column, parameter) in space.iter().enumerate() {
         let (lower, upper) = (runs.parameters.column(column).min(), runs.parameters.column(column).max());
         let margin = BEYOND * (upper - lower);
         if parameter.lower < lower - margin || parameter.upper > upper + margin {
             let message = format!(
-                "the prior of {} reaches from {} to {}, the runs from {lower} to {upper}: an emulator does not extrapolate",
+                "the prior of {} extends from {} to {}, the runs only from {lower} to {upper}: an emulator does not extrapolate",
                 parameter.name, parameter.lower, parameter.upper
             );
             return Err(wrong(&format!("/parameter/{column}/prior/uniform"), message));
@@ -153,32 +154,33 @@ pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) 
     Ok(Table { emulator, runs: count })
 }
 
-fn kept_or_fitted(key: String, runs: &Runs) -> Result<Arc<Emulator>, FitError> {
-    let kept = || KEPT.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(emulator) = kept().get(&key) {
+fn cached_or_fitted(key: String, runs: &Runs) -> Result<Arc<Emulator>, FitError> {
+    let cache = || CACHE.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(emulator) = cache().get(&key) {
         return Ok(emulator.clone());
     }
     let emulator = Arc::new(Emulator::fit(runs)?);
-    let mut all = kept();
-    if all.len() >= MOST_KEPT {
+    let mut all = cache();
+    if all.len() >= MOST_CACHED {
         all.clear();
     }
     all.insert(key, emulator.clone());
     Ok(emulator)
 }
 
-/// A column for each parameter, then `f1_hz`, `f2_hz`, … in any order of columns.
+/// Reads a table with a column for each parameter and columns `f1_hz`, `f2_hz`, …, in any order.
 fn read_runs(csv: &str, space: &ParameterSpace, modes: usize) -> Result<Runs, String> {
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(csv.as_bytes());
     let headers: Vec<String> = reader.headers().map_err(|e| e.to_string())?.iter().map(str::to_owned).collect();
-    let place = |name: &str| headers.iter().position(|h| h == name);
+    let column = |name: &str| headers.iter().position(|h| h == name);
     let mut wanted = Vec::new();
     for parameter in space {
         let name = shown(&parameter.name);
-        wanted
-            .push(place(&parameter.name).ok_or_else(|| format!("there is no column {name} for the parameter {name}"))?);
+        wanted.push(
+            column(&parameter.name).ok_or_else(|| format!("there is no column {name} for the parameter {name}"))?,
+        );
     }
-    let mode_columns: Vec<usize> = (1..).map_while(|mode| place(&format!("f{mode}_hz"))).collect();
+    let mode_columns: Vec<usize> = (1..).map_while(|mode| column(&format!("f{mode}_hz"))).collect();
     if mode_columns.len() < modes {
         return Err(format!("columns f1_hz to f{modes}_hz are needed; f{}_hz is missing", mode_columns.len() + 1));
     }
@@ -186,24 +188,26 @@ fn read_runs(csv: &str, space: &ParameterSpace, modes: usize) -> Result<Runs, St
     if let Some(unknown) = (0..headers.len()).find(|c| !wanted.contains(c) && headers[*c] != RUN_COLUMN) {
         let name = shown(&headers[unknown]);
         return Err(format!(
-            "the column {name} is no parameter, no frequency (f1_hz, f2_hz, …) and not \"{RUN_COLUMN}\""
+            "the column {name} is no parameter, no frequency (f1_hz, f2_hz, …) and not \"{RUN_COLUMN}\": remove or rename it"
         ));
     }
     if space.len() > MOST_COLUMNS || mode_columns.len() > MOST_COLUMNS {
         let (parameters, modes) = (space.len(), mode_columns.len());
-        return Err(format!("{parameters} parameters and {modes} modes: at most {MOST_COLUMNS} of each"));
+        return Err(format!("{parameters} parameters and {modes} modes: at most {MOST_COLUMNS} of each are allowed"));
     }
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for record in reader.records() {
         let record = record.map_err(|e| e.to_string())?;
         if rows.len() == MOST_RUNS {
-            return Err(format!("more than {MOST_RUNS} runs: choose among them, a few hundred usually do"));
+            return Err(format!("more than {MOST_RUNS} runs: select some of them, a few hundred are usually enough"));
         }
         let line = record.position().map_or(0, csv::Position::line);
         let cell = |column: &usize| {
             let text = record.get(*column).unwrap_or_default();
             let value: Option<f64> = text.parse().ok().filter(|v: &f64| v.is_finite());
-            value.ok_or_else(|| format!("line {line}, column {}: {} is no number", headers[*column], shown(text)))
+            value.ok_or_else(|| {
+                format!("line {line}, column {}: {} is not a finite number", headers[*column], shown(text))
+            })
         };
         rows.push(wanted.iter().map(cell).collect::<Result<_, _>>()?);
     }

@@ -19,7 +19,7 @@ pub struct Episode {
     pub number: i64,
     /// `damage`, `simulation_does_not_fit` or `silence`.
     pub kind: String,
-    /// The parameter of a damage alarm, otherwise [`FIT_SERIES`] or [`SILENCE_SERIES`].
+    /// The parameter of a damage alarm, otherwise `simulation:fit` or `structure:silence`.
     pub series: String,
     /// Version of the undamaged reference of a damage alarm; 0 for the other kinds.
     pub undamaged_version: u32,

@@ -78,7 +78,7 @@ pub struct Batches<'s> {
 }
 
 impl Batches<'_> {
-    /// Stores a batch, whole or not at all, unless it is there already.
+    /// Stores a batch completely or not at all, unless it is stored already.
     ///
     /// A batch with a known idempotency key is identified by the key, any other batch by the source and the times of its
     /// measurements.

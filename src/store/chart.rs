@@ -49,14 +49,14 @@ static SELECT_AFTER: LazyLock<String> = LazyLock::new(|| {
 });
 
 /// Statements that insert points or replace them. Structure, time and batch are the same in all rows.
-static INSERT_POINTS: InsertStatements = InsertStatements::ending_with(
-    "on conflict (structure_id, undamaged_version, series, measured_to_us, batch_id) do update
-     set shift = excluded.shift, shift_limit = excluded.shift_limit, ewma_limit = excluded.ewma_limit,
-         probability_limit = excluded.probability_limit, held = excluded.held, ewma = excluded.ewma,
-         above = excluded.above, state = excluded.state",
+static INSERT_POINTS: InsertStatements = InsertStatements::with_clause(
     "insert into chart_point",
     13,
     &[0, 3, 4],
+    " on conflict (structure_id, undamaged_version, series, measured_to_us, batch_id) do update
+     set shift = excluded.shift, shift_limit = excluded.shift_limit, ewma_limit = excluded.ewma_limit,
+         probability_limit = excluded.probability_limit, held = excluded.held, ewma = excluded.ewma,
+         above = excluded.above, state = excluded.state",
 );
 
 /// The result of storing the points of a batch.
@@ -145,8 +145,8 @@ async fn insert_points(transaction: &mut Transaction<'_>, batch: &Charted<'_>, p
 /// Determines the state of a new point from the points before it, and updates the states of the later points of its series and
 /// the alarm episodes that follow from them. `about` contains the stored points around it.
 ///
-/// It stops where the states no longer change, because the moving average and the count of points above the limit have finite
-/// memory.
+/// It stops where the states no longer change, because the influence of a point on the moving average and on the count of points
+/// above the limit fades.
 async fn place(
     transaction: &mut Transaction<'_>,
     batch: &Charted<'_>,

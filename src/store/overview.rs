@@ -220,7 +220,7 @@ mod tests {
         let (store, _folder) = open().await;
         for (number, (start, expire)) in steps.into_iter().enumerate() {
             let id = format!("b{number:03}");
-            // Every second batch is a repetition; another source would make it a new one.
+            // Batches with an even start share a source, so that some of them repeat stored ones.
             let source = if start % 2 == 0 { "s".to_owned() } else { format!("s{number}") };
             let _ = store.batches().insert_batch(&batch(&source, start, None), &id, at(0)).await.unwrap();
             let _ =

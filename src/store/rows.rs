@@ -25,15 +25,15 @@ pub(super) struct InsertStatements {
 impl InsertStatements {
     /// Statements that begin with `into`, for rows of so many columns.
     pub const fn new(into: &'static str, columns: usize, common: &'static [usize]) -> Self {
-        Self::ending_with("", into, columns, common)
+        Self::with_clause(into, columns, common, "")
     }
 
-    /// As [`Self::new`], with a clause after the values, such as `on conflict …`.
-    pub const fn ending_with(
-        clause: &'static str,
+    /// As [`Self::new`], with a clause after the values, such as ` on conflict …`.
+    pub const fn with_clause(
         into: &'static str,
         columns: usize,
         common: &'static [usize],
+        clause: &'static str,
     ) -> Self {
         Self { into, columns, common, clause, of_rows: [const { OnceLock::new() }; MOST_ROWS] }
     }
@@ -45,7 +45,7 @@ impl InsertStatements {
     pub fn of(&self, rows: usize) -> &str {
         self.of_rows[rows - 1].get_or_init(|| {
             let rows: Vec<String> = (0..rows).map(|row| self.row(row)).collect();
-            format!("{} values {} {}", self.into, rows.join(", "), self.clause).trim_end().to_owned()
+            format!("{} values {}{}", self.into, rows.join(", "), self.clause)
         })
     }
 

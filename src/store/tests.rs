@@ -1,4 +1,4 @@
-//! Files that are refused, and rules that whole batches in `tests/store` do not reach.
+//! Files that are refused, and rules that the tests in `tests/store` do not cover.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt as _;
@@ -102,7 +102,7 @@ pub(super) async fn open() -> (Store, tempfile::TempDir) {
     (store, folder)
 }
 
-/// Runs statements on the file of a folder without a store, making it where it is missing.
+/// Runs statements on the database file of a folder without opening a store; the file is created if it is missing.
 async fn by_hand(folder: &Path, statements: &[&'static str]) {
     let options = SqliteConnectOptions::new().filename(folder.join(DATABASE_FILE)).create_if_missing(true);
     let mut connection = SqliteConnection::connect_with(&options).await.unwrap();
@@ -188,7 +188,7 @@ async fn a_damaged_or_truncated_file_is_refused_as_corrupt() {
     let good = std::fs::read(&file).unwrap();
     for page in 0..good.len() / 4096 {
         let mut bad = good.clone();
-        let start = (page * 4096).max(100); // behind the file header
+        let start = (page * 4096).max(100); // after the file header
         bad[start..start + 60].fill(0xa5);
         std::fs::write(&file, &bad).unwrap();
         let error = refusal(folder.path()).await;
@@ -214,19 +214,19 @@ async fn a_known_key_decides_and_then_the_measurements() {
 }
 
 #[tokio::test]
-async fn what_is_foreseen_of_a_batch_holds_only_when_it_is_on_the_disk() {
+async fn the_speculative_outcome_of_a_batch_holds_only_after_the_commit() {
     let (store, _folder) = open().await;
     let given = batch("s", 0, None);
     let faults = crate::fault::Faults::arm();
     faults.set("store::commit", "1*return");
-    let (foreseen, outcome) = tokio::sync::oneshot::channel();
-    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), foreseen).await;
-    assert!(matches!(outcome.await, Ok(InsertBatch::Inserted { .. })), "it was told before the commit");
+    let (speculative, outcome) = tokio::sync::oneshot::channel();
+    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), speculative).await;
+    assert!(matches!(outcome.await, Ok(InsertBatch::Inserted { .. })), "it is sent before the commit");
     assert!(inserted.is_err());
     assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap(), None);
     faults.clear("store::commit");
-    let (foreseen, outcome) = tokio::sync::oneshot::channel();
-    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), foreseen).await.unwrap();
+    let (speculative, outcome) = tokio::sync::oneshot::channel();
+    let inserted = store.batches().insert_batch_speculative(&given, "b", at(0), speculative).await.unwrap();
     assert_eq!(outcome.await.unwrap(), inserted);
     assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap().unwrap().batch, given);
 }
@@ -258,7 +258,7 @@ async fn pages_of_exceedances_walk_the_current_ones_once_and_newest_first() {
     let (store, _folder) = open().await;
     for i in 0..12 {
         let id = format!("b{i:02}");
-        // Three batches at each time, so that pages end between equals.
+        // Three batches at each time, so that pages end between batches of equal time.
         store.batches().insert_batch(&batch(&format!("s{i}"), i / 3, None), &id, at(0)).await.unwrap();
         if i == 0 {
             store
@@ -289,7 +289,7 @@ async fn pages_of_exceedances_walk_the_current_ones_once_and_newest_first() {
             query.after_quantity = Some(last.quantity.clone());
             walked.extend(page.into_iter().map(|e| (e.measured_from, e.batch_id, e.quantity)));
         }
-        // b01 to b08 without b07, which is no longer current; two quantities each.
+        // b01 to b08 without b07, whose current assessment exceeds nothing; two quantities each.
         assert_eq!(walked.len(), 14, "limit {limit}");
         assert!(walked.is_sorted_by(|a, b| a > b), "limit {limit}");
     }

@@ -89,7 +89,7 @@ impl References<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
-        fault_point!("store::read", |_| Err(bad_row("undamaged state")(&"a fault")));
+        fault_point!("store::read", |_| Err(bad_row("undamaged reference")(&"a fault")));
         let (newest,): (Option<u32>,) =
             sqlx::query_as("select max(version) from undamaged_state where structure_id = $1")
                 .bind(structure.as_str())
@@ -107,7 +107,7 @@ impl References<'_> {
 
     /// As [`Self::undamaged`], but without checking that a reference that was read earlier is still the newest. A transaction that
     /// has not returned yet may have stored a newer one; storing an assessment reports this in
-    /// [`super::StoredAssessment::newest_undamaged`].
+    /// `StoredAssessment::newest_undamaged`.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
@@ -149,7 +149,7 @@ impl References<'_> {
         .bind(version)
         .fetch_all(&self.database.reader)
         .await?;
-        let bad = bad_row("undamaged state");
+        let bad = bad_row("undamaged reference");
         let quantity = |row| quantity(row, measurements as usize);
         Ok(Some(UndamagedRecord {
             state: UndamagedState {
@@ -161,7 +161,7 @@ impl References<'_> {
                 doubts: serde_json::from_str(&doubts).map_err(|e| bad(&e))?,
             },
             model_digest: Digest::from_stored(model_digest),
-            created_at: timestamp("undamaged state", created)?,
+            created_at: timestamp("undamaged reference", created)?,
             batches: batches.into_iter().map(|(id,)| id).collect(),
         }))
     }
@@ -171,7 +171,7 @@ impl References<'_> {
 type Key<'k> = (&'k str, u32);
 
 fn to_json<T: Serialize>(value: &T) -> Result<String, Error> {
-    serde_json::to_string(value).map_err(|e| bad_row("undamaged state")(&e))
+    serde_json::to_string(value).map_err(|e| bad_row("undamaged reference")(&e))
 }
 
 async fn insert_state(

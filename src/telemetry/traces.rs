@@ -33,6 +33,8 @@ impl Traces {
         }
         let wrong =
             |e: &dyn std::fmt::Display| format!("traces cannot be sent (log.otlp_endpoint, OTEL_EXPORTER_OTLP_…): {e}");
+        // As `notify::client_builder` does, which this module may not use; an error means that it is installed already.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         // Mozilla's certificates are added because small container images have none, and the client cannot be built
         // without any.
         let mozilla = webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter().filter_map(|der| Certificate::from_der(der).ok());

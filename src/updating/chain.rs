@@ -1,6 +1,6 @@
-//! Coupling stiffnesses of a chain of three masses out of two of its measured frequencies.
+//! Coupling stiffnesses of a chain of three masses from two of its measured frequencies.
 //!
-//! A chain of three masses with springs to the ground and two unknown coupling springs between them:
+//! The three masses have springs to the ground and two unknown coupling springs between them:
 //!
 //! ```text
 //!      ┌ g1 + k12      −k12          0     ┐
@@ -15,40 +15,40 @@ use std::f64::consts::PI;
 use nalgebra::{Matrix2, Matrix3};
 use serde::Serialize;
 
-/// Relative distance below which an eigenvalue is the one that was measured: rounding moves them by some 1e-13, and by
-/// its root where two solutions meet.
+/// Relative difference below which an eigenvalue is identified with a measured one. Rounding errors are about 1e-13, and their
+/// square root where two solutions coincide.
 const SAME_EIGENVALUE: f64 = 1e-6;
 
-/// Share of b² in b² − 4ac that is rounding.
+/// Rounding error of b² − 4ac as a share of b².
 const ROUNDING: f64 = 1e-13;
 
-/// Coupling stiffnesses with which the chain has two measured frequencies.
+/// Coupling stiffnesses for which the chain has two measured frequencies.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CouplingStiffness {
     /// Between the first and the second mass, N/m.
     pub k12_n_per_m: f64,
     /// Between the second and the third mass, N/m.
     pub k23_n_per_m: f64,
-    /// First natural frequency that these give, Hz.
+    /// First natural frequency of the chain with these stiffnesses, Hz.
     pub first_hz: f64,
-    /// ∂k/∂ln f, N/m: a row each for k12 and k23, a column each for the second and the third frequency. It grows beyond
-    /// bounds where two solutions meet.
+    /// Derivatives ∂k/∂ln f, N/m: rows for k12 and k23, columns for the second and the third frequency. They are unbounded where
+    /// two solutions coincide.
     pub sensitivity_n_per_m: [[f64; 2]; 2],
 }
 
 impl CouplingStiffness {
-    /// Standard deviations of k12 and k23, N/m, where both frequencies carry independent noise of this relative
-    /// standard deviation; to first order.
+    /// Standard deviations of k12 and k23, N/m, to first order, for independent noise of both frequencies with the relative
+    /// standard deviation `relative_noise`.
     pub fn std_n_per_m(&self, relative_noise: f64) -> [f64; 2] {
         self.sensitivity_n_per_m.map(|row| relative_noise * row[0].hypot(row[1]))
     }
 }
 
-/// What is not a chain, or not two of its frequencies.
+/// Why coupling stiffnesses cannot be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ChainError {
     /// A mass is not above 0, or the ground springs are negative or all absent.
-    #[error("masses {masses_kg:?} kg on ground springs {ground_n_per_m:?} N/m are no chain")]
+    #[error("masses of {masses_kg:?} kg on ground springs of {ground_n_per_m:?} N/m: masses must be above 0, ground springs not negative, and one of them above 0")]
     Chain {
         /// Masses given, kg.
         masses_kg: [f64; 3],
@@ -71,7 +71,7 @@ pub enum ChainError {
     },
 }
 
-/// All positive coupling stiffnesses with which the chain has these second and third frequencies.
+/// All positive coupling stiffnesses for which the chain has the given second and third frequencies.
 ///
 /// ```text
 ///  |K − λ2 M| = |K − λ3 M| = 0,    λ_i = (2π f_i)²
@@ -79,18 +79,17 @@ pub enum ChainError {
 ///  P = d1 d2 d3,    Q = d3 (d1 + d2),    R = d1 (d2 + d3),    S = d1 + d2 + d3
 /// ```
 ///
-/// `ground_n_per_m` is the sum of the springs from each mass to the ground. The determinant is linear in each
-/// stiffness, so that k23 falls out and a quadratic remains for k12: none, one or two solutions. Those of which the
-/// given frequencies are other modes than the second and the third are left out. With `first_hz` the solution nearest
-/// to it comes first; without, the one with the smallest k12. No solution: noise has carried the frequencies to where
-/// none exist. Near there two solutions meet, and their [`CouplingStiffness::std_n_per_m`] grows. In a chain that is
-/// the same from both ends, solutions come in mirrored pairs with one first frequency: nothing tells these apart.
+/// `ground_n_per_m` is the sum of the springs from each mass to the ground. The determinant is linear in each stiffness, so
+/// that eliminating k23 leaves a quadratic equation for k12 with up to two solutions. Solutions for which the given frequencies
+/// are not the second and third modes are discarded. If `first_hz` is given, the solution with the nearest first frequency comes
+/// first, otherwise the one with the smallest k12. There may be no solution because of measurement noise; near such frequencies
+/// two solutions almost coincide and their [`CouplingStiffness::std_n_per_m`] is large. A symmetric chain has mirrored pairs of
+/// solutions with the same first frequency, which cannot be distinguished.
 ///
-/// Source: Wang et al. (2025), Eq. 24, which says nothing of the second solution; on their rig it is often positive
-/// too.
+/// Source: Wang et al. (2025), Eq. 24, which does not mention the second solution; on their rig it is often positive, too.
 ///
 /// # Errors
-/// [`ChainError`].
+/// [`ChainError`] for masses, ground springs or frequencies that are not valid.
 pub fn coupling_stiffness(
     masses_kg: [f64; 3],
     ground_n_per_m: [f64; 3],
@@ -147,7 +146,7 @@ struct Determinant {
 }
 
 impl Determinant {
-    /// Of what is left on the diagonal without couplings.
+    /// From the diagonal d of K − λM without coupling springs.
     fn new([d1, d2, d3]: [f64; 3]) -> Self {
         Self { p: d1 * d2 * d3, q: d3 * (d1 + d2), r: d1 * (d2 + d3), s: d1 + d2 + d3 }
     }
@@ -158,13 +157,14 @@ impl Determinant {
 }
 
 impl Chain {
+    /// Diagonal d of K − λM without coupling springs.
     fn diagonal(&self, eigenvalue: f64) -> [f64; 3] {
         std::array::from_fn(|i| self.ground_n_per_m[i] - eigenvalue * self.masses_kg[i])
     }
 
-    /// Positive k12, k23 at which both determinants vanish.
+    /// Positive k12 and k23 for which both determinants vanish.
     fn roots(&self, eigenvalues: [f64; 2]) -> Vec<[f64; 2]> {
-        // In units of the largest diagonal entry all coefficients are near 1.
+        // Scaled by the largest diagonal entry, all coefficients are of the order of 1.
         let diagonals = eigenvalues.map(|eigenvalue| self.diagonal(eigenvalue));
         let unit = diagonals.iter().flatten().fold(0.0_f64, |unit, d| unit.max(d.abs()));
         let [second, third] = diagonals.map(|diagonal| Determinant::new(diagonal.map(|d| d / unit)));
@@ -175,7 +175,7 @@ impl Chain {
         );
         let k23 = |k12: f64| {
             let (by_second, by_third) = (second.r + second.s * k12, third.r + third.s * k12);
-            // Either equation gives k23; where one says nothing of it, the other does.
+            // Both equations give k23; the one with the larger coefficient is better conditioned.
             if by_second.abs() > by_third.abs() {
                 -(second.p + second.q * k12) / by_second
             } else {
@@ -196,7 +196,8 @@ impl Chain {
         eigenvalues
     }
 
-    /// ∂k/∂ln f of k12 and k23 by the second and the third frequency, N/m; infinite where two solutions meet.
+    /// Derivatives ∂k/∂ln f of k12 and k23 with respect to the second and the third frequency, N/m; infinite where two solutions
+    /// coincide.
     ///
     /// ```text
     ///  Σ_j ∂D_i/∂k_j dk_j + ∂D_i/∂λ_i dλ_i = 0,    dλ = 2λ d ln f,    D_i = |K − λ_i M|
@@ -227,7 +228,7 @@ impl Chain {
     }
 }
 
-/// Real roots of a x² + b x + c; a double one once.
+/// Real roots of a x² + b x + c; a double root is returned once.
 fn quadratic_roots(a: f64, b: f64, c: f64) -> Vec<f64> {
     let mut discriminant = b * b - 4.0 * a * c;
     if discriminant.abs() < ROUNDING * b * b {
@@ -236,7 +237,8 @@ fn quadratic_roots(a: f64, b: f64, c: f64) -> Vec<f64> {
     if discriminant < 0.0 {
         return Vec::new();
     }
-    // The sum of equal signs: no cancellation. With a = 0 the first root is at infinity, which nobody takes.
+    // Both terms of the sum have the same sign, so that no digits cancel. For a = 0 the first root is infinite and is discarded
+    // by the caller.
     let sum = -0.5 * (b + discriminant.sqrt().copysign(b));
     let mut roots = vec![sum / a, c / sum];
     if discriminant == 0.0 {

@@ -2,21 +2,21 @@
 
 use nalgebra::DMatrix;
 
-/// Share of a variance that a pivot of its Cholesky factor must keep: less is rounding, and the matrix singular.
+/// A covariance matrix is singular if a pivot of its Cholesky factor is below this share of the variance.
 const SINGULAR: f64 = 1e-12;
 
-/// Mean and covariance of the rows of a sample: the normal distribution fitted to it.
+/// Mean and covariance of a sample, which define the normal distribution fitted to it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Moments {
     mean: Vec<f64>,
-    /// Lower triangle, row by row; divided by rows − 1.
+    /// Lower triangle, row by row, with divisor n − 1.
     covariance: Vec<f64>,
-    /// `None` where the covariance is singular.
+    /// ln det of the covariance; `None` if it is singular.
     log_determinant: Option<f64>,
 }
 
 impl Moments {
-    /// Moments of rows that lie one behind the other, `[n, columns]`, in one pass.
+    /// Moments of a row-major matrix `[n, columns]`, computed in one pass.
     ///
     /// # Panics
     /// If the length is not a multiple of `columns`.
@@ -28,14 +28,14 @@ impl Moments {
         let mut shifted = vec![0.0; columns];
         let Some(first) = values.get(..columns) else { return Self { mean, covariance, log_determinant: None } };
         for row in values.chunks_exact(columns) {
-            // Relative to a row of the sample: sums of squares of what is far from zero would lose the spread in rounding.
+            // Relative to the first row, because sums of squares of values far from zero would lose the spread to rounding.
             for ((s, value), origin) in shifted.iter_mut().zip(row).zip(first) {
                 *s = value - origin;
             }
             let mut products = covariance.iter_mut();
             for (i, s) in shifted.iter().enumerate() {
                 mean[i] += s;
-                // In this order: a zip that ends takes one more from its left side.
+                // In this order, because `zip` takes one more item from its left side when the right side has ended.
                 for (other, product) in shifted[..=i].iter().zip(products.by_ref()) {
                     *product += s * other;
                 }
@@ -60,29 +60,29 @@ impl Moments {
         Self::from_rows(rows.transpose().as_slice(), rows.ncols())
     }
 
-    /// Mean of each column.
+    /// Mean of each column, `[columns]`.
     pub fn mean(&self) -> &[f64] {
         &self.mean
     }
 
-    /// Covariance, `[columns, columns]`, with n − 1.
+    /// Covariance with divisor n − 1, `[columns, columns]`.
     pub fn covariance(&self) -> DMatrix<f64> {
         let entry = |i: usize, j: usize| self.covariance[i.max(j) * (i.max(j) + 1) / 2 + i.min(j)];
         DMatrix::from_fn(self.mean.len(), self.mean.len(), entry)
     }
 
-    /// Bhattacharyya distance between the two normal distributions; `None` where a covariance is singular.
+    /// Bhattacharyya distance between the two normal distributions; `None` if a covariance is singular.
     ///
     /// ```text
     ///  D_B = −ln ∫ √(p q) dy = ⅛ Δᵀ Σ̄⁻¹ Δ + ½ ln( det Σ̄ / √(det Σ₁ det Σ₂) ),    Σ̄ = (Σ₁ + Σ₂)/2
     /// ```
     ///
-    /// 0 for equal ones, symmetric, and the same after any invertible linear map of both.
+    /// It is 0 for equal distributions, symmetric, and invariant under any invertible linear map of both.
     ///
     /// Source: Bhattacharyya (1943); Kailath (1967) for normal distributions.
     ///
     /// # Panics
-    /// If the two have not the same number of columns.
+    /// If the numbers of columns differ.
     pub fn bhattacharyya(&self, other: &Self) -> Option<f64> {
         let columns = self.mean.len();
         assert_eq!(columns, other.mean.len(), "samples of the same quantities");
@@ -98,7 +98,7 @@ impl Moments {
             y[i] = (y[i] - known) / row[i];
         }
         let shift: f64 = y.iter().map(|y| y * y).sum();
-        // Rounding may leave equal ones a hair below zero.
+        // Rounding can make the distance of equal distributions slightly negative.
         Some((shift / 8.0 + 0.5 * (log_determinant - f64::midpoint(own, theirs))).max(0.0))
     }
 }
@@ -114,15 +114,15 @@ pub fn bhattacharyya(measured: &DMatrix<f64>, simulated: &DMatrix<f64>) -> Optio
 ///  ln L = −D_B / ε²
 /// ```
 ///
-/// Wang et al. (2025), eq. (5), write exp(−d²/ε²) for any distance d. Here D_B stands for d²: near zero D_B is quadratic in
-/// the difference of the populations, as a squared Euclidean or Mahalanobis distance is, so that L is a bell about the truth
-/// with a width of order ε. Its square would be of fourth order: a flat top with steep edges, and a posterior that
-/// shrinks with n^-¼ instead of n^-½ at the ε² of [`epsilon_squared`].
+/// Source: Wang et al. (2025), Eq. 5, who write exp(−d²/ε²) for any distance d. Here D_B takes the place of d², because near zero
+/// D_B is quadratic in the difference of the populations, like a squared Euclidean or Mahalanobis distance. L is then
+/// approximately normal around the truth with a width of order ε. The square of D_B would be of fourth order and give a
+/// posterior whose width decreases with n^-¼ instead of n^-½ at the ε² of [`epsilon_squared`].
 pub fn log_likelihood(distance: f64, epsilon_squared: f64) -> f64 {
     -distance / epsilon_squared
 }
 
-/// The ε² at which [`log_likelihood`] is the likelihood of `rows` independent normal observations: 1/(4n).
+/// The ε² = 1/(4n) for which [`log_likelihood`] is the likelihood of n = `rows` independent normal observations.
 ///
 /// ```text
 ///  ln L(μ, Σ) relative to the fit N(ȳ, S) of the n observations:    −n·KL(N(ȳ, S) ‖ N(μ, Σ))
@@ -130,13 +130,13 @@ pub fn log_likelihood(distance: f64, epsilon_squared: f64) -> f64 {
 ///  spread, Σ = (1 + e)·S:      KL = m·(e²/4 + O(e³)),       D_B = m·(e²/16 + O(e³)),    m columns
 /// ```
 ///
-/// In both KL = 4 D_B, and in every direction between them, since to second order both are multiples of the same Fisher
-/// information: ln L = −4n D_B near the truth. Far from it the two differ.
+/// In both cases KL = 4 D_B, and also for any combination of shift and spread, because to second order both are multiples of the
+/// same Fisher information. Hence ln L = −4n D_B near the truth; far from it the two differ.
 pub fn epsilon_squared(rows: f64) -> f64 {
     0.25 / rows
 }
 
-/// Replaces a lower triangle by its Cholesky factor; ln det of the matrix, or `None` where it is singular.
+/// Replaces a lower triangle by its Cholesky factor. Returns ln det of the matrix, or `None` if it is singular.
 fn factorise(triangle: &mut [f64], size: usize) -> Option<f64> {
     let mut log_determinant = 0.0;
     for i in 0..size {
@@ -148,7 +148,7 @@ fn factorise(triangle: &mut [f64], size: usize) -> Option<f64> {
         }
         let variance = row[i];
         let pivot = variance - row[..i].iter().map(|l| l * l).sum::<f64>();
-        // Not `<=`: NaN must fail too.
+        // Written so that NaN fails too.
         let regular = variance > 0.0 && pivot > SINGULAR * variance && pivot.is_finite();
         if !regular {
             return None;

@@ -1,4 +1,4 @@
-//! The law between a position and the stiffness it sets: a curve through stiffnesses that [`super::chain`] identified.
+//! Fits an exponential law for stiffness as a function of a position to stiffnesses identified by [`super::chain`].
 //!
 //! Source: Wang et al. (2025), Eq. 25 and 26.
 
@@ -7,44 +7,45 @@ use serde::Serialize;
 
 use crate::stats;
 
-/// Largest B, times the range of the positions: beyond it, all change lies in 2 % of them. The search begins on both
-/// sides.
+/// Largest |B| multiplied by the range of the positions: beyond it, all change is within 2 % of the range.
 const STEEPEST: f64 = 50.0;
 
-/// Smallest B, times the range of the positions: below it, the curve is within a thousandth of a straight line.
+/// Smallest |B| multiplied by the range of the positions: below it, the curve differs from a straight line by less than 0.1 %.
 const FLATTEST: f64 = 0.01;
 
-/// Values of B tried on each side of 0 before the search.
+/// Number of starting values of B of each sign.
 const STARTS: usize = 40;
 
+/// Largest number of Levenberg–Marquardt iterations.
 const ITERATIONS: usize = 200;
 
-/// Root mean square of residuals, as a share of that of the values, up to which a line fits exactly.
+/// Root mean square of the residuals, as a share of that of the values, up to which the fit of a line counts as exact.
 const EXACT: f64 = 1e-10;
 
-/// What a residual is measured in.
+/// How residuals are weighted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Weighting<'a> {
     /// All points are equally accurate.
     Absolute,
     /// The standard deviation of a point is proportional to its stiffness.
     Relative,
-    /// Standard deviation of each point, or anything proportional to it: [`super::chain::CouplingStiffness::std_n_per_m`].
+    /// Standard deviation of each point up to a common factor, `[n]`, such as
+    /// [`super::chain::CouplingStiffness::std_n_per_m`].
     Std(&'a [f64]),
 }
 
 /// An estimated constant.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
-    /// Its value.
+    /// Estimated value.
     pub value: f64,
-    /// Its standard error.
+    /// Standard error.
     pub standard_error: f64,
     /// 95 % confidence interval from Student's t.
     pub interval_95: [f64; 2],
 }
 
-/// k(p) = A·exp(B·p) + C, fitted.
+/// A fit of k(p) = A·exp(B·p) + C.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ExponentialFit {
     /// A, in the unit of the stiffness.
@@ -53,10 +54,10 @@ pub struct ExponentialFit {
     pub b: Estimate,
     /// C, in the unit of the stiffness.
     pub c: Estimate,
-    /// Standard deviation of the residuals; after the [`Weighting`] in the unit of the stiffness, as a share of the
-    /// stiffness, or as a multiple of the given standard deviation.
+    /// Standard deviation of the weighted residuals: in the unit of the stiffness, as a share of the stiffness, or as a multiple of
+    /// the given standard deviations, depending on the [`Weighting`].
     pub residual_std: f64,
-    /// Points less the three constants.
+    /// Number of points minus the three constants.
     pub degrees_of_freedom: usize,
     #[serde(skip)]
     shape: Shape,
@@ -64,10 +65,10 @@ pub struct ExponentialFit {
     covariance: Matrix3<f64>,
 }
 
-/// Why no exponential can be fitted.
+/// Why an exponential cannot be fitted.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum FitError {
-    /// A position, stiffness or standard deviation is not usable.
+    /// A position, stiffness or standard deviation is not valid.
     #[error("point {point} is ({position}, {stiffness}): both must be finite, and its standard deviation above 0")]
     Point {
         /// Its number, from 0.
@@ -77,32 +78,34 @@ pub enum FitError {
         /// Its stiffness.
         stiffness: f64,
     },
-    /// As many standard deviations as points are needed.
-    #[error("{given} standard deviations for {points} points")]
+    /// The numbers of standard deviations and points differ.
+    #[error("{given} standard deviations for {points} points: there must be one for each point")]
     Weights {
         /// Standard deviations given.
         given: usize,
         /// Points given.
         points: usize,
     },
-    /// Three constants and a residual need four positions.
+    /// There are fewer than four different positions, which three constants and a residual need.
     #[error("{distinct} different positions: at least 4 are needed")]
     Positions {
         /// Different positions given.
         distinct: usize,
     },
-    /// A straight line fits as well, within the noise: A, B and C have no values of their own.
-    #[error("the points lie on a straight line within their noise: an exponential has no constants there")]
+    /// A straight line fits equally well within the noise, so that A, B and C are not determined.
+    #[error(
+        "the points are on a straight line within their noise: the constants of an exponential are not determined"
+    )]
     StraightLine,
-    /// All change lies at one end: B is not determined.
-    #[error("all change lies at one end of the positions: the exponent is not determined")]
+    /// All change is at one end of the positions, so that B is not determined.
+    #[error("all change is at one end of the positions: the exponent is not determined")]
     Step,
-    /// A is the rise at position 0, and that is beyond f64.
-    #[error("position 0 is too far from the points: the curve there is beyond any number")]
+    /// A, which is defined at position 0, is outside the range of f64.
+    #[error("position 0 is too far from the points: the constant A is outside the range of floating-point numbers")]
     FarFromZero,
 }
 
-/// The curve in constants that are of like size and hardly correlated:
+/// The curve in parameters of similar size and small correlation:
 ///
 /// ```text
 ///  k(p) = level + rise·g(z),    g(z) = (e^(βz) − 1)/(e^β − 1),    z = (p − start)/width
@@ -117,21 +120,23 @@ struct Shape {
 }
 
 impl Shape {
+    /// k(p).
     fn at(&self, position: f64) -> f64 {
         self.level + self.rise * rising(self.beta, (position - self.start) / self.width).0
     }
 
-    /// ∂k/∂(level, rise, β), the last over the rise.
+    /// Derivatives of k with respect to level, rise and β·rise.
     fn gradient(&self, position: f64) -> Vector3<f64> {
         let (g, slope) = rising(self.beta, (position - self.start) / self.width);
         Vector3::new(1.0, g, slope)
     }
 
+    /// The curve after a step in level, rise and β·rise.
     fn moved(&self, step: &Vector3<f64>) -> Self {
         Self { level: self.level + step[0], rise: self.rise + step[1], beta: self.beta + step[2] / self.rise, ..*self }
     }
 
-    /// A, B, C, and their derivatives by (level, rise, β·rise) in rows.
+    /// A, B and C, and in rows their derivatives with respect to level, rise and β·rise.
     fn constants(&self) -> ([f64; 3], Matrix3<f64>) {
         let Self { start, width, level, rise, beta } = *self;
         let growth = beta.exp_m1();
@@ -152,7 +157,7 @@ impl Shape {
     }
 }
 
-/// g(z) and ∂g/∂β; the straight line for β = 0.
+/// g(z) and ∂g/∂β; g(z) = z for β = 0.
 fn rising(beta: f64, z: f64) -> (f64, f64) {
     if beta == 0.0 {
         return (z, 0.5 * z * (z - 1.0));
@@ -161,15 +166,17 @@ fn rising(beta: f64, z: f64) -> (f64, f64) {
     (part / growth, (z * (beta * z).exp() - part * beta.exp() / growth) / growth)
 }
 
-/// Points with one over their standard deviation.
+/// Checked points.
 struct Data<'a> {
     points: &'a [(f64, f64)],
+    /// One over the standard deviation of each point.
     weights: Vec<f64>,
     start: f64,
     width: f64,
 }
 
 impl Data<'_> {
+    /// Weighted residuals, `[n]`.
     fn residuals(&self, shape: &Shape) -> Vec<f64> {
         self.points.iter().zip(&self.weights).map(|((p, k), w)| w * (k - shape.at(*p))).collect()
     }
@@ -178,6 +185,7 @@ impl Data<'_> {
         self.residuals(shape).iter().map(|r| r * r).sum()
     }
 
+    /// Rows of the weighted Jacobian J.
     fn rows(&self, shape: &Shape) -> Vec<Vector3<f64>> {
         self.points.iter().zip(&self.weights).map(|((p, _), w)| *w * shape.gradient(*p)).collect()
     }
@@ -188,20 +196,20 @@ impl Data<'_> {
         normal.try_inverse().ok_or(FitError::Step)
     }
 
-    /// The HC3 covariance: every point vouches for its own error.
+    /// The heteroscedasticity-consistent covariance HC3.
     fn robust_covariance(&self, shape: &Shape, residuals: &[f64]) -> Result<Matrix3<f64>, FitError> {
-        // A point that the curve follows wherever it goes has leverage 1 and no residual: 0/0 becomes 0.
-        const LEAST_FREEDOM: f64 = 1e-9;
+        // A point that determines the curve alone has leverage 1 and residual 0: this makes 0/0 become 0.
+        const LEAST_REMAINDER: f64 = 1e-9;
         let inverse = self.inverse_normal(shape)?;
         let weighted = |(row, residual): (&Vector3<f64>, &f64)| {
             let leverage = (row.transpose() * inverse * row)[0];
-            row * row.transpose() * (residual / (1.0 - leverage).max(LEAST_FREEDOM)).powi(2)
+            row * row.transpose() * (residual / (1.0 - leverage).max(LEAST_REMAINDER)).powi(2)
         };
         let between: Matrix3<f64> = self.rows(shape).iter().zip(residuals).map(weighted).sum();
         Ok(inverse * between * inverse)
     }
 
-    /// Best level and rise for a given β.
+    /// Optimal level and rise for a given β, by weighted linear regression.
     fn best(&self, beta: f64) -> Shape {
         let (mut sums, mut centre) = (0.0, [0.0; 2]);
         let g = |p: f64| rising(beta, (p - self.start) / self.width).0;
@@ -230,18 +238,18 @@ impl Data<'_> {
 ///  Absolute, Relative:  Cov = (JᵀJ)⁻¹ Jᵀ diag(r_i²/(1 − h_i)²) J (JᵀJ)⁻¹,    h_i = J_i (JᵀJ)⁻¹ J_iᵀ
 /// ```
 ///
-/// J is ∂(k(p_i)/s_i) by the constants. With standard deviations given, only their ratios count: s² scales them.
-/// Without, errors may be of any size at any point (HC3), and with ten points or fewer the intervals are too wide
-/// rather than too narrow. By Levenberg–Marquardt from the best of a grid over B of both signs, A and C being linear
-/// for each.
+/// J contains the derivatives of k(p_i)/s_i with respect to the constants. If standard deviations are given, only their ratios
+/// matter, because s² scales them. Otherwise the errors may differ from point to point (HC3); with ten points or fewer the
+/// intervals are then rather too wide than too narrow. The minimum is found by the Levenberg–Marquardt method, starting from the
+/// best point of a grid over B of both signs, with the optimal A and C for each.
 ///
-/// Stiffnesses from [`super::chain::coupling_stiffness`] deserve `Std`: on the rig of the paper their errors differ by a factor of
-/// 25, and the constants come out with a quarter to almost a half less error.
+/// `Std` is recommended for stiffnesses from [`super::chain::coupling_stiffness`]: on the rig of the paper their errors differ by
+/// a factor of 25, and the weights reduce the errors of the constants by a quarter to almost a half.
 ///
 /// Source: Wang et al. (2025), Eq. 25, which gives no intervals; MacKinnon & White (1985) for HC3.
 ///
 /// # Errors
-/// [`FitError`].
+/// [`FitError`] for points that are not valid or do not determine an exponential.
 pub fn fit_exponential(points: &[(f64, f64)], weighting: Weighting<'_>) -> Result<ExponentialFit, FitError> {
     let data = checked(points, weighting)?;
     let shape = best_shape(&data)?;
@@ -274,12 +282,12 @@ pub fn fit_exponential(points: &[(f64, f64)], weighting: Weighting<'_>) -> Resul
 }
 
 impl ExponentialFit {
-    /// Stiffness at a position.
+    /// Fitted stiffness at a position.
     pub fn curve(&self, position: f64) -> f64 {
         self.shape.at(position)
     }
 
-    /// 95 % confidence interval of the curve at one position; not of all positions at once, and not of a further point.
+    /// Pointwise 95 % confidence interval of the curve at a position. It is not a simultaneous band and not a prediction interval.
     pub fn band_95(&self, position: f64) -> [f64; 2] {
         let gradient = self.shape.gradient(position);
         let variance = (gradient.transpose() * self.covariance * gradient)[0];
@@ -312,7 +320,7 @@ fn checked<'a>(points: &'a [(f64, f64)], weighting: Weighting<'_>) -> Result<Dat
     Ok(Data { points, weights: stds.iter().map(|std| 1.0 / std).collect(), start, width: end - start })
 }
 
-/// The least sum of squares over level, rise and β.
+/// The curve with the smallest sum of squares.
 fn best_shape(data: &Data<'_>) -> Result<Shape, FitError> {
     let line = data.best(0.0);
     let of_line = data.sum_of_squares(&line);
@@ -338,7 +346,7 @@ fn best_shape(data: &Data<'_>) -> Result<Shape, FitError> {
         let Some(step) = normal.cholesky().map(|c| c.solve(&descent)) else { break };
         let next = shape.moved(&step);
         let sum = data.sum_of_squares(&next);
-        // NaN is no gain.
+        // False for NaN.
         if sum < least {
             let small = (next.beta - shape.beta).abs() < 1e-14 * shape.beta.abs();
             (shape, least) = (next, sum);
@@ -356,7 +364,7 @@ fn best_shape(data: &Data<'_>) -> Result<Shape, FitError> {
     if shape.beta.abs() > STEEPEST {
         return Err(FitError::Step);
     }
-    // What the bend gains over a line, against the noise: an F test of one constant.
+    // An F test of the improvement over a straight line by one further constant.
     let degrees_of_freedom = data.points.len() - 3;
     let t = stats::student_t_quantile(0.975, degrees_of_freedom);
     if shape.beta.abs() < FLATTEST || of_line - least < t * t * least / degrees_of_freedom as f64 {

@@ -1,14 +1,13 @@
-//! Reference methods: the same question as the trained flow's, answered without one.
+//! Reference methods of model updating, which find parameters from measured frequencies without a trained flow.
 //!
-//! - [`sensitivity`]: a deterministic inverse for each measurement;
-//! - [`stochastic`]: the population behind a batch, sampled by [`tmcmc`] under a likelihood by the Bhattacharyya
+//! - [`sensitivity`]: deterministic updating, one measurement at a time;
+//! - [`stochastic`]: the posterior of a population, sampled by [`tmcmc`] with a likelihood based on the Bhattacharyya
 //!   [`distance`];
-//! - [`chain`] and [`law`]: stiffnesses of couplings out of frequencies, and how they follow their settings.
+//! - [`chain`] and [`law`]: coupling stiffnesses of a chain from its frequencies, and their dependence on a position.
 
 pub mod chain;
 pub mod distance;
 pub mod law;
-
 pub mod sensitivity;
 pub mod stochastic;
 pub mod tmcmc;

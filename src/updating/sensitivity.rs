@@ -1,4 +1,4 @@
-//! Sensitivity-based updating: the parameters whose frequencies are those measured, one measurement at a time.
+//! Sensitivity-based model updating: finds the parameters whose frequencies are the measured ones, one measurement at a time.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -6,52 +6,53 @@ use rayon::prelude::*;
 use crate::physics;
 use crate::simulator::Simulator;
 
-/// Steps after which an update is given up.
+/// Largest number of iterations of an update.
 const MOST_ITERATIONS: usize = 60;
 
-/// Root mean square of the relative residuals below which the frequencies count as met.
+/// Root mean square of the relative residuals below which the frequencies are matched.
 const MET: f64 = 1e-9;
 
-/// Movement in the unit box below which the search has come to rest.
+/// Step in the unit box below which the search has converged.
 const AT_REST: f64 = 1e-9;
 
-/// Where the search for one measurement ended.
+/// Result of updating the parameters by one measurement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Update {
     /// Parameters, `[d]`, parameter units, inside the prior box.
     pub theta: Vec<f64>,
-    /// Root mean square of ln f/f(θ) over the modes measured.
+    /// Root mean square of ln f/f(θ) over the measured modes.
     pub residual: f64,
-    /// Steps taken, over all starts.
+    /// Number of iterations over all starts.
     pub iterations: usize,
-    /// Starts tried; the best ending counts.
+    /// Number of starts, of which the best result is kept.
     pub starts: usize,
-    /// The search came to rest: at frequencies that are met, at a least misfit, or at an edge of the box.
+    /// Whether the search converged: to matched frequencies, to a minimum of the misfit, or to a bound of the prior.
     pub converged: bool,
 }
 
 impl Update {
-    /// The measured frequencies are those at θ.
+    /// Whether the frequencies at θ match the measured ones.
     pub fn is_met(&self) -> bool {
         self.residual <= MET
     }
 }
 
-/// Updates the parameters by one measurement, beginning at `start` (`[d]`, parameter units).
+/// Updates the parameters by one measurement, starting from `start` (`[d]`, parameter units).
 ///
 /// ```text
 ///  minimise Σ_i (ln f_i − ln f_i(θ))²   over the prior box
 ///  (SᵀS + μ diag SᵀS) Δu = Sᵀ r,    r_i = ln f_i/f_i(θ),    S_ij = ∂ln f_i/∂u_j,    u: θ in the unit box
 /// ```
 ///
-/// by Levenberg–Marquardt, with the analytic derivatives of the eigenvalues; a parameter at an edge of the box that wants to
-/// leave it stays there, out of the others' step. `frequencies_hz`: one entry a mode, `None` where it was not measured.
+/// The Levenberg–Marquardt method with analytic derivatives of the eigenvalues, constrained to the box: a parameter at a bound
+/// whose step points outwards is fixed for this step. `frequencies_hz` has one entry for each mode, `[m]`, which is `None` if the
+/// mode was not measured.
 ///
 /// Source: Friswell & Mottershead (1995), Finite Element Model Updating in Structural Dynamics, chapter 8; the derivatives of
 /// Nelson (1976).
 ///
 /// # Errors
-/// [`physics::Error`], which a checked prior rules out.
+/// [`physics::Error`], which cannot occur inside a checked prior.
 pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f64]) -> Result<Update, physics::Error> {
     let parameters = simulator.space().as_slice();
     let present: Vec<(usize, f64)> = frequencies_hz.iter().enumerate().filter_map(|(i, f)| Some((i, (*f)?))).collect();
@@ -78,7 +79,7 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
         let mut right = descent.clone();
         for i in 0..d {
             normal[(i, i)] *= 1.0 + damping;
-            // Directions that move no frequency stay where they are.
+            // Keeps the matrix regular if a parameter does not affect any frequency; that parameter then does not change.
             normal[(i, i)] += 1e-14;
             if held(i) {
                 normal.row_mut(i).fill(0.0);
@@ -104,8 +105,8 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
     Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, starts: 1, converged })
 }
 
-/// [`update`] of many measurements over all cores, each beginning at the middle of the prior, then, where the frequencies
-/// were not met, once more at each of `further_starts`; the best ending counts.
+/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the middle of the prior; while its frequencies are not
+/// matched, it starts again from the next of `further_starts` (`[starts][d]`), and the best result is kept.
 ///
 /// # Errors
 /// As [`update`].
@@ -133,8 +134,8 @@ pub fn update_all(
     measurements.par_iter().map(one).collect()
 }
 
-/// Starts for measurements that the middle of the prior does not lead to: a lattice of inner points of the box, at most 64,
-/// over the first six parameters.
+/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box over the first six parameters, with
+/// the others at the middle of their priors, `[starts][d]`.
 pub fn prior_lattice(simulator: &Simulator) -> Vec<Vec<f64>> {
     const MOST: usize = 64;
     let space = simulator.space().as_slice();

@@ -1,5 +1,5 @@
-//! Stochastic updating of a population: mean and spread of the parameters, such that simulated frequencies are distributed
-//! as those measured.
+//! Stochastic model updating: finds the mean and the standard deviation of the parameters for which simulated frequencies have the
+//! same distribution as the measured ones.
 
 use nalgebra::DMatrix;
 use rand::{Rng as _, RngCore as _};
@@ -10,26 +10,28 @@ use super::tmcmc::{tmcmc, Samples, Settings, Stage, Target};
 use crate::simulator::Simulator;
 use crate::stats::{self, Stream};
 
-/// Fewest simulated measurements at each point by default.
+/// Smallest default number of simulated measurements at each θ.
 const SIMULATED: usize = 128;
 
-/// Simulated measurements at each point for a batch of this size, by default: points of a Sobol' sequence, whose moments move
-/// ln L by less than a half. That error is 4n times the square of the moments' own, which falls as one over their number.
+/// Default number of simulated measurements at each θ for a batch of n = `measurements` measurements. They are points of a Sobol'
+/// sequence, and their number is chosen so that the error of their moments changes ln L by less than ½. This error of ln L is 4n
+/// times the square of the error of the moments, which decreases inversely with the number of points.
 pub fn simulated_for(measurements: usize) -> usize {
     let needed = SIMULATED as f64 * (measurements as f64 / 500.0).sqrt();
     (needed.ceil() as usize).clamp(SIMULATED, MOST_POINTS).next_power_of_two()
 }
 
-/// Settings for `samples` samples where each evaluation costs a hundred runs of the model: chains that move on until half of
-/// the correlation is left, which halves the evaluations and widens the scatter of the evidence by a third.
+/// Settings for `samples` samples when each evaluation of the likelihood takes about a hundred model runs. The samples move only
+/// until their correlation has halved, which halves the number of evaluations and increases the scatter of the evidence by a
+/// third.
 pub fn settings(samples: usize) -> Settings {
     Settings { samples, correlation: 0.5, ..Settings::default() }
 }
 
-/// Points of one scrambled Sobol' sequence.
+/// Largest number of points of a scrambled Sobol' sequence.
 const MOST_POINTS: usize = 1 << 16;
 
-/// The posterior of a population's mean and spread, given a batch.
+/// The posterior of the mean μ and the standard deviation σ of a population, given a batch.
 ///
 /// ```text
 ///  θ = (μ, σ),    x ~ N(μ, diag σ²),    y = M(x) + noise
@@ -37,44 +39,47 @@ const MOST_POINTS: usize = 1 << 16;
 ///  μ ~ U(prior),    σ ~ U(0, width of the prior/√12)
 /// ```
 ///
-/// The simulated measurements are the images of the same points at every θ. Their normal scores come from a scrambled Sobol'
-/// sequence: a few hundred then give the moments that a random sample of thousands would, and the likelihood is smooth.
+/// The simulated measurements are computed from the same normal scores at every θ, which makes the likelihood smooth. The scores
+/// come from a scrambled Sobol' sequence, of which a few hundred points give moments as accurate as thousands of random points.
+///
+/// Source: Wang et al. (2025), Eq. 5.
 #[derive(Debug)]
 pub struct Population<'a> {
     simulator: &'a Simulator,
     modes: Vec<usize>,
     measured: Moments,
-    /// `[simulated, d + m]`: normal scores of the parameters and of the noise.
+    /// Normal scores of the parameters and of the noise, `[simulated, d + m]`.
     scores: DMatrix<f64>,
     noise_multiple: f64,
     epsilon_squared: f64,
 }
 
-/// Why a batch gives no posterior.
+/// Why the posterior of a population cannot be sampled.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Too few complete measurements for a covariance.
+    /// There are too few complete measurements for a covariance.
     #[error("{found} complete measurements: at least {needed} are needed for the covariance of {modes} frequencies")]
     TooFew {
-        /// Complete measurements.
+        /// Number of complete measurements.
         found: usize,
-        /// Fewest.
+        /// Smallest number needed.
         needed: usize,
         /// Frequencies used.
         modes: usize,
     },
-    /// Frequencies that all measurements have in common, or that go together exactly.
-    #[error("the measured frequencies do not vary independently: they have no distribution to compare")]
+    /// The covariance of the measured frequencies is singular.
+    #[error("the measured frequencies do not vary independently: their covariance is singular")]
     Singular,
-    /// More points or dimensions than the sequence has.
+    /// There are too few or too many simulated measurements, or too many dimensions for the sequence.
     #[error(
-        "{points} simulated measurements in {dimensions} dimensions: two more than modes at least, {MOST_POINTS} in {} at most",
+        "{points} simulated measurements in {dimensions} dimensions: at least two more than modes are needed, and at most \
+         {MOST_POINTS} in {} dimensions are possible",
         sobol_burley::NUM_DIMENSIONS
     )]
     Points {
         /// Points asked for.
         points: usize,
-        /// Parameters and noises.
+        /// Number of parameters, plus the number of modes if there is noise.
         dimensions: usize,
     },
     /// The sampling failed.
@@ -82,33 +87,34 @@ pub enum Error {
     Sampling(#[from] super::tmcmc::Error),
 }
 
-/// Mean and spread of each parameter under the posterior.
+/// Posterior mean and standard deviation of each parameter of a population, in parameter units.
 #[derive(Debug, Clone, Serialize)]
 pub struct Estimate {
     /// Posterior mean of μ, `[d]`.
     pub mean: Vec<f64>,
-    /// 90 % credible interval of μ.
+    /// 90 % credible interval of μ, `[d]`.
     pub mean_interval: Vec<[f64; 2]>,
     /// Posterior mean of σ, `[d]`.
     pub std: Vec<f64>,
-    /// 90 % credible interval of σ.
+    /// 90 % credible interval of σ, `[d]`.
     pub std_interval: Vec<[f64; 2]>,
     /// Log-evidence, nats, and its standard error.
     pub log_evidence: [f64; 2],
-    /// Calls of the likelihood.
+    /// Number of evaluations of the likelihood.
     pub evaluations: usize,
-    /// Simulated measurements in all.
+    /// Number of simulated measurements.
     pub model_runs: usize,
-    /// Least Bhattacharyya distance to the measurements over the samples: some (m + m(m + 1)/2)/4n of it is chance.
+    /// Smallest Bhattacharyya distance to the measurements over the samples. About (m + m(m + 1)/2)/4n of it is due to chance.
     pub least_distance: f64,
 }
 
 impl<'a> Population<'a> {
-    /// `measured_hz`: `[n, m]`, complete measurements; `modes`: columns to use; `noise_multiple`: noise of the measurements as
-    /// a multiple of the structure's own; `simulated`: points at each θ.
+    /// The posterior for the complete measurements `measured_hz`, Hz, `[n, m]`, of which the columns `modes` are used.
+    /// `noise_multiple` is the noise of the measurements as a multiple of that of the structure; `simulated` is the number of
+    /// simulated measurements at each θ.
     ///
     /// # Errors
-    /// [`Error`] for data without a distribution.
+    /// [`Error`] for too few or dependent measurements, and for a number of simulated measurements that is not possible.
     pub fn new(
         simulator: &'a Simulator,
         measured_hz: &DMatrix<f64>,
@@ -127,14 +133,14 @@ impl<'a> Population<'a> {
         }
         let noisy = simulator.is_noisy() && noise_multiple > 0.0;
         let dimensions = simulator.space().len() + if noisy { modes.len() } else { 0 };
-        // Beyond these the crate gives numbers without meaning, and checks only in debug.
+        // Beyond these limits the crate returns unspecified numbers, and checks only in debug builds.
         if !(modes.len() + 2..=MOST_POINTS).contains(&simulated) || dimensions > sobol_burley::NUM_DIMENSIONS as usize {
             return Err(Error::Points { points: simulated, dimensions });
         }
         let scramble = stats::stream(seed, "scrambling of simulated measurements").next_u32();
         let score = |row: usize, column: usize| {
             let uniform = f64::from(sobol_burley::sample(row as u32, column as u32, scramble));
-            // The least step of the sequence: neither end has a finite score.
+            // The smallest step of the sequence, because 0 and 1 have no finite score.
             stats::normal_quantile(uniform.clamp(f64::from(f32::EPSILON), 1.0 - f64::from(f32::EPSILON)))
         };
         let scores = standardised(DMatrix::from_fn(simulated, dimensions, score))
@@ -144,7 +150,7 @@ impl<'a> Population<'a> {
         Ok(Self { simulator, modes: modes.to_vec(), measured, scores, noise_multiple, epsilon_squared })
     }
 
-    /// Samples the posterior.
+    /// Samples the posterior by [`tmcmc`]. Returns the samples of (μ, σ), `[n, 2d]`, and their summary.
     ///
     /// # Errors
     /// [`Error::Sampling`].
@@ -173,7 +179,7 @@ impl<'a> Population<'a> {
         Ok((samples, estimate))
     }
 
-    /// Moments of the simulated frequencies at θ; `None` where the structure has no frequencies.
+    /// Moments of the simulated frequencies at θ; `None` if the frequencies cannot be computed.
     fn simulate(&self, theta: &[f64]) -> Option<Moments> {
         let (d, m) = (self.simulator.space().len(), self.modes.len());
         let mut rows = Vec::with_capacity(self.scores.nrows() * m);
@@ -183,10 +189,10 @@ impl<'a> Population<'a> {
                 *value = theta[k] + theta[d + k] * self.scores[(point, k)];
             }
             let frequencies = self.simulator.frequencies_hz(&x).ok()?;
-            for (place, &mode) in self.modes.iter().enumerate() {
+            for (column, &mode) in self.modes.iter().enumerate() {
                 let f = frequencies[mode];
                 let noise = if self.noise_multiple > 0.0 {
-                    self.noise_multiple * self.simulator.std_hz(mode, f) * self.scores[(point, d + place)]
+                    self.noise_multiple * self.simulator.std_hz(mode, f) * self.scores[(point, d + column)]
                 } else {
                     0.0
                 };
@@ -197,8 +203,8 @@ impl<'a> Population<'a> {
     }
 }
 
-/// The same points with mean 0 and covariance I, exactly: of a linear map their images then have the moments of infinitely
-/// many, and only its curvature is left to their number. `None` for fewer points than a covariance needs.
+/// Transforms the scores `[points, dimensions]` to have exactly mean 0 and covariance I. Their images under a linear map then have
+/// the exact moments, and only the curvature of the map causes an error. `None` for too few points for a covariance.
 ///
 /// Source: J. Barraquand (1995), Numerical valuation of high dimensional multivariate European securities, Management Science
 /// 41, 1882–1891 (quadratic resampling).

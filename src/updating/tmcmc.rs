@@ -1,4 +1,4 @@
-//! Transitional Markov chain Monte Carlo: samples of a posterior, and the evidence, from the prior by way of tempering.
+//! Transitional Markov chain Monte Carlo (TMCMC): samples a posterior and estimates the evidence by tempering from the prior.
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
@@ -9,51 +9,51 @@ use serde::{Deserialize, Serialize};
 use super::weights::{next_exponent, Weights};
 use crate::stats::{self, Stream};
 
-/// Stages after which the exponent will not reach 1 any more.
+/// Largest number of stages.
 const MOST_STAGES: usize = 300;
 
-/// Share of its standard deviation over the prior below which a parameter counts as collapsed.
+/// A parameter has collapsed if its standard deviation is below this share of that over the prior.
 const COLLAPSED: f64 = 1e-9;
 
-/// Added to the diagonal of the correlation matrix of the proposal: parameters in strict dependence stay proposable.
+/// Added to the diagonal of the correlation matrix of the proposal, so that it is regular for exactly dependent parameters.
 const CORRELATION_FLOOR: f64 = 1e-12;
 
-/// Range of the proposal scale β: far beyond what tuning should need, so that it cannot run away.
+/// Range of the proposal scale β, much wider than tuning needs, so that β cannot diverge.
 const SCALES: (f64, f64) = (1e-6, 10.0);
 
-/// What is sampled: a prior that can be drawn from, and a likelihood.
+/// A posterior to be sampled: a prior that can be drawn from, and a likelihood.
 ///
-/// All is asked from several threads at once. The same θ must give the same answer every time: a likelihood that simulates
-/// draws the same random numbers at every θ.
+/// The methods are called from several threads at once. They must be deterministic: a likelihood that simulates must use the same
+/// random numbers at every θ.
 pub trait Target: Sync {
-    /// Length of θ.
+    /// Number of dimensions d of θ.
     fn dimensions(&self) -> usize;
 
-    /// One draw of the prior, `[d]`.
+    /// Draws θ from the prior, `[d]`.
     fn draw_prior(&self, stream: &mut Stream) -> Vec<f64>;
 
-    /// Logarithm of the prior density, −∞ outside its support. A constant factor, the same everywhere, may be left out: it
-    /// changes neither samples nor evidence.
+    /// Logarithm of the prior density, −∞ outside its support. A constant factor may be omitted, because it changes neither the
+    /// samples nor the evidence.
     fn log_prior(&self, theta: &[f64]) -> f64;
 
-    /// Logarithm of the likelihood; −∞ where it is zero, as for a structure that is a mechanism. Only asked inside the
-    /// support of the prior. NaN and +∞ are bugs, and end the run.
+    /// Logarithm of the likelihood; −∞ where it is zero, as for a structure that is a mechanism. It is only evaluated inside the
+    /// support of the prior. NaN and +∞ are bugs and end the run with an error.
     fn log_likelihood(&self, theta: &[f64]) -> f64;
 }
 
-/// How many samples, and how carefully they move.
+/// Settings of [`tmcmc`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Settings {
-    /// Samples of each stage, and of the answer; at least 2.
+    /// Number of samples of each stage and of the result; at least 2.
     pub samples: usize,
-    /// Coefficient of variation of the weights that each stage goes for, above 0: smaller is more stages.
+    /// Target for the coefficient of variation of the weights in each stage, above 0. A smaller value gives more stages.
     pub weight_variation: f64,
-    /// Samples move on until no parameter is correlated more than this with its start, between 0 and 1: a short chain would
-    /// leave copies that count as samples, which makes the evidence and the spread less certain than they look.
+    /// In each stage the samples move until the correlation of every parameter with its start is at most this, from 0 to 1. With
+    /// fewer steps, copies of the same sample would remain and the uncertainty of the results would be underestimated.
     pub correlation: f64,
-    /// Metropolis steps of a sample in one stage, at most; at least 1. Separate modes keep the correlation up, so that it
-    /// comes to this many.
+    /// Largest number of Metropolis steps of a sample in one stage; at least 1. It is reached for a posterior with separate modes,
+    /// for which the correlation remains high.
     pub most_steps: usize,
 }
 
@@ -64,6 +64,7 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// Checks the ranges of the settings.
     fn check(&self) -> Result<(), Error> {
         let settings = [
             ("samples", self.samples as f64, self.samples >= 2),
@@ -82,76 +83,76 @@ impl Settings {
     }
 }
 
-/// One step of the way from the prior to the posterior.
+/// One stage of tempering between the prior and the posterior.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Stage {
-    /// Exponent of the likelihood that the samples have reached; 0 when they only left where the likelihood is zero.
+    /// Exponent of the likelihood at the end of the stage; 0 if the stage only discarded samples with zero likelihood.
     pub exponent: f64,
     /// Logarithm of the mean weight, nats.
     pub log_evidence_increment: f64,
-    /// Samples before the stage, counted by their weights: 1/Σ W², W the weights normalised to 1.
+    /// Effective sample size 1/Σ W² of the weighted samples before resampling, where W are the normalised weights.
     pub effective_sample_size: f64,
-    /// Metropolis steps of each sample.
+    /// Number of Metropolis steps of each sample.
     pub steps: usize,
-    /// Share of the proposals that were accepted.
+    /// Acceptance rate of the proposals.
     pub acceptance: f64,
-    /// Largest correlation left between a parameter and its start.
+    /// Largest remaining correlation between a parameter and its start.
     pub correlation: f64,
-    /// Calls of the likelihood; those of the prior draws count in the first stage.
+    /// Number of evaluations of the likelihood. The first stage includes those of the prior draws.
     pub evaluations: usize,
 }
 
-/// Samples of the posterior, all of the same weight.
+/// Equally weighted samples of the posterior.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Samples {
-    /// `[n, d]`.
+    /// The samples, `[n, d]`.
     pub theta: DMatrix<f64>,
     /// Log-likelihood of each sample, nats, `[n]`.
     pub log_likelihood: Vec<f64>,
     /// Logarithm of the evidence, ∫ prior × likelihood, nats.
     pub log_evidence: f64,
-    /// Its Monte Carlo standard error, estimated from this run, nats.
+    /// Monte Carlo standard error of `log_evidence`, estimated from this run, nats.
     pub log_evidence_std_error: f64,
-    /// Stages, the last at exponent 1.
+    /// The stages, of which the last has the exponent 1.
     pub stages: Vec<Stage>,
-    /// Calls of the likelihood.
+    /// Number of evaluations of the likelihood.
     pub evaluations: usize,
 }
 
-/// Why there are no samples.
+/// Why sampling failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// A setting out of its range.
-    #[error("setting {name} cannot be {value}")]
+    /// A setting is outside its range, see [`Settings`].
+    #[error("the setting {name} is {value}, which is outside its range")]
     Setting {
         /// Field of [`Settings`].
         name: &'static str,
-        /// What it was.
+        /// Value given.
         value: f64,
     },
     /// θ is empty.
     #[error("there is no parameter to sample")]
     NoParameters,
-    /// Nothing to begin with.
-    #[error("the likelihood is zero at all {draws} draws of the prior")]
+    /// The likelihood is zero at all draws from the prior.
+    #[error("the likelihood is zero at all {draws} draws from the prior")]
     ZeroLikelihood {
-        /// Draws of the prior.
+        /// Number of draws from the prior.
         draws: usize,
     },
-    /// A bug of the target.
+    /// The target returned a value that is not the logarithm of a density: a bug of the target.
     #[error("the logarithm of the {density} is {value} at {theta:?}")]
     NotADensity {
         /// Prior or likelihood.
         density: &'static str,
-        /// NaN or +∞; also −∞ where a prior excludes its own draw.
+        /// NaN or +∞, or −∞ for a prior at a point that was drawn from it.
         value: f64,
-        /// Where, `[d]`.
+        /// The point, `[d]`.
         theta: Vec<f64>,
     },
-    /// The likelihood is too far from the prior.
-    #[error("the likelihood has the exponent {exponent} after {stages} stages")]
+    /// The exponent did not reach 1, because the likelihood is concentrated in too small a part of the prior.
+    #[error("the exponent of the likelihood is only {exponent} after {stages} stages, and must reach 1")]
     TooManyStages {
-        /// Stages done.
+        /// Number of stages.
         stages: usize,
         /// Exponent reached.
         exponent: f64,
@@ -169,32 +170,32 @@ pub enum Error {
 ///  accepted with:          min(1, prior(θ')·L(θ')^p_s / prior(θ)·L(θ)^p_s)
 /// ```
 ///
-/// In each stage every sample draws a parent by the weights and moves from there, all by the same number of steps:
-/// until no parameter is correlated with its start more than [`Settings::correlation`]. β is tuned after each step towards
-/// an acceptance of 0.21/d + 0.23. Where the zeros of the likelihood alone vary the weights more than wanted, the first
-/// stage only leaves them, at exponent 0. A parameter that has collapsed (all samples in one place) is proposed with its
-/// standard deviation over the prior; strict dependence between parameters is loosened by 1e-12 on the diagonal of their
-/// correlation matrix.
+/// In each stage every sample is drawn from the weighted samples of the stage before and moves from there. All samples take the
+/// same number of steps, until the correlation of every parameter with its start is at most [`Settings::correlation`]. β is tuned
+/// after each step towards an acceptance rate of 0.21/d + 0.23. If zeros of the likelihood alone make the coefficient of
+/// variation too large, the first stage stays at exponent 0 and only discards the samples with zero likelihood. A parameter that
+/// has collapsed (all samples have the same value) is proposed with its standard deviation over the prior. Adding 1e-12 to the
+/// diagonal of the correlation matrix keeps the proposal regular for exactly dependent parameters.
 ///
-/// The standard error follows the families, the samples with one draw of the prior as ancestor:
+/// The standard error is computed from families, which are samples that descend from the same draw from the prior:
 ///
 /// ```text
 ///  SE² = 1 − (n/(n − 1))^S · (1 − Σ_families (Σ_i∈family W_i)²),    W the normalised weights of the last stage
 /// ```
 ///
-/// Unlike the sum of the stages' variances Σ (1/ESS − 1/n), which it is not let below, it sees samples that remain alike
-/// through several stages, as in a mode that cannot be left. The estimated evidence is nearly free of bias; its logarithm
-/// is low by SE²/2.
+/// It is at least the square root of the sum of the variances of the stages, Σ (1/ESS − 1/n). Unlike that sum, it accounts for
+/// samples that remain similar over several stages, as in a mode that the samples cannot leave. The estimate of the evidence is
+/// nearly unbiased; its logarithm is too low by SE²/2 on average.
 ///
-/// The same seed gives the same bits on any number of threads: every sample has a stream of its own in every stage.
+/// The same seed gives the same bits on any number of threads, because every sample has its own random stream in every stage.
 /// `progress` is called after each stage.
 ///
 /// Source: Ching & Chen (2007) for stages, weights and evidence. Betz et al. (2016) for β, and for why the samples move by
 /// several steps instead of a chain growing from each as often as it is drawn: such chains are biased. Lee & Whiteley (2018)
-/// for the standard error, with multinomial resampling as it needs.
+/// for the standard error, which requires multinomial resampling.
 ///
 /// # Errors
-/// [`Error`].
+/// [`Error`] for settings outside their range, and for a target that cannot be sampled.
 pub fn tmcmc<T: Target>(
     target: &T,
     settings: &Settings,
@@ -278,11 +279,12 @@ impl Point {
     }
 }
 
+/// A sample that moves.
 struct Chain {
     point: Point,
     /// θ at the beginning of the stage, `[d]`.
     start: Vec<f64>,
-    /// Draw of the prior it descends from.
+    /// Index of the draw from the prior that it descends from.
     family: usize,
     stream: Stream,
 }
@@ -296,16 +298,16 @@ impl Chain {
         Ok(Self { point, start, family: index, stream })
     }
 
-    /// One Metropolis step; what it counted.
+    /// Takes one Metropolis step; whether it was accepted, and the number of evaluations.
     fn step<T: Target>(&mut self, target: &T, exponent: f64, factor: &DMatrix<f64>) -> Result<Counts, Error> {
         let normal = DVector::from_fn(self.start.len(), |_, _| self.stream.sample::<f64, _>(StandardNormal));
         let step = factor * normal;
-        // Drawn before the outcome is known, so that the stream does not depend on it.
+        // Always drawn, so that the state of the random stream does not depend on the outcome.
         let threshold = self.stream.random::<f64>().ln();
         let proposed = self.point.theta.iter().zip(&step).map(|(x, s)| x + s).collect();
         let Some(proposed) = Point::at(target, proposed)? else { return Ok(Counts::default()) };
-        // Tempered: accepting by L instead of L^p would sample the posterior in the spread of the stage before it. A zero
-        // likelihood is zero at exponent 0 too.
+        // The target of the stage is tempered, so that L^p is compared instead of L. A likelihood of zero is zero at exponent 0,
+        // too.
         let log_ratio = if proposed.log_likelihood.is_infinite() {
             f64::NEG_INFINITY
         } else {
@@ -329,7 +331,7 @@ fn stream(seed: u64, stage: usize, chain: usize) -> Stream {
     stats::stream(seed, &format!("tmcmc stage {stage} chain {chain}"))
 }
 
-/// Every new sample draws its parent (multinomial) and starts there.
+/// Multinomial resampling: every new sample draws its parent by the weights and starts there.
 fn resampled(chains: &[Chain], weights: &[f64], seed: u64, stage: usize) -> Vec<Chain> {
     let cumulative: Vec<f64> = weights
         .iter()
@@ -341,7 +343,7 @@ fn resampled(chains: &[Chain], weights: &[f64], seed: u64, stage: usize) -> Vec<
     let total = cumulative[cumulative.len() - 1];
     let one = |index| {
         let mut stream = stream(seed, stage, index);
-        // Strictly below the total, and the first sum above it: never a weight of zero.
+        // The level is strictly below the total, and the first sum above it is taken, so that no sample of weight zero is drawn.
         let level = stream.random::<f64>() * total;
         let parent = &chains[cumulative.partition_point(|sum| *sum <= level).min(chains.len() - 1)];
         Chain { point: parent.point.clone(), start: parent.point.theta.clone(), family: parent.family, stream }
@@ -349,7 +351,8 @@ fn resampled(chains: &[Chain], weights: &[f64], seed: u64, stage: usize) -> Vec<
     (0..chains.len()).into_par_iter().map(one).collect()
 }
 
-/// Moves all samples until they have forgotten their start; what it took, as a stage without its weights.
+/// Moves all samples until their correlation with their starts is small enough. Returns the stage without the results of its
+/// weights.
 fn walk<T: Target>(
     target: &T,
     settings: &Settings,
@@ -374,7 +377,7 @@ fn walk<T: Target>(
             .try_reduce(Counts::default, |a, b| Ok(add(a, b)))?;
         total = add(total, counts);
         steps += 1;
-        // All samples take part in one acceptance: known well enough that the whole difference may count.
+        // The acceptance rate is averaged over all samples, so that it is accurate enough for the full correction.
         let acceptance = counts.accepted as f64 / chains.len() as f64;
         *scale = (*scale * (acceptance - wanted).exp()).clamp(SCALES.0, SCALES.1);
         let correlation = correlation_with_start(chains, prior_stds);
@@ -392,7 +395,7 @@ fn walk<T: Target>(
     }
 }
 
-/// Largest correlation over the parameters that the prior leaves free; 1 for one that had collapsed, or has.
+/// Largest correlation with the start over the parameters that are not fixed by the prior; 1 for a collapsed parameter.
 fn correlation_with_start(chains: &[Chain], prior_stds: &DVector<f64>) -> f64 {
     let n = chains.len() as f64;
     let one = |k: usize| {
@@ -412,14 +415,14 @@ fn correlation_with_start(chains: &[Chain], prior_stds: &DVector<f64>) -> f64 {
 
 // ---- Error and proposal ----
 
-/// Standard error of the log-evidence; `families` is Σ_families (Σ W)² of the last weights.
+/// Standard error of the log-evidence; `families` is Σ_families (Σ W)² of the weights of the last stage.
 fn std_error(stages: &[Stage], families: f64, n: f64) -> f64 {
     let by_families = 1.0 - (n / (n - 1.0)).powi(stages.len() as i32) * (1.0 - families);
     let by_stages: f64 = stages.iter().map(|s| 1.0 / s.effective_sample_size - 1.0 / n).sum();
     by_families.max(by_stages).max(0.0).sqrt()
 }
 
-/// Standard deviation of each parameter over draws of the prior; exactly 0, not rounding, where it is fixed.
+/// Standard deviation of each parameter over draws from the prior, `[d]`; exactly 0 for a parameter that is fixed.
 fn prior_stds(chains: &[Chain]) -> DVector<f64> {
     let weights = vec![1.0 / chains.len() as f64; chains.len()];
     let mut stds = covariance(chains, &weights).diagonal().map(f64::sqrt);
@@ -431,7 +434,7 @@ fn prior_stds(chains: &[Chain]) -> DVector<f64> {
     stds
 }
 
-/// Weighted covariance of θ; the weights sum to 1.
+/// Weighted covariance of θ, `[d, d]`; the weights have the sum 1.
 fn covariance(chains: &[Chain], weights: &[f64]) -> DMatrix<f64> {
     let d = chains[0].start.len();
     let mut mean = DVector::zeros(d);
@@ -447,7 +450,7 @@ fn covariance(chains: &[Chain], weights: &[f64]) -> DMatrix<f64> {
     covariance
 }
 
-/// F with F·Fᵀ = C, of full rank but for parameters that the prior does not leave free.
+/// Factor F of the proposal covariance C = F·Fᵀ, `[d, d]`, which has full rank except for parameters that the prior fixes.
 fn proposal_factor(covariance: &DMatrix<f64>, prior_stds: &DVector<f64>) -> DMatrix<f64> {
     let d = prior_stds.len();
     let stds = covariance.diagonal().map(f64::sqrt);
@@ -462,7 +465,7 @@ fn proposal_factor(covariance: &DMatrix<f64>, prior_stds: &DVector<f64>) -> DMat
         }
     });
     let widths = DVector::from_fn(d, |k, _| if collapsed[k] { prior_stds[k] } else { stds[k] });
-    // Rounding of some hundred parameters in strict dependence can outweigh the floor; each by itself always works.
+    // For about a hundred exactly dependent parameters, rounding errors can exceed the floor; independent proposals always work.
     let factor = correlation.cholesky().map_or_else(|| DMatrix::identity(d, d), |c| c.l());
     DMatrix::from_diagonal(&widths) * factor
 }

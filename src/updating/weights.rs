@@ -1,23 +1,23 @@
-//! Weights of tempered samples, and how far one tempering may go.
+//! Weights of tempered samples, and the choice of the next tempering exponent.
 
-/// Weights of samples, a power of their likelihood.
+/// Weights of samples, which are a power of their likelihood L.
 pub(super) struct Weights {
-    /// Sum 1, `[n]`.
+    /// Normalised weights W, with sum 1, `[n]`.
     pub normalised: Vec<f64>,
     /// Logarithm of the mean weight, nats.
     pub log_mean: f64,
-    /// 1/Σ W², W the normalised weights.
+    /// Effective sample size 1/Σ W².
     pub effective_sample_size: f64,
-    /// Coefficient of variation.
+    /// Coefficient of variation of the weights.
     variation: f64,
 }
 
 impl Weights {
-    /// L^step; zero where L is, even for a step of 0. Some L must not be zero.
+    /// Weights L^step. They are zero where L is zero, even for a step of 0. At least one L must be positive.
     pub fn new(log_likelihood: &[f64], step: f64) -> Self {
         let n = log_likelihood.len() as f64;
         let largest = log_likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        // Relative to the largest, which is 1 then: neither overflow nor a sum of zero.
+        // Relative to the largest, so that neither an overflow nor a sum of zero can occur.
         let relative = |l: &f64| if l.is_infinite() { 0.0 } else { (step * (l - largest)).exp() };
         let mut normalised: Vec<f64> = log_likelihood.iter().map(relative).collect();
         let sum: f64 = normalised.iter().sum();
@@ -34,7 +34,7 @@ impl Weights {
         }
     }
 
-    /// Σ_families (Σ_i∈family W_i)²; the families are numbered below n.
+    /// Σ_families (Σ_i∈family W_i)², where the families are numbered from 0 to n − 1.
     pub fn family_sum_of_squares(&self, families: impl Iterator<Item = usize>) -> f64 {
         let mut sums = vec![0.0; self.normalised.len()];
         for (family, weight) in families.zip(&self.normalised) {
@@ -44,7 +44,8 @@ impl Weights {
     }
 }
 
-/// The largest exponent up to 1 whose weights vary by no more than wanted; the present one where zeros alone vary them more.
+/// The largest exponent up to 1 for which the coefficient of variation of the weights is at most `wanted`. If zeros of the
+/// likelihood alone exceed it, the present exponent is returned.
 pub(super) fn next_exponent(log_likelihood: &[f64], present: f64, wanted: f64) -> f64 {
     let variation = |exponent: f64| Weights::new(log_likelihood, exponent - present).variation;
     if variation(1.0) <= wanted {
@@ -53,7 +54,7 @@ pub(super) fn next_exponent(log_likelihood: &[f64], present: f64, wanted: f64) -
     if variation(present) > wanted {
         return present;
     }
-    // The variation grows with the exponent.
+    // Bisection: the variation increases with the exponent.
     let (mut below, mut above) = (present, 1.0);
     while above - below > 1e-9 * (above - present) {
         let middle = f64::midpoint(below, above);
@@ -66,7 +67,7 @@ pub(super) fn next_exponent(log_likelihood: &[f64], present: f64, wanted: f64) -
             above = middle;
         }
     }
-    // Where not even rounding up is a step small enough, a large step is better than none.
+    // If even the smallest representable step is too large, it is taken nevertheless.
     if below > present {
         below
     } else {

@@ -31,7 +31,7 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 60] = [
+const TABLE: [(&str, &str, Needs, About); 63] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
@@ -91,6 +91,9 @@ const TABLE: [(&str, &str, Needs, About); 60] = [
     ("GET", "/docs", Nothing, Service),
     ("GET", "/docs/", Nothing, Service),
     ("GET", "/docs/{}", Nothing, Service),
+    ("GET", "/docs/api-explorer", Nothing, Service),
+    ("GET", "/docs/api-explorer/", Nothing, Service),
+    ("GET", "/docs/api-explorer/{}", Nothing, Service),
     ("GET", "/", Nothing, Service),
     ("GET", "/assets/{}", Nothing, Service),
 ];

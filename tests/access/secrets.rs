@@ -37,7 +37,8 @@ async fn no_secret_is_in_log_database_or_metrics() {
     let mut line = String::new();
     BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
     let url = line.trim().split_once("listens on ").unwrap().1.to_owned();
-    let (client, mut secrets) = (Client::new(), vec![first.clone(), from_file.clone()]);
+    let (client, mut secrets) =
+        (modalwatch::notify::client_builder().build().unwrap(), vec![first.clone(), from_file.clone()]);
     let ask =
         |method: Method, path: &str, token: &str| client.request(method, format!("{url}{path}")).bearer_auth(token);
 

@@ -1,14 +1,12 @@
 //! Which requests the service accepts before there is a token, and when it refuses to start.
 
-use std::io::Read as _;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, problem, Service};
+use crate::helpers::{command, created, problem, refusal, Service};
 use crate::world::{first_token, program};
 
 const LIST: &str = "/v1/structures";
@@ -19,23 +17,6 @@ fn public(data_dir: &Path) -> Command {
     command.args(["serve", "--listen", "0.0.0.0:0", "--data-dir"]).arg(data_dir);
     command.env("MODALWATCH__LOG__LEVEL", "warn").env_remove("MODALWATCH_ADMIN_TOKEN_FILE");
     command
-}
-
-/// The message of a service that must not start.
-fn refusal(command: &mut Command) -> String {
-    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let started = Instant::now();
-    while child.try_wait().unwrap().is_none() {
-        if started.elapsed() > Duration::from_secs(20) {
-            child.kill().unwrap();
-            panic!("it should have refused to start: {command:?}");
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    let mut text = String::new();
-    child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
-    assert!(!child.wait().unwrap().success(), "{text}");
-    text
 }
 
 #[tokio::test]

@@ -2,13 +2,12 @@
 
 use std::path::Path;
 use std::process::{Command, Output};
-use std::time::{Duration, Instant};
 
 use reqwest::{Method, RequestBuilder, Response};
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
-use crate::helpers::{command, created, Service};
+use crate::helpers::{self, command, created, Service};
 
 /// A service that requires tokens, and its first token.
 pub struct World {
@@ -82,15 +81,14 @@ impl World {
 
 /// Repeats a request until its answer has this status and code.
 pub async fn eventually(world: &World, path: &str, token: &str, status: u16, code: &str) {
-    let started = Instant::now();
-    loop {
+    helpers::eventually(&format!("an answer {status} of {path}"), async || {
         let response = world.get(path, token).await;
-        if response.status() == status {
-            let body: Value = response.json().await.unwrap();
-            assert_eq!(body["code"], code, "{body}");
-            return;
+        if response.status() != status {
+            return None;
         }
-        assert!(started.elapsed() < Duration::from_secs(20), "still {}", response.status());
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
+        let body: Value = response.json().await.unwrap();
+        assert_eq!(body["code"], code, "{body}");
+        Some(())
+    })
+    .await;
 }

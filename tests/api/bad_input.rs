@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{command, measurements, problem, repository, spawn, time, Service};
+use crate::helpers::{command, eventually, measurements, problem, repository, spawn, time, Service};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -53,17 +53,17 @@ async fn json_of_another_shape_is_a_422_with_a_pointer() {
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, NaN, 0.93]}}]}}"),
             "/measurements/0/frequencies_hz/1",
-            "NaN is no JSON number",
+            "NaN is not a JSON number",
         ),
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, Infinity, 0.93]}}]}}"),
             "/measurements/0/frequencies_hz/1",
-            "Infinity is no JSON number",
+            "Infinity is not a JSON number",
         ),
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, -Infinity, 0.93]}}]}}"),
             "/measurements/0/frequencies_hz/1",
-            "Infinity is no JSON number",
+            "Infinity is not a JSON number",
         ),
         (
             format!("{{\"measurements\": [{{{at}, \"frequencies_hz\": [0.41, 1e999, 0.93]}}]}}"),
@@ -87,8 +87,8 @@ async fn values_that_cannot_be_are_a_422_with_a_pointer() {
         ("frequencies_hz", json!([0.41, 0.0, 0.93]), "/measurements/2/frequencies_hz/1", "above 0"),
         ("frequencies_hz", json!([0.41, -0.0, 0.93]), "/measurements/2/frequencies_hz/1", "above 0"),
         ("frequencies_hz", json!([-0.41, 0.7, 0.93]), "/measurements/2/frequencies_hz/0", "-0.41 Hz"),
-        ("frequencies_hz", json!([0.41, 0.7, 1e6]), "/measurements/2/frequencies_hz/2", "is it in Hz?"),
-        ("frequencies_hz", json!([1e-4, 0.7, 0.93]), "/measurements/2/frequencies_hz/0", "it looks like kHz"),
+        ("frequencies_hz", json!([0.41, 0.7, 1e6]), "/measurements/2/frequencies_hz/2", "it must be in Hz"),
+        ("frequencies_hz", json!([1e-4, 0.7, 0.93]), "/measurements/2/frequencies_hz/0", "it seems to be in kHz"),
         ("frequencies_hz", json!([0.41, 0.93]), "/measurements/2/frequencies_hz", "2 frequencies, expected 3"),
         (
             "frequencies_hz",
@@ -96,7 +96,7 @@ async fn values_that_cannot_be_are_a_422_with_a_pointer() {
             "/measurements/2/frequencies_hz",
             "4 frequencies, expected 3",
         ),
-        ("frequencies_hz", json!([0.00041, 0.00092, 0.0012]), "/measurements/2/frequencies_hz/0", "looks like kHz"),
+        ("frequencies_hz", json!([0.00041, 0.00092, 0.0012]), "/measurements/2/frequencies_hz/0", "seems to be in kHz"),
         ("frequencies_hz", json!([null, null, null]), "/measurements/2/frequencies_hz", "all modes are missing"),
         ("std_hz", json!([0.1, 0.1]), "/measurements/2/std_hz", "expected 3"),
         ("std_hz", json!([0.1, 0.0, 0.1]), "/measurements/2/std_hz/1", "above 0"),
@@ -244,8 +244,8 @@ async fn tables_with_mistakes_are_refused_with_line_and_column() {
         (b"measured_at,f1_hz,f2_hz,f3_hz,lab\n".to_vec(), "line 1", "unknown column \"lab\""),
         (b"measured_at,f1_hz,f2_hz,f3_hz,f3_hz\n".to_vec(), "line 1", "twice"),
         (b"measured_at,f1_hz,f2_hz,f3_hz,f4_hz\n".to_vec(), "line 1", "3 modes"),
-        (with("2026-01-01T00:10:00Z,0.41,0.74").into(), "line 3", "3 cells, the header has 4"),
-        (with("2026-01-01T00:10:00Z,0.41,abc,0.93").into(), "line 3, column f2_hz", "\"abc\" is no number"),
+        (with("2026-01-01T00:10:00Z,0.41,0.74").into(), "line 3", "3 cells, but the header has 4"),
+        (with("2026-01-01T00:10:00Z,0.41,abc,0.93").into(), "line 3, column f2_hz", "\"abc\" is not a number"),
         (with("2026-01-01T00:10:00Z,0.41,NaN,0.93").into(), "line 3, column f2_hz", "leave the cell empty"),
         (with("2026-01-01T00:10:00Z,0.41,-0.74,0.93").into(), "line 3, column f2_hz", "above 0"),
         (with("2026-01-01T00:10:00,0.41,0.74,0.93").into(), "line 3, column measured_at", "offset"),
@@ -378,13 +378,7 @@ async fn a_batch_that_waited_is_assessed_when_its_baseline_is_there() {
     service.stop("TERM");
     let service = Service::start(folder.path());
     let path = format!("{BATCHES}/{}", batch.as_str().unwrap());
-    for _ in 0..100 {
-        if service.read(&path).await["state"] == "assessed" {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
-    panic!("{}", service.read(&path).await);
+    eventually("the assessment", async || (service.read(&path).await["state"] == "assessed").then_some(())).await;
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 
 use serde_json::{json, Value};
 
-use crate::helpers::{created, measurements, problem, spawn, time};
+use crate::helpers::{created, eventually, measurements, problem, spawn, time};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -76,14 +76,10 @@ async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards
     assert_eq!(damaged["assessment"]["undamaged_version"], Value::Null);
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
     let path = |batch: &Value| format!("{BATCHES}/{}", batch["batch"].as_str().unwrap());
-    let mut compared = Value::Null;
-    for _ in 0..100 {
-        compared = service.read(&path(&damaged)).await;
-        if compared["assessment"]["undamaged_version"] == 1 {
-            break;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
+    let compared = eventually("the comparison", async || {
+        Some(service.read(&path(&damaged)).await).filter(|batch| batch["assessment"]["undamaged_version"] == 1)
+    });
+    let compared = compared.await;
     assert_eq!(compared["assessment"]["parameters"][1]["probability_of_damage"], 1.0, "{compared}");
     let own = service.read(&path(&healthy)).await;
     assert_eq!(own["assessment"]["undamaged_version"], Value::Null, "{own}");
@@ -105,15 +101,13 @@ async fn an_undamaged_state_declared_among_posts_misses_none_of_them() {
     for task in tasks {
         created(task.await.unwrap().unwrap()).await;
     }
-    for _ in 0..100 {
+    eventually("the comparison of all batches", async || {
         let history = service.read("/v1/structures/three-dof/history?limit=100").await;
-        let others = history["items"].as_array().unwrap().iter().filter(|item| item["batch"] != healthy["batch"]);
-        if others.clone().count() == 39 && others.clone().all(|item| item["assessment"]["undamaged_version"] == 1) {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
-    panic!("some batches were never compared with the undamaged state");
+        let mut others = history["items"].as_array().unwrap().iter().filter(|item| item["batch"] != healthy["batch"]);
+        let all = others.clone().count() == 39 && others.all(|item| item["assessment"]["undamaged_version"] == 1);
+        all.then_some(())
+    })
+    .await;
 }
 
 #[tokio::test]

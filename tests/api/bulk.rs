@@ -1,11 +1,9 @@
 //! NDJSON: many batches in one request, each with its own answer.
 
-use std::time::Duration;
-
 use reqwest::Response;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, measurements, problem, spawn, Service};
+use crate::helpers::{command, eventually, measurements, problem, spawn, Service};
 
 const BATCHES: &str = "/v1/structures/three-dof/batches";
 
@@ -187,13 +185,8 @@ async fn a_client_that_goes_away_stops_it_between_two_lines() {
     let sending = tokio::spawn(request.body(reqwest::Body::wrap_stream(lines)).send());
     sender.send(Ok(format!("{}\n", line(1, 2)))).await.unwrap();
     sender.send(Ok("{\"measurements\": [{".to_owned())).await.unwrap();
-    for _ in 0..200 {
-        if stored(&service).await == 1 {
-            break;
-        }
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
-    assert_eq!(stored(&service).await, 1, "a line is stored before the next has come");
+    // A line is stored before the next has come.
+    eventually("one stored line", async || (stored(&service).await == 1).then_some(())).await;
     sending.abort();
     // The service continues, and what was acknowledged is stored.
     let batch = service.read("/v1/structures/three-dof/history").await["items"][0].clone();

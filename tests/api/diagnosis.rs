@@ -7,10 +7,10 @@ use rand::SeedableRng as _;
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, spawn, Service};
+use crate::helpers::{command, created, eventually, spawn, within, Service};
 
 #[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
-#[path = "../discrepancy/world.rs"]
+#[path = "../discrepancy/world/mod.rs"]
 mod world;
 
 /// Two springs of a chain are unknown; the simulation does not depend on temperature.
@@ -60,15 +60,15 @@ fn batch(day: f64, k1_factor: f64, rng: &mut impl rand::Rng) -> Vec<Value> {
 
 /// Waits until a state in the answer of a diagnosis is no longer "running".
 async fn finished(service: &Service, id: &str, pointer: &str) -> Value {
-    for _ in 0..3_000 {
+    within(Duration::from_mins(10), pointer, async || {
         let answer = service.read(&format!("/v1/diagnoses/{id}")).await;
         match answer.pointer(pointer).and_then(Value::as_str) {
-            Some("running") | None => tokio::time::sleep(Duration::from_millis(200)).await,
-            Some("done") => return answer,
+            Some("running") | None => None,
+            Some("done") => Some(answer),
             Some(other) => panic!("{pointer} is {other}: {answer}"),
         }
-    }
-    panic!("{pointer} of diagnosis {id} is still running after ten minutes");
+    })
+    .await
 }
 
 /// Damage alarms of a structure: (parameter, opened at).
@@ -83,15 +83,12 @@ async fn damage_alarms(service: &Service) -> Vec<(String, String)> {
 
 /// Waits until this number of batches is assessed under the present version.
 async fn wait_until_assessed(service: &Service, batches: usize) {
-    for _ in 0..600 {
+    within(Duration::from_mins(2), "the assessment of all batches", async || {
         let history = service.read("/v1/structures/soft/history?limit=1000").await;
         let assessed = history["items"].as_array().unwrap().iter().filter(|i| i["state"] == "assessed").count();
-        if assessed >= batches {
-            return;
-        }
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
-    panic!("{batches} batches were not assessed within two minutes");
+        (assessed >= batches).then_some(())
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -223,14 +220,10 @@ async fn diagnoses_that_cannot_be_made_say_why() {
     // With too few measurements the job ends and reports how many are needed.
     let asked: Value = service.post(path, &json!({})).await.json().await.unwrap();
     let id = asked["diagnosis"].as_str().unwrap();
-    let mut answer = service.read(&format!("/v1/diagnoses/{id}")).await;
-    for _ in 0..100 {
-        if answer["state"] != "running" {
-            break;
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-        answer = service.read(&format!("/v1/diagnoses/{id}")).await;
-    }
+    let answer = eventually("the end of the diagnosis", async || {
+        Some(service.read(&format!("/v1/diagnoses/{id}")).await).filter(|answer| answer["state"] != "running")
+    });
+    let answer = answer.await;
     assert_eq!(answer["state"], "failed");
     assert!(answer["failure"].as_str().unwrap().contains("at least 30"), "{answer}");
     let none = service.get(&format!("/v1/diagnoses/{id}/report")).send().await.unwrap();

@@ -2,7 +2,7 @@
 
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use reqwest::{Client, Method, RequestBuilder, Response};
@@ -45,7 +45,12 @@ impl Service {
         // Its log must be read, or the pipe fills and the service waits for it.
         let mut stderr = child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut stderr, &mut std::io::sink()));
-        Self { url: url.to_owned(), child, stdout: Some(stdout), client: Client::new() }
+        Self {
+            url: url.to_owned(),
+            child,
+            stdout: Some(stdout),
+            client: modalwatch::notify::client_builder().build().unwrap(),
+        }
     }
 
     /// Address without scheme.
@@ -95,8 +100,8 @@ impl Service {
         self.child.wait().unwrap();
     }
 
-    /// Sends a signal by name and waits for the process to end; returns its exit status.
-    pub fn stop(&mut self, signal: &str) -> std::process::ExitStatus {
+    /// Sends a signal by name and waits for the end; returns the exit status.
+    pub fn stop(&mut self, signal: &str) -> ExitStatus {
         self.signal(signal);
         self.wait(Duration::from_secs(40))
     }
@@ -106,15 +111,8 @@ impl Service {
         assert!(status.success());
     }
 
-    pub fn wait(&mut self, limit: Duration) -> std::process::ExitStatus {
-        let started = Instant::now();
-        loop {
-            if let Some(status) = self.child.try_wait().unwrap() {
-                return status;
-            }
-            assert!(started.elapsed() < limit, "the service did not stop within {limit:?}");
-            std::thread::sleep(Duration::from_millis(20));
-        }
+    pub fn wait(&mut self, limit: Duration) -> ExitStatus {
+        exit_within(&mut self.child, limit).unwrap_or_else(|| panic!("the service did not stop within {limit:?}"))
     }
 }
 
@@ -123,6 +121,48 @@ impl Drop for Service {
         let _ = self.child.kill();
         let _ = self.child.wait();
         drop(self.stdout.take());
+    }
+}
+
+/// The exit status of a process, if it ends within `limit`.
+pub fn exit_within(child: &mut Child, limit: Duration) -> Option<ExitStatus> {
+    let started = Instant::now();
+    loop {
+        let status = child.try_wait().unwrap();
+        if status.is_some() || started.elapsed() > limit {
+            return status;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// What a command that must not start prints; it is ended when it starts all the same.
+pub fn refusal(command: &mut Command) -> String {
+    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let Some(status) = exit_within(&mut child, Duration::from_secs(20)) else {
+        child.kill().unwrap();
+        panic!("it should have refused to start: {command:?}");
+    };
+    let mut text = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
+    assert!(!status.success(), "{text}");
+    text
+}
+
+/// Asks until `found` gives something, and returns it; panics with `what` after 20 s.
+pub async fn eventually<T>(what: &str, found: impl AsyncFnMut() -> Option<T>) -> T {
+    within(Duration::from_secs(20), what, found).await
+}
+
+/// As [`eventually`], for as long as `limit`.
+pub async fn within<T>(limit: Duration, what: &str, mut found: impl AsyncFnMut() -> Option<T>) -> T {
+    let started = Instant::now();
+    loop {
+        if let Some(value) = found().await {
+            return value;
+        }
+        assert!(started.elapsed() < limit, "{what}: not within {limit:?}");
+        tokio::time::sleep(Duration::from_millis(25)).await;
     }
 }
 

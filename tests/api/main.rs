@@ -6,10 +6,14 @@ mod bad_input;
 mod batches;
 mod bulk;
 mod diagnosis;
+mod docs;
 mod export;
 mod helpers;
 mod history;
 mod hostile;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod openapi;
 mod operations;
 mod restart;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, measurements, problem, repository, spawn, Service};
+use crate::helpers::{command, created, eventually, measurements, problem, repository, spawn, Service};
 
 const METHODS: [&str; 5] = ["get", "put", "post", "delete", "patch"];
 
@@ -292,12 +292,10 @@ async fn a_real_answer_of_each_get_is_as_the_document_says() {
     let schema = response_schema(&document, "/v1/structures/{id}/diagnoses", "post", 202, "application/json");
     assert!(validator(&document, &schema).is_valid(&diagnosis), "{diagnosis:#}");
     let diagnosis = diagnosis["diagnosis"].as_str().unwrap();
-    for _ in 0..600 {
-        if service.read(&format!("/v1/diagnoses/{diagnosis}")).await["state"] != "running" {
-            break;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    }
+    eventually("the end of the diagnosis", async || {
+        (service.read(&format!("/v1/diagnoses/{diagnosis}")).await["state"] != "running").then_some(())
+    })
+    .await;
 
     let webhook = json!({ "url": "https://receiver.invalid/alarms", "enabled": false });
     let webhook = created(service.post("/v1/webhooks", &webhook).await).await;
@@ -433,13 +431,13 @@ async fn the_last_line_of_an_archive_is_the_one_that_the_document_names() {
 }
 
 #[tokio::test]
-async fn the_docs_page_needs_nothing_from_elsewhere() {
+async fn the_api_explorer_needs_nothing_from_elsewhere() {
     let folder = tempfile::tempdir().unwrap();
     let service = Service::spawn(&mut command(folder.path()));
-    // reqwest follows the redirect from /docs.
-    let page = service.get("/docs").send().await.unwrap();
+    // reqwest follows the redirect to the folder.
+    let page = service.get("/docs/api-explorer").send().await.unwrap();
     assert_eq!(page.status(), 200);
-    assert!(page.url().path().ends_with("/docs/"), "{}", page.url());
+    assert!(page.url().path().ends_with("/docs/api-explorer/"), "{}", page.url());
     let policy = page.headers()["content-security-policy"].to_str().unwrap().to_owned();
     assert!(policy.contains("default-src 'none'") && policy.contains("script-src 'self';"), "{policy}");
     assert!(!policy.contains("unsafe"), "{policy}");
@@ -452,14 +450,14 @@ async fn the_docs_page_needs_nothing_from_elsewhere() {
         ("swagger-initializer.js", "text/javascript"),
         ("favicon-32x32.png", "image/png"),
     ] {
-        let answer = service.get(&format!("/docs/{file}")).send().await.unwrap();
+        let answer = service.get(&format!("/docs/api-explorer/{file}")).send().await.unwrap();
         assert_eq!(answer.status(), 200, "{file}");
         assert!(answer.headers()["content-type"].to_str().unwrap().starts_with(content_type), "{file}");
         assert_eq!(answer.headers()["content-security-policy"], policy, "{file}");
     }
-    let script = service.get("/docs/swagger-initializer.js").send().await.unwrap().text().await.unwrap();
-    assert!(script.contains("../openapi.json") && !script.contains("http"), "{script}");
-    problem(service.get("/docs/nothing.js").send().await.unwrap(), 404, "unknown_route").await;
+    let script = service.get("/docs/api-explorer/swagger-initializer.js").send().await.unwrap().text().await.unwrap();
+    assert!(script.contains("../../openapi.json") && !script.contains("http"), "{script}");
+    problem(service.get("/docs/api-explorer/nothing.js").send().await.unwrap(), 404, "unknown_route").await;
 }
 
 #[tokio::test]

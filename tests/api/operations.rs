@@ -1,12 +1,13 @@
 //! Start, stop, health, and the conditions under which the service does not start.
 
 use std::io::{Read as _, Write as _};
-use std::process::Stdio;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use crate::helpers::{command, created, measurements, problem, spawn, Service};
+use crate::helpers::{command, created, eventually, measurements, problem, refusal, spawn, Service};
 
 #[tokio::test]
 async fn health_readiness_version_and_metrics_are_answered() {
@@ -59,10 +60,10 @@ async fn a_full_queue_is_a_503_with_retry_after_and_stores_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command(folder.path());
     let service = Service::spawn(command.env("MODALWATCH__MONITOR__COMPUTE__QUEUE", "1"));
-    let service = std::sync::Arc::new(service);
+    let service = Arc::new(service);
     let tasks: Vec<_> = (0..16)
         .map(|i| {
-            let service = std::sync::Arc::clone(&service);
+            let service = Arc::clone(&service);
             let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 20, i * 86_400) });
             tokio::spawn(async move { service.post("/v1/structures/three-dof/batches", &body).await })
         })
@@ -123,14 +124,20 @@ async fn sigterm_under_load_answers_what_was_taken_and_exits_with_0() {
     let (mut service, folder) = spawn();
     let client = service.client.clone();
     let url = format!("http://{}/v1/structures/three-dof/batches", service.address());
+    let answered = Arc::new(AtomicUsize::new(0));
     let posts: Vec<_> = (0..40)
         .map(|i| {
             let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 20, i * 20_000) });
             let post = client.post(&url).json(&body).send();
-            tokio::spawn(async move { post.await.is_ok_and(|r| r.status() == 201) })
+            let answered = Arc::clone(&answered);
+            tokio::spawn(async move {
+                let taken = post.await.is_ok_and(|r| r.status() == 201);
+                answered.fetch_add(1, Ordering::Relaxed);
+                taken
+            })
         })
         .collect();
-    tokio::time::sleep(Duration::from_millis(30)).await;
+    eventually("an answer", async || (answered.load(Ordering::Relaxed) > 0).then_some(())).await;
     let status = tokio::task::spawn_blocking(move || service.stop("TERM")).await.unwrap();
     assert!(status.success(), "{status}");
     let mut taken = 0;
@@ -142,46 +149,26 @@ async fn sigterm_under_load_answers_what_was_taken_and_exits_with_0() {
     assert!(history["items"].as_array().unwrap().len() >= taken, "{taken} were answered 201");
 }
 
-/// Output of a command that must not start; it is ended if it does start.
-fn fails(command: &mut std::process::Command) -> String {
-    let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let started = Instant::now();
-    let status = loop {
-        if let Some(status) = child.try_wait().unwrap() {
-            break status;
-        }
-        if started.elapsed() > Duration::from_secs(20) {
-            child.kill().unwrap();
-            panic!("it should have refused to start: {command:?}");
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    };
-    assert!(!status.success());
-    let mut text = String::new();
-    child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
-    text
-}
-
 #[tokio::test]
 async fn what_keeps_the_service_from_starting_is_named() {
     let (service, used) = spawn();
     let folder = tempfile::tempdir().unwrap();
     let mut taken = command(folder.path());
-    let text = fails(taken.args(["--listen", service.address()]).env_remove("X"));
+    let text = refusal(taken.args(["--listen", service.address()]).env_remove("X"));
     assert!(text.contains("the argument '--listen"), "{text}");
     let mut taken = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch"));
-    let text = fails(taken.args(["serve", "--listen", service.address(), "--data-dir"]).arg(folder.path()));
+    let text = refusal(taken.args(["serve", "--listen", service.address(), "--data-dir"]).arg(folder.path()));
     assert!(text.contains("cannot listen on") && text.contains("--listen"), "{text}");
 
-    let text = fails(&mut command(used.path()));
+    let text = refusal(&mut command(used.path()));
     assert!(text.contains("in use by another modalwatch"), "{text}");
-    let text = fails(command(folder.path()).args(["--models", "/no/such/folder"]));
+    let text = refusal(command(folder.path()).args(["--models", "/no/such/folder"]));
     assert!(text.contains("/no/such/folder"), "{text}");
-    let text = fails(command(folder.path()).env("MODALWATCH__HTTP__LISTN", "x"));
+    let text = refusal(command(folder.path()).env("MODALWATCH__HTTP__LISTN", "x"));
     assert!(text.to_lowercase().contains("listn"), "{text}");
-    let text = fails(command(folder.path()).env("MODALWATCH__MONITOR__COMPUTE__QUEUE", "0"));
+    let text = refusal(command(folder.path()).env("MODALWATCH__MONITOR__COMPUTE__QUEUE", "0"));
     assert!(text.contains("monitor.compute.queue is 0"), "{text}");
-    let text = fails(command(folder.path()).env("MODALWATCH__LOG__LEVEL", "=="));
+    let text = refusal(command(folder.path()).env("MODALWATCH__LOG__LEVEL", "=="));
     assert!(text.contains("log.level"), "{text}");
 }
 
@@ -190,7 +177,7 @@ async fn a_database_that_is_not_ours_or_cannot_be_written_is_refused_and_left_as
     let with_file = |bytes: &[u8]| {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("modalwatch.sqlite"), bytes).unwrap();
-        let text = fails(&mut command(folder.path()));
+        let text = refusal(&mut command(folder.path()));
         assert_eq!(std::fs::read(folder.path().join("modalwatch.sqlite")).unwrap(), bytes);
         text
     };
@@ -211,7 +198,7 @@ async fn a_database_that_is_not_ours_or_cannot_be_written_is_refused_and_left_as
         std::fs::set_permissions(&path, permissions).unwrap();
     };
     set(true);
-    assert!(fails(&mut command(folder.path())).contains("is read-only"));
+    assert!(refusal(&mut command(folder.path())).contains("is read-only"));
     set(false);
 
     let mut bytes = std::fs::read(&path).unwrap();
@@ -219,7 +206,7 @@ async fn a_database_that_is_not_ours_or_cannot_be_written_is_refused_and_left_as
     let half = bytes.len() / 2 / 4_096 * 4_096;
     bytes[half..half + 2_000].fill(0xa5);
     std::fs::write(&path, &bytes).unwrap();
-    let text = fails(&mut command(folder.path()));
+    let text = refusal(&mut command(folder.path()));
     assert!(text.contains("damaged") || text.contains("malformed"), "{text}");
 }
 
@@ -242,7 +229,7 @@ async fn a_database_of_a_newer_program_is_refused() {
                  values (9999, 'from the future', 1, x'00', 0)";
     sqlx::query(newer).execute(&mut connection).await.unwrap();
     connection.close().await.unwrap();
-    let text = fails(&mut command(folder.path()));
+    let text = refusal(&mut command(folder.path()));
     assert!(text.contains("schema version 9999, newer"), "{text}");
 }
 

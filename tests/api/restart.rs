@@ -3,12 +3,12 @@
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rand::Rng as _;
 use serde_json::json;
 
-use crate::helpers::{measurements, Service};
+use crate::helpers::{eventually, measurements, Service};
 
 const ROUNDS: usize = 6;
 const CLIENTS: usize = 4;
@@ -48,10 +48,7 @@ async fn every_201_is_in_the_history_exactly_once_whenever_the_service_is_killed
             .collect();
         // The first answers may take long on a busy machine; the kill comes at a random moment after some of them.
         let enough = acknowledged.lock().unwrap().len() + LEAST_IN_A_LIFE;
-        let deadline = Instant::now() + Duration::from_secs(30);
-        while acknowledged.lock().unwrap().len() < enough && Instant::now() < deadline {
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
+        eventually("answers", async || (acknowledged.lock().unwrap().len() >= enough).then_some(())).await;
         tokio::time::sleep(Duration::from_millis(stream.random_range(0..300))).await;
         service.kill();
         for client in clients {
@@ -83,12 +80,9 @@ async fn every_201_is_in_the_history_exactly_once_whenever_the_service_is_killed
     println!("{} acknowledged, {} stored, {ROUNDS} times killed", acknowledged.len(), stored.len());
 
     // What was stored but not assessed when the service died is assessed after the restart.
-    for _ in 0..200 {
+    eventually("the assessment of all batches", async || {
         let pending = service.read("/v1/structures/three-dof/history?limit=1000").await;
-        if pending["items"].as_array().unwrap().iter().all(|item| item["state"] == "assessed") {
-            return;
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    panic!("some batches were not assessed after the restart");
+        pending["items"].as_array().unwrap().iter().all(|item| item["state"] == "assessed").then_some(())
+    })
+    .await;
 }

@@ -3,6 +3,7 @@
 use serde_json::{json, Value};
 
 use crate::helpers::{created, repository, spawn, time};
+use crate::needs;
 
 const BATCHES: &str = "/v1/structures/ruler-frame-4dof/batches";
 
@@ -27,7 +28,7 @@ fn rows(lab: &str) -> Option<Vec<Value>> {
 #[tokio::test]
 async fn two_laboratories_are_taken_with_their_missing_values() {
     let (Some(br), Some(de)) = (rows("br"), rows("de")) else {
-        println!("skipped: ../shared/data/ruler-frame-4dof is not on this machine");
+        needs::missing("the data ../shared/data/ruler-frame-4dof, which are not part of the repository");
         return;
     };
     let (service, _folder) = spawn();

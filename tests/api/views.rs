@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use reqwest::{Method, Response};
 use serde_json::{json, Value};
 
-use crate::helpers::{created, measurements, problem, spawn, three_dof_hz, time, Service};
+use crate::helpers::{created, eventually, measurements, problem, spawn, three_dof_hz, time, Service};
 
 const SERIES: &str = "/v1/structures/three-dof/series";
 
@@ -406,11 +406,8 @@ async fn streams_are_counted_and_a_closed_one_makes_room() {
     assert!(refused.headers()["retry-after"].to_str().unwrap().parse::<u32>().unwrap() > 0);
     problem(refused, 503, "too_many_streams").await;
     watchers.pop();
-    for _ in 0..100 {
-        if service.get("/v1/events").send().await.unwrap().status() == 200 {
-            return;
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
-    panic!("the place of a closed stream was not given back within ten seconds");
+    eventually("the place of a closed stream", async || {
+        (service.get("/v1/events").send().await.unwrap().status() == 200).then_some(())
+    })
+    .await;
 }

@@ -1,4 +1,4 @@
-//! The shipped baseline on the paper's case 1, and files that must be refused.
+//! The shipped model of the paper's case 1, and files that must be refused.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -21,7 +21,7 @@ use modalwatch::simulator::population::{Population, SimulatedMeasurements};
 use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 
-/// Relative standard deviation that exact measurements are posted with: the least the baseline was trained for.
+/// Relative standard deviation of the exact measurements: the smallest that the model was trained for.
 const EXACT: f64 = 1e-4;
 
 static THREE_DOF: LazyLock<std::sync::Arc<Baseline>> = LazyLock::new(|| shipped("three-dof"));
@@ -67,7 +67,7 @@ fn pools(samples: &BatchSamples) -> Vec<Vec<f64>> {
 
 #[test]
 fn case_1_is_learnt_to_the_stated_likelihood_and_r_squared() {
-    // The paper's case has no noise: a flow of its own, whose posteriors are nearly points.
+    // The paper's case has no noise, and needs a flow of its own, whose posteriors are almost points.
     let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("models/three-dof/structure.toml"));
     let exact = text.unwrap().replace("relative = 0.001", "relative = 0.0");
     let simulator = Simulator::new(StructureDefinition::parse_toml(&exact).unwrap()).unwrap();
@@ -92,7 +92,7 @@ fn case_1_is_learnt_to_the_stated_likelihood_and_r_squared() {
         );
         assert!(p.r_squared_single >= 0.9995, "{p:?}");
     }
-    // Exact posteriors are points: no interval of them means anything, and no service should use them.
+    // Posteriors of exact data are points, whose intervals are meaningless: no service should use this model.
     assert!(!trained.baseline.manifest().calibration.passed());
 }
 
@@ -153,7 +153,7 @@ fn case_1_probability_of_damage_is_that_of_the_realised_stiffnesses() {
     for (number, errors) in errors.iter().enumerate() {
         let largest = errors.iter().copied().fold(0.0, f64::max);
         println!("scenario {}: mean |PoD − realised| {:.4}, largest {largest:.3}", number + 1, stats::mean(errors));
-        // One of fifty stiffnesses that falls on the other side of δ is 0.02.
+        // One of fifty stiffnesses on the other side of δ changes the share by 0.02.
         assert!(stats::mean(errors) <= 0.02, "scenario {}: {}", number + 1, stats::mean(errors));
     }
 }
@@ -201,7 +201,7 @@ fn a_damaged_foreign_or_outdated_baseline_is_refused_with_the_reason() {
         refuse(&changed("\"parameters\": 3", "\"parameters\": 4"), &weights, &simulator),
         LoadError::Shape { .. }
     ));
-    // A list that lacks its last number, in each that an inference or an assessment goes through.
+    // The last entry is removed from each list that an inference or an assessment reads.
     let whole: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
     for list in [
         "/architecture/permutations",
@@ -218,7 +218,7 @@ fn a_damaged_foreign_or_outdated_baseline_is_refused_with_the_reason() {
         let error = refuse(&serde_json::to_vec(&short).unwrap(), &weights, &simulator);
         assert!(matches!(error, LoadError::Shape { .. }), "{list}: {error}");
     }
-    // Draws of noise-free data hardly depend on the latent seed, so the expected value itself is moved.
+    // Draws of noise-free data hardly depend on the seed, so the expected value itself is changed.
     let mut value: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
     let expected = &mut value["self_test"]["expected"][0][0];
     *expected = (expected.as_f64().unwrap() + 0.1).into();

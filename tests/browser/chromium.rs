@@ -22,11 +22,6 @@ pub struct Page {
     _profile: TempDir,
 }
 
-/// Whether there is a Chromium; the tests say so and pass when there is none.
-pub fn is_installed() -> bool {
-    Command::new("chromium").arg("--version").output().is_ok_and(|output| output.status.success())
-}
-
 impl Page {
     /// Starts a browser with an empty page.
     pub fn open() -> Self {

@@ -6,22 +6,20 @@ use serde_json::{json, Value};
 use tempfile::TempDir;
 use tokio::sync::{Mutex, MutexGuard};
 
-use crate::chromium::{is_installed, Page};
+use crate::chromium::Page;
 use crate::helpers::{created, measurements, repository, spawn, Service};
+use crate::needs;
 
 const UNDAMAGED: [f64; 3] = [4.0, 5.0, 6.0];
 const DAMAGED: [f64; 3] = [3.2, 5.0, 6.0];
 const DAY_S: usize = 86_400;
 const PER_BATCH: usize = 20;
 
-/// One browser at a time: each takes a core.
+/// One browser at a time, as each takes a core; `None`, and the test is recorded as skipped, where there is no chromium.
 pub async fn turn() -> Option<MutexGuard<'static, ()>> {
     static TURN: OnceLock<Mutex<()>> = OnceLock::new();
-    if is_installed() {
-        return Some(TURN.get_or_init(Mutex::default).lock().await);
-    }
-    eprintln!("skipped: chromium is not installed (.ci/tools installs it)");
-    None
+    needs::program("chromium")?;
+    Some(TURN.get_or_init(Mutex::default).lock().await)
 }
 
 async fn post(service: &Service, k: [f64; 3], day: usize) -> String {
@@ -88,7 +86,8 @@ const UNTOLD_FIGURES: &str = "
 
 /// Serious and critical findings of axe-core; `None` where it is not installed.
 fn axe_findings(page: &mut Page) -> Option<Value> {
-    let source = std::fs::read_to_string(repository("target/browser/node_modules/axe-core/axe.min.js")).ok()?;
+    let file = repository("target/browser/node_modules/axe-core/axe.min.js");
+    let source = needs::installed(&file).then(|| std::fs::read_to_string(file).unwrap())?;
     page.evaluate(&format!("{source}; undefined"));
     let run = "axe.run(document).then(({ violations, passes }) => ({
         rules: passes.length,
@@ -105,9 +104,8 @@ fn check_view(page: &mut Page, what: &str) {
     assert_eq!(page.evaluate(UNTOLD_FIGURES), json!([]), "figures without words: {what}");
     let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
     assert_eq!(overflow, json!(0), "the page scrolls sideways: {what}");
-    match axe_findings(page) {
-        Some(serious) => assert_eq!(serious, json!([]), "axe: {what}"),
-        None => eprintln!("skipped: axe-core is not in target/browser (.ci/tools installs it)"),
+    if let Some(serious) = axe_findings(page) {
+        assert_eq!(serious, json!([]), "axe: {what}");
     }
     assert_eq!(page.complaints(), Vec::<String>::new(), "console: {what}");
 }

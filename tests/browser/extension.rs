@@ -11,7 +11,7 @@ use serde_json::{json, Value};
 
 use crate::chromium::Page;
 use crate::dashboard::{at, turn};
-use crate::helpers::{command, created, time, Service};
+use crate::helpers::{command, created, time, within, Service};
 
 /// Two masses on two springs; the simulation knows nothing of temperature. Small, so that its flow is trained in seconds.
 const STRUCTURE: &str = r#"
@@ -66,16 +66,12 @@ fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
 
 /// Waits until the extension of the newest diagnosis has ended.
 async fn extension_ended(service: &Service) -> Value {
-    for _ in 0..900 {
+    within(Duration::from_mins(3), "the end of the extension", async || {
         let listed = service.read("/v1/structures/tiny/diagnoses").await;
         let path = format!("/v1/diagnoses/{}", listed["items"][0]["diagnosis"].as_str().unwrap());
-        let diagnosis = service.read(&path).await;
-        if diagnosis["extension"]["state"] != "running" {
-            return diagnosis;
-        }
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
-    panic!("the extension is still running after three minutes");
+        Some(service.read(&path).await).filter(|diagnosis| diagnosis["extension"]["state"] != "running")
+    })
+    .await
 }
 
 /// Presses a button of the diagnosis and confirms what the dialog asks.

@@ -1,7 +1,7 @@
 //! The dashboard of the real program in a real browser.
 //!
-//! Needs `chromium`, and `axe-core` in `target/browser/` (`.ci/tools` sees to both); without them the tests say so in
-//! one line and pass.
+//! Needs `chromium`, and `axe-core` in `target/browser/` (`.ci/tools` installs both); without them the tests are recorded as
+//! skipped.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -11,4 +11,7 @@ mod extension;
 #[allow(dead_code, reason = "of the helpers of tests/api some are enough here")]
 #[path = "../api/helpers.rs"]
 mod helpers;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod sign_in;

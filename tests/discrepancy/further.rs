@@ -1,7 +1,7 @@
-//! Effects hidden in the data of simulations that are no bodies on springs: a table of runs, and a beam.
+//! Hidden effects in data of other kinds of simulation: a table of runs, and a beam.
 //!
-//! The data come from Ritz's method with sine functions and from a chain written out by hand, neither of which the program
-//! has.
+//! The data are generated with Ritz's method with sine functions and with the explicit matrix of a chain, neither of which the
+//! program uses.
 
 use std::fmt::Write as _;
 
@@ -24,7 +24,7 @@ fn frequencies_hz(scaled_stiffness: &DMatrix<f64>, modes: usize) -> Vec<f64> {
     lambda[..modes].iter().map(|l| l.sqrt() / std::f64::consts::TAU).collect()
 }
 
-/// Measurements under a seasonal temperature, a line each; `frequencies` at a temperature.
+/// Measurements as CSV under a seasonal temperature; `frequencies` gives those at a temperature.
 fn season(seed: u64, modes: usize, mut frequencies: impl FnMut(f64, &mut ChaCha8Rng) -> Vec<f64>) -> String {
     let mut stream = ChaCha8Rng::seed_from_u64(seed);
     let names: Vec<String> = (1..=modes).map(|m| format!("f{m}_hz")).collect();
@@ -44,7 +44,7 @@ fn season(seed: u64, modes: usize, mut frequencies: impl FnMut(f64, &mut ChaCha8
     csv
 }
 
-/// A chain of three bodies: parameters are the stiffness of its two lower springs.
+/// A chain of three bodies; the parameters are the stiffness of its two lower springs.
 fn chain_hz(k1: f64, k2: f64) -> Vec<f64> {
     let (k3, kg) = (3.0e6, [1200.0_f64, 900.0, 700.0]);
     let k = [[k1 + k2, -k2, 0.0], [-k2, k2 + k3, -k3], [0.0, -k3, k3]];
@@ -77,7 +77,7 @@ fn number(answer: &Value, pointer: &str) -> f64 {
     answer.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("no {pointer} in {answer:#}"))
 }
 
-/// The law's slope in % per °C of the first cause, and half the width of its interval.
+/// The slope of the first cause per °C, as a share, and its 90 % interval.
 fn slope(answer: &Value) -> (f64, [f64; 2]) {
     let cause = &answer["causes"][0];
     let numbers = cause["parameters"].as_array().unwrap();
@@ -86,7 +86,7 @@ fn slope(answer: &Value) -> (f64, [f64; 2]) {
     (slope["value"].as_f64().unwrap(), [interval[0].as_f64().unwrap(), interval[1].as_f64().unwrap()])
 }
 
-/// Extends the structure by what the data show, and diagnoses the extension with them: nothing must be left.
+/// Extends the structure by the causes in the data; a diagnosis of the extended structure must find nothing.
 fn extended_finds_nothing(structure: &str, csv: &str) {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
@@ -121,7 +121,7 @@ fn a_table_names_the_parameter_that_follows_the_temperature_and_nothing_in_healt
     assert_eq!(found["causes"][0]["target"]["name"], "k2");
     assert_eq!(found["causes"][0]["covariate"], "temperature_c");
     let (value, [low, high]) = slope(&found);
-    // The 90 % interval, widened by as much again.
+    // Twice the half-width of the 90 % interval is allowed.
     println!("slope {value} [{low}, {high}]");
     assert!((value + 0.004).abs() < high - low, "{value} [{low}, {high}]");
     assert!(high < 0.0 && high - low < 0.002, "an interval that says nothing: [{low}, {high}]");
@@ -131,8 +131,8 @@ fn a_table_names_the_parameter_that_follows_the_temperature_and_nothing_in_healt
     let silent = answer(&structure, &healthy, &[]);
     assert_eq!(silent["verdict"], "nothing_found", "{silent:#}");
 
-    // The instrument, which acts on the frequencies themselves. Three modes over two parameters leave one direction to see it
-    // in: which mode it is cannot be told, that it is the instrument can.
+    // A fault of the instrument, which acts on the frequencies. With three modes and two parameters, only one direction
+    // remains: the mode cannot be identified, but the instrument can.
     let third_off = season(4, 3, |_, stream| {
         let mut f = chain_hz(draw(stream, 4.2e6), draw(stream, 3.6e6));
         f[2] *= 1.01;

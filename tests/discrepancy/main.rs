@@ -1,9 +1,12 @@
-//! `modalwatch diagnose` on worlds whose secret is known: the place, the size, the gain, the silence where nothing is
-//! hidden, and the honesty where no law fits. The program is run as people run it, on files.
+//! `modalwatch diagnose` on synthetic worlds with known hidden effects: target, size and gain must be right, nothing may be found
+//! where nothing is hidden, and no false cause may be named where no law fits. The program is run on files, as a user runs it.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod further;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod spectrum;
 mod world;
 
@@ -21,10 +24,10 @@ use rand_distr::StandardNormal;
 use serde_json::Value;
 use world::{Kind, Truth, World};
 
-/// Log evidence, nats, within which data do not tell two causes apart.
+/// Difference in log evidence, nats, below which two causes cannot be distinguished.
 const EQUIVALENT_NATS: f64 = 5.0;
 
-/// Share of the true model's gain on the rows held out that naming a cause should bring.
+/// Share of the gain of the true model on the rows held out that a diagnosis should reach.
 const GAIN: f64 = 0.8;
 
 // ---- Running ----
@@ -45,21 +48,21 @@ fn diagnose(structure_toml: &str, csv: &str, options: &[&str]) -> Output {
         .unwrap()
 }
 
-/// The answer as JSON, of a run that should succeed.
+/// The JSON answer of a run that must succeed.
 fn answer(structure_toml: &str, csv: &str, options: &[&str]) -> Value {
     let output = diagnose(structure_toml, csv, &[&["--json"], options].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-/// The complaint of a run that should fail.
+/// The error message of a run that must fail.
 fn refusal(structure_toml: &str, csv: &str, options: &[&str]) -> String {
     let output = diagnose(structure_toml, csv, options);
     assert!(!output.status.success(), "should have been refused: {}", String::from_utf8_lossy(&output.stdout));
     String::from_utf8(output.stderr).unwrap()
 }
 
-/// A world to draw: of one family, or of a kind.
+/// A world to draw: with one effect of a given family, or of a given kind.
 #[derive(Clone, Copy)]
 enum Order {
     Family(u64, &'static str, &'static str),
@@ -75,7 +78,7 @@ impl Order {
     }
 }
 
-/// Draws worlds, runs the program on each and judges it; as many at a time as there are cores, in the order given.
+/// Draws worlds, runs the program on each and judges the answers, in parallel on all cores; the results are in the order given.
 fn judged(orders: &[Order]) -> Vec<Judged> {
     let next = AtomicUsize::new(0);
     let done = Mutex::new(BTreeMap::new());
@@ -93,12 +96,12 @@ fn judged(orders: &[Order]) -> Vec<Judged> {
 
 // ---- Judging ----
 
-/// Whether a target moves every frequency by one share: three names of one thing.
+/// Whether a target multiplies all frequencies by one factor; such targets are equivalent.
 fn acts_on_all(kind: &str, name: &str) -> bool {
     matches!((kind, name), ("spring_group" | "mass_group", "all") | ("frequency_scale", ""))
 }
 
-/// Share by which all frequencies are multiplied by an effect of such a kind, and back.
+/// Factor on all frequencies of an effect of such a kind; [`from_frequency`] is the inverse.
 fn to_frequency(kind: &str, size: f64) -> f64 {
     match kind {
         "spring_group" => (1.0 + size).sqrt(),
@@ -124,7 +127,7 @@ fn target(cause: &Value) -> (&str, &str) {
     (part("kind"), part("name"))
 }
 
-/// Whether a cause is the hidden effect: its place, its covariate and its category; not its law.
+/// Whether a cause has the target, covariate and category of the hidden effect; its law may differ.
 fn names(cause: &Value, truth: &Truth) -> bool {
     let (kind, name) = target(cause);
     let between = || {
@@ -137,17 +140,17 @@ fn names(cause: &Value, truth: &Truth) -> bool {
         _ if acts_on_all(truth.kind, &truth.name) => acts_on_all(kind, name),
         _ => (kind, name) == (truth.kind, truth.name.as_str()),
     };
-    // Where each category has its own number the cause has no level.
+    // A cause in which each category has its own number has no level.
     let level = cause["target"]["level"].as_str();
     let same_level = truth.level.is_none() || level.is_none() || level == truth.level.as_deref();
     place && cause["covariate"].as_str() == truth.covariate.as_deref() && same_level
 }
 
-/// Whether the true size lies in the 90 % interval of a cause that names it; none where there is no size to compare.
+/// Whether the true size lies in the 90 % interval of a cause that names it; `None` if the sizes are not comparable.
 fn size_inside(cause: &Value, truth: &Truth) -> Option<bool> {
     let first = list(cause, "parameters").first()?;
     let (kind, _) = target(cause);
-    // A wrong setting can also be written as a share of itself.
+    // The error of a setting can also be stated as a share of its value.
     let incomparable = kind == "setting" && first["unit"] == "share";
     if incomparable || truth.kind == "mode_assignment" {
         return None;
@@ -157,22 +160,22 @@ fn size_inside(cause: &Value, truth: &Truth) -> Option<bool> {
     Some((edge(0)..=edge(1)).contains(&size))
 }
 
-/// A world, the answer and what it is worth.
+/// A world with the answer and its judgement.
 struct Judged {
     kind: Kind,
     world: World,
     answer: Value,
-    /// What is asked of a world of its kind.
+    /// Whether the answer is right for a world of this kind.
     right: bool,
-    /// Of a single effect in the right place: whether the size is inside its interval.
+    /// For a single effect with the right target: whether the size is inside its interval.
     size_inside: Option<bool>,
-    /// Gain of the answer on the rows held out, as a share of the true model's.
+    /// Gain of the answer on the rows held out, as a share of that of the true model.
     gain: f64,
 }
 
 impl Judged {
     fn new(kind: Kind, world: World, answer: Value) -> Self {
-        assert!(kind == Kind::Nothing || world.nats >= 20.0, "what is hidden cannot be seen");
+        assert!(kind == Kind::Nothing || world.nats >= 20.0, "the hidden effect is not detectable");
         let right = match kind {
             Kind::Nothing => answer["verdict"] == "nothing_found",
             Kind::Single => named(&answer, &world.truths[0]).is_some(),
@@ -184,7 +187,7 @@ impl Judged {
             _ => None,
         };
         let (base, truth) = world.holdout_log_density;
-        // Nothing found is nothing gained.
+        // Without a cause there is no gain.
         let gain = answer["gain"]["log_density_per_row"]["after"].as_f64().map_or(0.0, |a| (a - base) / (truth - base));
         Self { kind, world, answer, right, size_inside, gain }
     }
@@ -193,8 +196,8 @@ impl Judged {
         self.answer["verdict"].as_str().unwrap()
     }
 
-    /// The world and the answer, for people.
-    fn told(&self) -> String {
+    /// The world and the answer as text.
+    fn text(&self) -> String {
         let World { seed, description, holdout_rms_percent: (base, truth), .. } = &self.world;
         let mut text = format!("seed {seed}: {description}; held out {base:.3} % -> {truth:.3} %");
         let inside = self.size_inside.map_or("", |inside| if inside { ", size inside" } else { ", size OUTSIDE" });
@@ -226,7 +229,7 @@ impl Judged {
     }
 }
 
-/// Whether a cause that was not chosen is the effect, and as good as the one in whose place it stands.
+/// Whether an alternative is the effect, and nearly as probable as the cause that it would replace.
 fn as_good(other: &Value, truth: &Truth) -> bool {
     names(other, truth) && other["log_evidence_difference"].as_f64().unwrap() > -EQUIVALENT_NATS
 }
@@ -237,7 +240,7 @@ fn named<'a>(answer: &'a Value, truth: &Truth) -> Option<&'a Value> {
     match answer["verdict"].as_str()? {
         "cause" => causes.first().filter(|cause| names(cause, truth)),
         "ambiguous" => {
-            assert!(causes.len() <= 3, "an answer of {} is none", causes.len());
+            assert!(causes.len() <= 3, "{} causes are too many for an answer", causes.len());
             let first = names(&causes[0], truth);
             let equivalent = first || list(answer, "alternatives").iter().any(|other| as_good(other, truth));
             causes.iter().find(|cause| names(cause, truth)).filter(|_| equivalent)
@@ -246,7 +249,7 @@ fn named<'a>(answer: &'a Value, truth: &Truth) -> Option<&'a Value> {
     }
 }
 
-/// Whether two hidden effects are named by two of several causes, or by what these data cannot tell from them.
+/// Whether two hidden effects are named by two of several causes, or by alternatives that cannot be distinguished from them.
 fn both_named(answer: &Value, truths: &[Truth]) -> bool {
     let places = |truth: &Truth| {
         let causes = list(answer, "causes").iter().enumerate();
@@ -258,8 +261,8 @@ fn both_named(answer: &Value, truths: &[Truth]) -> bool {
     answer["verdict"] == "several" && first.iter().any(|a| second.iter().any(|b| a != b))
 }
 
-/// A cause that is nearly sure, of a target or a covariate that the hidden effect does not have, without a word that
-/// something is left.
+/// A cause with a high probability whose target or covariate differs from that of the hidden effect, in an answer that does not
+/// report a remainder.
 fn confident_wrong_name<'a>(answer: &'a Value, hidden: &Truth) -> Option<&'a Value> {
     let columns = hidden.covariate.as_deref().unwrap().split(world::AND).collect::<Vec<_>>();
     let wrong = |cause: &&Value| {
@@ -272,7 +275,7 @@ fn confident_wrong_name<'a>(answer: &'a Value, hidden: &Truth) -> Option<&'a Val
 
 // ---- Counting ----
 
-/// Counts of a set of worlds.
+/// The worlds of one kind.
 struct Tally<'a> {
     all: Vec<&'a Judged>,
 }
@@ -298,7 +301,7 @@ impl<'a> Tally<'a> {
         self.count(|j| j.right)
     }
 
-    /// Worlds whose size was compared, and those where it is inside.
+    /// Number of worlds whose size is comparable, and of those whose size is inside its interval.
     fn sizes(&self) -> (usize, usize) {
         (self.count(|j| j.size_inside.is_some()), self.count(|j| j.size_inside == Some(true)))
     }
@@ -310,7 +313,7 @@ impl<'a> Tally<'a> {
     }
 }
 
-/// What was hidden against what was named first, the counts, and every miss.
+/// Prints a table of the hidden target against the target of the first cause, the counts, and every miss.
 fn report(judged: &[Judged]) {
     let mut table = BTreeMap::<String, BTreeMap<String, usize>>::new();
     for j in judged.iter().filter(|j| j.kind != Kind::Two) {
@@ -335,12 +338,12 @@ fn report(judged: &[Judged]) {
         println!("{hidden:17}{cells}");
     }
     for j in judged.iter().filter(|j| !j.right) {
-        println!("MISS {}", j.told());
+        println!("MISS {}", j.text());
     }
     for j in
         judged.iter().filter(|j| j.right && (j.size_inside == Some(false) || (j.kind == Kind::Single && j.gain < GAIN)))
     {
-        println!("FAR {}", j.told());
+        println!("FAR {}", j.text());
     }
     let single = Tally::new(judged, Kind::Single);
     let (compared, inside) = single.sizes();
@@ -360,7 +363,7 @@ fn report(judged: &[Judged]) {
     println!("outside: {honest} called none of these; two: {extra} with a third cause");
 }
 
-/// Of the worlds with hysteresis: how many there are, and how often it was taken for a lag of the right spring.
+/// Number of worlds with hysteresis, and of those in which it was diagnosed as a lag of the right spring.
 fn hysteresis_taken_for_a_lag(judged: &[Judged]) -> (usize, usize) {
     let worlds = judged.iter().filter(|j| j.world.outside.is_some_and(|o| o.starts_with("hysteresis")));
     let lagged = |j: &&Judged| {
@@ -385,15 +388,20 @@ fn hidden_effects_are_found_in_a_fixed_set_of_worlds() {
     let judged = judged(&singles.chain(others).collect::<Vec<_>>());
     report(&judged);
 
-    // The rates asked of many worlds, with the slack that few worlds need.
+    // Of two hundred worlds 95.5 % are right and 94.5 % gain enough: of 29, 27.7 ± 1.1 and 27.4 ± 1.2; the bounds are 0.6 and 1.9
+    // standard errors below.
     let single = Tally::new(&judged, Kind::Single);
     assert!(single.right() + 2 >= single.worlds(), "{} wrong places", single.worlds() - single.right());
+    // 90 % of 27: 24.3 ± 1.6, and the bound is 1.5 standard errors below. All 27 inside happen by chance in 6 % of such sets, so
+    // that there is no bound above; the test of two hundred worlds has one.
     let (compared, inside) = single.sizes();
-    assert!(inside >= 22, "{inside} of {compared} sizes inside");
+    assert!(compared >= 25 && inside >= 22, "{inside} of {compared} sizes inside");
     assert!(single.count(|j| j.gain >= GAIN) >= 25, "gains");
+    // Of sixty worlds each 60, 57 and 59 are right. Of 6, 5 and 4 that makes 6, 4.75 ± 0.5 and 3.93 ± 0.26: three standard errors
+    // below are 4.9 (were one of sixty wrong), 3.3 and 3.2.
     assert!(Tally::new(&judged, Kind::Nothing).right() >= 5, "something in nothing");
     assert!(Tally::new(&judged, Kind::Two).right() >= 4, "two effects");
-    assert!(Tally::new(&judged, Kind::Outside).right() >= 3, "confident wrong names");
+    assert_eq!(Tally::new(&judged, Kind::Outside).right(), 4, "confident wrong names");
 }
 
 #[test]
@@ -410,10 +418,13 @@ fn hidden_effects_are_found_in_two_hundred_worlds() {
     let single = Tally::new(&judged, Kind::Single);
     assert!(single.share(|j| j.right) >= 0.95, "{} single effects in the right place", single.right());
     let (compared, inside) = single.sizes();
+    // A share of 182 scatters by 0.022 about 0.9: 3.5 times that below and 3.2 times above. The program reaches 0.874.
     let coverage = inside as f64 / compared as f64;
-    assert!((0.80..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
+    assert!((0.822..=0.97).contains(&coverage), "{inside} of {compared} sizes inside");
     assert!(single.median_gain() >= GAIN, "median gain {}", single.median_gain());
-    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.85), (Kind::Outside, 0.90)] {
+    // Shares of sixty: the program reaches 1, 0.95 ± 0.028 and 0.983 ± 0.017; three standard errors below, for nothing hidden
+    // three worlds.
+    for (kind, least) in [(Kind::Nothing, 0.95), (Kind::Two, 0.866), (Kind::Outside, 0.93)] {
         let tally = Tally::new(&judged, kind);
         assert!(tally.share(|j| j.right) >= least, "{kind:?}: {} of {} right", tally.right(), tally.worlds());
     }
@@ -426,14 +437,14 @@ fn a_softening_spring_is_found_in_simulated_time_histories() {
     let scatter = world.scatter.map(|s| format!("{:.3} %", 100.0 * s)).join(", ");
     println!("seed {}: {}; scatter {scatter}: {}", world.seed, world.description, answer["summary"]);
     let cause = named(&answer, &world.truth).expect("the softening spring, with amplitude");
-    let swing = cause["parameters"][0]["value"].as_f64().unwrap();
+    let range = cause["parameters"][0]["value"].as_f64().unwrap();
     let size = world.truth.size;
-    assert!((swing / size - 1.0).abs() < 0.25, "swing {swing}, by equivalent linearisation {size}");
+    assert!((range / size - 1.0).abs() < 0.25, "effect range {range}, by equivalent linearisation {size}");
 }
 
 // ---- Tables ----
 
-/// Masses, springs and the one free parameter of a chain of three.
+/// Masses, springs and noise of a chain of three masses; its first spring is the only free parameter.
 const CHAIN_KG: [f64; 3] = [1.0, 1.2, 0.8];
 const CHAIN_N_PER_M: [f64; 3] = [4000.0, 3000.0, 2000.0];
 const CHAIN_NOISE: f64 = 0.002;
@@ -446,7 +457,7 @@ fn chain_toml() -> String {
     world::structure_toml(3, CHAIN_NOISE, &masses, &springs, &[name("k", 0)])
 }
 
-/// Measurements of chains of the structure file, with further columns and their cells.
+/// Measurements of chains that agree with the structure file, with further columns.
 fn chain_csv(rows: usize, columns: &str, cells: impl Fn(usize, &mut ChaCha8Rng) -> String) -> String {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let mut text = format!("measured_at,f1_hz,f2_hz,f3_hz,{columns}\n");
@@ -464,7 +475,7 @@ fn chain_csv(rows: usize, columns: &str, cells: impl Fn(usize, &mut ChaCha8Rng) 
     text
 }
 
-/// The same table without the values of a column.
+/// The table with all values of one column removed.
 fn emptied(csv: &str, column: &str) -> String {
     let place = csv.lines().next().unwrap().split(',').position(|name| name == column).unwrap();
     let without = |(line, text): (usize, &str)| {
@@ -478,7 +489,7 @@ fn celsius(rng: &mut ChaCha8Rng) -> String {
     world::number(rng.random_range(-5.0..25.0))
 }
 
-/// That nothing was found in a table and a note says so-and-so.
+/// Asserts that nothing is found in a table and that a note contains all `words`.
 fn noted(csv: &str, words: &[&str]) {
     let answer = answer(&chain_toml(), csv, &[]);
     assert_eq!(answer["verdict"], "nothing_found", "{}", answer["summary"]);
@@ -486,7 +497,7 @@ fn noted(csv: &str, words: &[&str]) {
     assert!(notes.iter().any(|note| words.iter().all(|word| note.contains(word))), "{words:?} in {notes:?}");
 }
 
-/// That a table is refused with so-and-so.
+/// Asserts that a table is refused with a message that contains all `words`.
 fn refused(csv: &str, options: &[&str], words: &[&str]) {
     let text = refusal(&chain_toml(), csv, options);
     assert!(words.iter().all(|word| text.contains(word)), "{words:?} in {text:?}");
@@ -548,7 +559,7 @@ fn two_laboratories_differ_by_something_common_and_not_by_three_storeys() {
     let repository = Path::new(env!("CARGO_MANIFEST_DIR"));
     let data = repository.join("../shared/data/ruler-frame-4dof/ruler_frame_frequencies.csv");
     if !data.exists() {
-        println!("skipped: ../shared/data/ruler-frame-4dof is not on this machine");
+        needs::missing("the data ../shared/data/ruler-frame-4dof, which are not part of the repository");
         return;
     }
     let output = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
@@ -564,7 +575,7 @@ fn two_laboratories_differ_by_something_common_and_not_by_three_storeys() {
     let common = [("mass_group", "all"), ("spring_group", "all"), ("frequency_scale", "")];
     let target = (first["target"]["kind"].as_str().unwrap(), first["target"]["name"].as_str().unwrap());
     assert!(common.contains(&target), "{first}");
-    // Three ways to say the same: none may be called sure.
+    // Three equivalent targets: none of them may have a high probability.
     assert!(first["probability"].as_f64().unwrap() < 0.9);
 }
 
@@ -598,7 +609,7 @@ fn an_extended_structure_explains_its_data_and_half_an_effect_is_found_wanting()
     };
     let answer = verdict(&written);
     assert_eq!(answer["verdict"], "nothing_found", "{}", answer["summary"]);
-    // Half of the slope is left to find: the structure's own effect does not stand in the way.
+    // The effect with half the slope in the structure must not prevent that the other half is found.
     let mut half: Value = serde_json::from_str(&fs::read_to_string(&written).unwrap()).unwrap();
     let slope = half["effect"][0]["numbers"]["slope_per_unit"].as_f64().unwrap();
     half["effect"][0]["numbers"]["slope_per_unit"] = (0.5 * slope).into();

@@ -1,6 +1,6 @@
-//! A world in the time domain: a chain of three masses under ambient noise, one spring of which softens with amplitude.
-//! Its frequencies are read from spectra of the simulated response; no eigenvalue enters them. (Eigenvalues only set
-//! the time step, the damping and the bands that peaks are looked for in.)
+//! A world in the time domain: a chain of three masses under ambient noise, with one spring that softens with amplitude.
+//! Its frequencies are identified from spectra of the simulated response, without eigenvalues. (Eigenvalues only set the time
+//! step, the damping and the bands in which peaks are searched.)
 
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
@@ -14,7 +14,7 @@ use super::world::{
     frequencies_hz, mean, mean_and_sd, number, quantiles, rfc3339, rounded, structure_toml, Truth, EPOCH_2024_S,
 };
 
-/// Records of the measurements, and records at constant amplitude that the noise is measured from.
+/// Number of records for the measurements, and of records at constant amplitude from which the noise is estimated.
 const RECORDS: (usize, usize) = (140, 40);
 /// Length of a record in periods of the lowest mode.
 const PERIODS: f64 = 3000.0;
@@ -24,10 +24,10 @@ const STEPS: (f64, usize) = (40.0, 8);
 const SEGMENT: usize = 8192;
 /// Greatest rms elongation of the softening spring.
 const TOP_RMS_M: f64 = 2e-3;
-/// Elongation from which on the softening spring is linear again, with its tangent there.
+/// Elongation beyond which the softening spring continues linearly with its tangent.
 const LAST_CUBIC_M: f64 = 3.0 * TOP_RMS_M;
 
-/// A structure file, measurements of its softening double, and the truth.
+/// A structure file, measurements of the same structure with a softening spring, and the truth.
 #[derive(Debug, Clone)]
 pub struct SpectrumWorld {
     /// Seed it was drawn from.
@@ -36,11 +36,11 @@ pub struct SpectrumWorld {
     pub structure_toml: String,
     /// Measurements, one row each.
     pub csv: String,
-    /// The softening spring; its size by equivalent linearisation, k - 3 c rms², as the swing between the quantiles.
+    /// The softening spring; its size is the effect range by equivalent linearisation, k - 3 c rms².
     pub truth: Truth,
     /// Relative scatter of each frequency at constant amplitude.
     pub scatter: [f64; 3],
-    /// One line for a table.
+    /// The world in one line.
     pub description: String,
 }
 
@@ -57,12 +57,12 @@ struct Chain {
     spring_time_s: f64,
 }
 
-/// How a record is taken.
+/// Time step and length of a record.
 struct Recording {
     step_s: f64,
     warm_up: usize,
     samples: usize,
-    /// Linear frequencies, for the bands of the peaks.
+    /// Linear frequencies, which define the bands of the peaks.
     linear_hz: [f64; 3],
     damping_ratio: f64,
 }
@@ -194,8 +194,8 @@ fn draw_chain(rng: &mut ChaCha8Rng) -> Option<(Chain, Recording)> {
 type State = [f64; 6];
 
 impl Chain {
-    /// What the softening spring lacks of its linear force: c u³, and on along the tangent where the cubic would soon
-    /// turn the spring around.
+    /// Difference between the linear force and that of the softening spring: c u³, continued along its tangent where the cubic
+    /// would otherwise make the stiffness negative.
     fn softened_n(&self, elongation_m: f64) -> f64 {
         let cubic_m = elongation_m.clamp(-LAST_CUBIC_M, LAST_CUBIC_M);
         self.cubic_n_per_m3 * cubic_m * cubic_m * (cubic_m + 3.0 * (elongation_m - cubic_m))
@@ -231,7 +231,7 @@ impl Chain {
 
     /// Frequencies read from a record, and the rms elongation of the softening spring.
     fn record(&self, recording: &Recording, strength: f64, rng: &mut ChaCha8Rng) -> ([f64; 3], f64) {
-        // A held force of this size per step has the same power in every band, whatever the step.
+        // A force of this size, constant within a step, has a spectral density that does not depend on the step.
         let size_n = strength / recording.step_s.sqrt();
         let mut state = State::default();
         let mut next = |steps: usize| {
@@ -256,7 +256,7 @@ impl Chain {
 }
 
 impl Recording {
-    /// The peak of each mode in the spectrum of all channels together.
+    /// Frequency of the peak of each mode in the sum of the spectra of all channels.
     fn peaks_hz(&self, channels: &[Vec<f64>; 3]) -> [f64; 3] {
         let mut spectrum = vec![0.0; SEGMENT / 2];
         for samples in channels {
@@ -269,15 +269,15 @@ impl Recording {
             let band = (between[mode] / bin_hz) as usize..(between[mode + 1] / bin_hz) as usize;
             let top = band.max_by(|a, b| spectrum[*a].total_cmp(&spectrum[*b])).expect("a band has bins");
             let half_bins = (2.0 * self.damping_ratio * self.linear_hz[mode] / bin_hz).ceil() + 1.0;
-            // Twice: the second window stands in the middle of the peak.
+            // Twice, so that the second window is centred on the peak.
             let first = peak_bin(&spectrum, top as f64, half_bins);
             bin_hz * peak_bin(&spectrum, first, half_bins)
         })
     }
 }
 
-/// Place of a resonance near a bin: one over the spectrum is a parabola of the square of the frequency, fitted with
-/// equal weight on relative errors.
+/// Position of a resonance near a bin: the reciprocal spectrum is a parabola in the square of the frequency, which is fitted
+/// with equal weights for relative errors.
 fn peak_bin(spectrum: &[f64], centre: f64, half_bins: f64) -> f64 {
     let scale = spectrum[centre.round() as usize];
     let mut normal = [[0.0; 4]; 3];
@@ -313,7 +313,7 @@ fn solve_3(rows: [[f64; 4]; 3]) -> [f64; 3] {
     [x, y, z]
 }
 
-/// Adds the periodograms of segments that overlap by half, under a Hann window.
+/// Adds the periodograms of half-overlapping segments with a Hann window.
 fn add_periodograms(samples: &[f64], spectrum: &mut [f64]) {
     let window = (0..SEGMENT).map(|i| 0.5 - 0.5 * (TAU * i as f64 / SEGMENT as f64).cos()).collect::<Vec<_>>();
     for start in (0..samples.len().saturating_sub(SEGMENT - 1)).step_by(SEGMENT / 2) {

@@ -52,9 +52,9 @@ fn a_crossing_in_a_corner_and_a_sharp_veering_are_told() {
 #[test]
 fn modes_that_keep_apart_do_not_cross() {
     let apart = |u: &[f64]| vec![5.0 + u[0], 7.0 + u[1], 9.0 + 3.0 * u[0]];
-    // Closest at an edge of the box, where the gap would close only beyond it.
+    // The gap is smallest at an edge of the box and would close only outside it.
     let edge = |u: &[f64]| vec![5.0, 5.2 + u[0] + 0.3 * u[1]];
-    // Two modes that come near and part again slowly.
+    // Two modes that approach each other and separate slowly.
     let slow = |u: &[f64]| vec![10.0, 11.0 + 4.0 * (u[0] - 0.5).powi(2)];
     for seed in 0..5 {
         for n in [60, 200] {

@@ -8,7 +8,7 @@ use rand::Rng as _;
 use super::structures::{long_chain, rig};
 use super::{latin_hypercube, runs};
 
-/// Root mean square of ln f̂ − ln f of each mode at 1,000 fresh points of the unit cube that are not outside.
+/// Root mean square of ln f̂ − ln f of each mode at 1,000 new points of the unit cube that are not outside.
 fn error_met(emulator: &Emulator, truth: impl Fn(&[f64]) -> Vec<f64>) -> Vec<f64> {
     let mut stream = stats::stream(17, "fresh points");
     let mut squares = vec![0.0; emulator.modes()];
@@ -34,7 +34,8 @@ fn the_error_told_of_the_rig_is_small_and_met_at_fresh_points() {
             let told = emulator.relative_error(mode);
             assert!(told < 1e-5, "seed {seed}, mode {mode}: {told}");
             assert!(*met < 2.0 * told, "seed {seed}, mode {mode}: told {told}, met {met}");
-            // With an error that falls tenfold per degree, nine tenths of the runs do far worse than all: told is above met.
+            // The error falls tenfold per degree, so that a fit to nine tenths of the runs is far less accurate than one to all: the
+            // estimate is above the actual error.
             assert!(told < 2.0 * met || told < 1e-6, "seed {seed}, mode {mode}: told {told}, met {met}");
         }
     }
@@ -60,7 +61,7 @@ fn noise_shows_in_the_error_told_and_runs_done_twice_break_nothing() {
     let noisy = exact.frequencies_hz.map(|f| f * (1.0 + 0.01 * (stream.random::<f64>() - 0.5)));
     let emulator = Emulator::fit(&Runs { parameters: twice, frequencies_hz: noisy }).unwrap();
     for mode in 0..3 {
-        // A uniform error of ±0.5 % has the standard deviation 0.01/√12 = 0.0029; 200 runs tell it to some 5 %.
+        // A uniform error of ±0.5 % has the standard deviation 0.01/√12 = 0.0029; 200 runs determine it to about 5 %.
         let told = emulator.relative_error(mode);
         assert!((0.0024..0.0036).contains(&told), "mode {mode}: {told}");
     }
@@ -73,7 +74,7 @@ fn the_residual_of_each_run_left_out_explains_the_error_told() {
     for (mode, missed) in emulator.held_out_residuals().iter().enumerate() {
         assert_eq!(missed.len(), 60);
         let plain = (missed.iter().map(|e| e * e).sum::<f64>() / 60.0).sqrt();
-        // The same for selected terms; raised by the correction for whole sets.
+        // For selected terms it is the same; for whole sets the correction increases it.
         assert!(emulator.relative_error(mode) > 0.999 * plain && emulator.relative_error(mode) < 5.0 * plain);
     }
 }

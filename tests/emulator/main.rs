@@ -93,7 +93,7 @@ fn assert_jacobian_is_the_slope(emulator: &Emulator, theta: &[f64], widths: &[f6
 fn the_jacobian_is_the_slope_of_the_frequencies() {
     let smooth = Emulator::fit(&polynomial_runs(150)).unwrap();
     assert_jacobian_is_the_slope(&smooth, &[1.7, 3e8, 0.004], &[2.0, 2e9, 0.01]);
-    // Two of its modes veer and are emulated as a pair.
+    // Two of the modes veer and are emulated as a pair.
     let veering = Emulator::fit(&runs(latin_hypercube(100, 2, 1), structures::rig)).unwrap();
     for theta in [[0.3, 0.8], [0.51, 0.02], [0.5, 0.5]] {
         assert_jacobian_is_the_slope(&veering, &theta, &[1.0; 2]);

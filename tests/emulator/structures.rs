@@ -2,7 +2,8 @@
 
 use nalgebra::DMatrix;
 
-/// Natural frequencies of masses in a row, Hz: `ground[i]` ties mass i to the ground, `coupling[i]` to mass i + 1, N/m.
+/// Natural frequencies of a chain of masses, Hz. The spring `ground[i]` (N/m) connects mass i to the ground, and `coupling[i]`
+/// connects it to mass i + 1.
 fn chain(kg: &[f64], ground: &[f64], coupling: &[f64]) -> Vec<f64> {
     let n = kg.len();
     let mut scaled = DMatrix::<f64>::zeros(n, n);
@@ -28,7 +29,7 @@ pub fn rig(u: &[f64]) -> Vec<f64> {
     chain(&[1.52, 2.30, 1.08], &[4954.0; 3], &[k12, k23])
 }
 
-/// The lowest ten modes of 20 equal masses on 20 springs of 1 kN/m ± 30 %, the first of which is tied to the ground.
+/// The lowest ten modes of 20 equal masses on 20 springs of 1 kN/m ± 30 %, the first of which is connected to the ground.
 pub fn long_chain(u: &[f64]) -> Vec<f64> {
     let springs: Vec<f64> = u.iter().map(|u| 1000.0 * (0.7 + 0.6 * u)).collect();
     let mut ground = vec![0.0; springs.len()];

@@ -10,8 +10,9 @@ use serde_json::Value;
 
 use crate::helpers::{command, problem, spawn, Service};
 use crate::kit::{
-    all_assessed, audit, batch, body, history, open_files, post, ready, resident_mib, there, Acknowledged, BATCHES,
+    all_assessed, audit, batch, body, history, open_files, post, ready, resident_mib, Acknowledged, BATCHES,
 };
+use crate::needs;
 
 /// Bytes of a request that posts a batch.
 fn request(number: usize) -> Vec<u8> {
@@ -153,7 +154,10 @@ async fn nested_swollen_and_compressed_bodies_are_refused_in_flat_memory() {
         }
         // A gzip bomb is not unpacked: a megabyte that would be a gigabyte.
         // Its body is not read either, so that its connection ends with the answer: it has one of its own.
-        let bomb = reqwest::Client::new().post(format!("http://{}{BATCHES}", service.address()));
+        let bomb = modalwatch::notify::client_builder()
+            .build()
+            .unwrap()
+            .post(format!("http://{}{BATCHES}", service.address()));
         let bomb = bomb.header("content-encoding", "gzip");
         let bomb = bomb.header("content-type", "application/json").body(gzip_of_zeros(1 << 20));
         problem(bomb.send().await.unwrap(), 415, "unsupported_encoding").await;
@@ -178,12 +182,12 @@ fn gzip_of_zeros(length: usize) -> Vec<u8> {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn with_few_file_handles_connections_wait_and_the_database_still_opens() {
-    if !there("/usr/bin/prlimit", "util-linux") {
+    if needs::program("prlimit").is_none() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
     let plain = command(folder.path());
-    let mut limited = std::process::Command::new("/usr/bin/prlimit");
+    let mut limited = std::process::Command::new("prlimit");
     limited.arg("--nofile=96:96").arg(plain.get_program()).args(plain.get_args());
     limited.env("MODALWATCH__LOG__LEVEL", "warn").env("MODALWATCH__HTTP__HEADER_TIMEOUT_S", "2");
     let mut service = Service::spawn(&mut limited);

@@ -1,12 +1,17 @@
 //! Clocks that jump: `faketime` moves the system clock of the running program, while time goes on for its timers.
 
 use std::path::Path;
-use std::time::Duration;
 
+use modalwatch::measurement::MeasurementBatch;
+use modalwatch::quantity::StructureId;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, Service};
-use crate::kit::{audit, batch, body, history, post, ready, there, Acknowledged, BATCHES};
+use crate::helpers::{command, created, eventually, Service};
+use crate::kit::{audit, batch, body, define_as, history, post, ready, Acknowledged, BATCHES};
+use crate::needs;
+
+/// A structure whose id comes after three-dof.
+const OTHER: &str = "three-dof-too";
 
 const LIBRARY: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
 
@@ -18,26 +23,22 @@ fn set(file: &Path, time: &str) {
     std::fs::rename(&beside, file).unwrap();
 }
 
-/// Open alarms of silence.
-async fn silence_alarms(service: &Service) -> usize {
-    let alarms = service.read("/v1/structures/three-dof/alarms").await;
+/// Open alarms of silence of a structure.
+async fn silence_alarms(service: &Service, structure: &str) -> usize {
+    let alarms = service.read(&format!("/v1/structures/{structure}/alarms")).await;
     let open = |a: &&Value| a["kind"] == "silence" && a["ended_at"].is_null();
     alarms["items"].as_array().unwrap().iter().filter(open).count()
 }
 
-async fn wait_for_silence(service: &Service, wanted: usize) {
-    for _ in 0..200 {
-        if silence_alarms(service).await == wanted {
-            return;
-        }
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
-    panic!("{} alarms of silence, not {wanted}", silence_alarms(service).await);
+/// Waits until a structure has so many open alarms of silence.
+async fn wait_for_silence(service: &Service, structure: &str, wanted: usize) {
+    let what = format!("{wanted} alarms of silence of {structure}");
+    eventually(&what, async || (silence_alarms(service, structure).await == wanted).then_some(())).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_current() {
-    if !there(LIBRARY, "faketime") {
+    if !needs::installed(Path::new(LIBRARY)) {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -64,7 +65,8 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     // A year back: what was measured now is refused with the reason, what was measured then is taken.
     set(&file, "-365d");
     let (status, answer) = post(&service, &batch("logger", 2, 10)).await.unwrap();
-    let year = answer["detail"].as_str().unwrap_or_default().contains("in the future: it is 20");
+    let year =
+        answer["detail"].as_str().unwrap_or_default().contains("in the future: the clock of the service shows 20");
     assert!(status == 422 && year, "{answer}");
     let early =
         json!({ "measurements": [{ "measured_at": "2020-06-01T00:00:00Z", "frequencies_hz": [0.49, 0.92, 1.24] }] });
@@ -74,26 +76,27 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     let declared = service.post("/v1/structures/three-dof/reference", &json!({ "batches": [undamaged] })).await;
     created(declared).await;
     let path = format!("{BATCHES}/{other}");
-    let mut answer = Value::Null;
-    for _ in 0..100 {
-        answer = service.read(&path).await;
-        if answer["assessment"]["undamaged_version"] == 1 {
-            break;
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    assert_eq!(answer["assessment"]["undamaged_version"], 1, "{answer}");
+    eventually("the comparison", async || {
+        (service.read(&path).await["assessment"]["undamaged_version"] == 1).then_some(())
+    })
+    .await;
 
-    // A day ahead: nobody has sent anything for so long, until somebody does.
+    // A day ahead: no structure has sent anything for so long, until one of them does.
+    set(&file, "+0");
+    define_as(&service, OTHER).await;
+    let other = MeasurementBatch { structure: StructureId::parse(OTHER).unwrap(), ..batch("other", 0, 10) };
+    assert_eq!(post(&service, &other).await.unwrap().0, 201);
     set(&file, "+1d");
-    wait_for_silence(&service, 1).await;
+    wait_for_silence(&service, "three-dof", 1).await;
+    wait_for_silence(&service, OTHER, 1).await;
     take(&service).await;
-    wait_for_silence(&service, 0).await;
-    // And back again: that day is no silence.
+    wait_for_silence(&service, "three-dof", 0).await;
+    // And back again: that day is no silence. The service looks at all structures in the order of their ids, so that
+    // three-dof has been looked at when the alarm of the other one ends.
     set(&file, "+0");
     take(&service).await;
-    tokio::time::sleep(Duration::from_secs(6)).await;
-    assert_eq!(silence_alarms(&service).await, 0);
+    wait_for_silence(&service, OTHER, 0).await;
+    assert_eq!(silence_alarms(&service, "three-dof").await, 0);
 
     // Standing still: ids are distinct all the same, and requests still time out by the other clock.
     set(&file, "2027-01-01 00:00:00");

@@ -9,9 +9,10 @@ use tempfile::TempDir;
 
 use crate::helpers::{command, Service};
 use crate::kit::{
-    all_assessed, audit, batch, define_plain, history, history_of, plain_batch, post, ready, ready_again, there,
+    all_assessed, audit, batch, define_plain, history, history_of, plain_batch, post, ready, ready_again,
     without_floor, Acknowledged, PLAIN,
 };
+use crate::needs;
 
 /// A file system of a few MiB in memory.
 struct SmallDisk {
@@ -19,7 +20,7 @@ struct SmallDisk {
 }
 
 impl SmallDisk {
-    /// Mounts one; says so and gives none where that is not allowed.
+    /// Mounts one; `None`, and the test is recorded as skipped, where that is not allowed.
     fn mount(mebibytes: usize) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         let size = format!("size={mebibytes}m");
@@ -27,7 +28,7 @@ impl SmallDisk {
         if mounted.is_ok_and(|output| output.status.success()) {
             return Some(Self { folder });
         }
-        println!("skipped: a small file system cannot be mounted here (root may)");
+        needs::missing("only root may mount a small file system");
         None
     }
 }
@@ -131,20 +132,20 @@ async fn a_full_disk_refuses_writes_serves_reads_and_heals_without_a_restart() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn files_that_may_not_grow_refuse_writes_and_heal_without_a_restart() {
-    if !there("/usr/bin/prlimit", "util-linux") || !there("/bin/bash", "bash") {
+    if needs::program("prlimit").is_none() || needs::program("bash").is_none() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
     let plain = command(folder.path());
     // The signal that comes with the limit would end the program; the failed write is what is wanted.
-    let mut limited = Command::new("/bin/bash");
+    let mut limited = Command::new("bash");
     limited.args(["-c", "trap '' XFSZ; ulimit -S -f 1500; exec \"$0\" \"$@\""]);
     limited.arg(plain.get_program()).args(plain.get_args()).env("MODALWATCH__LOG__LEVEL", "error");
     let mut service = Service::spawn(without_floor(&mut limited));
     let mut acknowledged = Acknowledged::default();
     let pid = service.pid().to_string();
     let heal = || {
-        let raised = Command::new("/usr/bin/prlimit").args(["--pid", &pid, "--fsize=unlimited:"]).status().unwrap();
+        let raised = Command::new("prlimit").args(["--pid", &pid, "--fsize=unlimited:"]).status().unwrap();
         assert!(raised.success());
     };
     full_and_healed(&service, &mut acknowledged, heal).await;
@@ -176,7 +177,7 @@ async fn a_database_that_is_deleted_while_open_acknowledges_nothing_more() {
         let (is_ready, reasons) = ready(&service).await;
         assert!(!is_ready && reasons.to_string().contains("deleted or replaced"), "{reasons}");
         assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
-        // Put back before anything else wrote there, it goes on.
+        // Put back before anything else wrote it goes on.
         std::fs::rename(&away, folder.path().join(file)).unwrap();
         ready_again(&service, Duration::from_secs(10)).await;
     }
@@ -231,7 +232,7 @@ async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_
     let after = std::fs::metadata(&log).unwrap().len();
     assert!(after <= grown + (2 << 20), "the log goes on growing: {grown}, then {after} bytes");
 
-    // A writer for a second is waited for.
+    // A writer for a second is waited for: that second is what is tested, nothing could end the wait earlier.
     sqlx::query("begin immediate").execute(&mut other).await.unwrap();
     let waiting = batch("waiting", 0, 5);
     let (answered, ()) = tokio::join!(post(&service, &waiting), async {

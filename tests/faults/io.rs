@@ -4,8 +4,9 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use crate::helpers::{command, Service};
-use crate::kit::{all_assessed, audit, batch, post, ready, ready_again, there, Acknowledged};
+use crate::helpers::{command, exit_within, Service};
+use crate::kit::{all_assessed, audit, batch, post, ready, ready_again, Acknowledged};
+use crate::needs;
 
 /// Batches posted under each kind of fault.
 const PER_CASE: usize = 16;
@@ -30,7 +31,7 @@ fn control(service: &Service, control: &Path, order: &str) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() {
-    if !there("/usr/bin/fiu-ctrl", "fiu-utils") {
+    if needs::program("fiu-ctrl").is_none() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -95,7 +96,7 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_start_on_a_failing_disk_says_so_or_works_and_loses_nothing() {
-    if !there("/usr/bin/fiu-ctrl", "fiu-utils") {
+    if needs::program("fiu-ctrl").is_none() {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -115,16 +116,8 @@ async fn a_start_on_a_failing_disk_says_so_or_works_and_loses_nothing() {
         command.env("FIU_ENABLE", format!("enable_random name={point},probability={probability},failinfo=5"));
         command.stdout(std::process::Stdio::null()).stderr(std::process::Stdio::piped());
         let mut child = command.spawn().unwrap();
-        let started = std::time::Instant::now();
         // It either stops by itself with a reason, or starts; then it is killed.
-        let status = loop {
-            match child.try_wait().unwrap() {
-                Some(status) => break Some(status),
-                None if started.elapsed() > Duration::from_secs(2) => break None,
-                None => std::thread::sleep(Duration::from_millis(20)),
-            }
-        };
-        if let Some(status) = status {
+        if let Some(status) = exit_within(&mut child, Duration::from_secs(2)) {
             let mut said = String::new();
             std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut said).unwrap();
             assert!(!status.success() && said.contains("modalwatch: "), "{point} {probability}: {status} {said}");

@@ -3,14 +3,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::OnceLock;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Hertz, StructureId, Timestamp};
 use modalwatch::store::Store;
 use serde_json::{json, Value};
 
-use crate::helpers::{repository, Service};
+use crate::helpers::{repository, within, Service};
 
 pub const BATCHES: &str = "/v1/structures/three-dof/batches";
 pub const STRUCTURE: &str = "three-dof";
@@ -60,9 +60,14 @@ pub fn plain_batch(source: &str, number: usize, count: usize) -> MeasurementBatc
 
 /// Defines the structure without a baseline.
 pub async fn define_plain(service: &Service) {
+    define_as(service, PLAIN).await;
+}
+
+/// Defines the structure under another id.
+pub async fn define_as(service: &Service, id: &str) {
     let text = std::fs::read_to_string(repository("models/three-dof/structure.toml")).unwrap();
-    let text = text.replace("id = \"three-dof\"", "id = \"plain\"");
-    let request = service.request(reqwest::Method::PUT, "/v1/structures/plain");
+    let text = text.replace("id = \"three-dof\"", &format!("id = \"{id}\""));
+    let request = service.request(reqwest::Method::PUT, &format!("/v1/structures/{id}"));
     let answer = request.header("content-type", "application/toml").body(text).send().await.unwrap();
     assert!(answer.status().is_success(), "{}", answer.text().await.unwrap());
 }
@@ -175,19 +180,17 @@ pub async fn history_of(service: &Service, structure: &str) -> BTreeSet<String> 
 
 /// Waits until no batch of the history waits for its assessment.
 pub async fn all_assessed(service: &Service, limit: Duration) {
-    let started = Instant::now();
-    loop {
+    within(limit, "the assessment of all batches", async || {
         let page = service.read(&format!("/v1/structures/{STRUCTURE}/history?limit=1000")).await;
         let items = page["items"].as_array().unwrap();
         assert!(page["next"].is_null(), "more batches than one page");
-        let waiting = items.iter().filter(|item| item["state"] == "received").count();
-        if waiting == 0 {
-            assert!(items.iter().all(|item| item["state"] == "assessed"), "{page}");
-            return;
+        if items.iter().any(|item| item["state"] == "received") {
+            return None;
         }
-        assert!(started.elapsed() < limit, "{waiting} batches are not assessed after {limit:?}");
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+        assert!(items.iter().all(|item| item["state"] == "assessed"), "{page}");
+        Some(())
+    })
+    .await;
 }
 
 /// Whether `/readyz` says yes, and its reasons if not.
@@ -201,15 +204,7 @@ pub async fn ready(service: &Service) -> (bool, Value) {
 
 /// Waits until `/readyz` says yes.
 pub async fn ready_again(service: &Service, limit: Duration) {
-    let started = Instant::now();
-    loop {
-        let (is_ready, reasons) = ready(service).await;
-        if is_ready {
-            return;
-        }
-        assert!(started.elapsed() < limit, "not ready after {limit:?}: {reasons}");
-        tokio::time::sleep(Duration::from_millis(100)).await;
-    }
+    within(limit, "ready", async || ready(service).await.0.then_some(())).await;
 }
 
 /// Memory that a process has in RAM, MiB.
@@ -222,15 +217,6 @@ pub fn resident_mib(pid: u32) -> f64 {
 /// File handles that a process has open.
 pub fn open_files(pid: u32) -> usize {
     std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count()
-}
-
-/// Whether a file is there; where it is not, says what is skipped and what to install.
-pub fn there(path: &str, package: &str) -> bool {
-    let there = Path::new(path).exists();
-    if !there {
-        println!("skipped: {path} is not there (apt-get install {package})");
-    }
-    there
 }
 
 /// Lets a service write until its disk is full, where it would stop before.

@@ -1,7 +1,7 @@
 //! Faults from outside: the real program under kills, full and failing disks, jumping clocks, damaged files, hostile clients.
 //!
-//! `tests/README.md` lists every case with its test. What needs a tool that is not there (`fiu-run`, `faketime`, the right to
-//! mount) says so in one line and passes.
+//! `tests/README.md` lists every case with its test. A test whose tool is missing (`fiu-run`, `faketime`, the right to mount) is
+//! recorded as skipped, by `tests/zz_skipped/needs.rs`.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -16,5 +16,8 @@ mod input;
 mod io;
 mod kit;
 mod models;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod soak;
 mod stop;

@@ -313,7 +313,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
     let data = folder.path().join("data");
     let target = Target {
         url: Arc::new(RwLock::new("http://127.0.0.1:1".to_owned())),
-        client: Client::builder().timeout(Duration::from_secs(20)).build().unwrap(),
+        client: modalwatch::notify::client_builder().timeout(Duration::from_secs(20)).build().unwrap(),
         over: Arc::default(),
         forbidden: Arc::default(),
         counts: Arc::default(),

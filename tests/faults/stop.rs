@@ -1,20 +1,26 @@
 //! The way down: SIGTERM with a request that never ends, and a second SIGTERM.
 
-use std::io::Write as _;
+use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::helpers::{command, Service};
+use crate::helpers::{command, eventually, Service};
 use crate::kit::{audit, batch, body, post, Acknowledged, BATCHES};
 
-/// A request whose body never comes.
+/// A request whose body never comes; the service waits for it, since it has asked for the body.
 fn hanging(service: &Service) -> TcpStream {
     let mut stream = TcpStream::connect(service.address()).unwrap();
     let head = format!(
-        "POST {BATCHES} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n\r\n{{"
+        "POST {BATCHES} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n\
+         Expect: 100-continue\r\n\r\n"
     );
     stream.write_all(head.as_bytes()).unwrap();
-    std::thread::sleep(Duration::from_millis(200));
+    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    let mut answer = [0; 12];
+    stream.read_exact(&mut answer).unwrap();
+    assert_eq!(&answer, b"HTTP/1.1 100");
     stream
 }
 
@@ -40,6 +46,8 @@ async fn a_second_sigterm_ends_the_process_at_once_and_what_was_acknowledged_sta
     let _hanging = hanging(&service);
     // Load until the end.
     let (url, client) = (format!("http://{}{BATCHES}", service.address()), service.client.clone());
+    let answered = Arc::new(AtomicUsize::new(0));
+    let counter = Arc::clone(&answered);
     let load = tokio::spawn(async move {
         let mut taken = Vec::new();
         for number in 0.. {
@@ -50,12 +58,14 @@ async fn a_second_sigterm_ends_the_process_at_once_and_what_was_acknowledged_sta
             }
             let Ok(answer) = response.json::<serde_json::Value>().await else { break };
             taken.push((given, answer));
+            counter.fetch_add(1, Ordering::Relaxed);
         }
         taken
     });
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    eventually("some answers", async || (answered.load(Ordering::Relaxed) >= 5).then_some(())).await;
     service.signal("TERM");
-    tokio::time::sleep(Duration::from_millis(200)).await;
+    // The first signal has arrived when no more connections are taken.
+    eventually("the end of listening", async || TcpStream::connect(service.address()).err()).await;
     let started = Instant::now();
     // The drain time is 30 s: only the second signal can end it now.
     let status = service.stop("TERM");

@@ -1,9 +1,10 @@
-//! The flow as mathematics: inverse of forward, log-determinant, a posterior with a closed form, files and back.
+//! Mathematical properties of the flow: inverse, log-determinant, a posterior with a closed form, and its weight files.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 use candle_core::{DType, Device, Tensor};
-use modalwatch::flow::train::{train, Pairs, Stopped, TrainSettings};
+use modalwatch::flow::pairs::Pairs;
+use modalwatch::flow::train::{train, Stopped, TrainSettings};
 use modalwatch::flow::weights::{untrained_flow, Weights};
 use modalwatch::flow::{checkpoint, Architecture, Flow, FlowSettings};
 use modalwatch::stats;
@@ -25,7 +26,7 @@ fn small(parameters: usize, modes: usize, seed: u64) -> Architecture {
     settings.architecture(parameters, modes, 1, &mut stats::stream(seed, "permutations"))
 }
 
-/// A flow far from the identity: an untrained one begins as the identity, so its last layers are filled.
+/// A flow far from the identity. The last layers of an untrained flow are zero and are replaced by random weights.
 fn random_flow(architecture: &Architecture, seed: u64) -> (Flow, Weights) {
     let (flow, weights) = untrained_flow(architecture, DType::F64, seed).unwrap();
     for (name, var) in &weights {
@@ -97,7 +98,8 @@ fn the_log_determinant_is_that_of_the_finite_difference_jacobian() {
     }
 }
 
-/// The same draws by the tiles of `flow::sampler` and by candle, for sizes that fill tiles, leave rests and cut measurements.
+/// Draws by the tiles of `flow::sampler` equal those by candle, for sizes that fill tiles, leave remainders and divide
+/// measurements between tiles.
 #[test]
 fn draws_by_tiles_are_those_of_the_readable_flow() {
     for (parameters, rows, draws) in [(1, 3, 50), (2, 1, 1), (3, 50, 10), (5, 7, 64), (6, 2, 333)] {
@@ -128,7 +130,7 @@ fn draws_by_tiles_are_those_of_the_readable_flow() {
 fn the_density_integrates_to_one() {
     let (flow, _) = random_flow(&small(2, 3, 5), 5);
     let y = tensor(&normals(3, 5, "y"), (1, 1, 3));
-    // Where the flow has its mass is seen from its own draws; the grid reaches a tenth beyond the outermost of 20,000.
+    // The grid covers the range of 20,000 draws, extended by a tenth on each side.
     let draws = flow.sample(&flow.summarise(&y).unwrap(), 20_000, &mut stats::stream(5, "latent")).unwrap().0;
     let side = |column: usize| {
         let values = draws.narrow(1, column, 1).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
@@ -146,7 +148,7 @@ fn the_density_integrates_to_one() {
     let y = y.expand((points * points, 1, 3)).unwrap().contiguous().unwrap();
     let log_prob = flow.log_prob(&tensor(&grid, (points * points, 2)), &flow.summarise(&y).unwrap()).unwrap();
     let mass: f64 = log_prob.to_vec1::<f64>().unwrap().iter().map(|l| l.exp() * step1 * step2).sum();
-    // About 1/20,000 lies beyond the outermost draw on each of four sides.
+    // About 1/20,000 of the mass lies beyond the outermost draw on each of four sides.
     assert!((mass - 1.0).abs() < 5e-4, "{mass}");
 }
 
@@ -217,7 +219,8 @@ fn a_trained_flow_finds_the_posterior_of_a_linear_gaussian_model() {
             let exact_std = covariance[(k, k)].sqrt();
             let off = (stats::mean(&values) - mean[(k, 0)]) / exact_std;
             let ratio = stats::sample_std(&values).unwrap() / exact_std;
-            // Monte Carlo alone: 0.016 of a standard deviation and 1.1 %; 10,000 training pairs leave some 5 %.
+            // The Monte Carlo error is 0.016 standard deviations and 1.1 %; training on 10,000 pairs leaves errors of
+            // about 5 %.
             assert!(off.abs() < 0.15 && (ratio - 1.0).abs() < 0.1, "{y:?}, x{k}: mean off by {off} std, std {ratio}");
         }
     }
@@ -244,7 +247,7 @@ fn a_training_that_diverges_stops_and_keeps_the_best_weights() {
     let settings = TrainSettings { epochs: 9, ..TrainSettings::default() };
     let mut validation_losses = Vec::new();
     let epoch = |epoch: usize| {
-        // What an overflow would leave behind.
+        // The values that an overflow would give.
         let factor = if epoch < 5 { 1.0 } else { f64::NAN };
         Ok(Pairs { x: (&training.x * factor)?, y: training.y.clone() })
     };
@@ -253,7 +256,7 @@ fn a_training_that_diverges_stops_and_keeps_the_best_weights() {
     });
     let outcome = outcome.unwrap();
     assert_eq!(outcome.stopped, Stopped::Diverged { epoch: 5 });
-    // The step that was not finite has left no trace.
+    // The step with a loss that is not finite has changed nothing.
     assert!(outcome.best_epoch <= 4 && validation_losses.len() == 4, "{outcome:?}");
     let context = flow.summarise(&validation.y).unwrap();
     let x = flow.sample(&context, 1, &mut stats::stream(1, "z")).unwrap().0.to_vec2::<f32>().unwrap();
@@ -275,7 +278,7 @@ fn a_training_that_diverges_at_once_is_an_error() {
 }
 
 #[test]
-fn a_checkpoint_gives_back_the_same_flow_and_foreign_bytes_are_refused() {
+fn a_checkpoint_restores_the_same_flow_and_invalid_bytes_are_refused() {
     let architecture = small(3, 4, 1);
     let (flow, weights) = untrained_flow(&architecture, DType::F32, 1).unwrap();
     let bytes = checkpoint::to_bytes(&weights).unwrap();

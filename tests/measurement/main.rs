@@ -93,7 +93,7 @@ proptest! {
     }
 }
 
-/// What spreadsheets and loggers do to a table: each of these is the same two measurements.
+/// Variants of a table that spreadsheets and loggers write: each contains the same two measurements.
 #[test]
 fn the_ways_a_table_is_written_are_read_alike() {
     let (covariates, space) = (covariates(), space());
@@ -147,11 +147,15 @@ fn the_ways_a_table_is_written_are_read_alike() {
 fn what_cannot_be_meant_is_refused_with_its_line() {
     let refused = |text: &str| read(text.as_bytes(), 3, &covariates(), &options()).unwrap_err().remove(0);
     for (text, place, message) in [
-        ("measured_at;f1_hz;f2_hz;f3_hz\n\n2026-01-01T00:00:00Z;1.234,5;1;1\n", "line 3, column f1_hz", "is no number"),
+        (
+            "measured_at;f1_hz;f2_hz;f3_hz\n\n2026-01-01T00:00:00Z;1.234,5;1;1\n",
+            "line 3, column f1_hz",
+            "is not a number",
+        ),
         ("measured_at,f1_hz,f2_hz,f3_hz,\r\n2026-01-01T00:00:00Z,1,1,1,7\r\n", "line 2", "column without a name"),
-        ("measured_at,f1_hz,f2_hz,f3_hz\r\n\r\n2026-01-01T00:00:00Z,1,x,1", "line 3, column f2_hz", "is no number"),
+        ("measured_at,f1_hz,f2_hz,f3_hz\r\n\r\n2026-01-01T00:00:00Z,1,x,1", "line 3, column f2_hz", "is not a number"),
         ("sep=;\nmeasured_at;f1_hz;f2_hz\n", "line 2", "missing column f3_hz"),
-        ("measured_at,f1_hz,F1_HZ,f2_hz,f3_hz\n", "line 1", "is there twice"),
+        ("measured_at,f1_hz,F1_HZ,f2_hz,f3_hz\n", "line 1", "appears twice"),
         ("", "line 1", "empty"),
     ] {
         let problem = refused(text);

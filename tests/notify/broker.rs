@@ -1,30 +1,31 @@
 //! A real broker, Debian's mosquitto, and a client that publishes to it.
 
 use std::net::TcpStream;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS};
 use tempfile::TempDir;
 
-/// Its location on Debian, which is not in every search path.
-const PLACES: [&str; 3] = ["mosquitto", "/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"];
+use crate::needs;
 
 pub struct Broker {
     child: Child,
+    program: PathBuf,
     pub port: u16,
     folder: TempDir,
 }
 
 impl Broker {
-    /// A broker on a free port; `None`, with a message, if mosquitto is not installed.
+    /// A broker on a free port; `None`, and the test is recorded as skipped, where there is no mosquitto.
     pub fn start() -> Option<Self> {
         Self::start_with("")
     }
 
     /// As [`Broker::start`], with more lines of configuration.
     pub fn start_with(more: &str) -> Option<Self> {
+        let program = needs::program("mosquitto")?;
         let folder = tempfile::tempdir().unwrap();
         let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let config = format!(
@@ -32,11 +33,8 @@ impl Broker {
              allow_anonymous true\n{more}"
         );
         std::fs::write(folder.path().join("broker.conf"), config).unwrap();
-        let Some(child) = run(&folder.path().join("broker.conf")) else {
-            eprintln!("skipped: there is no mosquitto here (apt-get install mosquitto)");
-            return None;
-        };
-        let broker = Self { child, port, folder };
+        let child = run(&program, folder.path());
+        let broker = Self { child, program, port, folder };
         broker.wait();
         Some(broker)
     }
@@ -53,7 +51,7 @@ impl Broker {
 
     /// Starts it again on the same port.
     pub fn restart(&mut self) {
-        self.child = run(&self.folder.path().join("broker.conf")).unwrap();
+        self.child = run(&self.program, self.folder.path());
         self.wait();
     }
 
@@ -84,11 +82,9 @@ impl Broker {
     }
 }
 
-fn run(config: &Path) -> Option<Child> {
-    PLACES.iter().find_map(|place| {
-        let mut command = Command::new(place);
-        command.arg("-c").arg(config).stdout(Stdio::null()).stderr(Stdio::null()).spawn().ok()
-    })
+fn run(program: &Path, folder: &Path) -> Child {
+    let mut command = Command::new(program);
+    command.arg("-c").arg(folder.join("broker.conf")).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap()
 }
 
 impl Drop for Broker {

@@ -4,7 +4,7 @@ use serde_json::{json, Value};
 
 use crate::helpers::{created, problem, spawn};
 use crate::receiver::{Answer, Receiver};
-use crate::webhooks::{damage, declare_undamaged, start};
+use crate::webhooks::{damage, declare_undamaged, settled, start};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_webhook_gets_what_it_asked_for_and_nothing_else() {
@@ -38,7 +38,9 @@ async fn a_webhook_gets_what_it_asked_for_and_nothing_else() {
     declare_undamaged(&service).await;
     damage(&service).await;
     receiver.wait_for(3).await;
-    tokio::time::sleep(std::time::Duration::from_millis(300)).await;
+    for hook in [0, 1, 2, 3, 4, 7] {
+        settled(&service, &hooks[hook], "pending", 0).await;
+    }
     let mut paths: Vec<String> = receiver.all().into_iter().map(|r| r.path).collect();
     paths.sort();
     assert_eq!(paths, ["/all", "/new", "/wanted"]);

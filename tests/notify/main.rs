@@ -9,24 +9,14 @@ mod filters;
 mod helpers;
 mod hostile;
 mod mqtt;
+#[allow(dead_code, reason = "not every test binary needs every kind of thing")]
+#[path = "../zz_skipped/needs.rs"]
+mod needs;
 mod receiver;
 mod tls;
 mod webhooks;
 
-use std::time::Duration;
-
-use helpers::Service;
-
-/// Waits until `found` returns a value; panics with `what` after 20 s.
-async fn eventually<T>(what: &str, mut found: impl AsyncFnMut() -> Option<T>) -> T {
-    for _ in 0..400 {
-        if let Some(value) = found().await {
-            return value;
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    panic!("{what}: not within 20 s");
-}
+use helpers::{eventually, Service};
 
 /// A value of `/metrics` by its name and labels as they are written there; 0 if it does not exist.
 async fn metric(service: &Service, name: &str) -> f64 {

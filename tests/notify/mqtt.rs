@@ -3,7 +3,6 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
-use std::time::Duration;
 
 use serde_json::{json, Value};
 
@@ -171,10 +170,12 @@ async fn every_message_is_stored_exactly_once_whenever_the_service_is_killed() {
     broker.publish(&[(TOPIC, batch(MESSAGES))]).await;
     service = start(folder.path(), &broker);
     eventually("all messages", async || (stored(&service).await.len() > MESSAGES).then_some(())).await;
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    // Messages are taken in their order: behind this one nothing is left that could be stored a second time.
+    broker.publish(&[(TOPIC, batch(MESSAGES + 1))]).await;
+    eventually("the last message", async || (stored(&service).await.len() > MESSAGES + 1).then_some(())).await;
     let items = stored(&service).await;
     let times: BTreeSet<&str> = items.iter().map(|item| item["measured_from"].as_str().unwrap()).collect();
-    assert_eq!((items.len(), times.len()), (MESSAGES + 1, MESSAGES + 1));
+    assert_eq!((items.len(), times.len()), (MESSAGES + 2, MESSAGES + 2));
     println!("stored before each kill: {seen:?}");
     assert!(seen[0] < MESSAGES, "the service was killed when all was done: the test shows nothing");
     assert_eq!(service.read("/v1/quarantine").await["items"], json!([]));

@@ -17,11 +17,12 @@ use crate::broker::Broker;
 use crate::helpers::{command, measurements, Service};
 use crate::receiver::{Answer, Receiver};
 use crate::webhooks::{prepared, webhook};
-use crate::{eventually, metric};
+use crate::{eventually, metric, needs};
 
-/// Creates `authority.pem` and a certificate of it for localhost, `server.pem` and `server.key`. False, with a message,
-/// if openssl is not installed.
+/// Makes `authority.pem` and a certificate of it for localhost, `server.pem` and `server.key`. False, and the test is recorded as
+/// skipped, where there is no openssl.
 fn certificates(folder: &Path) -> bool {
+    let Some(openssl) = needs::program("openssl") else { return false };
     std::fs::write(folder.join("extensions"), "subjectAltName=DNS:localhost\nbasicConstraints=CA:FALSE\n").unwrap();
     let key = "-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
     for arguments in [
@@ -31,10 +32,7 @@ fn certificates(folder: &Path) -> bool {
          -out server.pem"
             .to_owned(),
     ] {
-        let Ok(output) = Command::new("openssl").args(arguments.split(' ')).current_dir(folder).output() else {
-            eprintln!("skipped: there is no openssl here");
-            return false;
-        };
+        let output = Command::new(&openssl).args(arguments.split(' ')).current_dir(folder).output().unwrap();
         assert!(output.status.success(), "{arguments}: {}", String::from_utf8_lossy(&output.stderr));
     }
     true
@@ -108,12 +106,9 @@ async fn a_broker_may_ask_for_a_password_over_an_encrypted_connection() {
     if !certificates(keys.path()) {
         return;
     }
-    let mut users = Command::new("mosquitto_passwd");
-    users.args(["-b", "-c", "users", "gateway", "a secret"]).current_dir(keys.path());
-    let Ok(output) = users.output() else {
-        eprintln!("skipped: there is no mosquitto_passwd here (apt-get install mosquitto)");
-        return;
-    };
+    let Some(mosquitto_passwd) = needs::program("mosquitto_passwd") else { return };
+    let mut users = Command::new(mosquitto_passwd);
+    let output = users.args(["-b", "-c", "users", "gateway", "a secret"]).current_dir(keys.path()).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let path = |name: &str| keys.path().join(name).display().to_string();
@@ -147,6 +142,12 @@ async fn a_broker_may_ask_for_a_password_over_an_encrypted_connection() {
     // Without the authority the broker is not trusted and receives no password.
     let other = tempfile::tempdir().unwrap();
     let stranger = start(other.path(), None);
-    tokio::time::sleep(std::time::Duration::from_secs(1)).await;
+    eventually("the refused certificate", async || {
+        let ready: Value = stranger.get("/readyz").send().await.unwrap().json().await.unwrap();
+        let finding =
+            ready["findings"].as_array().unwrap().iter().find(|finding| finding["code"] == "mqtt_unavailable");
+        finding.is_some_and(|finding| finding["message"].as_str().unwrap().contains("certificate")).then_some(())
+    })
+    .await;
     assert!(metric(&stranger, "modalwatch_mqtt_connected").await < 0.5);
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use serde_json::{json, Value};
 
-use crate::helpers::{created, measurements, problem, spawn, Service};
+use crate::helpers::{created, eventually, measurements, problem, spawn, Service};
 use crate::world::{answers, fails, run, settled, text, with_past, without};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -37,13 +37,7 @@ async fn a_backup_under_ingest_restores_to_the_same_answers() {
     // However slow the machine is: some batches before, some after.
     let more = async |count: usize| {
         let enough = posted.load(Ordering::Relaxed) + count;
-        for _ in 0..3_000 {
-            if posted.load(Ordering::Relaxed) >= enough {
-                return;
-            }
-            tokio::time::sleep(std::time::Duration::from_millis(10)).await;
-        }
-        panic!("nothing is posted any more");
+        eventually("more posts", async || (posted.load(Ordering::Relaxed) >= enough).then_some(())).await;
     };
     more(6).await;
     let before = ids(&service).await;

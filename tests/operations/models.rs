@@ -9,7 +9,7 @@ use data_encoding::HEXLOWER;
 use serde_json::{json, Value};
 use sha2::{Digest as _, Sha256};
 
-use crate::helpers::{command, measurements, problem, repository, Service};
+use crate::helpers::{command, eventually, measurements, problem, repository, Service};
 use crate::world::{settled, with_past};
 
 /// A models folder with the shipped `three-dof`.
@@ -107,8 +107,12 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
     let first = in_use(&service).await;
 
     let load = Load::begin(&service);
-    let pause = || tokio::time::sleep(std::time::Duration::from_millis(80));
-    pause().await;
+    // Each of four clients may have begun its post before the last switch; the fifth answer belongs to the present model.
+    let more_posts = async || {
+        let enough = load.posted.lock().unwrap().len() + 5;
+        eventually("more posts", async || (load.posted.lock().unwrap().len() >= enough).then_some(())).await;
+    };
+    more_posts().await;
 
     // Another manifest around the same weights: a good model with a digest of its own.
     let mut other = manifest(models.path());
@@ -120,7 +124,7 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
     assert_ne!(first, second);
     assert_eq!(swapped["undamaged_version"], 2, "{swapped}");
     assert_eq!(in_use(&service).await, second);
-    pause().await;
+    more_posts().await;
 
     // Each of these is refused with its reason, and the good one goes on.
     let refused = async |reason: &str| {
@@ -131,7 +135,7 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
         let ready = service.read("/readyz").await;
         let codes: Vec<&Value> = ready["findings"].as_array().unwrap().iter().map(|f| &f["code"]).collect();
         assert!(ready["ready"] == true && codes.contains(&&json!("model_reload_refused")), "{ready}");
-        pause().await;
+        more_posts().await;
     };
     std::fs::write(models.path().join("three-dof/baseline.safetensors"), &weights()[..5_000]).unwrap();
     refused("SHA-256").await;

@@ -1,12 +1,11 @@
 //! Disks that are full, fail and heal; old batches.
 
 use std::process::Command;
-use std::time::Duration;
 
 use reqwest::Response;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, measurements, problem, spawn, Service};
+use crate::helpers::{command, eventually, measurements, problem, spawn, Service};
 use crate::world::{run, settled, text, with_past};
 
 async fn post(service: &Service, start: usize) -> Response {
@@ -66,25 +65,17 @@ async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
 
 /// Waits until `/readyz` says yes: what it says of the writer may be a second old.
 async fn ready_again(service: &Service) {
-    for _ in 0..200 {
-        if service.get("/readyz").send().await.unwrap().status() == 200 {
-            return;
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    panic!("not ready within 10 s");
+    eventually("ready", async || (service.get("/readyz").send().await.unwrap().status() == 200).then_some(())).await;
 }
 
 /// Posts batches until one is answered like this: a signal takes its time.
 async fn wait_for_status(service: &Service, status: u16) -> Response {
-    for attempt in 0..100 {
-        let response = post(service, 86_400 * 100 + attempt * 4_000).await;
-        if response.status() == status {
-            return response;
-        }
-        tokio::time::sleep(Duration::from_millis(30)).await;
-    }
-    panic!("no post was answered {status}");
+    let mut attempt = 0;
+    eventually(&format!("a post that is answered {status}"), async || {
+        attempt += 1;
+        Some(post(service, 86_400 * 100 + attempt * 4_000).await).filter(|response| response.status() == status)
+    })
+    .await
 }
 
 /// A limit on the size of files makes every write of the log fail, until it is lifted: the process is the same throughout.
@@ -158,13 +149,7 @@ async fn batches_are_deleted_only_where_it_was_asked_for_and_never_those_of_stat
     deleting.env("MODALWATCH__RETENTION__MEASUREMENTS_DAYS", "1").env("MODALWATCH__RETENTION__EVERY_S", "1");
     let service = Service::spawn(&mut deleting);
     let kept: Vec<String> = all.iter().filter(|id| !expected.contains(id)).cloned().collect();
-    for _ in 0..200 {
-        if ids(&service).await == kept {
-            break;
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    assert_eq!(ids(&service).await, kept);
+    eventually("the deletion", async || (ids(&service).await == kept).then_some(())).await;
     let deleted = metric(&service, "modalwatch_retention_deleted_batches_total ").await;
     assert!((deleted - expected.len() as f64).abs() < 0.5, "{deleted}");
     let gone = format!("/v1/structures/three-dof/batches/{}", expected[0]);

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use serde_json::{json, Value};
 
-use crate::helpers::{created, measurements, Service};
+use crate::helpers::{created, eventually, measurements, Service};
 
 /// The program with arguments.
 pub fn program(arguments: &[&str]) -> Command {
@@ -64,14 +64,11 @@ pub async fn with_past(service: &Service, later: usize) {
 
 /// Waits until no batch waits for its assessment.
 pub async fn settled(service: &Service) {
-    for _ in 0..400 {
+    eventually("the assessment of all batches", async || {
         let page = service.read("/v1/structures/three-dof/history?limit=1000").await;
-        if page["items"].as_array().unwrap().iter().all(|item| item["state"] == "assessed") {
-            return;
-        }
-        tokio::time::sleep(std::time::Duration::from_millis(25)).await;
-    }
-    panic!("some batches were not assessed");
+        page["items"].as_array().unwrap().iter().all(|item| item["state"] == "assessed").then_some(())
+    })
+    .await;
 }
 
 /// Everything that a service answers about `three-dof`, by path.

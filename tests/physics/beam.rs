@@ -13,7 +13,7 @@ fn simulator(text: &str) -> Simulator {
     Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap()
 }
 
-/// One span between two supports, its bending stiffness unknown; `rest` goes into the file as it is.
+/// One span of unknown bending stiffness between two supports; `rest` is appended to the file.
 fn span(supports: [&str; 2], elements: usize, modes: usize, rest: &str) -> String {
     let (left, right) = (supports[0], supports[1]);
     let (end_m, low, high) = (1.0 + LENGTH_M, 0.5 * EI, 1.5 * EI);
@@ -54,7 +54,7 @@ fn root(equation: impl Fn(f64) -> f64, near: f64) -> f64 {
 
 /// βL of the first three modes under each pair of supports, from the frequency equations.
 fn closed_forms() -> Vec<([&'static str; 2], [f64; 3])> {
-    // Divided by cosh: the equations stay of order 1.
+    // Divided by cosh, so that the terms of the equations are of order 1.
     let clamped = |x: f64| x.cos() - 1.0 / x.cosh();
     let cantilever = |x: f64| x.cos() + 1.0 / x.cosh();
     let propped = |x: f64| x.sin() - x.cos() * x.tanh();
@@ -64,7 +64,7 @@ fn closed_forms() -> Vec<([&'static str; 2], [f64; 3])> {
         (["clamped", "clamped"], [4.7, 7.85, 11.0].map(|x| root(clamped, x))),
         (["clamped", "pinned"], [3.9, 7.07, 10.2].map(|x| root(propped, x))),
         (["pinned", "clamped"], [3.9, 7.07, 10.2].map(|x| root(propped, x))),
-        // A quarter, three quarters, … of the wave of a pinned beam.
+        // One, three and five quarters of a wavelength.
         (["guided", "pinned"], [0.5 * PI, 1.5 * PI, 2.5 * PI]),
     ]
 }
@@ -90,7 +90,7 @@ fn frequencies_converge_from_above_with_the_fourth_power_of_the_element_length()
             assert!(coarse > 0.0 && fine > 0.0, "{supports:?}, mode {mode}: {coarse:e}, {fine:e}");
             let order = (coarse / fine).log2();
             println!("{supports:?}, mode {}: error {coarse:.1e} with 6 elements, order {order:.2}", mode + 1);
-            // The next term of the error is of the sixth order: at 6 elements it moves the third mode's by some 0.2.
+            // The next term of the error is of sixth order: with 6 elements it changes the order of the third mode by about 0.2.
             assert!((order - 4.0).abs() < 0.25, "{supports:?}, mode {mode}: order {order}");
         }
     }
@@ -101,7 +101,7 @@ fn a_heavy_tip_on_a_light_cantilever_swings_as_on_a_spring() {
     let tip = span(["clamped", "free"], 8, 1, "[[mass]]\nname = \"tip\"\nkg = 50.0\nat = \"right\"\n");
     let light = tip.replace(&format!("mass_kg_per_m = {KG_PER_M}"), "mass_kg_per_m = 0.01");
     let found = frequencies_hz(&light)[0];
-    // Rayleigh: 33/140 of the beam swing along; what he leaves out is of the second order in the ratio of the masses.
+    // Rayleigh: 33/140 of the mass of the beam moves with the tip; the error is of second order in the ratio of the masses.
     let moving_kg = 50.0 + 33.0 / 140.0 * 0.01 * LENGTH_M;
     let exact = (3.0 * EI / LENGTH_M.powi(3) / moving_kg).sqrt() / TAU;
     assert!((found / exact - 1.0).abs() < 1e-6, "{found} against {exact}");
@@ -140,7 +140,7 @@ fn a_span_cut_in_two_is_the_same_span() {
     }
 }
 
-/// Two spans of different stiffness with a mass, a bearing of unknown stiffness and one that holds the rotation.
+/// Two spans of different stiffness with a mass, a bearing of unknown stiffness and a rotational spring.
 const TWO_SPANS: &str = r#"id = "two-spans"
 simulation = "beam"
 modes = 4

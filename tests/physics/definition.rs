@@ -54,7 +54,7 @@ fn json_and_toml_of_the_same_structure_have_the_same_digest() {
 
 #[test]
 fn each_mistake_is_named_with_its_line_and_place() {
-    // What is replaced in the file, by what; line, place and a piece of the message.
+    // Text to be replaced in the file, its replacement, and the line, the pointer and a part of the message of the mistake.
     let cases: &[(&str, &str, usize, &str, &str)] = &[
         ("modes = 2", "modes = 2\nmods = 3", 3, "", "unknown field `mods`"),
         ("modes = 2", "modes = 3", 2, "/modes", "1 to 2"),
@@ -179,7 +179,7 @@ fn simulated_noise_has_the_stated_size() {
     let ratios = measured(1.0).component_div(&measured(0.0));
     let deviations: Vec<f64> = ratios.iter().map(|r| r - 1.0).collect();
     let std = modalwatch::stats::sample_std(&deviations).unwrap();
-    // 12,000 draws: the standard error of a standard deviation is σ/√(2n) = 0.65 %; four of them.
+    // For 12,000 draws the standard error of a standard deviation is σ/√(2n) = 0.65 %; the tolerance is four of them.
     assert!((std / 0.005 - 1.0).abs() < 4.0 * 0.0065, "{std}");
 }
 

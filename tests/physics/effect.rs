@@ -23,8 +23,8 @@ fn targets(structure: &Structure) -> Vec<(Target, Vec<f64>)> {
         (Target::FrequencyScale(Some(1)), vec![SIZES[2]]),
         (Target::FrequencyOffset(None), vec![SIZES[2]]),
         (Target::FrequencyOffset(Some(0)), vec![-SIZES[2]]),
-        (Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)), vec![SIZES[3]]),
-        (Target::AddedSpring(Node::Ground, Node::Freedom(1)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Dof(0), Node::Dof(2)), vec![SIZES[3]]),
+        (Target::AddedSpring(Node::Ground, Node::Dof(1)), vec![SIZES[3]]),
         (Target::Oscillator(1), vec![0.05, 0.2]),
     ]
 }
@@ -34,9 +34,9 @@ fn structure() -> Structure {
     let spring = |i: usize, from, to, n_per_m| Spring::between(format!("k{i}"), from, to, n_per_m);
     let masses = vec![mass(0, 0.7), mass(1, 0.5), mass(2, 0.3)];
     let springs = vec![
-        spring(0, Node::Ground, Node::Freedom(0), 4.0),
-        spring(1, Node::Freedom(0), Node::Freedom(1), 5.0),
-        spring(2, Node::Freedom(1), Node::Freedom(2), 6.0),
+        spring(0, Node::Ground, Node::Dof(0), 4.0),
+        spring(1, Node::Dof(0), Node::Dof(1), 5.0),
+        spring(2, Node::Dof(1), Node::Dof(2), 6.0),
     ];
     Structure::new(masses, springs).unwrap()
 }
@@ -65,24 +65,24 @@ fn an_effect_is_the_structure_with_it_built_in() {
     ));
     let tie = |from, to, n_per_m| Spring::between("new", from, to, n_per_m);
     assert!(close(
-        &under(Target::AddedSpring(Node::Freedom(0), Node::Freedom(2)), &[1.5]),
-        &built(&|_, s| s.push(tie(Node::Freedom(0), Node::Freedom(2), 1.5)))
+        &under(Target::AddedSpring(Node::Dof(0), Node::Dof(2)), &[1.5]),
+        &built(&|_, s| s.push(tie(Node::Dof(0), Node::Dof(2), 1.5)))
     ));
     let (kg, hz) = (0.02, 0.4);
     assert!(close(
         &under(Target::Oscillator(1), &[kg, hz]),
         &built(&|m, s| {
             m.push(Mass::at("body", 3, kg));
-            s.push(tie(Node::Freedom(1), Node::Freedom(3), (std::f64::consts::TAU * hz).powi(2) * kg));
+            s.push(tie(Node::Dof(1), Node::Dof(3), (std::f64::consts::TAU * hz).powi(2) * kg));
         })
     ));
     let plain = natural_frequencies_hz(&base, 3).unwrap();
     let scaled: Vec<f64> = plain.iter().map(|f| f * 1.01).collect();
     assert!(close(&under(Target::FrequencyScale(None), &[0.01]), &scaled));
-    // All springs by 1 + g and all masses by 1/(1 + g) do the same.
+    // Scaling all springs by 1 + g is equivalent to scaling all masses by 1/(1 + g).
     let all = Target::Springs(vec![0, 1, 2]);
     assert!(close(&under(all, &[0.2]), &under(Target::Masses(vec![0, 1, 2]), &[1.0 / 1.2 - 1.0])));
-    // A mode that was overlooked.
+    // A mode that was not identified.
     let order = respond(&base, 2, &[Target::ModeOrder(vec![0, 2])], &[]).unwrap().frequencies_hz;
     assert!(close(&order, &[plain[0], plain[2]]));
 }
@@ -159,16 +159,16 @@ fn an_effect_of_a_file_acts_by_the_measurements_covariate() {
     let softer = simulator.structure().unwrap().with_stiffness(&[(1, 18.0)]).unwrap();
     let warm = simulator.under(&sizes(20.0).values).frequencies_hz(&[10.0]).unwrap();
     assert!(close(&warm, &natural_frequencies_hz(&softer, 2).unwrap()));
-    // A sensor that hangs at 9999 counts as the end of what was seen, a tenth beyond, and is told.
+    // The value 9999 of a faulty sensor is clamped to a tenth beyond the range of the effect, and reported.
     let broken = sizes(9999.0);
     assert_eq!(broken.beyond, ["temperature_c"]);
     assert!((broken.values[0] + 0.24).abs() < 1e-12);
-    // Without the covariate: the mean, and all values that were seen.
+    // Without the covariate: the mean size, and the sizes at all values that the effect was learnt from.
     let blind = simulator.effect_sizes(&BTreeMap::new());
     assert_eq!(blind.missing, ["temperature_c"]);
     assert!(blind.values[0].abs() < 1e-12);
-    assert_eq!(simulator.possible_sizes(&BTreeMap::new()).len(), 3);
-    // The file comes back as it was.
+    assert_eq!(simulator.marginalised_sizes(&BTreeMap::new()).len(), 3);
+    // The definition survives the round trip through JSON.
     let again = StructureDefinition::parse_json(&simulator.definition().canonical_json()).unwrap();
     assert_eq!(again.digest(), *simulator.digest());
 }
@@ -182,7 +182,7 @@ fn each_mistake_of_an_effect_is_named_with_its_place() {
         ("springs = [\"k2\"]", "added_spring = [\"m1\", \"m1\"]", "/effect/0/target", "to itself"),
         ("springs = [\"k2\"]", "mode_order = [1, 1]", "/effect/0/target", "2 different modes"),
         ("covariate = \"temperature_c\"\n", "covariate = \"wind\"\n", "/effect/0/covariate", "no [[covariate]]"),
-        ("covariate = \"temperature_c\"\n", "covariate = \"operator\"\n", "/effect/0/covariate", "other kind"),
+        ("covariate = \"temperature_c\"\n", "covariate = \"operator\"\n", "/effect/0/covariate", "of kind number"),
         ("covariate = \"temperature_c\"\n", "", "/effect/0/covariate", "needs a covariate"),
         ("law = \"linear\"", "law = \"lagged\"", "/effect/0/law", "history"),
         ("law = \"linear\"", "law = \"constant\"", "/effect/0/covariate", "no covariate"),

@@ -1,11 +1,11 @@
-//! Structures against closed forms, derivatives against finite differences, structure files against their mistakes.
+//! Structures compared with closed forms, derivatives with finite differences, and mistakes in structure files.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod batched;
 mod beam;
 mod definition;
 mod effect;
-mod side_by_side;
 mod table;
 
 use std::f64::consts::PI;
@@ -25,24 +25,24 @@ fn spring(index: usize, from: Node, to: Node, n_per_m: f64) -> Spring {
     Spring::between(format!("k{index}"), from, to, n_per_m)
 }
 
-/// n equal masses in a row, the first tied to the ground.
+/// A chain of n equal masses, the first of which is connected to the ground.
 fn chain(n: usize, kg: f64, n_per_m: f64) -> Structure {
-    let end = |i: usize| if i == 0 { Node::Ground } else { Node::Freedom(i - 1) };
-    let springs = (0..n).map(|i| spring(i, end(i), Node::Freedom(i), n_per_m)).collect();
+    let end = |i: usize| if i == 0 { Node::Ground } else { Node::Dof(i - 1) };
+    let springs = (0..n).map(|i| spring(i, end(i), Node::Dof(i), n_per_m)).collect();
     Structure::new((0..n).map(|i| mass(i, kg)).collect(), springs).unwrap()
 }
 
-/// Every mass tied to the ground, and random springs between them.
+/// Masses that are all connected to the ground, with random springs between them.
 fn random_structure(seed: u64) -> Structure {
     let mut stream = stats::stream(seed, "test structure");
     let n = stream.random_range(2..6);
     let masses = (0..n).map(|i| mass(i, stream.random_range(0.2..2.0))).collect();
     let mut springs = Vec::new();
     for i in 0..n {
-        springs.push(spring(springs.len(), Node::Ground, Node::Freedom(i), stream.random_range(1.0..9.0)));
+        springs.push(spring(springs.len(), Node::Ground, Node::Dof(i), stream.random_range(1.0..9.0)));
         for j in 0..i {
             if stream.random::<f64>() < 0.6 {
-                springs.push(spring(springs.len(), Node::Freedom(i), Node::Freedom(j), stream.random_range(1.0..9.0)));
+                springs.push(spring(springs.len(), Node::Dof(i), Node::Dof(j), stream.random_range(1.0..9.0)));
             }
         }
     }
@@ -139,16 +139,16 @@ fn derivatives_agree_with_central_finite_differences() {
     }
 }
 
-/// Three equal masses in a ring, each tied to the ground: the upper two frequencies are equal.
+/// Three equal masses in a ring, each connected to the ground: the upper two frequencies are equal.
 fn ring() -> Structure {
-    let mut springs: Vec<Spring> = (0..3).map(|i| spring(i, Node::Ground, Node::Freedom(i), 4.0)).collect();
-    springs.extend((0..3).map(|i| spring(3 + i, Node::Freedom(i), Node::Freedom((i + 1) % 3), 5.0)));
+    let mut springs: Vec<Spring> = (0..3).map(|i| spring(i, Node::Ground, Node::Dof(i), 4.0)).collect();
+    springs.extend((0..3).map(|i| spring(3 + i, Node::Dof(i), Node::Dof((i + 1) % 3), 5.0)));
     Structure::new((0..3).map(|i| mass(i, 0.5)).collect(), springs).unwrap()
 }
 
-/// Two equal oscillators that do not touch.
+/// Two equal oscillators that are not coupled.
 fn pair() -> Structure {
-    let springs = (0..2).map(|i| spring(i, Node::Ground, Node::Freedom(i), 4.0)).collect();
+    let springs = (0..2).map(|i| spring(i, Node::Ground, Node::Dof(i), 4.0)).collect();
     Structure::new((0..2).map(|i| mass(i, 0.5)).collect(), springs).unwrap()
 }
 
@@ -173,7 +173,7 @@ fn at_repeated_frequencies_the_derivatives_are_the_right_hand_ones() {
             let heavier = with_mass(&structure, index, structure.masses()[index].kg + h);
             for (mode, f) in natural_frequencies_hz(&heavier, n).unwrap().iter().enumerate() {
                 let slope = (f - found.frequencies_hz[mode]) / h;
-                // The second derivative is some 10 Hz/kg², so a step of 1e-6 kg is off by some 1e-5.
+                // The second derivative is some 10 Hz/kg², so that the error of a step of 1e-6 kg is about 1e-5.
                 let error = (sensitivity.by_mass[(mode, index)] - slope).abs();
                 assert!(error < 1e-4, "mass {index}, mode {mode}: {error}");
             }
@@ -192,8 +192,7 @@ fn a_cluster_cut_by_the_number_of_modes_asked_for_has_the_same_derivatives() {
 #[test]
 fn what_is_no_structure_is_named() {
     let two = || vec![mass(0, 1.0), mass(1, 1.0)];
-    let tied =
-        || vec![spring(0, Node::Ground, Node::Freedom(0), 1.0), spring(1, Node::Freedom(0), Node::Freedom(1), 1.0)];
+    let tied = || vec![spring(0, Node::Ground, Node::Dof(0), 1.0), spring(1, Node::Dof(0), Node::Dof(1), 1.0)];
     let with = |change: &dyn Fn(&mut Vec<Mass>, &mut Vec<Spring>)| {
         let (mut masses, mut springs) = (two(), tied());
         change(&mut masses, &mut springs);
@@ -204,11 +203,8 @@ fn what_is_no_structure_is_named() {
     assert!(matches!(with(&|m, _| m[1].kg = f64::NAN), Error::Mass { .. }));
     assert!(matches!(with(&|_, s| s[0].n_per_m = -2.0), Error::Stiffness { .. }));
     assert!(matches!(with(&|m, _| m[1].name = "m0".to_owned()), Error::DuplicateName(_)));
-    assert!(matches!(with(&|_, s| s[1].form = Form::Spring(Node::Freedom(0), Node::Freedom(0))), Error::Loop { .. }));
-    assert!(matches!(
-        with(&|_, s| s[1].form = Form::Spring(Node::Freedom(0), Node::Freedom(7))),
-        Error::UnknownMass { .. }
-    ));
+    assert!(matches!(with(&|_, s| s[1].form = Form::Spring(Node::Dof(0), Node::Dof(0))), Error::Loop { .. }));
+    assert!(matches!(with(&|_, s| s[1].form = Form::Spring(Node::Dof(0), Node::Dof(7))), Error::UnknownMass { .. }));
     assert_eq!(with(&|_, s| s[0].n_per_m = 0.0), Error::Mechanism { mass: "m0".to_owned() });
     assert_eq!(with(&|_, s| s.truncate(1)), Error::Mechanism { mass: "m1".to_owned() });
     let asked = natural_frequencies_hz(&chain(2, 1.0, 1.0), 3).unwrap_err();

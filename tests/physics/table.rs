@@ -9,7 +9,7 @@ use modalwatch::stats;
 use rand::seq::SliceRandom as _;
 use rand::Rng as _;
 
-/// Latin-hypercube runs of a simulator over its prior, as a CSV.
+/// Latin hypercube runs of a simulator over its prior as CSV.
 fn runs(simulator: &Simulator, count: usize, seed: u64) -> String {
     let mut stream = stats::stream(seed, "latin hypercube");
     let mut columns: Vec<Vec<f64>> = Vec::new();
@@ -79,7 +79,7 @@ fn a_table_stands_for_the_simulation_it_was_made_of() {
     for (mode, square) in squares.iter().enumerate() {
         let told = table.table().unwrap().emulator().relative_error(mode);
         println!("mode {}: error {:.1e}, told {told:.1e}", mode + 1, square.sqrt());
-        // The told error counts the edges of the box too, where it is largest.
+        // The estimated error includes the edges of the box, where the error is largest.
         assert!(square.sqrt() < 2.0 * told && told < 1e-3, "mode {mode}: {} {told}", square.sqrt());
         assert!((table.std_hz(mode, 10.0) - 10.0 * told).abs() < 1e-12, "without noise, the error is all");
     }
@@ -149,7 +149,7 @@ fn a_table_beside_its_structure_file_is_read_with_it() {
     std::fs::write(folder.path().join("runs.csv"), runs(&rig(), 80, 1)).unwrap();
     let read = modalwatch::baseline::library::read_structure_file(&path).unwrap();
     assert_eq!(read.table().unwrap().runs(), 80);
-    // The runs belong to the definition: other runs, another structure.
+    // The runs belong to the definition, so that other runs give another digest.
     let again = StructureDefinition::parse_json(&read.definition().canonical_json()).unwrap();
     assert_eq!(again.digest(), *read.digest());
     assert!(StructureDefinition::parse_toml(&text).unwrap_err().to_string().contains("send its text as csv"));
@@ -167,10 +167,10 @@ fn mistakes_in_a_table_are_named_with_their_place() {
         ("run,p12", "run,p13".to_owned(), "/table/csv", "no column \"p12\""),
         ("f3_hz", "f4_hz".to_owned(), "/table/csv", "f3_hz is missing"),
         ("run,p12", "label,p12".to_owned(), "/table/csv", "\"label\" is no parameter"),
-        (line.as_str(), line.replace(cells[4], "x"), "/table/csv", "column f2_hz: \"x\" is no number"),
+        (line.as_str(), line.replace(cells[4], "x"), "/table/csv", "column f2_hz: \"x\" is not a finite number"),
         (line.as_str(), line.replace(cells[4], "999"), "/table/csv", "run 7"),
         ("uniform = [0.0, 0.12]", "uniform = [0.0, 0.2]".to_owned(), "/parameter/0/prior/uniform", "does not extrapolate"),
-        ("name = \"p12\"\n", sets, "/parameter/0/sets", "they set nothing"),
+        ("name = \"p12\"\n", sets, "/parameter/0/sets", "set nothing"),
         ("[table]", body, "/mass", "has no mass"),
     ];
     for (from, to, pointer, message) in cases {

@@ -29,7 +29,7 @@ fn bank(baseline: &Baseline, moments: &[(f64, f64)], count: usize, seed: u64) ->
     let rows = drawn.frequencies_hz.row_iter();
     let observations: Vec<Observation> =
         rows.map(|row| Observation::complete(&row.iter().copied().collect::<Vec<_>>())).collect();
-    // As many as the service pools.
+    // The service pools as many.
     let draws = 10;
     let samples = baseline.infer(&observations, draws, seed).unwrap();
     let columns: Vec<Vec<f64>> = (0..moments.len()).map(|k| samples.column(k)).collect();
@@ -94,7 +94,7 @@ impl Operation {
         Self { references, series: vec![Series::new(settings); charts], limits }
     }
 
-    /// True when the batch raises an alarm.
+    /// Whether the batch raises an alarm.
     fn take(&mut self, bank: &Bank, size: usize, stream: &mut Stream) -> bool {
         let rows = bank.rows(size, stream);
         let mut alarm = false;
@@ -108,7 +108,7 @@ impl Operation {
 }
 
 #[test]
-fn healthy_operation_runs_as_long_as_wanted_to_a_false_alarm() {
+fn without_damage_the_mean_run_to_a_false_alarm_is_as_required() {
     for (id, moments) in [("three-dof", &TABLE_2[..]), ("rig", &[(0.0475, 0.004), (0.0475, 0.004)][..])] {
         let baseline = shipped(id);
         let healthy = bank(&baseline, moments, 60_000, 1);
@@ -117,14 +117,18 @@ fn healthy_operation_runs_as_long_as_wanted_to_a_false_alarm() {
             let mut stream = stats::stream(size as u64, "test: healthy operation");
             let (mut runs, mut known) = (Vec::new(), None);
             for _ in 0..operations {
-                // An undamaged state of a hundred batches: with fewer the mean run is longer, by design.
+                // An undamaged reference of a hundred batches: with fewer the mean run is longer, by design.
                 let mut operation = Operation::new(&healthy, moments.len(), size, 100 * size, &mut known, &mut stream);
                 let run = (1..=longest).find(|_| operation.take(&healthy, size, &mut stream)).unwrap_or(longest);
                 runs.push(f64::from(run));
             }
             let (mean, error) = (stats::mean(&runs), stats::sample_std(&runs).unwrap() / f64::from(operations).sqrt());
             println!("{id}, batches of {size}: mean run to a false alarm {mean:.0} ± {error:.0} batches (wanted 1000)");
-            assert!((1_000.0 / 1.5..=1_500.0).contains(&mean), "{id}, {size}: {mean} ± {error}");
+            // 300 runs scatter by `error`, 65 to 88 batches. The limits aim at 1,000; what they reach is 1,180 ± 31 (mean of
+            // the six cases here), because an undamaged state of a hundred batches still lengthens the runs. Three standard
+            // errors below the nominal value and above the reached one.
+            let (least, most) = (1_000.0 - 3.0 * error, 1_180.0 + 3.0 * error);
+            assert!((least..=most).contains(&mean), "{id}, {size}: {mean} ± {error}");
         }
     }
 }
@@ -144,7 +148,7 @@ fn a_tenth_less_of_k1_is_alarmed_within_three_batches() {
         }
         let run = (1..=50).find(|_| operation.take(&damaged, size, &mut stream)).unwrap_or(50);
         runs.push(f64::from(run));
-        // The rule of the paper on a healthy batch: share of the measurements below δ above 5 % for some parameter.
+        // The rule of the paper on an undamaged batch: for some parameter, more than 5 % of the measurements are below δ.
         let rows = healthy.rows(size, &mut stream);
         let beyond = |k: usize| {
             let delta = operation.references[k].mean - 1.645 * operation.references[k].std;
@@ -155,11 +159,15 @@ fn a_tenth_less_of_k1_is_alarmed_within_three_batches() {
     let naive = naive_healthy as f64 / f64::from(operations);
     println!(
         "k1 − 10 %, batches of 20: median {} batches to the alarm, 90 % within {}; the rule \"PoD above 5 %\" alarms in {:.0} % \
-         of healthy batches",
+         of undamaged batches",
         stats::quantile(&runs, 0.5),
         stats::quantile(&runs, 0.9),
         100.0 * naive
     );
-    assert!(stats::quantile(&runs, 0.5) <= 3.0);
-    assert!(naive > 0.3, "{naive}");
+    // Nine of ten alarms come with the first batch; the 90 % quantile of 300 runs is then 1 or 2.
+    assert!(stats::quantile(&runs, 0.9) <= 3.0);
+    // 20 measurements of which at least 2 are below the 5 % quantile: 0.26 for one parameter, 0.60 for three that are
+    // independent, and more as the quantile is itself estimated, from 100: 0.65. A share of 300 scatters by 0.028: four times
+    // that about 0.65.
+    assert!((0.54..=0.76).contains(&naive), "{naive}");
 }

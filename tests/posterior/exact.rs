@@ -1,4 +1,4 @@
-//! The exact posterior of one measurement by importance sampling, without a flow: the same answer by another method.
+//! The exact posterior of one measurement by importance sampling without a flow, as a reference.
 
 use modalwatch::simulator::Simulator;
 use modalwatch::stats::{self, Stream};
@@ -10,7 +10,7 @@ use rand_distr::{ChiSquared, StandardNormal};
 pub struct Moments {
     pub mean: Vec<f64>,
     pub std: Vec<f64>,
-    /// Effective number of samples behind them.
+    /// Effective sample size.
     pub effective: f64,
 }
 
@@ -29,8 +29,8 @@ const DRAWS: usize = 40_000;
 /// Posterior of x under the uniform prior for modes `present` measured at `measured_hz` with standard deviation
 /// `relative_std` of each.
 ///
-/// Proposal: multivariate t about each maximum of the likelihood that a search from a lattice of starts finds, with the
-/// curvature there; weights are exact.
+/// The proposal is a mixture of multivariate t distributions about the maxima of the likelihood, with the curvature
+/// there. The maxima are found by a search from a lattice of starting points. The weights are exact.
 pub fn posterior(
     simulator: &Simulator,
     measured_hz: &[Option<f64>],
@@ -64,7 +64,7 @@ pub fn posterior(
         if value < best - 12.0 {
             continue;
         }
-        // A little prior keeps directions that the modes do not see within the box.
+        // The prior keeps directions that the modes do not determine within the box.
         let precision = information + DMatrix::identity(d, d) * 12.0;
         let covariance = precision.try_inverse().unwrap() * 1.3;
         let factor = covariance.clone().cholesky().unwrap().l();
@@ -150,7 +150,7 @@ fn climb(
     (u, information)
 }
 
-/// A stream for tests, apart from those of the crate by its purpose.
+/// A random stream for tests, whose purpose differs from those of the crate.
 pub fn stream(seed: u64) -> Stream {
     stats::stream(seed, "test: exact posterior")
 }

@@ -1,4 +1,4 @@
-//! Two stiffnesses that the modes cannot tell apart: damage is told for both together, and for neither alone.
+//! Two stiffnesses that the modes cannot distinguish: damage is reported for both together, and for neither alone.
 
 use modalwatch::assessment::{self, Context};
 use modalwatch::baseline::observation::DEFAULT_NOISE_RANGE;
@@ -13,7 +13,7 @@ use modalwatch::trust::FindingCode;
 use super::population::{batch, undamaged, DRAWS};
 use super::shipped;
 
-/// Two equal masses between walls: the frequencies stay when left and right change places.
+/// Two equal masses between walls: the frequencies do not change when the left and the right spring are exchanged.
 const SYMMETRIC: &str = r#"
 id = "symmetric"
 modes = 2
@@ -31,7 +31,7 @@ parameter = [
 "#;
 
 #[test]
-fn damage_of_one_of_two_is_told_for_the_group_and_blames_neither() {
+fn damage_of_one_of_two_is_reported_for_the_group_and_for_neither_alone() {
     let simulator = Simulator::new(StructureDefinition::parse_toml(SYMMETRIC).unwrap()).unwrap();
     let settings = TrainSettings { epochs: 12, ..TrainSettings::default() };
     let trained = train(&simulator, 20_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
@@ -40,7 +40,7 @@ fn damage_of_one_of_two_is_told_for_the_group_and_blames_neither() {
     println!("{record:#?}");
     assert_eq!(record.groups, [["left".to_owned(), "right".to_owned()]]);
     for p in &record.parameters {
-        // Local information sees two separate points, the posterior sees that there are two.
+        // The local information describes one of two separate points, the posterior covers both.
         assert!(p.posterior_std > 1.5 * p.fisher_std, "{p:?}");
     }
     let state = undamaged(baseline, &batch(baseline, &[(100.0, 1.5), (100.0, 1.5)], 40, 1.0, 1));
@@ -68,7 +68,7 @@ fn damage_of_one_of_two_is_told_for_the_group_and_blames_neither() {
 }
 
 #[test]
-fn the_shipped_structures_can_be_told_apart() {
+fn the_parameters_of_the_shipped_structures_can_be_distinguished() {
     for id in ["three-dof", "rig"] {
         let baseline = shipped(id);
         assert_eq!(baseline.groups(), []);

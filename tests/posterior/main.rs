@@ -1,4 +1,4 @@
-//! What the shipped flows say of single measurements, held against the exact posterior, and the population behind a batch.
+//! Posteriors of the shipped models compared with the exact posterior, and the population behind a batch.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -23,7 +23,7 @@ fn shipped(id: &str) -> Arc<Baseline> {
     library.get(&StructureId::parse(id).unwrap()).unwrap().baseline.clone().unwrap()
 }
 
-/// Simulated measurements from the prior: parameters and what is measured of them.
+/// Simulated measurements from the prior: parameters and observations.
 fn prior_measurements(
     baseline: &Baseline,
     count: usize,
@@ -47,7 +47,7 @@ fn disagreement(baseline: &Baseline, relative_std: f64, starts: usize) -> Vec<(f
     let own = baseline.simulator().noise().std_hz(1.0);
     let count = 100;
     let (_, observations) = prior_measurements(baseline, count, relative_std / own, None, 4_711);
-    // 10,000 draws: 0.008 of a standard deviation, which is part of what is measured.
+    // The Monte Carlo error of 10,000 draws, 0.008 standard deviations, is part of the disagreement.
     let draws = 10_000;
     let samples = baseline.infer(&observations, draws, 1).unwrap();
     let mut stream = exact::stream(1);
@@ -64,15 +64,14 @@ fn disagreement(baseline: &Baseline, relative_std: f64, starts: usize) -> Vec<(f
             sum.1 += (stats::sample_std(own).unwrap() / truth.std[k] - 1.0).abs() / count as f64;
         }
     }
-    assert!(poor <= 5, "the exact posterior itself is known poorly for {poor} of {count} measurements");
+    assert!(poor <= 5, "the reference is inaccurate for {poor} of {count} measurements");
     sums
 }
 
 #[test]
 fn posteriors_agree_with_the_exact_ones() {
-    // Structure, starts of the search on each axis, noises. A measurement of the rig often has a second point of the box near
-    // it, and the flow alone leaves up to 1 % of its draws in humps that the exact posterior does not have: the simulation
-    // must have taken them out.
+    // Structure, starting points of the search per axis, noise levels. A measurement of the rig often has a second mode
+    // nearby, and up to 1 % of the draws of the flow alone are in spurious modes, which resampling must remove.
     let cases = [("three-dof", 3, [0.0001, 0.001, 0.005]), ("rig", 8, [0.0005, 0.005, 0.02])];
     for (id, starts, levels) in cases {
         let baseline = shipped(id);
@@ -132,7 +131,7 @@ fn intervals_of_single_measurements_cover_and_ranks_are_uniform() {
                     (lowest, highest) = (lowest.min(covered), highest.max(covered));
                     p_values.push(uniform(&ranks, draws));
                     line.push(format!("{} {covered:.3}", space[k].name));
-                    // 1,500 simulations: the share scatters by 0.0077.
+                    // The standard error of the share with 1,500 simulations is 0.0077.
                     assert!(
                         (0.87..=0.93).contains(&covered),
                         "{id} × {multiple}, missing {missing:?}, {}: {covered}",

@@ -1,4 +1,4 @@
-//! The population behind a batch: bias, coverage, and what remains where noise drowns the spread.
+//! The population behind a batch: bias, coverage, and the intervals where noise dominates the spread.
 
 use std::collections::BTreeMap;
 
@@ -45,7 +45,7 @@ pub fn batch(
 }
 
 pub fn undamaged(baseline: &Baseline, measurements: &[ModalMeasurement]) -> UndamagedState {
-    // A seed of its own, as the service gives each batch: draws of two populations must not move together.
+    // Another seed than that of the batches, as in the service: draws of two populations must be independent.
     assessment::undamaged_state(baseline, &[(measurements, Draws { seed: 6, ..DRAWS })], 0.05).unwrap()
 }
 
@@ -95,25 +95,31 @@ fn the_noise_counts_twice_in_the_pool_and_not_at_all_in_the_population() {
     let found = repeat(1.0, 400);
     for (k, f) in found.iter().enumerate() {
         let std = TABLE_2[k].1;
-        assert!((f.std / std - 1.0).abs() <= 0.10, "k{}: {f:?}", k + 1);
-        // A share of 400: 0.9 ± 0.015.
+        // One estimate of σ from 50 measurements scatters by 10 %, of k2 by 17 % because of the noise: the mean of 400 by
+        // 0.5 % and 0.8 %. Four times the larger; the estimates are low by up to 0.8 % themselves.
+        assert!((f.std / std - 1.0).abs() <= 0.035, "k{}: {f:?}", k + 1);
+        // A share of 400 scatters by 0.015 about 0.9: 3.3 times that.
         for covered in [f.mean_covered, f.std_covered, f.probability_covered] {
             assert!((0.85..=0.95).contains(&covered), "k{}: {f:?}", k + 1);
         }
     }
-    assert!(found[1].pooled_std / 0.1 > 1.4, "the pool of k2 should be some 50 % too wide: {found:?}");
+    // The noise of k2 is about 0.08 N/m, and the pool has it twice: √(0.1² + 2·0.08²) = 0.151. The mean of 400 scatters by
+    // 0.5 % of it: six times that, as the noise is known to two digits.
+    assert!((found[1].pooled_std / 0.151 - 1.0).abs() < 0.03, "the pool of k2 should be 51 % too wide: {found:?}");
 }
 
 #[test]
-fn where_noise_drowns_the_spread_the_intervals_cover_and_are_wide() {
+fn where_noise_dominates_the_spread_the_intervals_cover_and_are_wide() {
     let found = repeat(3.0, 150);
     for f in &found {
         for covered in [f.mean_covered, f.std_covered, f.probability_covered] {
-            // A share of 150: 0.9 ± 0.024.
-            assert!(covered >= 0.83, "{found:?}");
+            // A share of 150 scatters by 0.0245 about 0.9. The program's own values are between 0.87 and 0.94 here (1,000
+            // repetitions of the sampler alone), where the share scatters by 0.027 and 0.019. So 0.83 is 2.9 standard errors
+            // below the nominal value, and 0.985 is 3.5 above it and 2.4 above 0.94.
+            assert!((0.83..=0.985).contains(&covered), "{found:?}");
         }
     }
-    // Noise of 0.24 N/m over a spread of 0.1: the interval of σ is about as wide as σ, or wider.
+    // With noise of 0.24 N/m and a spread of 0.1 N/m, the interval of σ is about as wide as σ or wider.
     assert!(found[1].relative_width > 0.9, "{found:?}");
 }
 
@@ -126,7 +132,7 @@ fn without_noise_pool_and_population_agree() {
         for (k, (_, std)) in TABLE_2.iter().enumerate() {
             let pooled = Hyperparameters::from_pool(&samples.posterior.first(10).column(k), 10);
             let population = &samples.populations.parameters[k];
-            // The sampling error of 50 draws: σ/√50 and σ/√100; a fifth of it.
+            // The bounds are a fifth of the sampling errors of 50 draws, σ/√50 and σ/√100.
             assert!((pooled.mean - population.mean).abs() < 0.2 * std / 50.0_f64.sqrt(), "k{}: {population:?}", k + 1);
             assert!((pooled.std.unwrap() - population.std.unwrap()).abs() < 0.2 * std / 10.0, "k{}", k + 1);
         }
@@ -168,7 +174,7 @@ fn an_undamaged_state_with_damage_in_it_is_doubted_and_one_too_small_refused() {
     assert!(doubts.iter().any(|d| d.starts_with("k2: its batches differ")), "{doubts:?}");
     let small = assessment::undamaged_state(&baseline, &[(&healthy[..9], DRAWS)], 0.05).unwrap_err();
     assert!(small.to_string().contains("at least 10"), "{small}");
-    // Its threshold is known better from more measurements.
+    // More measurements determine the threshold more accurately.
     let width = |count: usize| {
         let q = &undamaged(&baseline, &batch(&baseline, &TABLE_2, count, 1.0, 4)).quantities[0];
         q.threshold_interval.unwrap()[1] - q.threshold_interval.unwrap()[0]

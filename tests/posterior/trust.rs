@@ -8,10 +8,10 @@ use modalwatch::trust::{FindingCode, Trust};
 use super::population::{batch, TABLE_2};
 use super::shipped;
 
-/// A healthy rig: both links in the middle of their way.
+/// An undamaged rig: both links in the middle of their range.
 const RIG: [(f64, f64); 2] = [(0.0475, 0.004), (0.0475, 0.004)];
 
-/// Fewer draws than the service takes: only where a search begins depends on them.
+/// Fewer draws than in the service: only the starting point of a search depends on them.
 const DRAWS: Draws = Draws { per_measurement: 10, for_population: 10, seed: 5 };
 
 fn draw(id: &str, measured: &[ModalMeasurement]) -> BatchSamples {
@@ -36,9 +36,11 @@ fn healthy_batches_are_rejected_at_the_nominal_rate() {
             .count();
         let share = rejected as f64 / count as f64;
         println!("{id}: {:.2} % of {count} healthy batches rejected", 100.0 * share);
-        // The share of 2,000 scatters by 0.22 %.
-        let low = if id == "rig" { 0.005 } else { 0.0 };
-        assert!((low..=0.02).contains(&share), "{id}: {share}");
+        // Rejected is below a p-value of 1 %; a share of 2,000 scatters by 0.22 %: 2.2 times that below and 3.5 times above.
+        // Three-dof has as many parameters as modes, so that its fit cannot be tested and only what leaves the prior is
+        // rejected: none of a healthy batch, save one or two by chance.
+        let (low, high) = if id == "rig" { (0.005, 0.0178) } else { (0.0, 0.001) };
+        assert!((low..=high).contains(&share), "{id}: {share}");
     }
 }
 
@@ -100,8 +102,8 @@ fn three_per_cent_in_one_mode_of_the_rig_are_noticed_where_the_links_cannot_abso
         noticed[0] as f64 >= 0.99 * repetitions as f64 && noticed[2] as f64 >= 0.99 * repetitions as f64,
         "{noticed:?}"
     );
-    // Mode 2 follows p12 alone (paper Fig. 17): 2.5 % of its shift are left over once p12 has moved, 0.15 standard
-    // deviations of the noise. No test of the fit can see that; as a change of p12 it shows.
+    // Mode 2 depends on p12 alone (paper Fig. 17): once p12 is adjusted, a residual of 2.5 % of the shift remains, 0.15
+    // standard deviations of the noise. No test of the fit can detect that; it appears as a change of p12.
     let base = draw("rig", &batch(&baseline, &RIG, 50, 1.0, 1)).populations.parameters[0].mean;
     let moved = draw("rig", &changed(&batch(&baseline, &RIG, 50, 1.0, 1), |i, f| if i == 1 { 1.03 * f } else { f }));
     assert!(moved.populations.parameters[0].mean - base > 0.005, "{}", moved.populations.parameters[0].mean);

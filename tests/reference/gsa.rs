@@ -34,11 +34,11 @@ fn ishigami_closed_form() -> (f64, [f64; 3], [f64; 3]) {
     (v, [v1 / v, v2 / v, 0.0], [(v1 + v13) / v, v2 / v, v13 / v])
 }
 
-/// Standard error of a first-order index at 4096 samples and 10 replicates, the largest of both functions here: the
-/// error of Jansen's estimator does not shrink with the index.
+/// Largest standard error of a first-order index of both functions with 4096 samples and 10 replicates. The error of the estimator
+/// of Jansen does not decrease with the index.
 const FIRST_ERROR: f64 = 0.0015;
 
-/// Within 1 %, or within `floor` where that is more.
+/// Asserts a difference below 1 % or below `floor`, whichever is larger.
 fn assert_close(found: &[Index], closed_form: &[f64], floor: f64) {
     for (i, (found, exact)) in found.iter().zip(closed_form).enumerate() {
         assert!((found.value - exact).abs() < floor.max(0.01 * exact), "input {i}: {found:?} against {exact}");
@@ -69,7 +69,7 @@ fn indices_of_the_g_function_are_the_closed_forms_within_one_percent() {
     let found = indices(&inputs(8, 0.0, 1.0), &Settings::default(), g);
     let of = found.outputs[0].indices.as_ref().unwrap();
     assert_close(&of.first, &first, 4.0 * FIRST_ERROR);
-    // The small ones among them are 1e-4: 4 standard errors of 1e-6.
+    // The small indices are 1e-4; the tolerance is 4 standard errors of 1e-6.
     assert_close(&of.total, &total, 4e-6);
 }
 
@@ -93,7 +93,7 @@ fn an_input_without_effect_has_no_total_index() {
     let found = indices(&inputs(4, -PI, PI), &settings(512, 3), ishigami);
     let of = found.outputs[0].indices.as_ref().unwrap();
     let dummy = of.total[3];
-    // A and A_B^i give the same output to the bit.
+    // The outputs at A and A_B^i have the same bits.
     assert!(dummy.value == 0.0 && dummy.interval_90[0] <= 0.0 && dummy.interval_90[1] >= 0.0, "{dummy:?}");
     assert!(of.first[3].value.abs() < 0.01, "{:?}", of.first[3]);
 }
@@ -112,7 +112,7 @@ fn ninety_percent_intervals_cover_ninety_percent() {
             }
         }
     }
-    // Three standard errors of a share of 0.9 over 400 seeds: 0.045.
+    // Three standard errors of a share of 0.9 over 400 seeds are 0.045.
     let tolerance = 3.0 * (0.9 * 0.1 / SEEDS as f64).sqrt();
     for count in covered.into_iter().flatten() {
         let share = f64::from(count) / SEEDS as f64;
@@ -176,7 +176,8 @@ fn the_most_inputs_and_the_most_samples_are_within_the_sequence() {
     let sum = |x: &[f64]| vec![x.iter().sum()];
     let found = indices(&inputs(128, 0.0, 1.0), &Settings { samples: 2048, replicates: 2, seed: 1 }, sum);
     let total: f64 = found.outputs[0].indices.as_ref().unwrap().total.iter().map(|index| index.value).sum();
-    // In 256 dimensions this is plain Monte Carlo: 8192 values give the variance to √(2/8192) = 1.6 %; four times that.
+    // In 256 dimensions this is plain Monte Carlo: the standard error of a variance of 8192 values is √(2/8192) = 1.6 %; the tolerance is four times
+    // that.
     assert!((total - 1.0).abs() < 0.063, "{total}");
     let found = indices(&inputs(1, 0.0, 1.0), &Settings { samples: 1 << 16, replicates: 2, seed: 1 }, sum);
     assert!((found.outputs[0].variance * 12.0 - 1.0).abs() < 1e-6);

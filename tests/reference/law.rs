@@ -8,7 +8,7 @@ use modalwatch::updating::law::{fit_exponential, Estimate, ExponentialFit, FitEr
 use nalgebra::Matrix3;
 use rand_distr::{Distribution as _, StandardNormal};
 
-/// The rig of Wang et al. (2025), Table 7: two springs of 2477 N/m hold each mass.
+/// The rig of Wang et al. (2025), Table 7: two springs of 2477 N/m connect each mass to the ground.
 const MASSES_KG: [f64; 3] = [1.52, 2.30, 1.08];
 const GROUND_N_PER_M: [f64; 3] = [2.0 * 2477.0; 3];
 
@@ -96,7 +96,7 @@ fn frequencies_of_the_papers_configurations_give_back_stiffnesses_and_laws() {
 
 #[test]
 fn the_first_frequency_tells_two_solutions_apart() {
-    // From 0.035 m on, the second solution of the rig is positive as well.
+    // Above 0.035 m, the second solution of the rig is positive, too.
     let (k12, k23) = (law(LAWS[0], 0.05), law(LAWS[1], 0.05));
     let [first, second, third] = frequencies_hz(MASSES_KG, GROUND_N_PER_M, k12, k23);
     let solve = |first| coupling_stiffness(MASSES_KG, GROUND_N_PER_M, first, second, third).unwrap();
@@ -127,7 +127,7 @@ fn a_chain_that_is_the_same_from_both_ends_has_mirrored_solutions() {
 
 #[test]
 fn frequencies_of_other_modes_give_no_stiffness() {
-    // The first and the third frequency of a chain, passed off as the second and the third.
+    // The first and third frequencies of a chain are given as the second and third.
     let [first, _, third] = frequencies_hz(MASSES_KG, GROUND_N_PER_M, 2000.0, 2000.0);
     let solutions = coupling_stiffness(MASSES_KG, GROUND_N_PER_M, None, first, third).unwrap();
     let is_second = |s: &CouplingStiffness| {
@@ -163,7 +163,7 @@ fn intervals_of_the_constants_and_the_band_cover_ninety_five_percent() {
     let mut covered = [[0_u32; 4]; 2];
     for seed in 0..SEEDS {
         let Identified { points, stds, unsolved } = identified(1e-3, seed);
-        // At (0.07, 0.02) m two solutions almost meet: half of all noise leaves none.
+        // At (0.07, 0.02) m two solutions almost coincide: with half of all noise draws there is no solution.
         assert!(unsolved <= 5, "{unsolved}");
         for i in 0..2 {
             let fit = fit_exponential(&points[i], Weighting::Std(&stds[i])).unwrap();
@@ -173,7 +173,7 @@ fn intervals_of_the_constants_and_the_band_cover_ninety_five_percent() {
             covered[i][3] += u32::from(covers(fit.band_95(0.045), law(LAWS[i], 0.045)));
         }
     }
-    // Three standard errors of a share of 0.95 over 1000 seeds: 0.021.
+    // Three standard errors of a share of 0.95 over 1000 seeds are 0.021.
     let tolerance = 3.0 * (0.95 * 0.05 / SEEDS as f64).sqrt();
     for count in covered.into_iter().flatten() {
         assert!((f64::from(count) / SEEDS as f64 - 0.95).abs() < tolerance, "{covered:?} of {SEEDS}");
@@ -225,7 +225,7 @@ fn points_that_determine_no_exponential_are_refused_with_the_reason() {
     assert_eq!(refused(&at(&|_| 5.0)), FitError::StraightLine);
     assert_eq!(refused(&at(&|p| if p > 10.5 { 2.0 } else { 1.0 })), FitError::Step);
     assert_eq!(refused(&at(&|p| if p < 0.5 { 2.0 } else { 1.0 })), FitError::Step);
-    // A line with noise of alternating sign bends no more than its noise.
+    // A line with noise of alternating sign is not curved beyond its noise.
     assert_eq!(refused(&at(&|p| p + 0.1 * (7.0 * p * p).cos())), FitError::StraightLine);
     assert_eq!(refused(&[]), FitError::Positions { distinct: 0 });
     let repeated = [(1.0, 1.0), (1.0, 1.1), (2.0, 2.0), (2.0, 2.1), (3.0, 4.0), (3.0, 4.1)];

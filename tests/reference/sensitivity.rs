@@ -23,7 +23,7 @@ fn measured(simulator: &Simulator, theta: &[f64]) -> Vec<Option<f64>> {
 
 #[test]
 fn updating_ends_at_the_truth_from_two_hundred_starts_or_says_that_it_does_not() {
-    // The middle of the undamaged state of each case.
+    // The means of the undamaged state of each case.
     let truths = [vec![4.0, 5.0, 6.0], vec![0.0475, 0.0475]];
     for ((name, text), truth) in CASES.into_iter().zip(truths) {
         let simulator = simulator(text);
@@ -45,10 +45,10 @@ fn updating_ends_at_the_truth_from_two_hundred_starts_or_says_that_it_does_not()
             "{name}: {rested} of 200 at rest, {met} meet the frequencies, {at_truth} at the truth; {iterations} steps"
         );
         assert_eq!(rested, 200, "{name}");
-        // Of the rig, a second point of the box comes close to the same frequencies: where a start leads there, the search
-        // rests at a misfit, and says so.
+        // The rig has a second point in the box with similar frequencies. If a start leads there, the search converges to a misfit
+        // and reports it.
         assert!(met >= if name == "rig" { 140 } else { 200 }, "{name}: {met}");
-        // Frequencies that are met elsewhere would be a second solution: of the middle of these states there is none.
+        // Frequencies that are matched at another point would be a second solution, which the means of these states do not have.
         assert_eq!(at_truth, met, "{name}");
     }
 }
@@ -75,7 +75,7 @@ fn a_measurement_from_beyond_the_prior_ends_at_its_edge() {
     let found = update(&simulator, &measured(&simulator, &[2.8, 5.0, 6.0]), &[5.0, 5.0, 5.0]).unwrap();
     assert!(found.converged && !found.is_met(), "{found:?}");
     assert!((found.theta[0] - 3.0).abs() < 1e-12, "{found:?}");
-    // The others take up what they can of the missing 0.2 N/m, but stay near.
+    // The other stiffnesses compensate a part of the missing 0.2 N/m, but remain close.
     assert!((found.theta[1] - 5.0).abs() < 0.3 && (found.theta[2] - 6.0).abs() < 0.3, "{found:?}");
 }
 
@@ -90,7 +90,7 @@ fn a_missing_mode_is_left_out_of_the_misfit() {
     }
 }
 
-/// Latin-hypercube runs of the rig as the CSV of a table.
+/// Latin hypercube runs of the rig as CSV.
 fn rig_runs(rig: &Simulator, count: usize) -> String {
     use rand::seq::SliceRandom as _;
     let mut stream = stats::stream(5, "latin hypercube");

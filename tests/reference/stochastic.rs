@@ -30,14 +30,14 @@ fn the_posterior_of_mean_and_spread_is_as_wide_as_sampling_theory_says_and_where
         let realised: Vec<f64> = drawn.theta.column(k).iter().copied().collect();
         let (mean, std) = (stats::mean(&realised), stats::sample_std(&realised).unwrap());
         println!("{} {mean:.4} {:.4}, {std:.4} {:.4}", moments()[k].0, estimate.mean[k], estimate.std[k]);
-        // Posterior means of 1,000 samples lie within some 0.1 of a posterior standard deviation; the curvature of the map
-        // and the finite simulated sample add as much.
+        // Posterior means of 1,000 samples have an error of about 0.1 posterior standard deviations; the curvature of the map and
+        // the finite simulated sample add as much.
         assert!((estimate.mean[k] - mean).abs() < 0.4 * std / root, "mean of {k}: {} {mean}", estimate.mean[k]);
         assert!((estimate.std[k] - std).abs() < 0.4 * std / (2.0_f64.sqrt() * root), "std of {k}: {}", estimate.std[k]);
         let spread = |column: usize| {
             stats::sample_std(&samples.theta.column(column).iter().copied().collect::<Vec<f64>>()).unwrap()
         };
-        // σ/√n and σ/√2n. A standard deviation of 1,000 correlated samples is known to some 5 %.
+        // σ/√n and σ/√2n. The error of a standard deviation of 1,000 correlated samples is about 5 %.
         for (found, theory) in [(spread(k), std / root), (spread(3 + k), std / (2.0_f64.sqrt() * root))] {
             assert!((0.8..1.25).contains(&(found / theory)), "{k}: {found} against {theory}");
         }
@@ -55,7 +55,7 @@ fn noise_of_the_measurements_is_not_taken_for_spread() {
     let (told, untold) = (std_of_k2(1.0), std_of_k2(0.0));
     let exact = stats::sample_std(&drawn.theta.column(1).iter().copied().collect::<Vec<f64>>()).unwrap();
     println!("k2: drawn {exact:.4}, with the noise told {told:.4}, untold {untold:.4}");
-    // 0.1 % of noise moves k2 by 0.08 N/m in a single measurement: untold, √(0.1² + 0.08²).
+    // Noise of 0.1 % changes k2 by 0.08 N/m in a single measurement: if it is not modelled, √(0.1² + 0.08²) results.
     assert!((told - exact).abs() < 0.02, "{told} {exact}");
     assert!(untold > 1.15 * exact, "{untold} {exact}");
 }
@@ -70,7 +70,7 @@ fn data_without_a_distribution_are_refused() {
     let drawn = Drawn::new(simulator.space(), &moments()).unwrap().draw(&simulator, 20, 0.0, 3).unwrap();
     let many = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, 1 << 17, 1);
     assert!(matches!(many, Err(Error::Points { .. })));
-    // Fewer points than a covariance needs would have no likelihood anywhere.
+    // With fewer points than a covariance needs, the likelihood would be zero everywhere.
     let few = Population::new(&simulator, &drawn.frequencies_hz, &MODES, 0.0, 4, 1);
     assert!(matches!(few, Err(Error::Points { .. })));
 }
@@ -88,7 +88,7 @@ fn the_points_of_the_simulation_have_the_moments_of_thousands() {
     for seed in 0..10 {
         let few = log_likelihood(modalwatch::updating::stochastic::simulated_for(count), seed);
         println!("ln L {few:.3} of few points, {exact:.3} of many");
-        // A nat is what matters between two points of the posterior.
+        // A difference of one nat matters between two points of the posterior.
         assert!((few - exact).abs() < 0.5, "{few} {exact}");
     }
 }

@@ -41,7 +41,7 @@ struct Conjugate {
     n: f64,
     precision: DMatrix<f64>,
     data_mean: DVector<f64>,
-    /// Log-likelihood where θ is the mean of the data.
+    /// Log-likelihood at θ equal to the mean of the data.
     log_largest: f64,
 }
 
@@ -53,7 +53,7 @@ impl Conjugate {
         let sigma = DMatrix::from_fn(d, d, entry);
         let precision = sigma.clone().try_inverse().unwrap();
         let data_mean = DVector::from_fn(d, |i, _| 1.0 + 0.5 * i as f64);
-        // Scatter of the data about their mean as large as expected: n·d in units of Σ.
+        // The scatter of the data about their mean has its expected value, n·d in units of Σ.
         let log_largest = -0.5 * n * (d as f64 * TAU.ln() + sigma.determinant().ln()) - 0.5 * n * d as f64;
         Self { s, n, precision, data_mean, log_largest }
     }
@@ -83,7 +83,7 @@ impl Target for Conjugate {
         (0..self.dimensions()).map(|_| self.s * normal(stream)).collect()
     }
 
-    // Without its constant, which must not matter.
+    // Without the constant factor, which must not matter.
     fn log_prior(&self, theta: &[f64]) -> f64 {
         -0.5 * theta.iter().map(|x| (x / self.s).powi(2)).sum::<f64>()
     }
@@ -134,8 +134,8 @@ fn a_conjugate_posterior_and_its_evidence_are_the_closed_form() {
         assert_eq!(samples.theta.shape(), (1_000, d));
         for i in 0..d {
             let own = column(&samples, i);
-            // 1,000 samples with a correlation of 0.3 left: the mean scatters by 0.035 of a standard deviation, measured
-            // over 200 seeds; four times that.
+            // For 1,000 samples with a remaining correlation of 0.3, the standard error of the mean is 0.035 standard deviations,
+            // measured over 200 seeds; the tolerance is four times that.
             let off = (stats::mean(&own) - mean[i]) / covariance[(i, i)].sqrt();
             assert!(off.abs() < 0.14, "d {d}, mean of {i}: {off}");
             for j in 0..=i {
@@ -144,8 +144,8 @@ fn a_conjugate_posterior_and_its_evidence_are_the_closed_form() {
                 let products: Vec<f64> = own.iter().zip(&other).map(|(x, y)| (x - a) * (y - b)).collect();
                 let scale = (covariance[(i, i)] * covariance[(j, j)]).sqrt();
                 let off = (stats::mean(&products) - covariance[(i, j)]) / scale;
-                // A variance scatters by √(2/1,000) = 0.045 of itself, a covariance by less; times 1.1 for what is left
-                // of the copies, four times that.
+                // The relative standard error of a variance is √(2/1,000) = 4.5 %, that of a covariance is smaller. A factor of 1.1
+                // accounts for remaining copies; the tolerance is four times that.
                 assert!(off.abs() < 0.2, "d {d}, covariance of {i} and {j}: {off}");
             }
         }
@@ -165,18 +165,19 @@ fn the_evidence_is_unbiased_and_its_error_is_the_scatter_over_seeds() {
         let target = Conjugate::new(d);
         let runs: Vec<Samples> = (0..60).map(|seed| sample(&target, seed)).collect();
         let off: Vec<f64> = runs.iter().map(|r| r.log_evidence - target.log_evidence()).collect();
-        // The evidence is what an ideal run does not bias; its logarithm is low by half its variance.
+        // The estimate of the evidence is unbiased; its logarithm is too low by half its variance on average.
         let (ratio, ratio_error) = mean_and_error(&off.iter().map(|o| o.exp()).collect::<Vec<_>>());
         assert!((ratio - 1.0).abs() < 3.0 * ratio_error, "d {d}: evidence {ratio} ± {ratio_error} of the exact one");
         let told = stats::mean(&runs.iter().map(|r| r.log_evidence_std_error.powi(2)).collect::<Vec<_>>()).sqrt();
         let (bias, error) = mean_and_error(&off);
         assert!((bias + 0.5 * told.powi(2)).abs() < 3.0 * error, "d {d}: log-evidence off by {bias} ± {error}");
-        // The scatter of 60 runs is known to 1/√(2·60) = 9 %: a third is more than three times that.
+        // The relative standard error of the scatter over 60 runs is 1/√(2·60) = 9 %: a third is more than three times that.
         let scatter = stats::sample_std(&off).unwrap();
         println!("d {d}: evidence × {ratio:.3} ± {ratio_error:.3}, log {bias:.3} ± {error:.3}; scatter {scatter:.3}, told {told:.3}");
         assert!((1.0 / 1.35..1.35).contains(&(told / scatter)), "d {d}: told {told}, scatter {scatter}");
-        // Copies in the samples would leave the mean of each run more uncertain than 1,000 samples make it: 0.0316 of a
-        // standard deviation. 0.035 is what a correlation of 0.3 leaves; known to 9 %, three times that.
+        // Copies among the samples would make the standard error of the mean of each run larger than that of 1,000 independent
+        // samples, 0.0316 standard deviations. A remaining correlation of 0.3 gives 0.035, measured with an error of 9 %; the
+        // tolerance is three times that.
         let (mean, covariance) = target.posterior();
         let means: Vec<f64> =
             runs.iter().map(|r| (stats::mean(&column(r, 0)) - mean[0]) / covariance[(0, 0)].sqrt()).collect();
@@ -187,8 +188,8 @@ fn the_evidence_is_unbiased_and_its_error_is_the_scatter_over_seeds() {
 
 #[test]
 fn short_chains_are_told_in_the_error() {
-    // One step a stage: samples stay alike over the stages, and the sum of the stages' variances would tell a third of the
-    // scatter.
+    // With one step per stage, samples remain similar over the stages, and the sum of the variances of the stages would give only
+    // a third of the scatter.
     let target = Conjugate::new(2);
     let settings = Settings { most_steps: 1, ..Settings::default() };
     let runs: Vec<Samples> = (0..60).map(|seed| tmcmc(&target, &settings, seed, &|_| {}).unwrap()).collect();
@@ -197,7 +198,7 @@ fn short_chains_are_told_in_the_error() {
     let by_stage = |s: &Stage| 1.0 / s.effective_sample_size - 1e-3;
     let independent = runs[0].stages.iter().map(by_stage).sum::<f64>().sqrt();
     println!("scatter {scatter:.3}, told {told:.3}, stages alone {independent:.3}");
-    // As above, 9 % of the scatter, and some 15 % for an error that is itself told from few families.
+    // As above, 9 % of the scatter, and about 15 % for an error that is itself estimated from few families.
     assert!((1.0 / 1.5..1.5).contains(&(told / scatter)), "told {told}, scatter {scatter}");
     assert!(independent < 0.5 * scatter);
 }
@@ -216,7 +217,7 @@ fn the_evidence_of_a_likelihood_inside_a_box_is_one_over_the_volume() {
         let own = column(&samples, k);
         // As for the conjugate posterior.
         assert!(((stats::mean(&own) - centre[k]) / std[k]).abs() < 0.14, "mean of {k}");
-        // √(1/2,000) = 0.022 of a standard deviation, times 1.1, four times that.
+        // The standard error is √(1/2,000) = 0.022 standard deviations, times 1.1; the tolerance is four times that.
         assert!((stats::sample_std(&own).unwrap() / std[k] - 1.0).abs() < 0.1, "spread of {k}");
     }
 }
@@ -235,8 +236,9 @@ fn two_modes_keep_their_weights() {
     let scatter = stats::sample_std(&shares).unwrap();
     println!("share of the smaller mode {share:.3} ± {error:.3}, scatter of one run {scatter:.3}");
     assert!((share - 0.3).abs() < 3.0 * error, "{share} ± {error}");
-    // A single draw of 1,000 gives 0.014; modes that cannot be left gather that over all stages, each with weights that
-    // count half: √(1 + 2·6 stages) times as much is 0.052. A run that lost a mode would be off by 0.3.
+    // A single draw of 1,000 gives a standard error of 0.014. Samples cannot leave their mode, so that it accumulates over all 6
+    // stages, in each of which the weights halve the effective sample size: √(1 + 2·6) times as much is 0.052. A run that lost a
+    // mode would have an error of 0.3.
     assert!(shares.iter().all(|s| (s - 0.3).abs() < 0.2), "{shares:?}");
     assert!(scatter < 0.055, "{scatter}");
     let (ratio, error) = mean_and_error(&runs.iter().map(|r| (r.log_evidence + 400f64.ln()).exp()).collect::<Vec<_>>());
@@ -258,7 +260,8 @@ fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
 
 #[test]
 fn a_likelihood_of_zero_takes_its_share_of_the_evidence() {
-    // Zero but in the given share of the box: at 0.3 and 0.05 the zeros alone vary the weights more than wanted.
+    // The likelihood is zero except in the given share of the box. For 0.3 and 0.05 the zeros alone exceed the target for the
+    // variation of the weights.
     for share in [0.6, 0.5, 0.3, 0.05] {
         let log_likelihood =
             |x: &[f64]| if x[0] < share { log_normal(x[0], 0.0, 0.2 * share) } else { f64::NEG_INFINITY };
@@ -294,10 +297,10 @@ fn a_parameter_that_the_prior_fixes_or_one_survivor_does_not_stop_the_rest() {
     let samples = sample(&fixed, 1);
     assert!(samples.log_evidence.abs() < 4.0 * samples.log_evidence_std_error);
     assert!((stats::sample_std(&column(&samples, 0)).unwrap() / 0.05 - 1.0).abs() < 0.1);
-    // Not even by rounding.
+    // Exactly, without rounding errors.
     assert!(samples.theta.column(1).iter().all(|x| x.total_cmp(&(2e6 / 3.0)).is_eq()));
 
-    // One draw of the prior in 1,000 is expected where the likelihood is not zero; a seed with one.
+    // One of 1,000 draws from the prior is expected where the likelihood is positive; this seed has one.
     let narrow = InBox {
         bounds: vec![(0.0, 1.0)],
         log_likelihood: |x: &[f64]| if (x[0] - 0.5).abs() < 5e-4 { 0.0 } else { f64::NEG_INFINITY },
@@ -307,7 +310,7 @@ fn a_parameter_that_the_prior_fixes_or_one_survivor_does_not_stop_the_rest() {
         .filter_map(|seed| tmcmc(&narrow, &Settings::default(), seed, &|_| {}).ok())
         .find(one)
         .expect("a third of the seeds leave one survivor");
-    // Uniform over its 1e-3: a standard deviation of 2.9e-4, of which a walk from one point should have found most.
+    // Uniform over a width of 1e-3: a standard deviation of 2.9e-4, most of which the samples should cover from a single point.
     let std = stats::sample_std(&column(&samples, 0)).unwrap();
     assert!((2e-4..3.5e-4).contains(&std), "{std}");
     assert!((samples.log_evidence - 1e-3f64.ln()).abs() < 1e-9);
@@ -316,12 +319,12 @@ fn a_parameter_that_the_prior_fixes_or_one_survivor_does_not_stop_the_rest() {
 
 #[test]
 fn parameters_in_strict_dependence_are_sampled_along_their_ridge() {
-    // Only the sum is known, to 1e-6 of the width of the prior.
+    // The data determine only the sum, to 1e-6 of the width of the prior.
     let target = InBox { bounds: vec![(0.0, 1.0); 2], log_likelihood: |x: &[f64]| log_normal(x[0] + x[1], 1.0, 1e-6) };
     let samples = sample(&target, 3);
     // The sum of two uniform draws has the density 1 at 1.
     assert!(samples.log_evidence.abs() < 4.0 * samples.log_evidence_std_error, "{}", samples.log_evidence);
-    // Along the ridge uniform: 1/√12, known to 0.02 of itself times 1.1, four times that.
+    // Uniform along the ridge: 1/√12 with a relative standard error of 2 %, times 1.1; the tolerance is four times that.
     let std = stats::sample_std(&column(&samples, 0)).unwrap();
     assert!((std * 12f64.sqrt() - 1.0).abs() < 0.1, "{std}");
 }
@@ -402,7 +405,7 @@ fn rows(count: usize, columns: usize, shift: f64, scale: f64, seed: u64) -> DMat
 
 #[test]
 fn moments_are_those_of_the_rows() {
-    // 300 Hz with a spread of 1e-5 Hz: squares would lose it.
+    // 300 Hz with a standard deviation of 1e-5 Hz, which sums of squares would lose to rounding.
     let sample = rows(200, 3, 300.0, 1e-5, 1);
     let moments = Moments::from_matrix(&sample);
     let mean = sample.row_mean();
@@ -424,7 +427,7 @@ fn the_distance_is_the_integral_of_the_root_of_both_densities() {
     };
     for (mean, std) in [(0.0, 1.0), (0.5, 1.0), (0.0, 3.0), (-2.0, 0.4), (6.0, 2.0)] {
         let closed = bhattacharyya(&standardised(0.0, 1.0, 1), &standardised(mean, std, 2)).unwrap();
-        // The trapezoidal rule on a smooth function that vanishes at both ends: exact to rounding.
+        // The trapezoidal rule for a smooth function that vanishes at both ends is exact to rounding.
         let step = 1e-3;
         let root = |x: f64| (0.5 * (log_normal(x, 0.0, 1.0) + log_normal(x, mean, std))).exp();
         let integral: f64 = (-40_000..=40_000).map(|i| root(f64::from(i) * step) * step).sum();
@@ -467,7 +470,7 @@ fn a_singular_covariance_has_no_distance() {
     }
 }
 
-/// What the docs of `epsilon_squared` say, held against the exact likelihood of normal observations.
+/// The claim in the documentation of `epsilon_squared`, compared with the exact likelihood of normal observations.
 #[test]
 fn four_n_times_the_distance_is_the_log_likelihood_ratio_near_the_truth() {
     let n = 100.0;
@@ -494,7 +497,8 @@ fn the_likelihood_of_the_distance_gives_the_spread_of_the_exact_posterior() {
     let measured = Moments::from_matrix(&measured);
     // The same draws at every θ.
     let z: Vec<f64> = rows(simulated, 1, 0.0, 1.0, 5).iter().copied().collect();
-    // Both sides are samples: their means differ by 1/n + 1/N, as those of n·N/(n + N) rows against the truth.
+    // Both sides are samples: the variance of the difference of their means is 1/n + 1/N, as for n·N/(n + N) rows compared with the
+    // truth.
     let epsilon_squared = epsilon_squared((n * simulated) as f64 / (n + simulated) as f64);
     let target = InBox {
         bounds: vec![(0.0, 20.0), (0.1, 10.0)],

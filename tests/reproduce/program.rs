@@ -46,7 +46,7 @@ fn a_quick_reproduction_has_every_table_and_finds_what_was_drawn() {
         assert_eq!(times.len(), 4, "{table}");
         assert!(times.iter().all(|t| t["seconds"].as_f64().unwrap() > 0.0), "{table}");
     }
-    // A flow of a short training, against the values drawn. The full one is held to 0.003 and 0.005 in tests/baseline.
+    // A flow with a short training, compared with the values drawn. tests/baseline requires 0.003 and 0.005 of the full one.
     for (state, parameter, mean, std) in errors(case1, "table3").into_iter().chain(errors(case1, "table4")) {
         println!("{state} {parameter}: mean off by {mean:.5}, std by {std:.5} N/m");
         assert!(mean < 0.015 && std < 0.015, "{state} {parameter}: {mean} {std}");
@@ -55,7 +55,7 @@ fn a_quick_reproduction_has_every_table_and_finds_what_was_drawn() {
         println!("{state} {parameter}: mean off by {mean:.5}, std by {std:.5} m");
         assert!(mean < 0.001 && std < 0.001, "{state} {parameter}: {mean} {std}");
     }
-    // Figure 17: f1 by p23 more than by p12, f2 by p12, f3 by p23.
+    // Figure 17: f1 depends on p23 more than on p12, f2 on p12, f3 on p23.
     let total = |output: usize, input: usize| {
         case2
             .pointer(&format!("/rig/sensitivity/outputs/{output}/indices/total/{input}/value"))
@@ -91,7 +91,7 @@ fn samples_of_the_damaged_rig_lie_on_an_l() {
     let (p12, p23) = (samples(0), samples(1));
     let near = |p: f64| (p - 0.02).abs() < 0.004;
     let on_the_l = p12.iter().zip(&p23).filter(|(a, b)| near(**a) || near(**b)).count();
-    // Three in ten of samples spread over the prior would lie so near.
+    // Of samples spread over the prior, 30 % would be this close.
     assert!(on_the_l as f64 > 0.9 * p12.len() as f64, "{on_the_l} of {}", p12.len());
 }
 
@@ -120,11 +120,11 @@ fn the_three_methods_of_update_agree_on_a_batch() {
             value(&sensitivity, k, "std"),
             value(&tmcmc, k, "std")
         );
-        // The means of 60 measurements are known to an eighth of their spread; all have the same 60.
+        // The standard error of the mean of 60 measurements is an eighth of their standard deviation; all methods have the same 60.
         for mean in means {
             assert!((mean - means[2]).abs() < 0.15 * spread, "parameter {k}: {means:?}");
         }
-        // The deterministic inverse counts the noise as spread, the other two do not.
+        // The sensitivity method includes the noise in the standard deviation, the other two do not.
         assert!(value(&sensitivity, k, "std") > 0.97 * spread, "parameter {k}");
     }
     assert!(tmcmc["evidence"]["log_evidence"][0].as_f64().unwrap().is_finite());
@@ -133,7 +133,7 @@ fn the_three_methods_of_update_agree_on_a_batch() {
     assert!(refused("sensitivity", "nowhere.csv").contains("nowhere.csv"));
 }
 
-/// What `update` says of data that it cannot use.
+/// The error message of `update` for data that it cannot use.
 fn refused(method: &str, data: &str) -> String {
     let arguments = ["update", "--method", method, "--structure", "three-dof", "--data", data];
     let output = Command::new(env!("CARGO_BIN_EXE_modalwatch")).args(arguments).output().unwrap();
@@ -149,7 +149,7 @@ fn update_says_what_it_leaves_out_and_what_it_cannot_do() {
         std::fs::write(&path, text).unwrap();
         path.to_str().unwrap().to_owned()
     };
-    // One mode for three parameters: every point of a surface would do.
+    // One mode does not determine three parameters.
     let blind = file("blind.csv", "f1_hz,f2_hz,f3_hz\n0.4695,,\n0.4709,,\n");
     assert!(refused("sensitivity", &blind).contains("3 modes"), "{}", refused("sensitivity", &blind));
     assert!(refused("tmcmc", &blind).contains("complete measurements"));
@@ -159,10 +159,10 @@ fn update_says_what_it_leaves_out_and_what_it_cannot_do() {
     assert_eq!((answer["measurements_used"].as_u64(), answer["measurements_left_out"].as_u64()), (Some(1), Some(1)));
     let notes = answer["notes"].to_string();
     assert!(notes.contains("fewer modes") && notes.contains("not used by this method"), "{notes}");
-    // One measurement has no spread.
+    // One measurement has no standard deviation.
     assert!(answer["parameters"][0]["std"].is_null());
 
-    // A population far beyond the prior: k1 at 1.5 N/m, the prior begins at 3.
+    // A population far outside the prior: k1 is 1.5 N/m, and the prior begins at 3 N/m.
     let beyond = folder.path().join("beyond.csv");
     let beyond = beyond.to_str().unwrap();
     let population = ["k1=1.5,0.05", "k2=5,0.1", "k3=6,0.2"];

@@ -8,7 +8,7 @@ use modalwatch::reproduce::report::html;
 use modalwatch::reproduce::{Case, Reproduction};
 use tempfile::TempDir;
 
-use crate::fake;
+use crate::{fake, needs};
 
 /// Tables and figures of both cases.
 const IDS: [&str; 21] = [
@@ -80,8 +80,8 @@ fn a_case_without_data_or_with_infinite_ones_is_still_a_page() {
     assert!(IDS.iter().all(|id| given(&page, id) == 1 || *id == "fig17"));
 }
 
-/// Chromium without a window; none where it is not installed.
-fn chromium(home: &Path, arguments: &[&str], file: &Path) -> Option<Output> {
+/// Runs Chromium without a window.
+fn chromium(home: &Path, arguments: &[&str], file: &Path) -> Output {
     let mut command = Command::new("chromium");
     command.args([
         "--headless",
@@ -92,14 +92,10 @@ fn chromium(home: &Path, arguments: &[&str], file: &Path) -> Option<Output> {
         "--hide-scrollbars",
     ]);
     command.arg(format!("--user-data-dir={}", home.join("profile").display()));
-    let output = command.args(arguments).arg(format!("file://{}", file.display())).output().ok();
-    if output.is_none() {
-        println!("skipped: no chromium to look at the page with");
-    }
-    output
+    command.args(arguments).arg(format!("file://{}", file.display())).output().unwrap()
 }
 
-/// Opens what is folded away and tells the page above how wide this one is.
+/// Opens collapsed sections and reports the width of this page to its parent.
 const MEASURE: &str = "<script>document.querySelectorAll('details').forEach(d => d.open = true);\
     const empty = [...document.querySelectorAll('svg')].filter(s => { const b = s.getBoundingClientRect();\
     return b.width === 0 || b.height === 0; }).length;\
@@ -110,7 +106,7 @@ const MEASURE: &str = "<script>document.querySelectorAll('details').forEach(d =>
     parent.postMessage(`scroll=${wide} inner=${innerWidth} empty=${empty} small=${small}`, '*');\
     </script>";
 
-/// A page that shows another in a frame of a given width: a window of Chromium is never narrower than 500 px.
+/// A page that shows another in a frame of a given width, because a window of Chromium is never narrower than 500 px.
 fn framed(page: &Path, width: u32) -> String {
     format!(
         "<!doctype html><title>waiting</title><script>onmessage = e => document.title = e.data</script>\
@@ -121,6 +117,9 @@ fn framed(page: &Path, width: u32) -> String {
 
 #[test]
 fn in_a_browser_the_page_never_scrolls_sideways_and_every_drawing_has_a_size() {
+    if needs::program("chromium").is_none() {
+        return;
+    }
     let folder = TempDir::new().unwrap();
     let home = folder.path();
     let page = html(&fake::reproduction(5));
@@ -131,7 +130,7 @@ fn in_a_browser_the_page_never_scrolls_sideways_and_every_drawing_has_a_size() {
         let frame = home.join(format!("frame-{width}.html"));
         fs::write(&frame, framed(&measuring, width)).unwrap();
         let arguments = ["--dump-dom", "--virtual-time-budget=5000", "--window-size=1300,900"];
-        let Some(output) = chromium(home, &arguments, &frame) else { return };
+        let output = chromium(home, &arguments, &frame);
         let log = String::from_utf8_lossy(&output.stderr);
         assert!(!log.contains("CONSOLE"), "at {width} px: {log}");
         let dom = String::from_utf8_lossy(&output.stdout);

@@ -22,8 +22,8 @@ mod start;
 fn chain(stiffnesses: &[f64]) -> Structure {
     let count = stiffnesses.len();
     let masses = (0..count).map(|i| Mass::at(format!("m{i}"), i, 2.0)).collect();
-    let below = |i: usize| if i == 0 { Node::Ground } else { Node::Freedom(i - 1) };
-    let spring = |(i, k): (usize, &f64)| Spring::between(format!("k{i}"), below(i), Node::Freedom(i), *k);
+    let below = |i: usize| if i == 0 { Node::Ground } else { Node::Dof(i - 1) };
+    let spring = |(i, k): (usize, &f64)| Spring::between(format!("k{i}"), below(i), Node::Dof(i), *k);
     Structure::new(masses, stiffnesses.iter().enumerate().map(spring).collect()).unwrap()
 }
 
@@ -154,7 +154,7 @@ fn what_is_wrong_with_instrumented_points_is_said() {
     };
     let table = [
         (wrong("\"m4\", ", "\"m9\", "), "/mode_shapes/points/1: \"m9\" is no mass or node that moves"),
-        (wrong("\"m4\", ", "\"m2\", "), "/mode_shapes/points/1: \"m2\" is there twice"),
+        (wrong("\"m4\", ", "\"m2\", "), "/mode_shapes/points/1: \"m2\" is listed twice"),
         (wrong("[\"m2\", \"m4\", \"m6\"]", "[\"m2\"]"), "/mode_shapes/points: 1 points: a shape has at least 2"),
         (wrong("noise = 0.005", "noise = 0.0"), "/mode_shapes/noise: 0 is no share of a shape's root mean square"),
     ];

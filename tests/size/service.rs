@@ -66,7 +66,7 @@ async fn what_is_wrong_with_a_shape_is_said_with_its_place() {
     let points = right["mode_shapes"][0].as_array().unwrap().len();
     let cases: Vec<(Value, &str, &str)> = vec![
         (json!([[1.0, 2.0], null, null, null, null]), "/0", "2 numbers, expected 5: one for each of m2, m4, m6"),
-        (json!([vec![0.0; points], null, null, null, null]), "/0", "its numbers are all 0"),
+        (json!([vec![0.0; points], null, null, null, null]), "/0", "all components are 0"),
         (json!([null, null]), "", "2 shapes, expected 5"),
     ];
     for (shapes, place, message) in cases {

@@ -1,4 +1,4 @@
-//! Charts and episodes: batches that come late, twice, at the same time, in maintenance.
+//! Alarm charts and episodes: batches that arrive late, twice, at the same time, or during maintenance.
 
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
@@ -76,7 +76,7 @@ async fn assessing_a_batch_again_changes_no_alarm() {
 }
 
 #[tokio::test]
-async fn a_batch_that_comes_late_moves_the_alarm_and_keeps_who_has_seen_it() {
+async fn a_batch_that_arrives_late_moves_the_alarm_and_keeps_its_acknowledgement() {
     let (store, _folder) = opened().await;
     chart(&store, "b3", 3_000, 0.0).await;
     chart(&store, "b5", 5_000, 4.0).await;
@@ -157,13 +157,13 @@ async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_state_begins_a
         ["b0", "b2", "b3"],
         "b0 was never compared, and all after the undamaged batch come again"
     );
-    // Computed before the new state, stored after it: it must not raise what has ended.
+    // Computed before the new reference and stored after it, a point must not reopen an alarm that has ended.
     assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 8.0).await;
     assert_eq!(store.alarms().episodes(&bridge(), None, true, 10).await.unwrap(), []);
 }
 
 #[tokio::test]
-async fn silence_is_one_alarm_until_something_comes() {
+async fn missing_data_are_one_alarm_until_a_batch_arrives() {
     let (store, _folder) = opened().await;
     assert!(store.alarms().set_silent(&bridge(), Some(at(10)), at(99)).await.unwrap());
     assert!(!store.alarms().set_silent(&bridge(), Some(at(10)), at(100)).await.unwrap());
@@ -172,8 +172,8 @@ async fn silence_is_one_alarm_until_something_comes() {
     assert_eq!((episode.kind.as_str(), episode.opened_at, episode.ended_at), ("silence", at(10), Some(at(120))));
 }
 
-/// What the outbox has for a webhook that wants everything, oldest first.
-async fn told(store: &Store) -> Vec<String> {
+/// The messages in the outbox for a webhook that selects all events, oldest first.
+async fn messages(store: &Store) -> Vec<String> {
     let mut found = store.outbox().deliveries("hook", None, None, 100).await.unwrap();
     found.reverse();
     found.into_iter().map(|d| format!("{} {}", d.event.kind, d.event.alarm)).collect()
@@ -197,18 +197,18 @@ async fn opened_with_a_webhook() -> (Store, tempfile::TempDir) {
 }
 
 #[tokio::test]
-async fn each_change_of_an_alarm_is_told_once_and_writing_it_again_is_no_change() {
+async fn each_change_of_an_alarm_is_one_message_and_storing_it_again_is_no_change() {
     let (store, _folder) = opened_with_a_webhook().await;
     chart(&store, "b1", 1_000, 0.0).await;
     chart(&store, "b3", 3_000, 4.0).await;
-    assert_eq!(told(&store).await, ["alarm.opened 1"]);
-    // It lasts, rises, is assessed again, and gets an earlier beginning: the same alarm.
+    assert_eq!(messages(&store).await, ["alarm.opened 1"]);
+    // The alarm stays open, rises, is assessed again, and begins earlier: it remains the same alarm.
     chart(&store, "b4", 4_000, 6.0).await;
     assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 4.0).await;
     assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 4.5).await;
     chart(&store, "b2", 2_000, 5.0).await;
     assert_eq!(episodes(&store).await.len(), 1);
-    assert_eq!(told(&store).await, ["alarm.opened 1"]);
+    assert_eq!(messages(&store).await, ["alarm.opened 1"]);
     let seen = Acknowledgement { at: at(6_000), by: "night shift".to_owned(), note: None };
     for _ in 0..2 {
         store.alarms().acknowledge(&bridge(), 1, seen.clone()).await.unwrap().unwrap();
@@ -216,37 +216,37 @@ async fn each_change_of_an_alarm_is_told_once_and_writing_it_again_is_no_change(
     chart(&store, "b5", 5_000, 0.0).await;
     chart(&store, "b6", 6_000, 0.0).await;
     let so_far = ["alarm.opened 1", "alarm.acknowledged 1", "alarm.ended 1"];
-    assert_eq!(told(&store).await, so_far);
-    // Its end moves, but it has ended before and after.
+    assert_eq!(messages(&store).await, so_far);
+    // Its end moves, but it was ended before and after.
     assess(&store, "b5", batch("b5", 5_000, 1).time_span(), 0.1).await;
-    assert_eq!(told(&store).await, so_far);
-    // A corrected batch shows that it lasts, another that it has ended all the same.
+    assert_eq!(messages(&store).await, so_far);
+    // A corrected batch reopens the alarm.
     assess(&store, "b6", batch("b6", 6_000, 1).time_span(), 7.0).await;
-    assert_eq!(told(&store).await[3..], ["alarm.reopened 1"]);
+    assert_eq!(messages(&store).await[3..], ["alarm.reopened 1"]);
     let facts = store.outbox().deliveries("hook", None, None, 1).await.unwrap().remove(0).event.facts;
     assert!(facts.contains("\"ended_at_us\":null") && facts.contains("\"peak_shift\":7.0"), "{facts}");
 }
 
 #[tokio::test]
-async fn an_alarm_that_was_none_is_withdrawn_and_one_found_in_the_past_is_told_with_its_end() {
+async fn a_wrong_alarm_is_withdrawn_and_one_found_in_the_past_is_sent_with_its_end() {
     let (store, _folder) = opened_with_a_webhook().await;
     chart(&store, "b1", 1_000, 4.0).await;
     chart(&store, "b2", 2_000, 0.0).await;
     assess(&store, "b1", batch("b1", 1_000, 1).time_span(), 1.0).await;
-    assert_eq!(told(&store).await, ["alarm.opened 1", "alarm.withdrawn 1"]);
+    assert_eq!(messages(&store).await, ["alarm.opened 1", "alarm.withdrawn 1"]);
     for (i, shift) in [0.0, 0.0, 0.0, 0.0].into_iter().enumerate() {
         chart(&store, &format!("c{i}"), 10_000 + 1_000 * i as i64, shift).await;
     }
     chart(&store, "late", 9_500, 8.0).await;
-    assert_eq!(told(&store).await[2..], ["alarm.opened 2", "alarm.ended 2"]);
-    assert_eq!(store.outbox().prune_outbox(at(1_000_000_000)).await.unwrap(), 0, "what waits is not forgotten");
+    assert_eq!(messages(&store).await[2..], ["alarm.opened 2", "alarm.ended 2"]);
+    assert_eq!(store.outbox().prune_outbox(at(1_000_000_000)).await.unwrap(), 0, "waiting messages are not deleted");
 }
 
 #[tokio::test]
-async fn silence_is_told_when_it_begins_and_when_it_ends() {
+async fn missing_data_are_reported_when_they_begin_and_when_they_end() {
     let (store, _folder) = opened_with_a_webhook().await;
     for since in [Some(at(5)), Some(at(5)), None, None] {
         store.alarms().set_silent(&bridge(), since, at(100)).await.unwrap();
     }
-    assert_eq!(told(&store).await, ["alarm.opened 1", "alarm.ended 1"]);
+    assert_eq!(messages(&store).await, ["alarm.opened 1", "alarm.ended 1"]);
 }

@@ -1,4 +1,4 @@
-//! Diagnoses and extensions as one list.
+//! Diagnoses and extensions as one list of jobs.
 
 use modalwatch::quantity::Digest;
 use modalwatch::store::{JobKind, JobState};
@@ -35,7 +35,7 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
     assert_eq!((newest.kind, newest.state, newest.finished_at), (extension, JobState::Done, Some(at(50))));
     assert_eq!(newest.summary.as_deref(), Some("k2 by temperature_c; k1 by wind"));
 
-    // What a stop leaves behind has failed, and when.
+    // Jobs that were running when the service stopped have failed.
     assert!(store.diagnoses().begin_extension("d1", at(60)).await.unwrap());
     assert_eq!(store.diagnoses().end_interrupted_jobs(at(70)).await.unwrap(), 2);
     let jobs = store.diagnoses().jobs(100).await.unwrap();

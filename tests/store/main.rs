@@ -1,4 +1,4 @@
-//! The archive: whole or not at all, whoever goes away in the middle.
+//! The store through its public interface: batches are stored completely or not at all, also when the caller disconnects.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -137,11 +137,11 @@ async fn a_writer_who_goes_away_leaves_whole_batches_and_a_usable_store() {
     for i in 0..60 {
         let given = batch(&format!("s{i}"), 0, 40);
         let id = format!("b{i}");
-        // Dropped at once, or after some microseconds in the middle of the transaction.
+        // The future is dropped at once, or after some microseconds during the transaction.
         let _ =
             tokio::time::timeout(Duration::from_micros(i * 20), store.batches().insert_batch(&given, &id, at(0))).await;
     }
-    // One more write waits for those still under way and shows that the connection is not left in a transaction.
+    // One more write waits for the others and shows that no transaction was left open.
     assert!(matches!(
         store.batches().insert_batch(&batch("last", 0, 40), "last", at(0)).await.unwrap(),
         InsertBatch::Inserted { .. }
@@ -163,7 +163,7 @@ async fn a_refused_batch_leaves_nothing_behind() {
     let expected = InsertBatch::MeasurementConflict { ordinal: 3, measured_at: at(10), batch_id: "b1".to_owned() };
     assert_eq!(overlapping, expected);
     assert!(store.batches().batch(&bridge(), "b2").await.unwrap().is_none());
-    // The three that did not collide are free.
+    // The three measurements without a conflict can be stored by another batch.
     assert!(matches!(
         store.batches().insert_batch(&batch("logger", 7, 3), "b3", at(2)).await.unwrap(),
         InsertBatch::Inserted { .. }

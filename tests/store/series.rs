@@ -1,4 +1,4 @@
-//! Series of windows that hold a hundred thousand batches: what stays, and how long it takes.
+//! Time series of a hundred thousand batches: what the reduction keeps, and how long it takes.
 
 use std::time::Instant;
 
@@ -17,7 +17,7 @@ const EVERY_S: i64 = 600;
 const SPIKE: i64 = 77_777;
 /// The batch that is rejected.
 const REJECTED: i64 = 12_345;
-/// The first batch after a day without any.
+/// The first batch after a day without batches.
 const AFTER_THE_GAP: i64 = 50_000;
 
 const ALL: SeriesWindow = SeriesWindow { from: None, to: None, points: 1_000 };
@@ -31,7 +31,7 @@ fn blob(values: &[f64]) -> Vec<u8> {
     values.iter().flat_map(|value| value.to_le_bytes()).collect()
 }
 
-/// Puts [`MANY`] assessed batches of one measurement each into the tables, as the service would have.
+/// Fills the tables with [`MANY`] assessed batches of one measurement each, as the service would store them.
 async fn fill(folder: &tempfile::TempDir) {
     let mut connection = connection(folder).await;
     let mut transaction = connection.begin_with("begin immediate").await.unwrap();
@@ -152,7 +152,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     assert_eq!(overview[0].last_measured_at.unwrap().micros(), time_of(MANY - 1));
     assert_eq!(overview[0].chart_states.len(), 5);
 
-    // Of too many measurements, every third is looked at.
+    // Of too many measurements, every third is read.
     let too_many = Extent { measurements: 1_200_000, ..extent };
     assert_eq!(too_many.stride(), 3);
     let started = Instant::now();
@@ -161,7 +161,7 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let looked_at: Vec<i64> = (0..MANY).step_by(3).map(time_of).collect();
     assert!(thinned.rows.len() > 400 && thinned.rows.iter().all(|row| looked_at.binary_search(&row.time_us).is_ok()));
 
-    // A window out of the middle costs what lies in it, and its bounds hold.
+    // A window costs as much as the batches in it, and its bounds are respected.
     let window = SeriesWindow { from: Some(at(600_000)), to: Some(at(606_000)), points: 1_000 };
     let started = Instant::now();
     let extent = store.series().extent(&bridge(), window).await.unwrap();
@@ -220,19 +220,19 @@ async fn the_column_for_plots_says_what_the_rows_say() {
             }
         }
         if i % 2 == 1 {
-            // Another baseline has other quantities, in another order.
+            // Another trained baseline has other quantities in another order.
             given.quantities.reverse();
             given.quantities[0].name = "k9".to_owned();
         }
         store.assessments().insert_assessment(&bridge(), &id, &given, Vec::new()).await.unwrap();
     }
-    // Longer than the points of the plot, so that the reduction takes part.
+    // More batches than points, so that the series is reduced.
     let window = SeriesWindow { points: 20, ..ALL };
     let extent = store.series().extent(&bridge(), window).await.unwrap();
     let by_column = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
     assert!(by_column.1.reduced && by_column.0.iter().any(|quantity| quantity.batches.reduced));
     sqlx::query("update assessment set plotted = null").execute(&mut connection(&folder).await).await.unwrap();
     let by_rows = store.series().assessed_series(&bridge(), window, &extent).await.unwrap();
-    // NaN is not equal to itself: the texts are compared.
+    // The texts are compared, because NaN is not equal to itself.
     assert_eq!(format!("{by_column:?}"), format!("{by_rows:?}"));
 }

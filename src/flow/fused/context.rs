@@ -1,49 +1,50 @@
-//! The context network on a tile, there and back.
+//! The context network on a tile: forward and backward pass.
 
-use super::layout::{Layout, Place};
+use super::layout::{DenseWeights, Layout};
+use crate::flow::architecture::Architecture;
 use crate::flow::context::KERNEL;
 use crate::flow::kernel::{add, add_bias_and_silu_with_slopes, add_weight_gradient, through_slopes};
-use crate::flow::Architecture;
 
-/// The context network: two convolutions and a dense layer, beside the shortcut; or the shortcut alone.
+/// The context network: two convolutions and a dense layer, and the shortcut; or the shortcut alone.
 pub(super) struct Context {
-    layers: Option<[Place; 3]>,
+    layers: Option<[DenseWeights; 3]>,
     modes: usize,
     features: usize,
     shortcut: usize,
 }
 
-/// What the way back needs of the way there, for one tile, and the gradients on that way.
+/// Intermediate results of the forward pass of one tile that the backward pass needs, and buffers for its gradients.
 pub(super) struct Trace {
-    /// Input of each layer; the first two unfolded into windows.
+    /// Input of each layer; that of the convolutions is unfolded into windows.
     inputs: [Vec<f32>; 3],
+    /// Derivative of each layer's activation.
     slopes: [Vec<f32>; 3],
-    /// What each layer gives.
+    /// Output of each layer.
     outputs: [Vec<f32>; 3],
-    /// Gradients by the input and the output of the layer at hand.
+    /// Gradients with respect to the input and the output of the current layer.
     of_input: Vec<f32>,
     of_output: Vec<f32>,
 }
 
 impl Context {
     pub(super) fn new(layout: &Layout, architecture: &Architecture, shortcut: usize) -> Self {
-        let place = |name| layout.place(&format!("context.{name}"));
-        let layers = (architecture.fixed_context == 0).then(|| ["conv1", "conv2", "features"].map(place));
+        let dense = |name| layout.dense(&format!("context.{name}"));
+        let layers = (architecture.fixed_context == 0).then(|| ["conv1", "conv2", "features"].map(dense));
         let features = if layers.is_some() { architecture.context_features } else { 0 };
         Self { layers, modes: architecture.modes, features, shortcut }
     }
 
-    /// Whether anything but the shortcut is read of an observation.
+    /// Whether there is a network besides the shortcut.
     pub(super) fn has_network(&self) -> bool {
         self.layers.is_some()
     }
 
-    /// Entries of S(y).
+    /// Number of entries of S(y).
     pub(super) fn width(&self) -> usize {
         self.features + self.shortcut
     }
 
-    /// Columns that a layer sees for each observation.
+    /// Number of columns per observation in a layer.
     fn columns(&self, layer: usize) -> usize {
         if layer < 2 {
             self.modes
@@ -52,18 +53,19 @@ impl Context {
         }
     }
 
+    /// A trace for tiles of up to `tile` observations.
     pub(super) fn trace(&self, tile: usize) -> Trace {
-        let sized = |size: fn(&Place) -> usize| {
-            let buffer = |layer: usize, place: &Place| vec![0.0; size(place) * self.columns(layer) * tile];
+        let sized = |size: fn(&DenseWeights) -> usize| {
+            let buffer = |layer: usize, dense: &DenseWeights| vec![0.0; size(dense) * self.columns(layer) * tile];
             self.layers.as_ref().map_or_else(Default::default, |all| [0, 1, 2].map(|layer| buffer(layer, &all[layer])))
         };
-        let (inputs, outputs) = (sized(|place| place.inputs), sized(|place| place.outputs));
+        let (inputs, outputs) = (sized(|dense| dense.inputs), sized(|dense| dense.outputs));
         let largest = |buffers: &[Vec<f32>; 3]| vec![0.0; buffers.iter().map(Vec::len).max().unwrap_or(0)];
         Trace { slopes: outputs.clone(), of_input: largest(&inputs), of_output: largest(&outputs), inputs, outputs }
     }
 
-    /// S(y) of `count` observations into `context`. `observation` gives the numbers of each mode one after another and the
-    /// shortcut of row `i`.
+    /// Writes S(y) of `count` observations to `context`. `observation(i)` returns the inputs of row i, mode by mode, and
+    /// its shortcut.
     pub(super) fn forward<'a>(
         &self,
         weights: &[f32],
@@ -83,21 +85,25 @@ impl Context {
             unfold(observation(row).0, self.modes, &mut trace.inputs[0][row * window..(row + 1) * window]);
         }
         for layer in 0..3 {
-            let place = &layers[layer];
-            let dense = place.layer(weights);
+            let dense = &layers[layer];
+            let layer_weights = dense.layer(weights);
             let columns = self.columns(layer) * count;
-            let output = &mut trace.outputs[layer][..place.outputs * columns];
-            dense.product(&trace.inputs[layer][..place.inputs * columns], output, false);
-            add_bias_and_silu_with_slopes(output, dense.bias, &mut trace.slopes[layer][..place.outputs * columns]);
+            let output = &mut trace.outputs[layer][..dense.outputs * columns];
+            layer_weights.product(&trace.inputs[layer][..dense.inputs * columns], output, false);
+            add_bias_and_silu_with_slopes(
+                output,
+                layer_weights.bias,
+                &mut trace.slopes[layer][..dense.outputs * columns],
+            );
             match layer {
                 0 => {
                     let next = layers[1].inputs * self.modes;
                     let windows = trace.inputs[1].chunks_exact_mut(next);
-                    for (output, windows) in output.chunks_exact(place.outputs * self.modes).zip(windows) {
+                    for (output, windows) in output.chunks_exact(dense.outputs * self.modes).zip(windows) {
                         unfold(output, self.modes, windows);
                     }
                 }
-                // The features of all modes of an observation lie one after another already.
+                // The features of all modes of an observation are contiguous already.
                 1 => trace.inputs[2][..output.len()].copy_from_slice(output),
                 _ => {
                     let columns = context.chunks_exact_mut(self.width()).zip(output.chunks_exact(self.features));
@@ -110,7 +116,7 @@ impl Context {
         }
     }
 
-    /// Adds the gradients by the weights to `gradient`, from that by S(y).
+    /// Adds the gradient with respect to the weights to `gradient`, given that with respect to S(y).
     pub(super) fn backward(
         &self,
         weights: &[f32],
@@ -125,24 +131,24 @@ impl Context {
             own.copy_from_slice(&column[..self.features]);
         }
         for layer in [2, 1, 0] {
-            let place = &layers[layer];
+            let dense = &layers[layer];
             let columns = self.columns(layer) * count;
-            let of_output = &mut trace.of_output[..place.outputs * columns];
-            let slopes = &trace.slopes[layer][..place.outputs * columns];
-            through_slopes(of_output, slopes, &mut gradient[place.bias.clone()]);
-            let input = &trace.inputs[layer][..place.inputs * columns];
-            add_weight_gradient(&mut gradient[place.weight.clone()], input, of_output, columns);
+            let of_output = &mut trace.of_output[..dense.outputs * columns];
+            let slopes = &trace.slopes[layer][..dense.outputs * columns];
+            through_slopes(of_output, slopes, &mut gradient[dense.bias.clone()]);
+            let input = &trace.inputs[layer][..dense.inputs * columns];
+            add_weight_gradient(&mut gradient[dense.weight.clone()], input, of_output, columns);
             if layer == 0 {
                 return;
             }
-            let of_input = &mut trace.of_input[..place.inputs * columns];
-            place.layer(weights).input_gradient(of_output, of_input);
+            let of_input = &mut trace.of_input[..dense.inputs * columns];
+            dense.layer(weights).input_gradient(of_output, of_input);
             let of_previous = &mut trace.of_output[..layers[layer - 1].outputs * self.modes * count];
             if layer == 2 {
                 of_previous.copy_from_slice(of_input);
             } else {
-                let windows = of_input.chunks_exact(place.inputs * self.modes);
-                for (own, windows) in of_previous.chunks_exact_mut(place.inputs / KERNEL * self.modes).zip(windows) {
+                let windows = of_input.chunks_exact(dense.inputs * self.modes);
+                for (own, windows) in of_previous.chunks_exact_mut(dense.inputs / KERNEL * self.modes).zip(windows) {
                     fold(windows, self.modes, own);
                 }
             }
@@ -150,12 +156,12 @@ impl Context {
     }
 }
 
-/// The neighbours of each mode: column k of an observation becomes (y_{k−1}, y_k, y_{k+1}), zeros beyond the ends.
+/// Unfolds an observation into windows: column k becomes (y_{k−1}, y_k, y_{k+1}), with zeros beyond the ends.
 fn unfold(values: &[f32], modes: usize, windows: &mut [f32]) {
     let channels = values.len() / modes;
     for (mode, window) in windows.chunks_exact_mut(KERNEL * channels).enumerate() {
-        for (place, part) in window.chunks_exact_mut(channels).enumerate() {
-            match (mode + place).checked_sub(KERNEL / 2).filter(|from| *from < modes) {
+        for (offset, part) in window.chunks_exact_mut(channels).enumerate() {
+            match (mode + offset).checked_sub(KERNEL / 2).filter(|from| *from < modes) {
                 Some(from) => part.copy_from_slice(&values[from * channels..(from + 1) * channels]),
                 None => part.fill(0.0),
             }
@@ -163,13 +169,13 @@ fn unfold(values: &[f32], modes: usize, windows: &mut [f32]) {
     }
 }
 
-/// The gradient that goes with [`unfold`].
+/// The adjoint of [`unfold`]: adds up the gradients with respect to the windows.
 fn fold(windows: &[f32], modes: usize, values: &mut [f32]) {
     let channels = values.len() / modes;
     values.fill(0.0);
     for (mode, window) in windows.chunks_exact(KERNEL * channels).enumerate() {
-        for (place, part) in window.chunks_exact(channels).enumerate() {
-            if let Some(to) = (mode + place).checked_sub(KERNEL / 2).filter(|to| *to < modes) {
+        for (offset, part) in window.chunks_exact(channels).enumerate() {
+            if let Some(to) = (mode + offset).checked_sub(KERNEL / 2).filter(|to| *to < modes) {
                 add(&mut values[to * channels..(to + 1) * channels], part);
             }
         }

@@ -1,4 +1,4 @@
-//! Where each weight lies in the one long vector that the optimiser works on.
+//! Layout of all weights in the single vector that the optimiser works on.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -9,14 +9,14 @@ use faer::MatRef;
 use crate::flow::kernel::Layer;
 use crate::flow::weights::Weights;
 
-/// Places of all weights by name, one after another in alphabetical order.
+/// Range of each weight, by name. The weights follow each other in alphabetical order.
 pub(super) struct Layout {
-    places: BTreeMap<String, Range<usize>>,
+    ranges: BTreeMap<String, Range<usize>>,
 }
 
-/// A dense layer in the long vector.
+/// Ranges of the weight and bias of a dense layer in the vector of all weights.
 #[derive(Clone)]
-pub(super) struct Place {
+pub(super) struct DenseWeights {
     pub weight: Range<usize>,
     pub bias: Range<usize>,
     pub inputs: usize,
@@ -24,37 +24,38 @@ pub(super) struct Place {
 }
 
 impl Layout {
-    /// The layout of `weights`, and their values in it.
+    /// The layout of `weights`, and the vector of their values.
     pub(super) fn read(weights: &Weights) -> Result<(Self, Vec<f32>)> {
         let mut values = Vec::new();
-        let mut places = BTreeMap::new();
+        let mut ranges = BTreeMap::new();
         for (name, var) in weights {
             let start = values.len();
             values.extend(var.flatten_all()?.to_vec1::<f32>()?);
-            places.insert(name.clone(), start..values.len());
+            ranges.insert(name.clone(), start..values.len());
         }
-        Ok((Self { places }, values))
+        Ok((Self { ranges }, values))
     }
 
-    /// Gives `weights` these values.
+    /// Writes these values to `weights`.
     pub(super) fn write(&self, values: &[f32], weights: &Weights) -> Result<()> {
-        for (name, place) in &self.places {
+        for (name, range) in &self.ranges {
             let var = &weights[name];
-            var.set(&Tensor::from_slice(&values[place.clone()], var.shape().clone(), &Device::Cpu)?)?;
+            var.set(&Tensor::from_slice(&values[range.clone()], var.shape().clone(), &Device::Cpu)?)?;
         }
         Ok(())
     }
 
-    /// The layer `name`, which must be there.
-    pub(super) fn place(&self, name: &str) -> Place {
-        let [weight, bias] = ["weight", "bias"].map(|part| self.places[&format!("{name}.{part}")].clone());
-        Place { inputs: weight.len() / bias.len(), outputs: bias.len(), weight, bias }
+    /// The layer `name`, which must exist.
+    pub(super) fn dense(&self, name: &str) -> DenseWeights {
+        let [weight, bias] = ["weight", "bias"].map(|part| self.ranges[&format!("{name}.{part}")].clone());
+        DenseWeights { inputs: weight.len() / bias.len(), outputs: bias.len(), weight, bias }
     }
 }
 
-impl Place {
+impl DenseWeights {
+    /// The layer in `values`, the vector of all weights.
     pub(super) fn layer<'a>(&self, values: &'a [f32]) -> Layer<'a> {
-        // As in candle's tensors and in the weight files.
+        // Row-major, as in candle's tensors and in the weight files.
         let weight = MatRef::from_row_major_slice(&values[self.weight.clone()], self.outputs, self.inputs);
         Layer { weight, bias: &values[self.bias.clone()] }
     }

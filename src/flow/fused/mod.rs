@@ -1,11 +1,12 @@
-//! Training on the CPU without candle: loss, gradient and optimiser by hand, in single precision.
+//! Training on the CPU without candle: loss, gradient and optimiser written out, in single precision.
 //!
-//! candle makes a tensor of every step forward and another of every step back, and adds the gradients of shared inputs one by
-//! one. Here a tile of the batch passes the whole flow, there and back, in buffers made once, and all weights lie in one long
-//! vector. `Flow::forward` with candle's gradient remains the readable form, and the oracle of the tests.
+//! candle allocates a tensor for every operation of the forward and the backward pass, and adds the gradients of shared
+//! inputs one by one. Here a tile of the batch passes through the whole flow, forward and backward, in reused buffers, and
+//! all weights are in one vector. `Flow::forward` with candle's gradient remains the readable form, and the reference in
+//! the tests.
 //!
 //! ```text
-//!  loss = 1/M Σ ( ½|z|² − Σ s ),   ∂loss/∂z = z/M,   ∂loss/∂s = −1/M beside what comes through exp(s)
+//!  loss = 1/M Σ ( ½|z|² − Σ s ),   ∂loss/∂z = z/M,   ∂loss/∂s = −1/M plus the part through exp(s)
 //! ```
 
 mod context;
@@ -18,21 +19,22 @@ mod tests;
 use candle_core::{DType, Result, Tensor};
 use rayon::prelude::*;
 
-use super::train::Pairs;
+use super::model::Flow;
+use super::pairs::Pairs;
 use super::weights::Weights;
-use super::Flow;
 use context::Context;
 use layout::Layout;
-use net::Net;
+use net::{Gradients, Net};
 use optimiser::AdamW;
 
-/// Rows that pass the flow together: with width 64, what a tile leaves for the way back stays in the second-level cache.
+/// Rows per tile: with width 64, the traces of a tile stay in the second-level cache until the backward pass.
 const TILE: usize = 64;
 
-/// Sums of gradients that are made side by side and then added in order: the same bits whatever the number of threads.
+/// Number of partial sums of the gradient. They are computed in parallel and added in a fixed order, so that the bits of
+/// the result do not depend on the number of threads.
 const LANES: usize = 8;
 
-/// A flow whose weights are being trained.
+/// A flow in training.
 pub struct Fused {
     layout: Layout,
     weights: Vec<f32>,
@@ -43,14 +45,14 @@ pub struct Fused {
     optimiser: AdamW,
 }
 
-/// A coupling unit with the permutation in front of it.
+/// A coupling unit with the permutation before it.
 struct Unit {
     /// Column j of the unit's input is parameter `order[j]`.
     order: Vec<usize>,
     nets: Vec<Net>,
 }
 
-/// Memory of one sum of gradients.
+/// Buffers for one partial sum of the gradient.
 struct Lane {
     gradient: Vec<f32>,
     loss: f64,
@@ -58,7 +60,7 @@ struct Lane {
     context_gradient: Vec<f32>,
     state: Vec<f32>,
     context_trace: context::Trace,
-    /// One for each net, in the order of the way there.
+    /// One trace per net, in the order of the forward pass.
     traces: Vec<net::Trace>,
     scratch: net::Scratch,
 }
@@ -67,26 +69,26 @@ struct Lane {
 pub struct Rows {
     count: usize,
     x: Vec<f32>,
-    /// The numbers of each mode one after another.
+    /// The inputs of each observation, mode by mode.
     y: Vec<f32>,
     shortcut: Vec<f32>,
 }
 
 impl Fused {
-    /// The flow with its present weights; `None` where its numbers are not single precision on the CPU.
+    /// Reads the flow with its current weights; `None` where they are not single precision on the CPU.
     ///
     /// # Errors
     /// A candle error when the weights cannot be read.
     pub fn new(flow: &Flow, weights: &Weights) -> Result<Option<Self>> {
         let on_cpu = weights.values().all(|var| var.device().is_cpu());
-        if flow.dtype != DType::F32 || !on_cpu {
+        if flow.dtype() != DType::F32 || !on_cpu {
             return Ok(None);
         }
         let (layout, values) = Layout::read(weights)?;
         let architecture = flow.architecture();
         let dimensions = architecture.parameters;
         let first = dimensions / 2;
-        let context = Context::new(&layout, architecture, flow.context.shortcut_width());
+        let context = Context::new(&layout, architecture, flow.context().shortcut_width());
         let clamp = architecture.clamp_tenths as f32 / 10.0;
         let unit = |(index, order): (usize, &Vec<u32>)| {
             let net =
@@ -102,17 +104,17 @@ impl Fused {
         Ok(Some(Self { layout, weights: values, dimensions, context, units, lanes: Vec::new(), optimiser }))
     }
 
-    /// `pairs` as this flow reads them.
+    /// Converts `pairs` to plain numbers.
     ///
     /// # Errors
-    /// A candle error when shapes do not fit.
+    /// A candle error when the shapes do not fit together.
     pub fn rows(&self, flow: &Flow, pairs: &Pairs) -> Result<Rows> {
         let plain = |tensor: &Tensor| tensor.flatten_all()?.to_vec1::<f32>();
         Ok(Rows {
             count: pairs.x.dim(0)?,
             x: plain(&pairs.x)?,
             y: if self.context.has_network() { plain(&pairs.y.transpose(1, 2)?.contiguous()?)? } else { Vec::new() },
-            shortcut: plain(&flow.context.shortcut(&pairs.y)?)?,
+            shortcut: plain(&flow.context().shortcut(&pairs.y)?)?,
         })
     }
 
@@ -122,8 +124,8 @@ impl Fused {
         self.pass(rows, &all, false)
     }
 
-    /// One step of the optimiser on the `chosen` rows; returns their mean loss before it, nats. Where that is not finite,
-    /// nothing is changed.
+    /// Makes one step of the optimiser on the `chosen` rows and returns their mean loss before it, nats. Where that is not
+    /// finite, no step is made.
     pub fn step(&mut self, rows: &Rows, chosen: &[u32], learning_rate: f64) -> f64 {
         let loss = self.pass(rows, chosen, true);
         if loss.is_finite() {
@@ -133,20 +135,20 @@ impl Fused {
         loss
     }
 
-    /// The present weights.
+    /// The current weights, in the order of the layout.
     pub fn weights(&self) -> &[f32] {
         &self.weights
     }
 
-    /// Writes `values`, as [`Self::weights`] gave them, into the variables of the flow.
+    /// Writes `values`, obtained from [`Self::weights`], to the variables of the flow.
     ///
     /// # Errors
-    /// A candle error when `weights` are those of another flow.
+    /// A candle error when `weights` belong to another flow.
     pub fn write(&self, values: &[f32], weights: &Weights) -> Result<()> {
         self.layout.write(values, weights)
     }
 
-    /// Mean loss of the `chosen` rows; with `back`, its gradient lies in the lanes, one addend in each.
+    /// Mean loss of the `chosen` rows. With `back`, the lanes contain the partial sums of its gradient afterwards.
     fn pass(&mut self, rows: &Rows, chosen: &[u32], back: bool) -> f64 {
         let mut own = std::mem::take(&mut self.lanes);
         while own.len() < lanes(chosen.len()) {
@@ -169,7 +171,7 @@ impl Fused {
         sum / chosen.len() as f64
     }
 
-    /// One tile, there and, where `share` is given, back.
+    /// Forward pass of one tile and, with `share` (1/M), its backward pass.
     fn tile(&self, rows: &Rows, tile: &[u32], share: Option<f32>, lane: &mut Lane) {
         let (d, count, weights) = (self.dimensions, tile.len(), &self.weights);
         let (of_y, of_shortcut) = (rows.y.len() / rows.count, rows.shortcut.len() / rows.count);
@@ -206,19 +208,21 @@ impl Fused {
         for z in state.iter_mut() {
             *z *= share;
         }
+        let weights_gradient = &mut lane.gradient;
+        let mut gradients = Gradients { state, context: context_gradient, weights: weights_gradient, share, count };
         let mut traces = lane.traces.iter().rev();
         for unit in self.units.iter().rev() {
             for net in unit.nets.iter().rev() {
                 let trace = traces.next().expect("there is a trace for each net");
-                let (gradient, scratch) = (&mut lane.gradient, &mut lane.scratch);
-                net.backward(weights, state, context_gradient, gradient, share, count, trace, scratch);
+                net.backward(weights, &mut gradients, trace, &mut lane.scratch);
             }
-            for column in state.chunks_exact_mut(d) {
+            for column in gradients.state.chunks_exact_mut(d) {
                 permuted.copy_from_slice(column);
                 unit.order.iter().zip(&permuted).for_each(|(&to, &value)| column[to] = value);
             }
         }
-        self.context.backward(weights, context_gradient, &mut lane.gradient, count, &mut lane.context_trace);
+        let Gradients { context, weights: gradient, .. } = gradients;
+        self.context.backward(weights, context, gradient, count, &mut lane.context_trace);
     }
 
     fn lane(&self) -> Lane {
@@ -236,7 +240,7 @@ impl Fused {
     }
 }
 
-/// Sums that a batch of `rows` is split into.
+/// Number of partial sums for a batch of `rows`.
 fn lanes(rows: usize) -> usize {
     rows.div_ceil(TILE).min(LANES)
 }

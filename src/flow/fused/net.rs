@@ -1,45 +1,60 @@
-//! One half of a coupling unit on a tile, there and back.
+//! One half of a coupling unit on a tile: forward and backward pass.
 
 use std::ops::Range;
 
-use super::layout::{Layout, Place};
+use super::layout::{DenseWeights, Layout};
 use crate::flow::kernel::{
     add, add_bias_and_silu_with_slopes, add_bias_gradient, add_weight_gradient, bounded_scales, through_slopes,
 };
 
-/// A subnet and what it does to the state: the rows `active` are scaled and shifted by functions of the rows `passive` and
-/// of the context.
+/// A subnet and its action on the state: the rows `active` are scaled and shifted by functions of the rows `passive` and of
+/// the context.
 ///
 /// ```text
 ///  (s̃, t) = W₃ silu(W₂ silu(W₁ u + b₁) + b₂) + b₃,   u = (passive, context),   s = α·tanh(s̃/α)
 ///  active ← active ⊙ exp(s) + t
 /// ```
 pub(super) struct Net {
-    input: Place,
-    hidden: Place,
-    output: Place,
+    input: DenseWeights,
+    hidden: DenseWeights,
+    output: DenseWeights,
     passive: Range<usize>,
     active: Range<usize>,
     clamp: f32,
 }
 
-/// What the way back needs of the way there, for one tile.
+/// Intermediate results of the forward pass of one tile that the backward pass needs.
 pub(super) struct Trace {
-    /// u, and after it both hidden layers, with the derivatives of their activations.
+    /// u.
     inputs: Vec<f32>,
+    /// Both hidden layers, and the derivatives of their activations.
     first: Vec<f32>,
     first_slopes: Vec<f32>,
     second: Vec<f32>,
     second_slopes: Vec<f32>,
-    /// s̃ over t, less their biases.
+    /// s̃ above t, without their biases.
     output: Vec<f32>,
-    /// The active rows before, s, and exp(s).
+    /// The active rows before the transformation, s, and exp(s).
     before: Vec<f32>,
     scales: Vec<f32>,
     factors: Vec<f32>,
 }
 
-/// Gradients on their way through a net, for one tile; shared by all nets.
+/// Gradients of the loss for one tile in the backward pass.
+pub(super) struct Gradients<'a> {
+    /// With respect to the state, the same number of entries for each column.
+    pub state: &'a mut [f32],
+    /// With respect to the context.
+    pub context: &'a mut [f32],
+    /// With respect to all weights.
+    pub weights: &'a mut [f32],
+    /// 1/M, the weight of a row in the mean loss.
+    pub share: f32,
+    /// Number of columns.
+    pub count: usize,
+}
+
+/// Buffers for the gradients inside a net, for one tile; shared by all nets.
 pub(super) struct Scratch {
     output: Vec<f32>,
     hidden: Vec<f32>,
@@ -49,10 +64,11 @@ pub(super) struct Scratch {
 
 impl Net {
     pub(super) fn new(layout: &Layout, name: &str, passive: Range<usize>, active: Range<usize>, clamp: f32) -> Self {
-        let place = |layer: &str| layout.place(&format!("{name}.{layer}"));
-        Self { input: place("input"), hidden: place("hidden"), output: place("output"), passive, active, clamp }
+        let dense = |layer: &str| layout.dense(&format!("{name}.{layer}"));
+        Self { input: dense("input"), hidden: dense("hidden"), output: dense("output"), passive, active, clamp }
     }
 
+    /// A trace for tiles of up to `tile` columns.
     pub(super) fn trace(&self, tile: usize) -> Trace {
         let (width, active) = (self.hidden.outputs, self.active.len());
         let buffer = |rows: usize| vec![0.0; rows * tile];
@@ -69,7 +85,7 @@ impl Net {
         }
     }
 
-    /// Scratch that also a net of the other sizes can use.
+    /// Buffers that are large enough for each of `nets`.
     pub(super) fn scratch(nets: &[&Net], tile: usize) -> Scratch {
         let largest = |size: fn(&Net) -> usize| vec![0.0; tile * nets.iter().map(|net| size(net)).max().unwrap_or(0)];
         Scratch {
@@ -80,7 +96,7 @@ impl Net {
         }
     }
 
-    /// Transforms `state` (`dimensions` numbers a column, `count` columns) and returns Σ s.
+    /// Forward pass: transforms `state` (`count` columns of `dimensions` numbers) and returns Σ s.
     pub(super) fn forward(
         &self,
         weights: &[f32],
@@ -91,7 +107,7 @@ impl Net {
     ) -> f64 {
         let dimensions = state.len() / count;
         let (passive, features, active) = (self.passive.len(), context.len() / count, self.active.len());
-        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|place| place.layer(weights));
+        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|dense| dense.layer(weights));
         let width = input.outputs();
 
         let inputs = &mut trace.inputs[..(passive + features) * count];
@@ -129,28 +145,25 @@ impl Net {
         scales.iter().map(|scale| f64::from(*scale)).sum()
     }
 
-    /// The gradient of the loss by the state after this net becomes that by the state before; the gradient by the context is
-    /// added to `context_gradient`, those by the weights to `gradient`. `share` is 1/M, the weight of a row in the mean.
-    #[expect(clippy::too_many_arguments, reason = "two ends of the net, its weights, its memory and its gradients")]
+    /// Backward pass: turns the gradient with respect to the state after this net into that with respect to the state
+    /// before it, and adds the gradients with respect to the context and the weights.
     pub(super) fn backward(
         &self,
         weights: &[f32],
-        state_gradient: &mut [f32],
-        context_gradient: &mut [f32],
-        gradient: &mut [f32],
-        share: f32,
-        count: usize,
+        gradients: &mut Gradients<'_>,
         trace: &Trace,
         scratch: &mut Scratch,
     ) {
-        let dimensions = state_gradient.len() / count;
-        let (passive, features, active) = (self.passive.len(), context_gradient.len() / count, self.active.len());
-        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|place| place.layer(weights));
+        let Gradients { state, context, weights: gradient, share, count } = gradients;
+        let (share, count) = (*share, *count);
+        let dimensions = state.len() / count;
+        let (passive, features, active) = (self.passive.len(), context.len() / count, self.active.len());
+        let [input, hidden, output] = [&self.input, &self.hidden, &self.output].map(|dense| dense.layer(weights));
         let width = input.outputs();
 
         let of_output = &mut scratch.output[..2 * active * count];
         for (column, own) in of_output.chunks_exact_mut(2 * active).enumerate() {
-            let state = &mut state_gradient[column * dimensions..][self.active.clone()];
+            let state = &mut state[column * dimensions..][self.active.clone()];
             for row in 0..active {
                 let at = column * active + row;
                 let scaled = state[row] * trace.factors[at];
@@ -174,8 +187,8 @@ impl Net {
         add_weight_gradient(&mut gradient[self.input.weight.clone()], inputs, of_first, count);
         let of_inputs = &mut scratch.inputs[..(passive + features) * count];
         input.input_gradient(of_first, of_inputs);
-        let columns = of_inputs.chunks_exact(passive + features).zip(state_gradient.chunks_exact_mut(dimensions));
-        for ((own, state), context) in columns.zip(context_gradient.chunks_exact_mut(features)) {
+        let columns = of_inputs.chunks_exact(passive + features).zip(state.chunks_exact_mut(dimensions));
+        for ((own, state), context) in columns.zip(context.chunks_exact_mut(features)) {
             add(&mut state[self.passive.clone()], &own[..passive]);
             add(context, &own[passive..]);
         }

@@ -1,16 +1,16 @@
-//! AdamW on one long vector.
+//! The optimiser, on a vector of all weights.
 
 use rayon::prelude::*;
 
 use crate::flow::kernel::add;
 
-/// Weights that are updated by one task.
+/// Weights that one task updates.
 const AT_A_TIME: usize = 4_096;
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPSILON: f32 = 1e-8;
 
-/// Adam with the settings of candle's `AdamW` and no weight decay.
+/// Adam with the default settings of candle's `AdamW` and without weight decay.
 ///
 /// ```text
 ///  m ← β₁m + (1 − β₁)g,   v ← β₂v + (1 − β₂)g²,   w ← w − η · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε)
@@ -26,7 +26,7 @@ impl AdamW {
         Self { first: vec![0.0; weights], second: vec![0.0; weights], steps: 0 }
     }
 
-    /// One step; the gradient is the sum of `gradients`, added in their order.
+    /// Makes one step. The gradient is the sum of `gradients`, added in their order.
     pub(super) fn step(&mut self, weights: &mut [f32], gradients: &[&[f32]], learning_rate: f64) {
         self.steps += 1;
         let correction = |beta: f32| 1.0 / (1.0 - f64::from(beta).powi(self.steps));
@@ -34,18 +34,18 @@ impl AdamW {
         let of_first = of_first as f32;
         let moments = self.first.par_chunks_mut(AT_A_TIME).zip(self.second.par_chunks_mut(AT_A_TIME));
         weights.par_chunks_mut(AT_A_TIME).zip(moments).enumerate().for_each(|(chunk, (weights, (first, second)))| {
-            let place = chunk * AT_A_TIME..chunk * AT_A_TIME + weights.len();
+            let range = chunk * AT_A_TIME..chunk * AT_A_TIME + weights.len();
             let mut sum = [0.0; AT_A_TIME];
             let sum = &mut sum[..weights.len()];
             for gradient in gradients {
-                add(sum, &gradient[place.clone()]);
+                add(sum, &gradient[range.clone()]);
             }
             update(weights, sum, first, second, of_first, of_second);
         });
     }
 }
 
-/// w, m and v of the next step; `of_first` is η/(1 − β₁ᵗ), `of_second` 1/(1 − β₂ᵗ).
+/// Computes w, m and v of the next step. `of_first`: η/(1 − β₁ᵗ); `of_second`: 1/(1 − β₂ᵗ).
 #[pulp::with_simd(update = pulp::Arch::new())]
 #[inline(always)]
 fn update_simd<S: pulp::Simd>(

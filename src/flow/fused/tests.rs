@@ -1,16 +1,16 @@
-//! The fused way against candle's, in double precision.
+//! Fused training against candle in double precision.
 
 use candle_core::{DType, Device, Tensor};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 use super::*;
-use crate::flow::train::mean_loss;
+use crate::flow::architecture::FlowSettings;
+use crate::flow::pairs::mean_loss;
 use crate::flow::weights::untrained_flow;
-use crate::flow::FlowSettings;
 use crate::stats;
 
-/// Flows of one precision each with the same weights, none of them zero, and pairs.
+/// Flows in single and double precision with the same weights, none of which is zero, and pairs.
 struct Case {
     single: (Flow, Weights),
     double: (Flow, Weights),
@@ -20,7 +20,7 @@ struct Case {
 fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
     let settings = FlowSettings { units: 3, width: 24, context_channels: 4, context_features: 8, clamp_tenths: 20 };
     let mut architecture = settings.architecture(parameters, modes, channels, &mut stats::stream(1, "permutations"));
-    // No channel stands for no context network.
+    // `channels` = 0: no context network.
     if channels == 0 {
         architecture.fixed_context = modes;
     }
@@ -28,8 +28,8 @@ fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
     let double = untrained_flow(&architecture, DType::F64, 1).unwrap();
     let mut stream = stats::stream(2, "case");
     for (name, var) in &single.1 {
-        // The last layers begin at zero, where half of the gradients vanish. With 0.2 a layer of 24 hands on about what it gets,
-        // so that single precision is not lost in the weights themselves.
+        // The last layers are initialised to zero, where half of the gradients vanish. With a standard deviation of 0.2 a
+        // layer of width 24 approximately preserves the size of its input, so that rounding errors are not amplified.
         let draws: Vec<f32> = (0..var.elem_count()).map(|_| 0.2 * stream.sample::<f32, _>(StandardNormal)).collect();
         var.set(&Tensor::from_vec(draws, var.shape().clone(), &Device::Cpu).unwrap()).unwrap();
         double.1[name].set(&var.to_dtype(DType::F64).unwrap()).unwrap();
@@ -49,8 +49,8 @@ fn case(parameters: usize, modes: usize, channels: usize, rows: usize) -> Case {
 
 #[test]
 fn loss_and_gradient_are_those_of_candle() {
-    // One parameter (an empty half), odd and even numbers, several channels and no context network, batches of a part of a tile
-    // and of many tiles.
+    // One parameter (an empty half), odd and even numbers, several channels, no context network, batches smaller than a
+    // tile and of many tiles.
     for (parameters, modes, channels, rows) in
         [(1, 2, 1, 7), (3, 3, 1, 64), (4, 5, 3, 150), (5, 1, 2, 700), (6, 9, 0, 65)]
     {
@@ -71,9 +71,9 @@ fn loss_and_gradient_are_those_of_candle() {
         );
         for (name, var) in &case.double.1 {
             let exact = gradients.get(var).unwrap().flatten_all().unwrap().to_vec1::<f64>().unwrap();
-            let place = fused.layout.place(name.rsplit_once('.').unwrap().0);
-            let place = if name.ends_with("weight") { place.weight } else { place.bias };
-            let found: Vec<f64> = (place.start..place.end)
+            let dense = fused.layout.dense(name.rsplit_once('.').unwrap().0);
+            let range = if name.ends_with("weight") { dense.weight } else { dense.bias };
+            let found: Vec<f64> = range
                 .map(|at| fused.lanes[..lanes(rows)].iter().map(|lane| f64::from(lane.gradient[at])).sum())
                 .collect();
             let largest = exact.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
@@ -86,7 +86,7 @@ fn loss_and_gradient_are_those_of_candle() {
 }
 
 #[test]
-fn the_optimiser_takes_the_steps_of_candles() {
+fn the_optimiser_takes_the_same_steps_as_candle() {
     use candle_nn::{AdamW as Reference, Optimizer as _, ParamsAdamW};
     let case = case(3, 3, 1, 96);
     let [single, double] = &case.pairs;
@@ -101,7 +101,7 @@ fn the_optimiser_takes_the_steps_of_candles() {
         let loss = mean_loss(flow, &double.x, &double.y).unwrap();
         reference.backward_step(&loss).unwrap();
         let expected: f64 = loss.to_scalar().unwrap();
-        // A step is η·g/|g| at first: a gradient that is nearly zero may go either way, which the loss hardly sees.
+        // The first step is η·g/|g|: for a nearly zero gradient its sign is arbitrary, with hardly any effect on the loss.
         assert!((found - expected).abs() < 1e-4 * expected.abs(), "step {step}: loss {found}, expected {expected}");
     }
 }

@@ -9,7 +9,7 @@ use tokio::sync::mpsc::channel;
 use super::error::{invalid, ImportError};
 use super::lines::{check_whole, each_line};
 use crate::baseline::Baseline;
-use crate::measurement::check::{check_measurements, Place, RawMeasurement};
+use crate::measurement::check::{check_measurements, FieldPath, RawMeasurement};
 use crate::measurement::MeasurementBatch;
 use crate::monitor::assessor::Assessor;
 use crate::monitor::error::Error;
@@ -231,7 +231,7 @@ fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Resu
 /// A batch after the same checks as one that is sent to the service.
 fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBatch, Timestamp), Error> {
     let raw = |(index, m): (usize, &crate::store::archive::Measurement)| RawMeasurement {
-        place: Place::Json { index },
+        path: FieldPath::Json { index },
         measured_at: Some(m.measured_at.clone()),
         frequencies_hz: m.frequencies_hz.clone(),
         std_hz: m.std_hz.clone(),

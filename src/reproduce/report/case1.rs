@@ -1,13 +1,13 @@
 //! Tables 3 to 6 and Figures 8 to 14.
 
 use super::figure::{
-    accuracy, damage, damage_told, frequencies, frequency_keys, method_keys, methods, posterior_keys, posteriors,
+    accuracy, damage, damage_text, frequencies, frequency_keys, method_keys, methods, posterior_keys, posteriors,
     CHANGED, OURS, TEXT,
 };
 use super::table;
 use super::words::capital;
 use crate::plot::{figure, key, Swatch};
-use crate::reproduce::{Case, State};
+use crate::reproduce::result::{Case, Quantity, State};
 
 /// The case, in the order of the paper.
 pub fn html(case: &Case) -> String {
@@ -58,11 +58,11 @@ fn found(undamaged: Option<&State>) -> String {
     let panels = undamaged.map_or_else(Vec::new, |state| posteriors(state, ""));
     let prior = undamaged.and_then(|state| state.quantities.first()).and_then(|q| Some((q.prior?, &q.unit)));
     let prior = prior.map_or_else(String::new, |([low, high], unit)| {
-        format!(" The prior is level from {low} to {high} {unit}; the panels show what of it is in view.")
+        format!(" The prior is uniform from {low} to {high} {unit}; the panels show a part of it.")
     });
     let caption = format!(
-        "Figure 10. What the measurements tell of the stiffnesses in the undamaged state: the posterior should lie on \
-         the target; 50 draws leave some difference.{prior}"
+        "Figure 10. Posterior of each stiffness in the undamaged state. It should agree with the target, except for the \
+         difference due to only 50 draws.{prior}"
     );
     figure("fig10", &panels, &posterior_keys(), &caption)
 }
@@ -74,16 +74,15 @@ fn title(state: &State) -> String {
 fn measured_damaged(scenarios: &[State]) -> String {
     let panels: Vec<String> = scenarios.iter().flat_map(|state| frequencies(state, &title(state))).collect();
     let caption =
-        "Figure 11. The natural frequencies measured in the damage scenarios, a row each: against Figure 9 they \
-         are lower, the more stiffness is lost.";
+        "Figure 11. The natural frequencies measured in the damage scenarios, a row each: the more stiffness \
+         is lost, the lower they are compared with Figure 9.";
     figure("fig11", &panels, &frequency_keys(), caption)
 }
 
 fn found_damaged(scenarios: &[State]) -> String {
     let panels: Vec<String> = scenarios.iter().flat_map(|state| posteriors(state, &title(state))).collect();
-    let caption = "Figure 12. Posterior of each stiffness in the damage scenarios: it should follow the target to its \
-                   new place, and stay where nothing has changed. Where the target reaches below the prior, the \
-                   posterior cannot follow.";
+    let caption = "Figure 12. Posterior of each stiffness in the damage scenarios: it should follow the target, and \
+                   stay where nothing has changed. It cannot follow a target that extends below the prior.";
     figure("fig12", &panels, &posterior_keys(), caption)
 }
 
@@ -92,11 +91,11 @@ fn compared(undamaged: Option<&State>, scenarios: &[State]) -> String {
         let before = undamaged.map_or(&[][..], |state| &state.quantities);
         before.iter().zip(&state.quantities).map(|(before, now)| damage(before, now, &title(state), false)).collect()
     };
-    let told: Vec<String> = scenarios.iter().map(|state| damage_told(state, |_| true)).collect();
+    let texts: Vec<String> = scenarios.iter().map(|state| damage_text(state, |_| true)).collect();
     let caption = format!(
-        "Figure 13. Each stiffness in the damage scenarios against the undamaged state: the tinted area below δ shows \
-         the probability of damage (PoD), near 5 % where nothing has changed; the figures are shares of the samples. {}.",
-        told.join(". ")
+        "Figure 13. Each stiffness in the damage scenarios compared with the undamaged state. The tinted area below δ is \
+         the probability of damage (PoD), which is near 5 % where nothing has changed; the numbers are shares of the samples. {}.",
+        texts.join(". ")
     );
     let keys = key(Swatch::Line, OURS, "undamaged")
         + &key(Swatch::Line, CHANGED, "damage scenario")
@@ -106,11 +105,10 @@ fn compared(undamaged: Option<&State>, scenarios: &[State]) -> String {
 
 fn by_method(case: &Case) -> String {
     let quantities = case.states.first().map_or(&[][..], |state| &state.quantities);
-    let panel =
-        |(k, q): (usize, &crate::reproduce::Quantity)| methods(&case.methods, k, [&q.name, &q.unit], q.target, &[]);
+    let panel = |(k, q): (usize, &Quantity)| methods(&case.methods, k, [&q.name, &q.unit], q.target, &[]);
     let panels: Vec<String> = quantities.iter().enumerate().map(panel).collect();
     let caption =
-        "Figure 14. The population of each stiffness as each method finds it from the same 500 measurements: the \
-                   curves should lie on the target and on one another.";
+        "Figure 14. The population of each stiffness that each method finds from the same 500 measurements: the \
+                   curves should agree with the target and with each other.";
     figure("fig14", &panels, &(method_keys() + &key(Swatch::Dashed, TEXT, "target")), caption)
 }

@@ -1,15 +1,15 @@
 //! Tables 8 to 10 and Figures 16 to 22.
 
-use super::figure::{accuracy, damage, damage_told, method_keys, methods, with_unit, CHANGED, OURS, PRIOR, TEXT};
+use super::figure::{accuracy, damage, damage_text, method_keys, methods, with_unit, CHANGED, OURS, PRIOR, TEXT};
 use super::table::{self, framed, head, interval};
 use super::words::{capital, decimals, fixed, grouped};
 use crate::gsa::{Index, Sensitivity};
 use crate::plot::density::grid;
 use crate::plot::{escaped, figure, key, Cloud, Curve, Heat, Panel, Swatch};
-use crate::reproduce::{Case, Configuration, LawFit, Quantity, State};
+use crate::reproduce::result::{Case, Configuration, LawFit, Quantity, State};
 use crate::updating::law::Estimate;
 
-/// Settings of a link that a plot shows whatever is found, m.
+/// Range of positions that a plot shows at least, m.
 const SHOWN_M: [f64; 2] = [0.01, 0.08];
 
 /// The case, in the order of the paper.
@@ -67,8 +67,8 @@ fn configurations(all: &[Configuration]) -> String {
     };
     let (undamaged, damaged) = (of(false), of(true));
     let caption = format!(
-        "Figure 16. The {} settings of the two links: {} count as damaged, since one of the links has its \
-         smallest p, where its coupling is softest.",
+        "Figure 16. The {} settings of the two links. In {} of them, which are the damaged ones, one of the links \
+         has its smallest p, where its coupling is softest.",
         all.len(),
         damaged.len()
     );
@@ -93,10 +93,10 @@ fn sensitivity(s: &Sensitivity) -> String {
         rows: rows.clone(),
         cells: outputs.clone().map(row).collect(),
     };
-    let caption = "Figure 17. Total Sobol' indices: the share of the variance of each frequency that an input takes \
-                   part in. The paper finds p23, and less of p12, in f1, p12 in f2, p23 in f3, and hardly anything of the \
-                   rest. The same cells stand out here, but one: the share of p12 in f1 is no larger than that of m2, and \
-                   both depend on how far masses and ground springs vary, which the paper does not state.";
+    let caption = "Figure 17. Total Sobol' indices: the share of the variance of each frequency to which an input \
+                   contributes. In the paper, f1 depends on p23 and less on p12, f2 on p12, f3 on p23, and hardly any \
+                   frequency on the other inputs. This agrees with one exception: here the index of p12 for f1 is no larger \
+                   than that of m2. Both depend on the ranges of masses and ground springs, which the paper does not state.";
     let shown = |input, output| {
         total(s, input, output).map_or_else(|| "–".to_owned(), |index| interval(index.value, index.interval_90, 3))
     };
@@ -108,11 +108,11 @@ fn sensitivity(s: &Sensitivity) -> String {
     let body = format!("<tbody>{}</tbody>", s.inputs.iter().enumerate().map(line).collect::<String>());
     let titles: Vec<(&str, bool)> =
         std::iter::once(("input", true)).chain(rows.iter().map(|r| (r.as_str(), false))).collect();
-    let told = format!(
+    let text = format!(
         "The indices of Figure 17 with their 90 % intervals, from {} runs of the model",
         grouped(s.evaluations)
     );
-    figure("fig17", &[heat.svg()], "", caption) + &framed("fig17-table", &told, &head(&titles), &body)
+    figure("fig17", &[heat.svg()], "", caption) + &framed("fig17-table", &text, &head(&titles), &body)
 }
 
 fn laws(laws: &[LawFit]) -> String {
@@ -143,7 +143,7 @@ fn laws(laws: &[LawFit]) -> String {
     };
     let caption =
         "Figure 18. Stiffness of each coupling, identified from the frequencies of one configuration at a time, over \
-                   the position of its link: the fitted curve should lie on that of the paper's Eq. 26, with which the \
+                   the position of its link: the fitted curve should agree with Eq. 26 of the paper, with which the \
                    measurements were simulated.";
     let keys = key(Swatch::Dot, OURS, "identified")
         + &key(Swatch::Line, CHANGED, "fitted")
@@ -199,23 +199,23 @@ fn settings(states: &[State]) -> String {
         panel.svg()
     };
     let caption =
-        "Figure 20. Posterior samples of the two positions, ten for each configuration: undamaged they fill the \
-                   square of the settings, damaged they make an L, since one of the links is at 0.02 m.";
+        "Figure 20. Posterior samples of the two positions, ten for each configuration: the undamaged ones fill \
+                   the square of the settings, the damaged ones form an L, because one of the links is at 0.02 m.";
     let keys = key(Swatch::Dot, CHANGED, "posterior samples") + &key(Swatch::Cross, TEXT, "positions set");
     figure("fig20", &states.iter().map(panel).collect::<Vec<_>>(), &keys, caption)
 }
 
 fn compared(states: &[State]) -> String {
-    let [undamaged, damaged] = [0, 1].map(|place| states.get(place).map_or(&[][..], |state| &state.quantities));
+    let [undamaged, damaged] = [0, 1].map(|index| states.get(index).map_or(&[][..], |state| &state.quantities));
     let stiffness = |q: &Quantity| q.prior.is_none();
     let pairs = undamaged.iter().zip(damaged).filter(|(q, _)| stiffness(q));
     let panels: Vec<String> = pairs.map(|(before, now)| damage(before, now, "", true)).collect();
-    let told = states.get(1).map_or_else(String::new, |state| format!(" {}.", damage_told(state, stiffness)));
+    let text = states.get(1).map_or_else(String::new, |state| format!(" {}.", damage_text(state, stiffness)));
     let caption = format!(
-        "Figure 21. Stiffness of the couplings, undamaged and damaged: the heap at the soft end is the damage; in \
-         about half of the damaged configurations it is the other coupling that is soft. The curves are smoothed and \
-         reach beyond the samples; the probability of damage is the share of the samples themselves left of δ. Table 8 \
-         counts positions instead, with a δ of their own.{told}"
+        "Figure 21. Stiffness of the couplings, undamaged and damaged: the peak at the soft end is the damage; in \
+         about half of the damaged configurations the other coupling is soft. The curves are smoothed and extend beyond \
+         the samples; the probability of damage is the share of the samples to the left of δ. Table 8 judges positions \
+         instead, with their own δ.{text}"
     );
     let keys = key(Swatch::Line, OURS, "undamaged")
         + &key(Swatch::Line, CHANGED, "damaged")
@@ -234,8 +234,8 @@ fn by_method(case: &Case) -> String {
     let panel =
         |(k, (q, set)): (usize, (&Quantity, &Vec<f64>))| methods(&case.methods, k, [&q.name, &q.unit], None, set);
     let panels: Vec<String> = quantities.iter().zip(&set).enumerate().map(panel).collect();
-    let caption = "Figure 22. The population of each position as each method finds it from all 61 configurations: \
-                   TMCMC looks for a normal distribution and can only match the middle and the width of the level one \
+    let caption = "Figure 22. The population of each position that each method finds from all 61 configurations: \
+                   TMCMC assumes a normal distribution and can only match the mean and the width of the uniform one \
                    that was set.";
     figure("fig22", &panels, &(method_keys() + &key(Swatch::Bar, PRIOR, "positions set")), caption)
 }

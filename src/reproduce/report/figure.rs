@@ -1,12 +1,12 @@
-//! Panels that both cases share.
+//! Figures that both cases have.
 
 use super::words::{capital, fixed};
 use crate::plot::density::{columns, histogram, kernel, normal_curve};
 use crate::plot::{figure, key, Bars, Cloud, Curve, Panel, Swatch};
-use crate::reproduce::{Accuracy, Method, MethodSamples, Quantity, State};
+use crate::reproduce::result::{Accuracy, Method, MethodSamples, Quantity, State};
 use crate::stats;
 
-/// Colours by what they stand for; text's own beyond the last.
+/// Indices of colours by their meaning; an index beyond the last is the colour of the text.
 pub const OURS: usize = 0;
 pub const CHANGED: usize = 1;
 pub const PRIOR: usize = 6;
@@ -58,8 +58,8 @@ pub fn accuracy(id: &str, number: usize, accuracy: &[Accuracy]) -> String {
     let panels: Vec<String> = accuracy.iter().map(panel).collect();
     let keys = key(Swatch::Dot, OURS, "one posterior sample") + &key(Swatch::Dashed, TEXT, "estimate = truth");
     let caption = format!(
-        "Figure {number}. What the trained flow makes of simulated measurements at points that it was not trained on: \
-         the closer the points lie to the diagonal, the better; scatter about it is what the measurement leaves open."
+        "Figure {number}. Estimates of the trained flow from simulated measurements at points that it was not trained on. \
+         The closer the points are to the diagonal, the better; their scatter is the uncertainty that the measurement leaves."
     );
     figure(id, &panels, &keys, &caption)
 }
@@ -94,7 +94,7 @@ pub fn posteriors(state: &State, prefix: &str) -> Vec<String> {
         let shown: Vec<[f64; 2]> = [&posterior, &target].into_iter().filter_map(|points| ends(points)).collect();
         let low = shown.iter().map(|e| e[0]).fold(f64::INFINITY, f64::min);
         let high = shown.iter().map(|e| e[1]).fold(f64::NEG_INFINITY, f64::max);
-        // Of the prior only what lies in view: on its own scale the posterior would be a needle.
+        // Only the visible part of the prior: on the scale of the whole prior the posterior would be too narrow to see.
         let prior = |[a, b]: [f64; 2]| (low.max(a) < high.min(b)).then(|| (low.max(a), high.min(b), 1.0 / (b - a)));
         let panel = Panel {
             title: format!("{prefix}{}", q.name),
@@ -122,7 +122,7 @@ pub fn posterior_keys() -> String {
         + &key(Swatch::Dashed, CHANGED, "target")
 }
 
-/// Figures 13 and 21: a quantity in the undamaged and in another state, and what of the latter lies below δ.
+/// Figures 13 and 21: a quantity in the undamaged and in another state, and the part of the latter below δ.
 pub fn damage(undamaged: &Quantity, other: &Quantity, prefix: &str, bars: bool) -> String {
     let curve =
         |q: &Quantity, colour, filled_to| Curve { colour, filled_to, points: kernel(&q.samples), dashed: false };
@@ -141,14 +141,15 @@ pub fn damage(undamaged: &Quantity, other: &Quantity, prefix: &str, bars: bool) 
     panel.svg()
 }
 
-/// What a caption says of the probabilities of damage of a state.
-pub fn damage_told(state: &State, wanted: impl Fn(&Quantity) -> bool) -> String {
+/// The probabilities of damage of a state, for a caption.
+pub fn damage_text(state: &State, wanted: impl Fn(&Quantity) -> bool) -> String {
     let one = |q: &Quantity| format!("{} {} %", name(q), fixed(100.0 * q.probability_of_damage, 1));
-    let told: Vec<String> = state.quantities.iter().filter(|q| wanted(q)).map(one).collect();
-    format!("{}: {}", capital(&state.name), told.join(", "))
+    let texts: Vec<String> = state.quantities.iter().filter(|q| wanted(q)).map(one).collect();
+    format!("{}: {}", capital(&state.name), texts.join(", "))
 }
 
-/// Figures 14 and 22: densities of a parameter by each method; `target` is a curve, `drawn` the values themselves.
+/// Figures 14 and 22: densities of a parameter by each method. `target` gives the normal curve that the values were drawn from, or
+/// `drawn` the values themselves.
 pub fn methods(
     methods: &[MethodSamples],
     k: usize,

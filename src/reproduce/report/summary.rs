@@ -1,14 +1,14 @@
-//! What was run and what came of it, in a few lines.
+//! Summary of what was run and of the results.
 
 use super::words::{duration, factor, fixed, grouped, listed, method, paper_is_inside, percent, row_decimals};
 use crate::plot::escaped;
 use crate::reproduce::paper::FIVE_HUNDRED;
-use crate::reproduce::{Case, Method, Reproduction, Row, Time};
+use crate::reproduce::result::{Case, Method, Reproduction, Row, Time};
 
-/// Most values of the paper that are named one by one.
-const NAMED: usize = 6;
+/// Largest number of values of the paper that are listed individually.
+const MOST_LISTED: usize = 6;
 
-/// Fewest repetitions whose range is set against single values.
+/// Smallest number of repetitions whose range is compared with single values.
 const FEWEST: usize = 20;
 
 /// A list of sentences.
@@ -20,7 +20,7 @@ pub fn html(reproduction: &Reproduction) -> String {
     let mut lines = vec![run(reproduction, &cases), machine(reproduction)];
     let all: Vec<(&str, &Row)> =
         cases.iter().flat_map(|(name, case)| rows(case).into_iter().map(move |row| (*name, row))).collect();
-    // A range over a few repetitions holds next to nothing.
+    // The range over a few repetitions is too uncertain.
     if reproduction.settings.repetitions >= FEWEST {
         lines.extend(agreement(&all));
     }
@@ -28,8 +28,8 @@ pub fn html(reproduction: &Reproduction) -> String {
     lines.extend(cases.iter().filter_map(|(name, case)| methods(name, case)));
     lines.extend(faster(&cases));
     let short =
-        "<p class=\"bad\">This was a short run, to look at: too few repetitions and too little training to judge the \
-                 method by.</p>";
+        "<p class=\"bad\">This was a short demonstration: it has too few repetitions and too little training to judge \
+                 the methods.</p>";
     let short = if reproduction.settings.quick { short } else { "" };
     format!("{short}<ul><li>{}</li></ul>", lines.join("</li><li>"))
 }
@@ -44,8 +44,8 @@ fn run(reproduction: &Reproduction, cases: &[(&str, &Case)]) -> String {
     let names = if names.is_empty() { "Nothing".to_owned() } else { listed(&names) };
     format!(
         "{names} of Wang et al. (2025, Mechanical Systems and Signal Processing 232, 112743): {} repetitions with \
-         fresh measurements, each by sensitivity-based updating, TMCMC ({} samples) and a cINN (trained once, on {} \
-         simulated pairs, {} passes). Seed {}.",
+         new measurements, each by sensitivity-based updating, TMCMC ({} samples) and a cINN (trained once, on {} \
+         simulated samples, {} epochs). Seed {}.",
         s.repetitions,
         grouped(s.tmcmc_samples),
         grouped(s.training_samples),
@@ -67,24 +67,24 @@ fn machine(reproduction: &Reproduction) -> String {
 }
 
 /// `k1, scenario 3`.
-fn place(row: &Row) -> String {
+fn label(row: &Row) -> String {
     format!("{}, {}", escaped(&row.parameter), escaped(&row.state))
 }
 
-/// The largest errors of the flow against what was drawn.
+/// The largest average errors of the flow with respect to the values that were drawn.
 fn errors(name: &str, rows: &[&Row]) -> Option<String> {
     let flow = || rows.iter().copied().filter(|row| row.method == Method::Cinn);
     let worst = |error: fn(&Row) -> f64| {
         let known = flow().filter(|row| error(row).is_finite());
         known.max_by(|a, b| (error(a) / a.std.target).total_cmp(&(error(b) / b.std.target)))
     };
-    let told = |row: &Row, error: f64| {
+    let text = |row: &Row, error: f64| {
         format!(
             "{} {} ({} % of the standard deviation; {})",
             fixed(error, row_decimals(row) + 1),
             escaped(&row.unit),
             fixed(100.0 * error / row.std.target, 1),
-            place(row)
+            label(row)
         )
     };
     let mean = worst(|row| row.mean_absolute_mean_error)?;
@@ -92,30 +92,30 @@ fn errors(name: &str, rows: &[&Row]) -> Option<String> {
     let pod = flow().filter_map(|row| Some((row.mean_absolute_pod_error?, row)));
     let pod = pod.filter(|p| p.0.is_finite()).max_by(|a, b| a.0.total_cmp(&b.0));
     let pod = pod.map_or_else(String::new, |(error, row)| {
-        format!(", of a probability of damage {} percentage points ({})", percent(error), place(row))
+        format!(", of a probability of damage {} percentage points ({})", percent(error), label(row))
     });
     Some(format!(
-        "{name}, the cINN against the values actually drawn: the largest average error of a mean is {}, of a standard \
+        "{name}, the cINN compared with the values actually drawn: the largest average error of a mean is {}, of a standard \
          deviation {}{pod}.",
-        told(mean, mean.mean_absolute_mean_error),
-        told(std, std.mean_absolute_std_error)
+        text(mean, mean.mean_absolute_mean_error),
+        text(std, std.mean_absolute_std_error)
     ))
 }
 
-/// How many of the paper's values lie in our range.
+/// How many of the values of the paper are in our range.
 fn agreement(rows: &[(&str, &Row)]) -> Option<String> {
     let figures = rows.iter().flat_map(|(case, row)| {
-        // The paper's cINN figures of Table 5 are those of Table 3 again.
-        let again = row.state == FIVE_HUNDRED && row.method == Method::Cinn;
+        // The values of the cINN in Table 5 of the paper repeat those of Table 3.
+        let repeated = row.state == FIVE_HUNDRED && row.method == Method::Cinn;
         let all = [("mean", Some(&row.mean)), ("std", Some(&row.std)), ("PoD", row.probability_of_damage.as_ref())];
-        let counted = all.into_iter().filter(move |_| !again);
+        let counted = all.into_iter().filter(move |_| !repeated);
         counted.filter_map(move |(what, compared)| Some((*case, *row, what, compared?)))
     });
     let (mut within, mut outside) = (0_usize, Vec::new());
     for (case, row, what, compared) in figures {
         match paper_is_inside(compared) {
             Some(true) => within += 1,
-            Some(false) => outside.push(format!("{case}: {what} of {} by {}", place(row), method(row.method))),
+            Some(false) => outside.push(format!("{case}: {what} of {} by {}", label(row), method(row.method))),
             None => {}
         }
     }
@@ -126,13 +126,13 @@ fn agreement(rows: &[(&str, &Row)]) -> Option<String> {
     let share = fixed(100.0 * within as f64 / all as f64, 0);
     let named = match outside.len() {
         0 => String::new(),
-        count if count > NAMED => " The tables print the others in bold.".to_owned(),
+        count if count > MOST_LISTED => " The tables print the others in bold.".to_owned(),
         _ => format!(" Outside: {}.", outside.join("; ")),
     };
-    Some(format!("Of the paper's {all} printed values, {within} ({share} %) lie within our 5–95 % range.{named}"))
+    Some(format!("Of the {all} values printed in the paper, {within} ({share} %) are within our 5–95 % range.{named}"))
 }
 
-/// What each method is off by on the same measurements.
+/// Average errors of each method on the same measurements.
 fn methods(name: &str, case: &Case) -> Option<String> {
     let (rows, table) = if case.table5.is_empty() { (&case.table9, 9) } else { (&case.table5, 5) };
     let of = |by: Method| {
@@ -142,20 +142,20 @@ fn methods(name: &str, case: &Case) -> Option<String> {
             .map(|row| [row.mean_absolute_mean_error, row.mean_absolute_std_error].map(|e| 100.0 * e / row.std.target))
             .collect();
         let average = |k: usize| errors.iter().map(|e| e[k]).sum::<f64>() / errors.len() as f64;
-        let told = format!("{} {} and {} %", method(by), fixed(average(0), 1), fixed(average(1), 1));
-        (!errors.is_empty()).then_some(told)
+        let text = format!("{} {} and {} %", method(by), fixed(average(0), 1), fixed(average(1), 1));
+        (!errors.is_empty()).then_some(text)
     };
-    let told: Vec<String> = [Method::Sensitivity, Method::Tmcmc, Method::Cinn].into_iter().filter_map(of).collect();
-    (!told.is_empty()).then(|| {
+    let texts: Vec<String> = [Method::Sensitivity, Method::Tmcmc, Method::Cinn].into_iter().filter_map(of).collect();
+    (!texts.is_empty()).then(|| {
         format!(
             "{name}, all methods on the same measurements (<a href=\"#table{table}\">Table {table}</a>), average \
              errors of mean and of standard deviation in % of the standard deviation: {}.",
-            listed(&told)
+            listed(&texts)
         )
     })
 }
 
-/// The flow's times against TMCMC's, here and in the paper.
+/// Speed of the flow relative to TMCMC, here and in the paper.
 fn faster(cases: &[(&str, &Case)]) -> Option<String> {
     let one = |(name, case): &(&str, &Case)| {
         let all: Vec<&Time> = case.table6.iter().chain(&case.table10).collect();
@@ -166,12 +166,12 @@ fn faster(cases: &[(&str, &Case)]) -> Option<String> {
             format!("× {} (paper: × {})", factor(chain.seconds / own), factor(chain.paper_seconds / paper))
         };
         Some(format!(
-            "{name} {}, with its training counted {}",
+            "{name} {}, including its training {}",
             ratio(inference.seconds, inference.paper_seconds),
             ratio(inference.seconds + training.seconds, inference.paper_seconds + training.paper_seconds)
         ))
     };
-    let told: Vec<String> = cases.iter().filter_map(one).collect();
-    (!told.is_empty())
-        .then(|| format!("Speed of the trained cINN as a multiple of that of TMCMC: {}.", told.join("; ")))
+    let texts: Vec<String> = cases.iter().filter_map(one).collect();
+    (!texts.is_empty())
+        .then(|| format!("Speed of the trained cINN as a multiple of that of TMCMC: {}.", texts.join("; ")))
 }

@@ -1,10 +1,10 @@
-//! Tables: numbers of ours beside the paper's, and times.
+//! Tables that compare values and times with those of the paper.
 
 use super::words::{capital, duration, factor, fixed, grouped, method, paper_is_inside, percent, row_decimals};
 use crate::plot::{escaped, strip};
-use crate::reproduce::{Compared, Method, Row, Spread, Time};
+use crate::reproduce::result::{Compared, Method, Row, Spread, Time};
 
-/// A table in a box of its own that scrolls; `head` and `body` are HTML.
+/// A table in a scrollable box; `head` and `body` are HTML.
 pub fn framed(id: &str, caption: &str, head: &str, body: &str) -> String {
     let caption = escaped(caption);
     let label = caption.split(". ").next().unwrap_or_default();
@@ -14,7 +14,7 @@ pub fn framed(id: &str, caption: &str, head: &str, body: &str) -> String {
     )
 }
 
-/// Titles of columns; `true` flushes left.
+/// Titles of columns; `true` aligns to the left.
 pub fn head(titles: &[(&str, bool)]) -> String {
     let class = |words: bool| if words { " class=\"words\"" } else { "" };
     let cell = |(title, words): &(&str, bool)| format!("<th scope=\"col\"{}>{title}</th>", class(*words));
@@ -64,7 +64,7 @@ const COLUMNS: [(&str, bool); 7] = [
     ("side by side", true),
 ];
 
-/// Tables 3, 4 and 8: what the trained flow finds of each state; the other methods below, folded away.
+/// Tables 3, 4 and 8: what the trained flow finds for each state, followed by a collapsed table of the other methods.
 pub fn states(id: &str, caption: &str, rows: &[Row]) -> String {
     let one = |wanted: &[Method], id: &str, caption: &str| {
         let mut body = String::new();
@@ -88,12 +88,12 @@ pub fn states(id: &str, caption: &str, rows: &[Row]) -> String {
     if !rows.iter().any(|row| others.contains(&row.method)) {
         return flow;
     }
-    let caption = "The same by the other two methods; the paper prints none of these numbers";
+    let caption = "The same values by the other two methods, which the paper does not print";
     let folded = one(&others, &format!("{id}-others"), caption);
-    format!("{flow}<details><summary>The same measurements by sensitivity and by TMCMC</summary>{folded}</details>")
+    format!("{flow}<details><summary>The same measurements by the sensitivity method and by TMCMC</summary>{folded}</details>")
 }
 
-/// Tables 5 and 9: the methods below one another, for each number.
+/// Tables 5 and 9: the three methods for each value.
 pub fn methods(id: &str, caption: &str, rows: &[Row]) -> String {
     let mut names: Vec<(&str, &str)> = Vec::new();
     for row in rows {
@@ -166,7 +166,7 @@ fn cells(line: &Line<'_>) -> String {
         Figure::Damage => percent(value),
         _ => fixed(value, decimals),
     };
-    // Differences below these are none that matter.
+    // Smaller differences do not matter.
     let least = if line.figure == Figure::Damage { 0.02 } else { 0.02 * line.row.std.target };
     let dash = || "–".to_owned();
     let at = paper_percentile.map_or_else(dash, |p| match paper_is_inside(compared) {
@@ -185,7 +185,7 @@ fn cells(line: &Line<'_>) -> String {
     format!("<td>{}</td>", cells.join("</td><td>"))
 }
 
-/// Mean over the repetitions of the distance from what was drawn.
+/// Mean over the repetitions of the absolute difference from the values that were drawn.
 fn error(line: &Line<'_>, decimals: usize) -> String {
     let row = line.row;
     match line.figure {

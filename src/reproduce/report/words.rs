@@ -1,8 +1,8 @@
-//! Numbers and names as a reader sees them.
+//! Formatting of numbers and names.
 
-use crate::reproduce::{Compared, Method, Row};
+use crate::reproduce::result::{Compared, Method, Row};
 
-/// A number with so many decimals; a dash where there is none.
+/// A number with a given number of decimals; a dash if it is not finite.
 pub fn fixed(value: f64, decimals: usize) -> String {
     if !value.is_finite() {
         return "–".to_owned();
@@ -37,7 +37,7 @@ pub fn row_decimals(row: &Row) -> usize {
     decimals(if std.is_finite() && std > 0.0 { std } else { row.mean.target })
 }
 
-/// A share in per cent; what is not quite nothing or all is not rounded to it.
+/// A share in per cent. A share that is nearly but not exactly 0 or 1 is shown as an inequality.
 pub fn percent(share: f64) -> String {
     match 100.0 * share {
         p if p > 99.95 && share < 1.0 => "&gt; 99.9".to_owned(),
@@ -46,7 +46,7 @@ pub fn percent(share: f64) -> String {
     }
 }
 
-/// A time, in the units that one would say it in.
+/// A duration in suitable units.
 pub fn duration(seconds: f64) -> String {
     let whole = seconds.round().max(0.0) as u64;
     match seconds {
@@ -72,7 +72,7 @@ pub fn grouped(count: usize) -> String {
     shown
 }
 
-/// How many times as fast.
+/// A ratio of speeds.
 pub fn factor(ratio: f64) -> String {
     if ratio >= 10.0 {
         fixed(ratio, 0)
@@ -81,13 +81,13 @@ pub fn factor(ratio: f64) -> String {
     }
 }
 
-/// Whether the paper's value lies in our 5–95 % range; none without one.
+/// Whether the value of the paper is in our 5–95 % range; `None` if the paper has no value.
 pub fn paper_is_inside(c: &Compared) -> Option<bool> {
-    // Shares of a few hundred samples are often met to the bit, but for rounding.
+    // Shares of a few hundred samples are often equal except for rounding.
     c.paper.map(|paper| (c.ours.low - 1e-12..=c.ours.high + 1e-12).contains(&paper))
 }
 
-/// What a method is called.
+/// Name of a method.
 pub fn method(method: Method) -> &'static str {
     match method {
         Method::Sensitivity => "sensitivity",
@@ -96,13 +96,13 @@ pub fn method(method: Method) -> &'static str {
     }
 }
 
-/// Begins with a capital.
+/// The text with its first letter in upper case.
 pub fn capital(text: &str) -> String {
     let mut rest = text.chars();
     rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
 }
 
-/// A list as one says it: `a, b and c`.
+/// A list in words: `a, b and c`.
 pub fn listed(items: &[String]) -> String {
     match items {
         [] => String::new(),

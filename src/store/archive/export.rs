@@ -156,7 +156,7 @@ impl Archive<'_> {
             let state = Undamaged {
                 version,
                 model_digest,
-                created_at: timestamp("undamaged state", created)?.to_string(),
+                created_at: timestamp("undamaged reference", created)?.to_string(),
                 threshold_probability,
                 measurements,
                 conditions,

@@ -95,7 +95,7 @@ impl Archive<'_> {
     /// [`Error::Row`] if that version is a different reference here.
     pub async fn import_undamaged(self, structure: &StructureId, state: Undamaged) -> Result<bool, Error> {
         let structure = structure.to_string();
-        let wrong = |detail: &dyn std::fmt::Display| bad_row("undamaged state of the archive")(detail);
+        let wrong = |detail: &dyn std::fmt::Display| bad_row("undamaged reference of the archive")(detail);
         let created = Timestamp::parse(&state.created_at).map_err(|e| wrong(&e))?;
         for quantity in &state.quantities {
             for draws in [&quantity.mean_draws, &quantity.std_draws].into_iter().flatten() {
@@ -115,8 +115,8 @@ impl Archive<'_> {
                     if model_digest == state.model_digest && created_here == created.micros() {
                         return Ok(false);
                     }
-                    let detail = format!("{structure} has another undamaged state {} here", state.version);
-                    return Err(bad_row("undamaged state of the archive")(&detail));
+                    let detail = format!("{structure} already has a different undamaged reference {} here", state.version);
+                    return Err(bad_row("undamaged reference of the archive")(&detail));
                 }
                 insert_undamaged(transaction, &structure, &state, created).await?;
                 sqlx::query(

@@ -1,5 +1,6 @@
 //! Checking a copy of the database, and writing files durably.
 
+use data_encoding::HEXLOWER;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read as _;
@@ -108,8 +109,7 @@ pub(super) fn sha256(path: &Path) -> Result<String, Error> {
             read => hasher.update(&chunk[..read]),
         }
     }
-    let digest: Vec<String> = hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-    Ok(digest.concat())
+    Ok(HEXLOWER.encode(&hasher.finalize()))
 }
 
 /// Syncs a folder, without which a rename in it is not durable.

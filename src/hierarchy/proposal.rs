@@ -1,31 +1,34 @@
-//! Samples near where the posterior of each measurement and the population behind the batch meet.
+//! Importance proposals for the parameters of each measurement, from its posterior and the population together.
 
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rayon::prelude::*;
 
-use super::problem::{unit_columns, within};
+use super::population::Populations;
+use super::problem::{unit_columns, within, WIDEST};
 use super::widths::Widths;
-use super::{Populations, WIDEST};
 use crate::parameter::ParameterSpace;
 use crate::posterior::PosteriorSamples;
 use crate::stats::{self, NormalQuantiles};
 
-/// Widths of the normal distributions that proposals come from, and the turns that eight proposals take among them.
+/// Widths of the components of the proposal mixture, and the component of each of eight consecutive proposals.
 const WIDTHS: [f64; 3] = [1.0, 1.6, 3.0];
 const TURNS: [usize; 8] = [0, 1, 0, 1, 0, 1, 0, 2];
 
-/// Samples near where posterior and population meet, for batches whose noise hides the spread: few samples of the posterior
-/// itself fall there. Returns them with the logarithm of their density in the unit box.
+/// Draws importance proposals for noise-dominated batches, where few samples of a posterior have a significant weight under
+/// the population. The proposal density is the product of the posterior and the population in normal approximation,
+/// widened. Returns the proposals, `draws` per measurement, and the logarithms of their densities in the unit box, n·draws
+/// values.
 ///
 /// ```text
 ///  r_j = Σ_w share_w N(x; c_j, w² C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
 /// ```
 ///
-/// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them, its spread at least
-/// half that of one posterior. The points are of a scrambled Sobol' sequence, each measurement's its own, and take the widths
-/// in turn: they stand for an integral as well as several times as many random ones (Owen & Zhou 2000, Safe and effective
-/// importance sampling).
+/// m_j, V_j: moments of the posterior samples of measurement j; μ, Σ: the population estimated from them (`found`), with a
+/// standard deviation of at least half that of one posterior. The points form a scrambled Sobol' sequence for each
+/// measurement and take the widths in turn: they integrate as accurately as several times as many random points.
+///
+/// Source: A. Owen, Y. Zhou (2000), Safe and effective importance sampling, JASA 95, 135–143.
 pub fn proposals(
     samples: &PosteriorSamples,
     found: &Populations,
@@ -38,7 +41,7 @@ pub fn proposals(
     let within = within(&unit_columns(samples, space), samples.draws());
     let mean = DVector::from_fn(d, |k, _| parameters[k].to_unit(found.parameters[k].mean));
     let precision = DMatrix::from_fn(d, d, |i, j| {
-        // A first estimate of nearly nothing must leave room to look for another.
+        // A first estimate near zero must not prevent the proposals from reaching larger values.
         let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(0.5 * within[i]).max(1e-6);
         if i == j {
             std.powi(-2)
@@ -63,7 +66,7 @@ pub fn proposals(
         let (mut points, mut log_density) = (Vec::with_capacity(draws * d), Vec::with_capacity(draws));
         let mut stretched = vec![0.0; d];
         for draw in 0..draws {
-            // In the middle of its cell of 2⁻²⁴: no level is 0 or 1.
+            // The level is moved to the middle of its cell of 2⁻²⁴, so that none is 0 or 1.
             let level =
                 |k: usize| f64::from(sobol_burley::sample(draw as u32, k as u32, scrambling)) + 0.5_f64.powi(25);
             for (k, stretched) in stretched.iter_mut().enumerate() {
@@ -76,7 +79,7 @@ pub fn proposals(
                 points.push(parameters[k].from_unit(position.clamp(0.0, 1.0)));
             }
             let squared: f64 = stretched.iter().map(|z| z * z).sum();
-            // Beyond the prior nothing is possible.
+            // Proposals outside the prior get zero weight.
             log_density.push(if inside { widths.log_density(squared) - log_volume } else { IMPOSSIBLE });
         }
         (points, log_density)
@@ -88,5 +91,5 @@ pub fn proposals(
     (PosteriorSamples::new(theta, draws), log_density.concat())
 }
 
-/// Logarithm of a density of a sample that counts for nothing.
+/// Log-density that gives a sample zero weight.
 const IMPOSSIBLE: f64 = 1e9;

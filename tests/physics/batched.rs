@@ -1,7 +1,7 @@
-//! Runs side by side against the same runs one by one.
+//! The batched eigensolver compared with single runs.
 
 use modalwatch::baseline::library::find_structure;
-use modalwatch::physics::side_by_side::{SideBySide, MOST_FREEDOMS};
+use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS};
 use modalwatch::physics::{natural_frequencies_with, Node, Structure};
 use modalwatch::stats;
 use nalgebra::DMatrix;
@@ -9,14 +9,14 @@ use rand::Rng as _;
 
 use super::{chain, mass, random_structure, spring};
 
-/// Both are exact to rounding: some 1e-15 of the largest eigenvalue, which here is at most a thousand times the smallest.
+/// Both are exact to rounding, about 1e-15 of the largest eigenvalue, which here is at most a thousand times the smallest.
 const ROUNDING: f64 = 1e-11;
 
 fn agree(found: f64, expected: f64) -> bool {
     (found / expected - 1.0).abs() < ROUNDING
 }
 
-/// Stiffnesses of `runs` runs, of each of the springs.
+/// Random stiffnesses of the springs in each run.
 fn stiffnesses(structure: &Structure, springs: &[usize], runs: usize, seed: u64) -> Vec<f64> {
     let mut stream = stats::stream(seed, "stiffnesses");
     let one = |spring: &usize, factor: f64| structure.springs()[*spring].n_per_m * factor;
@@ -25,8 +25,8 @@ fn stiffnesses(structure: &Structure, springs: &[usize], runs: usize, seed: u64)
 
 fn as_one_by_one(structure: &Structure, springs: &[usize], runs: usize, seed: u64) {
     let given = stiffnesses(structure, springs, runs, seed);
-    let modes = structure.freedoms();
-    let found = SideBySide::new(structure, springs, modes).unwrap().frequencies_hz(&given);
+    let modes = structure.dofs();
+    let found = BatchedEigensolver::new(structure, springs, modes).unwrap().frequencies_hz(&given);
     assert_eq!(found.len(), runs * modes);
     for (run, found) in found.chunks(modes).enumerate() {
         let own = &given[run * springs.len()..(run + 1) * springs.len()];
@@ -44,22 +44,22 @@ fn random_structures_have_the_frequencies_that_they_have_one_by_one() {
         let structure = random_structure(seed);
         let changing: Vec<usize> =
             (0..structure.springs().len()).filter(|s| !(s + seed as usize).is_multiple_of(3)).collect();
-        // Full vectors, and some that are not.
+        // Numbers of runs that are multiples of the number of lanes, and others.
         as_one_by_one(&structure, &changing, 1 + seed as usize, seed);
     }
-    for freedoms in 1..=MOST_FREEDOMS {
-        as_one_by_one(&chain(freedoms, 0.7, 1300.0), &(0..freedoms).collect::<Vec<_>>(), 19, 7);
+    for dofs in 1..=MOST_DOFS {
+        as_one_by_one(&chain(dofs, 0.7, 1300.0), &(0..dofs).collect::<Vec<_>>(), 19, 7);
     }
-    assert!(SideBySide::new(&chain(MOST_FREEDOMS + 1, 0.7, 1300.0), &[0], 1).is_none());
-    assert!(SideBySide::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
+    assert!(BatchedEigensolver::new(&chain(MOST_DOFS + 1, 0.7, 1300.0), &[0], 1).is_none());
+    assert!(BatchedEigensolver::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
 }
 
 #[test]
 fn equal_eigenvalues_come_out_equal() {
-    // Three masses on springs of their own, two of them alike, far apart from the third.
-    let own = |i: usize| spring(i, Node::Ground, Node::Freedom(i), 4.0);
+    // Three separate oscillators: two are equal, and the third has a much higher frequency.
+    let own = |i: usize| spring(i, Node::Ground, Node::Dof(i), 4.0);
     let structure = Structure::new((0..3).map(|i| mass(i, 1.0)).collect(), (0..3).map(own).collect()).unwrap();
-    let found = SideBySide::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
+    let found = BatchedEigensolver::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
     let hz = |n_per_m: f64| n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
     for (found, expected) in found.iter().zip([hz(4.0), hz(4.0), hz(4.0e6)]) {
         assert!(agree(*found, expected), "{found} Hz, expected {expected} Hz");
@@ -69,10 +69,10 @@ fn equal_eigenvalues_come_out_equal() {
 #[test]
 fn a_run_without_frequencies_spoils_no_other() {
     let structure = chain(3, 0.5, 100.0);
-    let runs = SideBySide::new(&structure, &[0, 1, 2], 2).unwrap();
+    let runs = BatchedEigensolver::new(&structure, &[0, 1, 2], 2).unwrap();
     let good = [80.0, 90.0, 110.0];
     let alone = runs.frequencies_hz(&good);
-    // A mechanism, and stiffnesses that are none.
+    // A mechanism, and invalid stiffnesses.
     for bad in [[0.0, 90.0, 110.0], [80.0, -1.0, 110.0], [80.0, f64::NAN, 110.0], [f64::INFINITY, 1.0, 1.0]] {
         let found = runs.frequencies_hz(&[good, bad, good].concat());
         assert!(found[2..4].iter().all(|f| f.is_nan()), "{bad:?}: {found:?}");

@@ -1,97 +1,100 @@
-//! Natural frequencies of a small structure at many stiffnesses, eight of them at a time, one in each lane of a vector.
+//! Batched eigensolver: natural frequencies of a small structure at many stiffnesses, eight at a time, one in each SIMD lane.
 //!
-//! Posterior samples are weighed by thousands of runs of the same few masses: alone, each costs mostly its assembly and the
-//! branches of its iteration.
+//! Weighting posterior samples takes thousands of runs of the same small structure. Solved one by one, most of the time of a
+//! run goes into assembly and into the branches of the iteration.
 
 use std::f64::consts::PI;
 
 use super::modes::{Scaled, SINGULAR};
-use super::Structure;
+use super::structure::Structure;
 
-/// Degrees of freedom up to which this is used; the work of a sweep grows with their cube.
-pub const MOST_FREEDOMS: usize = 8;
+/// Largest number of degrees of freedom: the work of a sweep grows with its cube.
+pub const MOST_DOFS: usize = 8;
 
-/// Runs side by side: the numbers of the widest vector.
+/// Runs per batch: the number of `f64` lanes in the widest vector register.
 const LANES: usize = 8;
 
-/// Sweeps of the iteration, which doubles its digits with each from the third on or so.
+/// Largest number of sweeps: the iteration converges quadratically from about the third sweep on.
 const MOST_SWEEPS: usize = 15;
 
-/// What lies off the diagonal, relative to all, when the iteration ends: it moves an eigenvalue by the square of this over the
-/// gap to the next.
+/// The iteration ends when the norm of the off-diagonal entries, relative to the norm of the matrix, falls below this. The
+/// remaining error of an eigenvalue is of the order of its square, divided by the gap to the next eigenvalue.
 const NEGLIGIBLE: f64 = 1e-14;
 
-/// A number of each run; on a line of the cache.
+/// One number of each run, aligned to a cache line.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Lanes([f64; LANES]);
 
 /// The lower triangle of a symmetric matrix of each run.
-type Matrices = [[Lanes; MOST_FREEDOMS]; MOST_FREEDOMS];
+type Matrices = [[Lanes; MOST_DOFS]; MOST_DOFS];
 
-/// A structure some of whose stiffnesses change from run to run.
+/// Solves the eigenproblem of a structure some of whose stiffnesses change from run to run.
 ///
 /// ```text
-///  A(k) = A_0 + Σ_s k_s A_s,    A_0, A_s: R⁻¹ K R⁻ᵀ of the other springs, and of one unit of spring s;   M = R Rᵀ
+///  A(k) = A_0 + Σ_s k_s A_s,    M = R Rᵀ
+///  A_0 = R⁻¹ K_0 R⁻ᵀ of the springs that do not change,    A_s = R⁻¹ K_s R⁻ᵀ of spring s with unit stiffness
 /// ```
 #[derive(Debug, Clone)]
-pub struct SideBySide {
-    freedoms: usize,
+pub struct BatchedEigensolver {
+    dofs: usize,
     modes: usize,
     /// Lower triangle of A_0, row by row.
     fixed: Vec<f64>,
-    /// Those of each A_s.
+    /// Lower triangle of each A_s, row by row.
     units: Vec<Vec<f64>>,
 }
 
-impl SideBySide {
-    /// The lowest `modes` frequencies of a structure, `springs` (their indices) of which change. `None` for one that has more
-    /// than [`MOST_FREEDOMS`] or fewer than `modes` degrees of freedom, or one without a mass.
+impl BatchedEigensolver {
+    /// Prepares runs of `structure` in which the springs with the indices `springs` change and the lowest `modes` frequencies
+    /// are wanted. Returns `None` if the structure has more than [`MOST_DOFS`] or fewer than `modes` degrees of freedom, or if
+    /// its mass matrix is not positive definite.
     pub fn new(structure: &Structure, springs: &[usize], modes: usize) -> Option<Self> {
-        let freedoms = structure.freedoms();
-        if freedoms > MOST_FREEDOMS || modes > freedoms {
+        let dofs = structure.dofs();
+        if dofs > MOST_DOFS || modes > dofs {
             return None;
         }
         let lower = |stiffness: &dyn Fn(usize, f64) -> f64| {
             let all = structure.springs().iter().enumerate();
             let changes: Vec<(usize, f64)> = all.map(|(spring, s)| (spring, stiffness(spring, s.n_per_m))).collect();
             let scaled = Scaled::new(structure, &changes).ok()?.stiffness;
-            let entries = (0..freedoms).flat_map(|row| (0..=row).map(move |column| (row, column)));
+            let entries = (0..dofs).flat_map(|row| (0..=row).map(move |column| (row, column)));
             Some(entries.map(|entry| scaled[entry]).collect::<Vec<f64>>())
         };
         let fixed = lower(&|spring, own| if springs.contains(&spring) { 0.0 } else { own })?;
         let unit = |changed: &usize| lower(&|spring, _| f64::from(u8::from(spring == *changed)));
         let units = springs.iter().map(unit).collect::<Option<_>>()?;
-        Some(Self { freedoms, modes, fixed, units })
+        Some(Self { dofs, modes, fixed, units })
     }
 
-    /// Natural frequencies, Hz, ascending, `[runs·modes]`, those of one run together; NaN for a run with a stiffness that is
-    /// negative or not finite, or that makes a mechanism. `n_per_m`: stiffnesses of the springs that change, run by run.
+    /// Natural frequencies, Hz, ascending within each run, as a row-major matrix `[runs, modes]`. `n_per_m` holds the stiffnesses
+    /// of the springs that change, as a row-major matrix `[runs, springs]`. The frequencies of a run are NaN if one of its
+    /// stiffnesses is negative or not finite, or if the structure is a mechanism.
     ///
     /// # Panics
-    /// When no spring changes, or not one stiffness of each is given: a bug.
+    /// If no spring changes, or if the length of `n_per_m` is not a multiple of the number of springs: a bug of the caller.
     pub fn frequencies_hz(&self, n_per_m: &[f64]) -> Vec<f64> {
         let springs = self.units.len();
-        assert!(n_per_m.len().is_multiple_of(springs), "{} stiffnesses of {springs} springs", n_per_m.len());
+        assert!(n_per_m.len().is_multiple_of(springs), "{} stiffnesses for {springs} springs", n_per_m.len());
         let mut frequencies = Vec::with_capacity(n_per_m.len() / springs * self.modes);
         for runs in n_per_m.chunks(LANES * springs) {
-            let mut matrices = [[Lanes([0.0; LANES]); MOST_FREEDOMS]; MOST_FREEDOMS];
-            // Lanes that are left over repeat the last run.
+            let mut matrices = [[Lanes([0.0; LANES]); MOST_DOFS]; MOST_DOFS];
+            // Unused lanes repeat the last run.
             let count = runs.len() / springs;
             let stiffness =
                 |spring: usize| Lanes(std::array::from_fn(|lane| runs[lane.min(count - 1) * springs + spring]));
             let stiffnesses: Vec<Lanes> = (0..springs).map(stiffness).collect();
             assemble(&mut matrices, &self.fixed, &self.units, &stiffnesses);
-            diagonalise(&mut matrices, self.freedoms);
+            diagonalise(&mut matrices, self.dofs);
             for lane in 0..count {
                 let given = &runs[lane * springs..(lane + 1) * springs];
                 let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
-                let mut all: [f64; MOST_FREEDOMS] = std::array::from_fn(|i| matrices[i][i].0[lane]);
-                let eigenvalues = &mut all[..self.freedoms];
+                let mut all: [f64; MOST_DOFS] = std::array::from_fn(|i| matrices[i][i].0[lane]);
+                let eigenvalues = &mut all[..self.dofs];
                 eigenvalues.sort_unstable_by(f64::total_cmp);
-                let (smallest, largest) = (eigenvalues[0], eigenvalues[self.freedoms - 1]);
-                let tied = valid && smallest > SINGULAR * largest && largest.is_finite();
-                let frequency = |eigenvalue: &f64| if tied { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
+                let (smallest, largest) = (eigenvalues[0], eigenvalues[self.dofs - 1]);
+                let solved = valid && smallest > SINGULAR * largest && largest.is_finite();
+                let frequency = |eigenvalue: &f64| if solved { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
                 frequencies.extend(eigenvalues[..self.modes].iter().map(frequency));
             }
         }
@@ -99,7 +102,7 @@ impl SideBySide {
     }
 }
 
-/// A(k) of each run.
+/// Computes A(k) of each run.
 #[pulp::with_simd(assemble = pulp::Arch::new())]
 #[inline(always)]
 fn assemble_simd<S: pulp::Simd>(
@@ -122,18 +125,20 @@ fn assemble_simd<S: pulp::Simd>(
     }
 }
 
-/// Leaves the eigenvalues on the diagonals, by Jacobi's rotations in cyclic order.
+/// Diagonalises the matrix of each run by the cyclic Jacobi method; the eigenvalues are left on the diagonals.
 ///
 /// ```text
 ///  t = sgn(d)·2a_pq / (|d| + √(d² + 4a_pq²)),   d = a_qq − a_pp,   c = 1/√(1 + t²),   s = t c
 ///  a_pp −= t a_pq,   a_qq += t a_pq,   (a_rp, a_rq) ← (c a_rp − s a_rq, s a_rp + c a_rq),   a_pq ← 0
 /// ```
 ///
-/// Without branches, and the same operations in every lane. Source: Golub & Van Loan (2013), Matrix Computations, §8.5.
+/// The loop over the lanes has no branches, so that it compiles to vector instructions.
+///
+/// Source: Golub & Van Loan (2013), Matrix Computations, §8.5.
 #[pulp::with_simd(diagonalise = pulp::Arch::new())]
 #[inline(always)]
 fn diagonalise_simd<S: pulp::Simd>(_: S, a: &mut Matrices, n: usize) {
-    // Keeps 0/0 away where nothing is to be rotated.
+    // Avoids 0/0 where the entry to be eliminated is zero already.
     const LEAST: f64 = f64::MIN_POSITIVE;
     for _ in 0..MOST_SWEEPS {
         let (mut off, mut all) = ([0.0; LANES], [0.0; LANES]);
@@ -147,7 +152,7 @@ fn diagonalise_simd<S: pulp::Simd>(_: S, a: &mut Matrices, n: usize) {
                 *all += entry * entry;
             }
         }
-        // What is no number does not hold the others up.
+        // A comparison with NaN is false, so that a run without a solution does not delay the others.
         if !off.iter().zip(&all).any(|(off, all)| *off > NEGLIGIBLE * NEGLIGIBLE * all) {
             return;
         }

@@ -1,0 +1,132 @@
+//! The trained model itself: a flow, the standardisation of its inputs, its structure, and its manifest.
+
+use candle_core::Tensor;
+
+use super::conditions::fit_features;
+use super::error::InferenceError;
+use super::manifest::{Group, Manifest};
+use super::observation::{Encoder, Observation};
+use super::start::{locate_all, Located};
+use crate::flow::sampler::Sampler;
+use crate::flow::Flow;
+use crate::parameter::ParameterSpace;
+use crate::quantity::Digest;
+use crate::simulator::Simulator;
+use crate::stats::Stream;
+
+/// A trained model: the flow of one structure with its manifest.
+pub struct Baseline {
+    pub(super) flow: Flow,
+    /// The flow's weights in the form that sampling uses; `None` where they are not single precision.
+    sampler: Option<Sampler>,
+    encoder: Encoder,
+    pub(super) simulator: Simulator,
+    /// The training box. The flow's real line corresponds to this box.
+    pub(super) training_space: ParameterSpace,
+    pub(super) manifest: Manifest,
+    digest: Digest,
+}
+
+impl Baseline {
+    /// Assembles a model; `digest` identifies it.
+    ///
+    /// # Errors
+    /// A candle error when the weights cannot be read.
+    pub(super) fn new(
+        flow: Flow,
+        simulator: &Simulator,
+        manifest: Manifest,
+        digest: Digest,
+    ) -> Result<Self, candle_core::Error> {
+        Ok(Self {
+            sampler: Sampler::new(&flow)?,
+            flow,
+            encoder: Encoder::new(&manifest.whitening, &manifest.conditions),
+            training_space: manifest.conditions.training_space(simulator.space()),
+            simulator: simulator.clone(),
+            manifest,
+            digest,
+        })
+    }
+
+    /// The structure that the model was trained for.
+    pub fn simulator(&self) -> &Simulator {
+        &self.simulator
+    }
+
+    /// The parameters of that structure.
+    pub fn space(&self) -> &ParameterSpace {
+        self.simulator.space()
+    }
+
+    /// How the model was trained and what was measured of it.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// Groups of parameters that the modes cannot distinguish.
+    pub fn groups(&self) -> Vec<Group> {
+        self.manifest.identifiability.resolve(self.space())
+    }
+
+    /// SHA-256 of the manifest file, which in turn contains that of the weights. It identifies the model in every result.
+    pub fn digest(&self) -> &Digest {
+        &self.digest
+    }
+
+    /// Whether the flow starts at the best fit of each measurement: with many parameters or with mode shapes.
+    pub fn starts_at_fit(&self) -> bool {
+        self.manifest.conditions.starts_at_fit
+    }
+
+    /// Samples of the flow, as [`Flow::sample`], but with the weights read once.
+    pub(super) fn draw_from_flow(
+        &self,
+        context: &Tensor,
+        draws: usize,
+        stream: &mut Stream,
+    ) -> Result<(Tensor, Tensor), candle_core::Error> {
+        match &self.sampler {
+            Some(sampler) => sampler.sample(context, draws, stream),
+            None => self.flow.sample(context, draws, stream),
+        }
+    }
+
+    /// The summary S(y) of each observation, `[n, context]`, for a flow that does not start at the best fit.
+    ///
+    /// # Errors
+    /// [`InferenceError::Modes`] for another number of modes.
+    pub(super) fn condition(&self, observations: &[Observation]) -> Result<Tensor, InferenceError> {
+        self.check_modes(observations)?;
+        Ok(self.flow.summarise(&self.encoder.encode(observations)?.to_dtype(self.flow.dtype())?)?)
+    }
+
+    /// The best fit of each observation, and the condition of the flow at these fits, `[n, features]`.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes or a simulation that fails.
+    pub(super) fn locate(&self, observations: &[Observation]) -> Result<(Vec<Located>, Tensor), InferenceError> {
+        self.check_modes(observations)?;
+        let located =
+            locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))?;
+        let context = fit_condition(&located, self.space().len())?.to_dtype(self.flow.dtype())?;
+        Ok((located, context))
+    }
+
+    fn check_modes(&self, observations: &[Observation]) -> Result<(), InferenceError> {
+        let expected = self.simulator.modes();
+        match observations.iter().find(|o| o.frequencies_hz.len() != expected) {
+            Some(o) => Err(InferenceError::Modes { found: o.frequencies_hz.len(), expected }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Input of a flow that starts at the best fit, `[n, features]`, f64.
+///
+/// # Errors
+/// A candle error, which would be a bug.
+pub(super) fn fit_condition(located: &[Located], parameters: usize) -> Result<Tensor, candle_core::Error> {
+    let values: Vec<f64> = located.iter().flat_map(Located::features).collect();
+    Tensor::from_vec(values, (located.len(), fit_features(parameters)), &candle_core::Device::Cpu)
+}

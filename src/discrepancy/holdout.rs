@@ -1,0 +1,74 @@
+//! Rows held out for measuring the gain.
+
+use serde::{Deserialize, Serialize};
+
+use super::data::{Data, Values};
+use crate::quantity::shown;
+
+/// Which rows are held out for measuring the gain; written `last:0.25` or `where:lab=de`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Holdout {
+    /// The last share of the rows in time.
+    Last(f64),
+    /// The rows in which a covariate has a given category.
+    Where {
+        /// Name of the covariate.
+        covariate: String,
+        /// Its category.
+        level: String,
+    },
+}
+
+impl std::str::FromStr for Holdout {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || format!("{} must read last:0.25, a share below 1, or where:lab=de", shown(text));
+        match text.split_once(':') {
+            Some(("last", share)) => {
+                let share: f64 = share.parse().map_err(|_| wrong())?;
+                (0.0..1.0).contains(&share).then_some(Self::Last(share)).ok_or_else(wrong)
+            }
+            Some(("where", rest)) => {
+                let (covariate, level) = rest.split_once('=').ok_or_else(wrong)?;
+                Ok(Self::Where { covariate: covariate.to_owned(), level: level.to_owned() })
+            }
+            _ => Err(wrong()),
+        }
+    }
+}
+
+impl Holdout {
+    /// Splits the rows into those that are searched for causes and those held out.
+    ///
+    /// # Errors
+    /// The reason, as the end of a sentence that starts with "the hold-out": a share outside 0 to 1, or a column or category
+    /// that the data do not have.
+    pub(super) fn split(&self, data: &Data) -> Result<(Vec<usize>, Vec<usize>), String> {
+        let all = 0..data.rows();
+        match self {
+            Self::Last(share) => {
+                if !(0.0..1.0).contains(share) {
+                    return Err(format!("last:{share} must have a share from 0 to below 1"));
+                }
+                let first = data.rows() - (share * data.rows() as f64).round() as usize;
+                Ok((all.clone().take(first).collect(), all.skip(first).collect()))
+            }
+            Self::Where { covariate, level } => {
+                let column = data.column(covariate).ok_or_else(|| {
+                    let names: Vec<&str> = data.columns.iter().map(|c| c.name.as_str()).collect();
+                    format!("names the column {covariate}, but there are {}", names.join(", "))
+                })?;
+                let Values::Categories(names, indices) = &column.values else {
+                    return Err(format!("names the column {covariate}, which holds numbers: it must hold categories"));
+                };
+                let Some(wanted) = names.iter().position(|n| n == level) else {
+                    let names = names.join(", ");
+                    return Err(format!("asks for {covariate} = {level}, but its categories are {names}"));
+                };
+                Ok(all.partition(|row| indices[*row] != Some(wanted)))
+            }
+        }
+    }
+}

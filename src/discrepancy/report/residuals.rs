@@ -1,0 +1,155 @@
+//! Plots of the residuals without and with the causes.
+
+use super::figures::digits;
+use crate::discrepancy::data::{Data, Values, TIME};
+use crate::discrepancy::diagnosis::Outcome;
+use crate::discrepancy::fit::Fit;
+use crate::discrepancy::study::Study;
+use crate::plot::{Plot, Points, Scatter};
+use crate::simulator::Simulator;
+use crate::stats;
+
+/// Greatest number of rows that are drawn.
+const MOST_DRAWN: usize = 1500;
+
+/// Stride that spreads points evenly over an interval, whatever the period of the data: the golden ratio minus 1.
+const GOLDEN: f64 = 0.618_033_988_749_895;
+
+/// Colours of [`Points`]: orange without, blue with the causes.
+const BEFORE: usize = 1;
+const AFTER: usize = 0;
+
+/// Label of the axis of residuals.
+const RESIDUAL: &str = "measured minus predicted, %";
+
+/// Rows that are drawn, with the residuals of each mode without and with the causes, per cent.
+pub(super) struct Drawn<'a> {
+    pub(super) data: &'a Data,
+    pub(super) rows: Vec<usize>,
+    /// Whether each row is held out.
+    held: Vec<bool>,
+    /// `[modes][rows]`, NaN for a missing mode.
+    pub(super) before: Vec<Vec<f64>>,
+    /// The same with the causes; `None` if there are none.
+    pub(super) after: Option<Vec<Vec<f64>>>,
+}
+
+/// A covariate at the rows that are drawn.
+pub(super) struct Axis {
+    pub(super) label: String,
+    /// Names of the categories; empty for numbers.
+    pub(super) names: Vec<String>,
+    pub(super) values: Vec<f64>,
+}
+
+impl<'a> Drawn<'a> {
+    /// `None` if the structure has no frequencies in some row under one of the fits.
+    pub(super) fn new(simulator: &'a Simulator, data: &'a Data, outcome: &Outcome) -> Option<Self> {
+        let stride = (data.rows() as f64 / MOST_DRAWN as f64).max(1.0);
+        let count = (data.rows() as f64 / stride).floor() as usize;
+        // Evenly, but not at a fixed phase, which would select the same hour of every day.
+        let place = |i: usize| if stride > 1.0 { (i as f64 * GOLDEN).fract() } else { 0.0 };
+        let rows: Vec<usize> = (0..count).map(|i| ((i as f64 + place(i)) * stride) as usize).collect();
+        // Both fits contain the effects of the structure.
+        let bare = simulator.without_effects();
+        let study = Study::new(&bare, data);
+        let residuals = |fit: &Fit| -> Option<Vec<Vec<f64>>> {
+            let mut by_mode = vec![vec![f64::NAN; rows.len()]; simulator.modes()];
+            for (row, view) in study.view(&rows, fit)?.iter().enumerate() {
+                for (mode, residual) in view.present.iter().zip(view.residual.iter()) {
+                    by_mode[*mode][row] = 100.0 * residual;
+                }
+            }
+            Some(by_mode)
+        };
+        let before = residuals(&outcome.before)?;
+        let after = if outcome.diagnosis.causes.is_empty() { None } else { Some(residuals(&outcome.after)?) };
+        let mut held = vec![false; data.rows()];
+        outcome.holdout.iter().for_each(|row| held[*row] = true);
+        Some(Self { data, held: rows.iter().map(|row| held[*row]).collect(), rows, before, after })
+    }
+
+    pub(super) fn axis(&self, name: &str) -> Axis {
+        let (names, values) = match self.data.column(name).map(|c| &c.values) {
+            Some(Values::Numbers(values)) => (Vec::new(), self.rows.iter().map(|r| values[*r]).collect()),
+            Some(Values::Categories(names, indices)) => {
+                let index = |r: &usize| indices[*r].map_or(f64::NAN, |i| i as f64);
+                (names.clone(), self.rows.iter().map(index).collect())
+            }
+            None => (Vec::new(), self.rows.iter().map(|r| self.data.times_days[*r]).collect()),
+        };
+        let label = if name == TIME { "days since the first row".to_owned() } else { name.to_owned() };
+        Axis { label, names, values }
+    }
+
+    /// Title of a mode's plot, with its median frequency.
+    pub(super) fn title(&self, mode: usize) -> String {
+        let logs = self.rows.iter().map(|r| self.data.log_frequencies[*r][mode]).filter(|y| y.is_finite());
+        let logs: Vec<f64> = logs.collect();
+        if logs.is_empty() {
+            return format!("Mode {}, never measured", mode + 1);
+        }
+        format!("Mode {}, about {} Hz", mode + 1, digits(stats::quantile(&logs, 0.5).exp()))
+    }
+
+    /// Residuals of a mode over a covariate, without and with the causes.
+    pub(super) fn before_and_after(&self, mode: usize, axis: &Axis) -> String {
+        let fits = match &self.after {
+            Some(after) => {
+                vec![("without the causes", BEFORE, &self.before[mode]), ("with the causes", AFTER, &after[mode])]
+            }
+            None => vec![("all rows", BEFORE, &self.before[mode])],
+        };
+        let mut clouds = Vec::new();
+        for (place, (name, colour, residuals)) in fits.iter().enumerate() {
+            let shift = if fits.len() > 1 { 0.4 * place as f64 - 0.2 } else { 0.0 };
+            for held in [false, true] {
+                let what = if held { ", held out" } else { "" };
+                let points = self.points(residuals, axis, shift, |row| self.held[row] == held);
+                clouds.push(Points { name: format!("{name}{what}"), colour: *colour, hollow: held, points });
+            }
+        }
+        figure(self.title(mode), axis, clouds)
+    }
+
+    /// Points of the `chosen` rows; those of a category are spread around its position, displaced by `shift`.
+    pub(super) fn points(
+        &self,
+        residuals: &[f64],
+        axis: &Axis,
+        shift: f64,
+        chosen: impl Fn(usize) -> bool,
+    ) -> Vec<(f64, f64)> {
+        let jitter = |row: usize| {
+            if axis.names.is_empty() {
+                0.0
+            } else {
+                shift + 0.3 * ((row as f64 * GOLDEN).fract() - 0.5)
+            }
+        };
+        let known = (0..self.rows.len()).filter(|row| chosen(*row));
+        let points = known.map(|row| (axis.values[row] + jitter(row), residuals[row]));
+        points.filter(|(x, y)| x.is_finite() && y.is_finite()).collect()
+    }
+}
+
+/// A plot of clouds over a covariate; outliers are drawn at its edge.
+pub(super) fn figure(title: String, axis: &Axis, mut clouds: Vec<Points>) -> String {
+    let all: Vec<f64> = clouds.iter().flat_map(|c| c.points.iter().map(|p| p.1)).collect();
+    let (low, high) = (stats::quantile(&all, 0.005), stats::quantile(&all, 0.995));
+    let margin = 0.35 * (high - low);
+    let mut beyond = 0;
+    for (_, y) in clouds.iter_mut().flat_map(|c| &mut c.points) {
+        let inside = y.max(low - margin).min(high + margin);
+        beyond += usize::from((inside - *y).abs() > 0.0);
+        *y = inside;
+    }
+    let caption = match beyond {
+        0 => String::new(),
+        _ => format!("{beyond} of {} points lie outside the scale and are drawn at its edge.", all.len()),
+    };
+    let y_label = RESIDUAL.to_owned();
+    let marks = vec![(0.0, String::new())];
+    let plot = Plot { title, x_label: axis.label.clone(), y_label, marks, ..Plot::default() };
+    Scatter { plot, points: clouds, x_names: axis.names.clone() }.figure(&caption)
+}

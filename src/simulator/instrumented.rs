@@ -1,0 +1,84 @@
+//! Instrumented points of a structure, at which its mode shapes are measured.
+
+use std::collections::BTreeSet;
+
+use super::definition::{DefinitionProblem, StructureDefinition};
+use super::layout::Problems;
+use super::model::SimulationModel;
+use crate::measurement::shape::InstrumentedPoints;
+use crate::physics::modes;
+use crate::physics::shapes::shapes_at;
+use crate::quantity::shown;
+
+/// Smallest number of instrumented points: a shape at a single point contains no information.
+const FEWEST_POINTS: usize = 2;
+
+/// Largest noise of a shape: with more, shapes of neighbouring modes cannot be distinguished.
+const MOST_NOISE: f64 = 0.5;
+
+/// The instrumented points of a checked structure.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Instrumented {
+    /// Degree of freedom of each point.
+    pub(super) dofs: Vec<usize>,
+    /// Standard deviation of each component of a measured shape of unit norm.
+    pub(super) std: f64,
+    /// Their names, and the mode shapes of the nominal structure.
+    pub(super) points: InstrumentedPoints,
+}
+
+/// Checks the instrumented points of a definition; `None` if it has none or has mistakes.
+pub(super) fn check(
+    definition: &StructureDefinition,
+    model: &SimulationModel,
+    problems: &mut Problems,
+) -> Option<Instrumented> {
+    let given = definition.mode_shapes.as_ref()?;
+    let mut wrong = |key: &str, message: String| {
+        problems.push(DefinitionProblem::new(format!("/mode_shapes{key}"), message));
+    };
+    let SimulationModel::Matrices { structure, .. } = model else {
+        wrong(
+            "",
+            "a table of runs contains no mode shapes: remove mode_shapes, or describe the structure by masses or beams"
+                .to_owned(),
+        );
+        return None;
+    };
+    if !definition.effects.is_empty() {
+        wrong("", "mode shapes under effects are not simulated yet: remove mode_shapes or the effects".to_owned());
+    }
+    let noise = given.noise;
+    if !(noise.is_finite() && noise > 0.0 && noise < MOST_NOISE) {
+        wrong("/noise", format!("a noise of {noise} is not valid: it is a share of the shape's root mean square, above 0 and below {MOST_NOISE}"));
+    }
+    if given.points.len() < FEWEST_POINTS {
+        let count = given.points.len();
+        wrong("/points", format!("{count} points: a shape needs at least {FEWEST_POINTS}"));
+    }
+    let mut seen = BTreeSet::new();
+    let mut dofs = Vec::new();
+    for (index, name) in given.points.iter().enumerate() {
+        let key = format!("/points/{index}");
+        match structure.attachment_points().iter().find(|point| point.name == *name) {
+            None => wrong(&key, format!("{} is not the name of a mass or of a node that can deflect", shown(name))),
+            Some(_) if !seen.insert(name) => {
+                wrong(&key, format!("{} is listed twice: list each point once", shown(name)));
+            }
+            Some(point) => dofs.push(point.dof),
+        }
+    }
+    if dofs.len() != given.points.len() || !problems.is_empty() {
+        return None;
+    }
+    let nominal = match modes(structure, definition.modes) {
+        Ok(modes) => shapes_at(&modes, &dofs),
+        Err(error) => {
+            problems.push(DefinitionProblem::new("/mode_shapes", format!("at the nominal stiffnesses: {error}")));
+            return None;
+        }
+    };
+    let nominal = nominal.column_iter().map(|shape| shape.iter().copied().collect()).collect();
+    let points = InstrumentedPoints { names: given.points.clone(), nominal };
+    Some(Instrumented { std: noise / (dofs.len() as f64).sqrt(), dofs, points })
+}

@@ -1,0 +1,62 @@
+//! The parts of a structure before its stiffnesses have values, and the checks that all kinds of structures share.
+
+use std::collections::BTreeMap;
+
+use super::definition::{DefinitionProblem, SpringDefinition};
+use crate::physics::{AttachmentPoint, Form, Mass};
+use crate::quantity::shown;
+
+/// All mistakes found so far.
+pub(super) type Problems = Vec<DefinitionProblem>;
+
+/// The parts of a structure without the values of its stiffnesses.
+pub(super) struct Layout {
+    /// Number of degrees of freedom.
+    pub dofs: usize,
+    pub attachment_points: Vec<AttachmentPoint>,
+    pub masses: Vec<Mass>,
+    /// Patterns of the stiffnesses: springs, then beam spans.
+    pub forms: Vec<Form>,
+}
+
+/// Checks that names are unique and can be used as a column of a table.
+pub(super) fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a String>, problems: &mut Problems) {
+    let mut seen = BTreeMap::new();
+    for (index, name) in names.enumerate() {
+        let pointer = format!("/{section}/{index}/name");
+        let allowed = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
+        if name.is_empty() || name.len() > 64 || !name.chars().all(allowed) {
+            let message = format!("the name {} must be 1 to 64 of letters, digits, '_', '-', '.'", shown(name));
+            problems.push(DefinitionProblem::new(&pointer, message));
+        }
+        if let Some(first) = seen.insert(name, index) {
+            let message = format!("the {section} name {} is used already by /{section}/{first}", shown(name));
+            problems.push(DefinitionProblem::new(&pointer, message));
+        }
+    }
+}
+
+/// Checks that the mass of a body is positive.
+pub(super) fn check_kg(name: &str, kg: f64, index: usize, problems: &mut Problems) {
+    if !(kg.is_finite() && kg > 0.0) {
+        let message = format!("mass {} has {kg} kg: it must be finite and above 0", shown(name));
+        problems.push(DefinitionProblem::new(format!("/mass/{index}/kg"), message));
+    }
+}
+
+/// Checks that the two ends of a spring differ and that its nominal stiffness is valid.
+pub(super) fn check_spring(spring: &SpringDefinition, index: usize, problems: &mut Problems) {
+    if spring.from == spring.to {
+        let message =
+            format!("spring {} goes from {} to itself: give it two ends", shown(&spring.name), shown(&spring.from));
+        problems.push(DefinitionProblem::new(format!("/spring/{index}/to"), message));
+    }
+    for (key, unit, value) in [("n_per_m", "N/m", spring.n_per_m), ("n_m_per_rad", "N·m/rad", spring.n_m_per_rad)] {
+        if let Some(value) = value.filter(|k| !(k.is_finite() && *k >= 0.0)) {
+            let name = shown(&spring.name);
+            let message =
+                format!("spring {name} has a stiffness of {value} {unit}: it must be finite and not negative");
+            problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
+        }
+    }
+}

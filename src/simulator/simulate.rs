@@ -1,0 +1,453 @@
+//! The simulator: natural frequencies of a structure as a function of its parameters.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::{Arc, OnceLock};
+
+use nalgebra::DMatrix;
+
+use super::batched::BatchedRuns;
+use super::check;
+use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
+use super::effect::{self, SimulationEffect};
+use super::instrumented::Instrumented;
+use super::model::{chained, changes, structure_at, Binding, SimulationModel};
+use super::table::Table;
+use crate::measurement::{Covariate, CovariateValue};
+use crate::parameter::{Parameter, ParameterSpace};
+use crate::physics::effect::{measured, respond, Target};
+use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_with, Structure};
+use crate::quantity::{Digest, StructureId};
+
+/// Factor by which a frequency may leave the nominal range before it is treated as a wrong unit or a wrong column.
+const FREQUENCY_MARGIN: f64 = 100.0;
+
+/// Largest number of attempts to draw a positive noisy frequency.
+pub(super) const NOISE_TRIES: usize = 100;
+
+/// Why a simulation failed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// The natural frequencies cannot be computed at these parameters.
+    #[error("at the parameters {parameters:?}: {source}")]
+    Physics {
+        /// The parameters, in the order of the parameter space.
+        parameters: Vec<f64>,
+        /// The cause.
+        source: physics::Error,
+    },
+    /// The noise is so large that no draw of a frequency is positive.
+    #[error("a frequency of {frequency_hz} Hz with noise of {std_hz} Hz is not positive in any of {NOISE_TRIES} draws: reduce the noise")]
+    Noise {
+        /// Frequency without noise, Hz.
+        frequency_hz: f64,
+        /// Standard deviation of the noise, Hz.
+        std_hz: f64,
+    },
+}
+
+/// Computes the natural frequencies of a structure as a function of its parameters θ. Cheap to clone.
+#[derive(Debug, Clone)]
+pub struct Simulator {
+    parts: Arc<Parts>,
+    /// Sizes of the effects: those given, or else their means over the covariate values that they were learnt from.
+    sizes: Arc<[f64]>,
+}
+
+#[derive(Debug)]
+struct Parts {
+    definition: StructureDefinition,
+    digest: Digest,
+    checked: check::Checked,
+    /// Prepared when it is first needed; `None` for a simulation that cannot be batched.
+    batched: OnceLock<Option<BatchedRuns>>,
+}
+
+/// Frequencies under effects and their derivatives.
+#[derive(Debug, Clone)]
+pub struct Response {
+    /// Frequencies as the instrument reports them, Hz, `[m]`.
+    pub frequencies_hz: Vec<f64>,
+    /// Derivatives with respect to the parameters, Hz per parameter unit, `[m, d]`.
+    pub by_parameter: DMatrix<f64>,
+    /// Derivatives with respect to the sizes of the further effects, Hz per unit of the size, `[m, sizes]`.
+    pub by_size: DMatrix<f64>,
+}
+
+/// The stiffness of a spring that a parameter sets through a law.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DerivedStiffness {
+    /// `spring:` followed by the name of the spring.
+    pub name: String,
+    /// Column of the parameter.
+    pub parameter: usize,
+    /// The law.
+    pub law: Law,
+}
+
+impl DerivedStiffness {
+    /// Stiffness k(p) at a parameter value, N/m.
+    pub fn value(&self, p: f64) -> f64 {
+        self.law.value(p)
+    }
+}
+
+impl Simulator {
+    /// Checks a definition and builds its simulator.
+    ///
+    /// # Errors
+    /// [`DefinitionError`] with every mistake and its JSON pointer.
+    pub fn new(definition: StructureDefinition) -> Result<Self, DefinitionError> {
+        let checked = check::check(&definition).map_err(|problems| DefinitionError { problems })?;
+        let digest = definition.digest();
+        let sizes = effect::typical_sizes(&checked.effects).into();
+        Ok(Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes })
+    }
+
+    /// Sizes of the effects over which a measurement with missing covariates is marginalised: one entry `[sizes]` for each value
+    /// that the missing covariates can have. Empty if no covariate is missing. All effects of a covariate use the same value.
+    pub fn marginalised_sizes(&self, covariates: &BTreeMap<String, CovariateValue>) -> Vec<Vec<f64>> {
+        effect::marginalised_sizes(self.effects(), covariates)
+    }
+
+    /// The same simulation without the effects of the structure file.
+    #[must_use]
+    pub fn without_effects(&self) -> Self {
+        let parts = &self.parts;
+        let checked = check::Checked { effects: Vec::new(), ..parts.checked.clone() };
+        let (definition, digest) = (parts.definition.clone(), parts.digest.clone());
+        Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes: Arc::new([]) }
+    }
+
+    /// Effects of the structure file.
+    pub fn effects(&self) -> &[SimulationEffect] {
+        &self.parts.checked.effects
+    }
+
+    /// The simulation under effects of the sizes `sizes` (all sizes of the first effect first); if `sizes` is empty, under effects
+    /// of their mean sizes.
+    ///
+    /// # Panics
+    /// If `sizes` is neither empty nor as long as the sizes of all effects.
+    #[must_use]
+    pub fn under(&self, sizes: &[f64]) -> Self {
+        if sizes.is_empty() {
+            return Self { sizes: effect::typical_sizes(self.effects()).into(), ..self.clone() };
+        }
+        assert_eq!(sizes.len(), self.sizes.len(), "one size for each of the structure's effects");
+        Self { sizes: sizes.into(), ..self.clone() }
+    }
+
+    /// Sizes of the effects under the covariates of a measurement.
+    pub fn effect_sizes(&self, covariates: &BTreeMap<String, CovariateValue>) -> effect::Sizes {
+        effect::sizes(self.effects(), covariates)
+    }
+
+    /// Id of the structure.
+    pub fn id(&self) -> &StructureId {
+        &self.parts.checked.id
+    }
+
+    /// The definition that the simulator was built from.
+    pub fn definition(&self) -> &StructureDefinition {
+        &self.parts.definition
+    }
+
+    /// Digest of the definition.
+    pub fn digest(&self) -> &Digest {
+        &self.parts.digest
+    }
+
+    /// What computes the frequencies.
+    pub fn model(&self) -> &SimulationModel {
+        &self.parts.checked.model
+    }
+
+    /// The structure at its nominal stiffnesses; `None` for a table.
+    pub fn structure(&self) -> Option<&Structure> {
+        match self.model() {
+            SimulationModel::Matrices { structure, .. } => Some(structure),
+            SimulationModel::Table(_) => None,
+        }
+    }
+
+    /// The emulated runs, if the simulation is a table.
+    pub fn table(&self) -> Option<&Table> {
+        match self.model() {
+            SimulationModel::Table(table) => Some(table),
+            SimulationModel::Matrices { .. } => None,
+        }
+    }
+
+    /// Number of modes that the simulation has, of which the lowest [`Self::modes`] are measured.
+    pub fn available_modes(&self) -> usize {
+        self.model().available_modes()
+    }
+
+    /// Warnings about the accuracy of the simulation.
+    pub fn warnings(&self) -> Vec<String> {
+        self.table().map_or_else(Vec::new, |table| table.warnings(self.modes()))
+    }
+
+    /// Whether the simulation is an emulator that has no runs near the parameters `theta` (`[d]`) under the effects.
+    pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
+        let Some(table) = self.table() else { return false };
+        let mut moved = theta.to_vec();
+        let mut first = 0;
+        for effect in self.effects() {
+            if let Target::ParameterScale(column) = effect.target {
+                moved[column] *= 1.0 + self.sizes[first];
+            }
+            first += effect.target.sizes();
+        }
+        table.is_outside(&moved)
+    }
+
+    /// The stiffnesses that parameters set; empty for a table.
+    pub(super) fn bindings(&self) -> &[Binding] {
+        match self.model() {
+            SimulationModel::Matrices { bindings, .. } => bindings,
+            SimulationModel::Table(_) => &[],
+        }
+    }
+
+    /// The instrumented points, if mode shapes are measured.
+    pub(super) fn instrumented(&self) -> Option<&Instrumented> {
+        self.parts.checked.instrumented.as_ref()
+    }
+
+    /// The parameters.
+    pub fn space(&self) -> &ParameterSpace {
+        &self.parts.checked.space
+    }
+
+    /// Number of measured modes m.
+    pub fn modes(&self) -> usize {
+        self.parts.definition.modes
+    }
+
+    /// The declared covariates.
+    pub fn covariates(&self) -> &[Covariate] {
+        &self.parts.checked.covariates
+    }
+
+    /// Standard deviation of one measured frequency, as given in the structure file.
+    pub fn noise(&self) -> MeasurementNoise {
+        self.parts.definition.measurement_noise
+    }
+
+    /// Standard deviation of a measured frequency about the simulated one, Hz: the noise given in the structure file, combined
+    /// with the error of an emulator.
+    pub fn std_hz(&self, mode: usize, frequency_hz: f64) -> f64 {
+        self.with_emulator_error(mode, frequency_hz, self.noise().std_hz(frequency_hz))
+    }
+
+    /// Standard deviation of a measurement combined with the error of an emulator, Hz.
+    ///
+    /// ```text
+    ///  √(s² + (ε f)²),    ε: relative cross-validation error of the emulator for the mode, 0 without an emulator
+    /// ```
+    pub fn with_emulator_error(&self, mode: usize, frequency_hz: f64, measured_std_hz: f64) -> f64 {
+        let relative = self.table().map_or(0.0, |table| table.emulator().relative_error(mode));
+        if relative > 0.0 {
+            measured_std_hz.hypot(relative * frequency_hz)
+        } else {
+            measured_std_hz
+        }
+    }
+
+    /// Whether measured frequencies scatter about the simulated ones, by noise or by the error of an emulator.
+    pub fn is_noisy(&self) -> bool {
+        (0..self.modes()).any(|mode| self.std_hz(mode, 1.0) > 0.0)
+    }
+
+    /// Natural frequencies without noise, Hz, `[m]`, at parameters `theta` (`[d]`, parameter units). They ascend unless an effect
+    /// changes the order of modes.
+    ///
+    /// # Errors
+    /// [`physics::Error`] for parameters that give a negative stiffness or a mechanism.
+    pub fn frequencies_hz(&self, theta: &[f64]) -> Result<Vec<f64>, physics::Error> {
+        if !self.effects().is_empty() {
+            return self.respond(theta, self.modes(), &[], &[]).map(|response| response.frequencies_hz);
+        }
+        match self.model() {
+            SimulationModel::Matrices { structure, bindings } => {
+                natural_frequencies_with(structure, &changes(bindings, theta), self.modes())
+            }
+            SimulationModel::Table(table) => {
+                let mut frequencies = table.frequencies_hz(theta);
+                frequencies.truncate(self.modes());
+                Ok(frequencies)
+            }
+        }
+    }
+
+    /// [`Self::frequencies_hz`] at some rows of `theta` (`[n, d]`, parameter units): Hz, row-major `[rows, m]`. NaN for a row
+    /// whose frequencies cannot be computed.
+    pub fn frequencies_of_rows_hz(&self, theta: &DMatrix<f64>, rows: Range<usize>) -> Vec<f64> {
+        let prepare = || self.effects().is_empty().then(|| BatchedRuns::new(self.model(), self.modes())).flatten();
+        if let Some(runs) = self.parts.batched.get_or_init(prepare) {
+            return runs.frequencies_hz(theta, rows);
+        }
+        let mut of_row = vec![0.0; theta.ncols()];
+        let mut frequencies = Vec::with_capacity(rows.len() * self.modes());
+        for row in rows {
+            of_row.iter_mut().zip(theta.row(row).iter()).for_each(|(own, value)| *own = *value);
+            match self.frequencies_hz(&of_row) {
+                Ok(found) => frequencies.extend(found),
+                Err(_) => frequencies.resize(frequencies.len() + self.modes(), f64::NAN),
+            }
+        }
+        frequencies
+    }
+
+    /// Derivatives of the frequencies at parameters `theta` (`[d]`), Hz per parameter unit, `[m, d]`.
+    ///
+    /// ```text
+    ///  ∂f_i/∂p = Σ_k ∂f_i/∂k · dk/dp      over the stiffnesses k that p sets
+    /// ```
+    ///
+    /// For repeated eigenvalues see [`frequency_sensitivity`]: sums over several stiffnesses are then not derivatives.
+    ///
+    /// # Errors
+    /// As [`Self::frequencies_hz`].
+    pub fn jacobian(&self, theta: &[f64]) -> Result<DMatrix<f64>, physics::Error> {
+        if !self.effects().is_empty() {
+            return self.respond(theta, self.modes(), &[], &[]).map(|response| response.by_parameter);
+        }
+        self.frequencies_and_jacobian(theta).map(|(_, jacobian)| jacobian)
+    }
+
+    /// [`Self::frequencies_hz`] and [`Self::jacobian`] from a single eigenproblem.
+    ///
+    /// # Errors
+    /// As [`Self::frequencies_hz`].
+    pub fn frequencies_and_jacobian(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
+        if !self.effects().is_empty() {
+            let response = self.respond(theta, self.modes(), &[], &[])?;
+            return Ok((response.frequencies_hz, response.by_parameter));
+        }
+        match self.model() {
+            SimulationModel::Matrices { structure, bindings } => {
+                let structure = structure_at(structure, bindings, theta)?;
+                let modes = modes(&structure, self.modes())?;
+                let sensitivity = frequency_sensitivity(&structure, &modes);
+                let jacobian = chained(&sensitivity.by_spring, bindings, theta);
+                Ok((modes.frequencies_hz, jacobian))
+            }
+            SimulationModel::Table(table) => {
+                let (mut frequencies, jacobian) = table.frequencies_and_jacobian(theta);
+                frequencies.truncate(self.modes());
+                Ok((frequencies, jacobian.rows(0, self.modes()).into_owned()))
+            }
+        }
+    }
+
+    /// The lowest `modes` frequencies at parameters `theta` (`[d]`) under the effects of the structure file and the further effects
+    /// `targets`, and their derivatives with respect to the parameters and to the sizes `sizes` of the further effects.
+    ///
+    /// # Errors
+    /// As [`Self::frequencies_hz`] and [`respond`].
+    pub fn respond(
+        &self,
+        theta: &[f64],
+        modes: usize,
+        targets: &[Target],
+        sizes: &[f64],
+    ) -> Result<Response, physics::Error> {
+        let own: usize = self.sizes.len();
+        let targets: Vec<Target> = self.effects().iter().map(|e| &e.target).chain(targets).cloned().collect();
+        let sizes: Vec<f64> = self.sizes.iter().chain(sizes).copied().collect();
+        let (targets, sizes) = (targets.as_slice(), sizes.as_slice());
+        let mut theta = theta.to_vec();
+        let mut set_scale = vec![1.0; theta.len()];
+        let mut first = 0;
+        for target in targets {
+            match target {
+                Target::SettingOffset(column) => theta[*column] += sizes[first],
+                Target::SettingScale(column) | Target::ParameterScale(column) => {
+                    theta[*column] *= 1.0 + sizes[first];
+                    set_scale[*column] *= 1.0 + sizes[first];
+                }
+                _ => {}
+            }
+            first += target.sizes();
+        }
+        let (frequencies_hz, mut by_parameter, mut by_size) = match self.model() {
+            SimulationModel::Matrices { structure, bindings } => {
+                let response = respond(&structure_at(structure, bindings, &theta)?, modes, targets, sizes)?;
+                let by_parameter = chained(&response.by_spring, bindings, &theta);
+                (response.frequencies_hz, by_parameter, response.by_size)
+            }
+            SimulationModel::Table(table) => {
+                let (frequencies, jacobian) = table.frequencies_and_jacobian(&theta);
+                let measured = measured(&frequencies, &jacobian, modes, targets, sizes)?;
+                (measured.frequencies_hz, measured.by_parameter, measured.by_size)
+            }
+        };
+        first = 0;
+        for target in targets {
+            for mode in 0..modes {
+                match target {
+                    Target::SettingOffset(column) => by_size[(mode, first)] = by_parameter[(mode, *column)],
+                    Target::SettingScale(column) | Target::ParameterScale(column) => {
+                        by_size[(mode, first)] = by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
+                    }
+                    _ => {}
+                }
+            }
+            first += target.sizes();
+        }
+        for (column, scale) in set_scale.iter().enumerate() {
+            by_parameter.column_mut(column).scale_mut(*scale);
+        }
+        let by_size = by_size.columns(own, sizes.len() - own).into_owned();
+        Ok(Response { frequencies_hz, by_parameter, by_size })
+    }
+
+    /// Natural frequencies at the nominal stiffnesses, or in the middle of the prior of a table, Hz, `[m]`.
+    pub fn nominal_frequencies_hz(&self) -> Vec<f64> {
+        self.parts.checked.nominal_frequencies_hz.clone()
+    }
+
+    /// Smallest and largest plausible measured frequency, Hz: the nominal range, widened by a factor of 100 on both sides. Values
+    /// outside are a wrong unit or a wrong column.
+    ///
+    /// rad/s instead of Hz is still accepted here and recognised later from the posterior.
+    pub fn frequency_limits_hz(&self) -> (f64, f64) {
+        let nominal = self.nominal_frequencies_hz();
+        let first = nominal.first().copied().unwrap_or(f64::MIN_POSITIVE);
+        let last = nominal.last().copied().unwrap_or(f64::MAX);
+        (first / FREQUENCY_MARGIN, last * FREQUENCY_MARGIN)
+    }
+
+    /// The springs that a parameter sets through a law. Their stiffness is monitored in addition to the parameter.
+    pub fn derived_stiffnesses(&self) -> Vec<DerivedStiffness> {
+        let derived = |binding: &Binding| {
+            let name = format!("spring:{}", self.structure()?.springs()[binding.spring].name);
+            Some(DerivedStiffness { name, parameter: binding.parameter, law: binding.law? })
+        };
+        self.bindings().iter().filter_map(derived).collect()
+    }
+
+    /// Relative change of stiffness per unit of a parameter, d ln k/dp, for the first stiffness that the parameter sets.
+    ///
+    /// A parameter that sets no stiffness is treated as the stiffness itself, 1/p. If its prior includes 0, this is undefined,
+    /// and one over the width of the prior is returned instead.
+    pub fn stiffness_share(&self, column: usize, p: f64) -> f64 {
+        let binding = self.bindings().iter().find(|b| b.parameter == column);
+        let parameter = &self.space().as_slice()[column];
+        let of_itself = if parameter.has_share() { 1.0 / p } else { 1.0 / (parameter.upper - parameter.lower) };
+        binding.map_or(of_itself, |b| b.slope(p) / b.stiffness(p))
+    }
+
+    /// Name of each parameter that sets several springs together, with the indices of these springs.
+    pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
+        let group = |(column, parameter): (usize, &Parameter)| {
+            let bindings = self.bindings().iter().filter(|b| b.parameter == column);
+            let springs: Vec<usize> = bindings.map(|b| b.spring).collect();
+            (springs.len() > 1).then(|| (parameter.name.clone(), springs))
+        };
+        self.space().iter().enumerate().filter_map(group).collect()
+    }
+}

@@ -1,0 +1,21 @@
+//! The last test binary by name, so that its output stands at the end of `cargo test`: which tests were skipped, and why.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
+#[allow(dead_code, reason = "the tests that need something use the rest")]
+mod needs;
+
+use std::io::Write as _;
+
+#[test]
+fn in_ci_no_tool_is_missing_and_every_skipped_test_is_named_here() {
+    let skipped = needs::skipped();
+    // Written past the harness, which shows what a test prints only where it fails.
+    let mut out = std::io::stderr().lock();
+    writeln!(out, "\n{} tests were skipped, wholly or in part:", skipped.len()).unwrap();
+    for line in &skipped {
+        writeln!(out, "  {line}").unwrap();
+    }
+    let missing: Vec<&String> = skipped.iter().filter(|line| line.contains(".ci/tools")).collect();
+    assert!(!needs::in_ci() || missing.is_empty(), "CI=true, and tools are missing: {missing:?}");
+}
