@@ -7,7 +7,7 @@ use tokio::sync::oneshot;
 use tracing::Instrument as _;
 
 use super::assessor::{Assessor, Computed, Finished, Task};
-use super::compute::{Place as QueuePlace, QueueFull};
+use super::compute::{Place, QueueFull};
 use super::error::{Error, IngestError};
 use super::records::{BatchView, Records};
 use super::replay::Replay;
@@ -37,7 +37,7 @@ pub struct Ingested {
 /// The computation for a batch while it was being stored.
 enum Begun {
     Computed(Box<Computed>),
-    Not(QueuePlace),
+    Not(Place),
 }
 
 /// Takes batches: checks, stores and assesses them.
@@ -106,7 +106,7 @@ impl Ingest {
     }
 
     /// Runs in a task of its own, so that a client that goes away does not interrupt it.
-    async fn take_with(&self, batch: MeasurementBatch, place: QueuePlace) -> Result<Ingested, IngestError> {
+    async fn take_with(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let (ingest, structure) = (self.clone(), batch.structure.clone());
         let task = tokio::spawn(async move { ingest.take_here(batch, place).await }.in_current_span());
         task.await.unwrap_or_else(|_| {
@@ -116,7 +116,7 @@ impl Ingest {
         })
     }
 
-    async fn take_here(&self, batch: MeasurementBatch, place: QueuePlace) -> Result<Ingested, IngestError> {
+    async fn take_here(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());

@@ -81,7 +81,7 @@ pub struct QuantityMark {
 /// An alarm chart over a window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartSeries {
-    /// The parameter, or [`crate::alarm::chart::FIT_SERIES`].
+    /// The parameter, or `simulation:fit`.
     pub chart: String,
     /// Points by the time of the last measurement of their batch. The values are the shift and the moving average.
     pub points: Reduced<ChartMark>,
