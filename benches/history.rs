@@ -3,7 +3,7 @@
 //! - `queries`: pages of history, the overview of a thousand structures, a plot of a hundred thousand batches; over loopback, by
 //!   the program itself, on a database of `MODALWATCH_BENCH_BATCHES` batches (1 000 000), which is made first and removed
 //!   afterwards. Half of them are of one structure.
-//! - `replay`: stored batches assessed again after a new undamaged state, on one thread and on all.
+//! - `replay`: stored batches assessed again after a new undamaged reference, on one thread and on all.
 //!
 //! Arguments after `--`: which of these (both without).
 
@@ -287,7 +287,7 @@ async fn replay(threads: usize) -> f64 {
         .replay()
         .declare_reference(&structure, first.into_iter().collect(), 0.05)
         .await
-        .expect("an undamaged state");
+        .expect("an undamaged reference");
     let waiting = async || !monitor.store().batches().pending(&structure, 1).await.expect("an answer").is_empty();
     while waiting().await {
         tokio::time::sleep(Duration::from_millis(5)).await;

@@ -95,7 +95,7 @@ impl Service {
         response.json().await.expect("the answer is whole")
     }
 
-    /// Declares a first batch as the undamaged state.
+    /// Declares a first batch as the undamaged reference.
     async fn declare_undamaged(&self) {
         let batch = self.post(&batches(ASSESSED), body("undamaged", 0, LARGE)).await;
         let declared = json!({ "batches": [batch["batch"]] }).to_string().into_bytes();

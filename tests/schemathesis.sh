@@ -26,7 +26,7 @@ finish() {
 }
 trap finish EXIT
 
-# The paper's case 1: five batches, an undamaged state, alarms.
+# The paper's case 1: five batches, an undamaged reference, alarms.
 "$program" demo --exit --listen 127.0.0.1:0 --data-dir "$folder/data" > "$folder/demo.log" 2>&1 || {
     cat "$folder/demo.log"
     exit 1

@@ -156,7 +156,7 @@ mod tests {
         let settings = AlarmSettings { mean_run_batches: 150.0, ..AlarmSettings::default() };
         let situation = Situation { shared: 0.1, degrees_of_freedom: 99, charts: 2 };
         let found = detection(situation, &limits(situation, &settings), &settings, 3, 7);
-        // Runs are longer than wanted where the undamaged state is not known well (a share of 0.1 here), never shorter; 400
+        // Runs are longer than wanted where the undamaged reference is not known well (a share of 0.1 here), never shorter; 400
         // runs are known to 5 to 7 %.
         assert!((0.85..2.0).contains(&(found.healthy_run_batches / 150.0)), "{}", found.healthy_run_batches);
         let within: Vec<f64> = found.curve.iter().map(|p| p.within).collect();

@@ -200,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn with_a_perfectly_known_undamaged_state_the_limit_is_the_normal_quantile() {
+    fn with_a_perfectly_known_undamaged_reference_the_limit_is_the_normal_quantile() {
         let situation = Situation { shared: 0.0, degrees_of_freedom: 1_000_000, charts: 1 };
         let found = limits(situation, &settings(200.0)).single;
         let run = 1.0 / stats::normal_cdf(-found);
@@ -209,14 +209,14 @@ mod tests {
     }
 
     #[test]
-    fn limits_widen_with_charts_and_with_a_small_undamaged_state() {
+    fn limits_widen_with_charts_and_with_a_small_undamaged_reference() {
         let limit = |shared, degrees_of_freedom, charts| {
             limits(Situation { shared, degrees_of_freedom, charts }, &settings(300.0)).single
         };
         let easy = limit(0.0, 10_000, 1);
         assert!(limit(0.0, 10_000, 5) > easy + 0.2);
         assert!(limit(0.0, 9, 1) > easy + 0.2);
-        // The less is known of the undamaged state, the wider.
+        // The less is known of the undamaged reference, the wider.
         let by_size: Vec<f64> = [(0.0, 1_000), (0.2, 120), (0.5, 29), (0.9, 9)].map(|(s, d)| limit(s, d, 2)).into();
         assert!(by_size.windows(2).all(|pair| pair[1] > pair[0]), "{by_size:?}");
     }

@@ -8,7 +8,7 @@ use crate::alarm::chart::{self, fit_settings, ChartPoint, FIT_SERIES};
 use crate::alarm::limits::LimitCurve;
 use crate::alarm::AlarmSettings;
 use crate::baseline::Baseline;
-use crate::damage::{UndamagedQuantity, UndamagedState};
+use crate::damage::{UndamagedQuantity, UndamagedReference};
 use crate::parameter::DamageDirection;
 use crate::trust::{FindingCode, FindingEffect};
 
@@ -39,7 +39,7 @@ pub struct KnownLimits {
 
 impl KnownLimits {
     /// Simulates the limits that batches compared with this reference will need, before one of them waits for it.
-    pub fn prepare(&self, baseline: &Baseline, state: &UndamagedState, settings: &AlarmSettings) {
+    pub fn prepare(&self, baseline: &Baseline, state: &UndamagedReference, settings: &AlarmSettings) {
         let charted = charted(baseline, state);
         for (quantity, _) in &charted {
             self.get(quantity.reference.degrees_of_freedom, charted.len(), settings);
@@ -63,7 +63,7 @@ impl KnownLimits {
 pub fn chart_points(
     baseline: &Baseline,
     assessment: &Assessment,
-    undamaged: Option<&UndamagedState>,
+    undamaged: Option<&UndamagedReference>,
     settings: &AlarmSettings,
     known: &KnownLimits,
 ) -> Vec<NewChartPoint> {
@@ -107,7 +107,7 @@ fn fit_point(assessment: &Assessment, settings: &AlarmSettings) -> Option<NewCha
 
 /// Parameters and groups with a damage direction. A spring that follows a parameter is left out, because its chart would only
 /// repeat that of the parameter.
-fn charted<'a>(baseline: &Baseline, state: &'a UndamagedState) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
+fn charted<'a>(baseline: &Baseline, state: &'a UndamagedReference) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
     let (space, groups) = (baseline.space(), baseline.groups());
     let direction = |name: &str| {
         let column = match groups.iter().find(|group| group.name == name) {

@@ -6,7 +6,7 @@ use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Draws, Error};
 use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
-use crate::damage::{self, QuantityKind, UndamagedState};
+use crate::damage::{self, QuantityKind, UndamagedReference};
 use crate::measurement::ModalMeasurement;
 use crate::posterior::PosteriorSamples;
 use crate::quantity::{Hertz, Timestamp};
@@ -20,7 +20,7 @@ const MUCH_MASS: f64 = 0.05;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Context<'a> {
     /// The undamaged reference.
-    pub undamaged: Option<&'a UndamagedState>,
+    pub undamaged: Option<&'a UndamagedReference>,
     /// Frequencies of the last measurement of the same source before the batch, `[modes]`.
     pub previous: Option<&'a [Option<Hertz>]>,
 }

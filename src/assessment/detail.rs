@@ -2,7 +2,7 @@
 
 use super::samples::{BatchSamples, Error};
 use crate::baseline::Baseline;
-use crate::damage::UndamagedState;
+use crate::damage::UndamagedReference;
 use crate::measurement::ModalMeasurement;
 use crate::parameter::Parameter;
 use crate::plot::density;
@@ -80,7 +80,7 @@ pub fn detail(
     measurements: &[ModalMeasurement],
     samples: &BatchSamples,
     per_measurement: usize,
-    undamaged: Option<&UndamagedState>,
+    undamaged: Option<&UndamagedReference>,
 ) -> Result<BatchDetail, Error> {
     let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
     let parameter = |(column, parameter): (usize, &Parameter)| {

@@ -4,7 +4,7 @@ use super::conditions::conditions;
 use super::quantities::monitored_quantities;
 use super::samples::{draw, joined, Draws, Error};
 use crate::baseline::Baseline;
-use crate::damage::{self, UndamagedState};
+use crate::damage::{self, UndamagedReference};
 use crate::measurement::ModalMeasurement;
 use crate::trust::{FindingEffect, Trust};
 
@@ -36,11 +36,11 @@ pub enum ReferenceError {
 ///
 /// # Errors
 /// [`ReferenceError`].
-pub fn undamaged_state(
+pub fn undamaged_reference(
     baseline: &Baseline,
     batches: &[(&[ModalMeasurement], Draws)],
     threshold_probability: f64,
-) -> Result<UndamagedState, ReferenceError> {
+) -> Result<UndamagedReference, ReferenceError> {
     let (mut parts, mut sizes) = (Vec::new(), Vec::new());
     for (batch, (measurements, draws)) in batches.iter().enumerate() {
         let samples =
@@ -59,7 +59,7 @@ pub fn undamaged_state(
     };
     let samples = joined(baseline, parts, *draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
     let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
-    let mut state = UndamagedState::from_samples(&quantities, &sizes, threshold_probability)?;
+    let mut state = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
     state.conditions = conditions(batches.iter().flat_map(|(measurements, _)| *measurements));
     Ok(state)
 }

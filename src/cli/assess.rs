@@ -52,7 +52,7 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let draws = |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), model.digest()));
     let undamaged_draws = draws(&undamaged_batch);
     let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
-    let mut undamaged = assessment::undamaged_state(&model, &batches, args.threshold_probability)
+    let mut undamaged = assessment::undamaged_reference(&model, &batches, args.threshold_probability)
         .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
     let context = assessment::Context { undamaged: Some(&undamaged), previous: None };

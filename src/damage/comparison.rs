@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::pool::{Hyperparameters, QuantityKind, QuantitySamples};
-use super::reference::{UndamagedQuantity, UndamagedState};
+use super::reference::{UndamagedQuantity, UndamagedReference};
 use super::threshold::{probability_of_damage, threshold};
 use crate::hierarchy::{interval, PopulationEstimate};
 use crate::parameter::DamageDirection;
@@ -61,7 +61,7 @@ pub struct QuantityAssessment {
 }
 
 /// Assesses each quantity, and compares it with the undamaged reference if there is one.
-pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedState>) -> Vec<QuantityAssessment> {
+pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedReference>) -> Vec<QuantityAssessment> {
     let one = |sample: &QuantitySamples| {
         let population = &sample.population;
         let damage = undamaged.filter(|_| sample.group.is_none()).and_then(|state| compare(sample, state));
@@ -82,7 +82,7 @@ pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedState>) -
     samples.par_iter().map(one).collect()
 }
 
-fn compare(sample: &QuantitySamples, state: &UndamagedState) -> Option<Damage> {
+fn compare(sample: &QuantitySamples, state: &UndamagedReference) -> Option<Damage> {
     let reference = state.quantities.iter().find(|q| q.name == sample.name)?;
     let threshold_here = reference.threshold?;
     let pooled_probability = probability_of_damage(&sample.pool, reference.pooled_threshold?, sample.damage)?;

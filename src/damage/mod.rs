@@ -23,5 +23,7 @@ mod threshold;
 
 pub use comparison::{assess, Damage, QuantityAssessment};
 pub use pool::{Hyperparameters, QuantityKind, QuantitySamples};
-pub use reference::{ChartReference, Error, SeenCovariate, UndamagedQuantity, UndamagedState, MINIMUM_MEASUREMENTS};
+pub use reference::{
+    ChartReference, Error, SeenCovariate, UndamagedQuantity, UndamagedReference, MINIMUM_MEASUREMENTS,
+};
 pub use threshold::{probability_of_damage, threshold};

@@ -57,7 +57,7 @@ pub struct ChartReference {
 
 /// The undamaged reference of a structure, which batches are compared with; a version never changes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct UndamagedState {
+pub struct UndamagedReference {
     /// Version, from 1.
     pub version: u32,
     /// p of the threshold; a batch whose probability of damage is larger exceeds it.
@@ -113,7 +113,7 @@ const CONTAMINATION_LEVEL: f64 = 0.001;
 /// Significance level at which the scatter between batches enters the charts.
 const BETWEEN_LEVEL: f64 = 0.01;
 
-impl UndamagedState {
+impl UndamagedReference {
     /// The undamaged reference from the samples of several batches, pooled batch after batch; `sizes` are the numbers of
     /// measurements of the batches, `probability` is p of the threshold. The version is 0 until it is stored.
     ///

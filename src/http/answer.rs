@@ -7,7 +7,7 @@ use super::cell::{Cell, ColumnKind};
 use crate::assessment::{Assessment, BatchState};
 use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
-use crate::monitor::stored::{BatchRecord, HistoryEntry, StoredChartPoint, UndamagedRecord};
+use crate::monitor::stored::{BatchRecord, HistoryEntry, ReferenceRecord, StoredChartPoint};
 use crate::monitor::{BatchView, Missing};
 use crate::quantity::{StructureId, Timestamp};
 use crate::trust::{Finding, TrustVerdict};
@@ -363,7 +363,7 @@ pub struct Undamaged {
 
 impl Undamaged {
     /// The answer for an undamaged reference.
-    pub fn new(structure: &crate::quantity::StructureId, record: &UndamagedRecord) -> Self {
+    pub fn new(structure: &crate::quantity::StructureId, record: &ReferenceRecord) -> Self {
         Self {
             structure: structure.to_string(),
             version: record.state.version,

@@ -13,7 +13,7 @@ use super::error::ApiError;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
-use crate::damage::{QuantityKind, UndamagedState};
+use crate::damage::{QuantityKind, UndamagedReference};
 use crate::measurement::CovariateKind;
 use crate::monitor::stored::{
     ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
@@ -255,7 +255,7 @@ fn frequencies(measured: Reduced<()>, nominal_hz: Vec<f64>, covariates: &[String
     Ok(Frequencies { modes, nominal_hz, times, values_hz, covariates })
 }
 
-fn track(series: QuantitySeries, undamaged: Option<&UndamagedState>) -> Result<Track, ApiError> {
+fn track(series: QuantitySeries, undamaged: Option<&UndamagedReference>) -> Result<Track, ApiError> {
     let state = undamaged.and_then(|state| state.quantities.iter().find(|q| q.name == series.name));
     let rows = series.batches.rows;
     let [mean, probability_of_damage] = columns(&rows);

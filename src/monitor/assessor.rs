@@ -15,9 +15,9 @@ use super::settings::MonitorSettings;
 use super::structures::{ActiveStructure, ActiveStructures};
 use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, KnownLimits, NewChartPoint};
 use crate::baseline::{assessment_seed, Baseline};
-use crate::damage::UndamagedState;
+use crate::damage::UndamagedReference;
 use crate::quantity::{shown, Hertz, StructureId, Timestamp};
-use crate::store::{BatchRecord, Store, StoredAssessment, StoredChartPoint, UndamagedRecord};
+use crate::store::{BatchRecord, ReferenceRecord, Store, StoredAssessment, StoredChartPoint};
 
 /// A batch to assess, and what it is assessed with.
 pub(super) struct Task {
@@ -85,7 +85,7 @@ impl Task {
     }
 
     /// Whether the batch is compared with an undamaged reference: one made with the same trained baseline and without the batch.
-    fn is_comparable(&self, undamaged: &UndamagedRecord) -> bool {
+    fn is_comparable(&self, undamaged: &ReferenceRecord) -> bool {
         undamaged.model_digest == *self.baseline.digest() && !undamaged.batches.contains(&self.record.batch_id)
     }
 }
@@ -149,7 +149,7 @@ impl Assessor {
             (Arc::clone(&task.baseline), Arc::clone(&task.record), Arc::clone(&task.previous));
         let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
         let work = move || {
-            let undamaged: Option<&UndamagedState> = undamaged.as_deref().map(|record| &record.state);
+            let undamaged: Option<&UndamagedReference> = undamaged.as_deref().map(|record| &record.state);
             let context = Context { undamaged, previous: previous.as_deref() };
             let measurements = &record.batch.measurements;
             let assessment = assessment::assess(&baseline, measurements, context, draws, Timestamp::now())?;

@@ -10,7 +10,7 @@ use crate::quantity::{Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
     BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, MeasurementQuery, QuantitySeries,
-    SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark, UndamagedRecord,
+    ReferenceRecord, SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
 };
 
 /// A batch with its results.
@@ -102,7 +102,7 @@ impl Records {
     ///
     /// # Errors
     /// [`Error::Store`].
-    pub async fn reference(&self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+    pub async fn reference(&self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
         Ok(self.assessor.store.reference().undamaged(structure).await?)
     }
 

@@ -7,9 +7,9 @@ use tracing::{info, warn};
 use super::assessor::Assessor;
 use super::compute::Place;
 use super::error::{DeclareError, Error};
-use crate::assessment::{undamaged_state, Draws, ReferenceError};
+use crate::assessment::{undamaged_reference, Draws, ReferenceError};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::UndamagedRecord;
+use crate::store::ReferenceRecord;
 
 /// Makes undamaged references.
 pub(super) struct References {
@@ -67,7 +67,7 @@ impl References {
         batch_ids: Vec<String>,
         threshold_probability: f64,
         place: Place,
-    ) -> Result<Arc<UndamagedRecord>, DeclareError> {
+    ) -> Result<Arc<ReferenceRecord>, DeclareError> {
         let Assessor { store, structures, events, alarms, .. } = &*self.assessor;
         let baseline = structures.get(structure)?.trained_baseline()?;
         let mut records = Vec::new();
@@ -84,7 +84,7 @@ impl References {
             .run(move || {
                 let batches: Vec<_> =
                     records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
-                let state = undamaged_state(&baseline, &batches, threshold_probability)?;
+                let state = undamaged_reference(&baseline, &batches, threshold_probability)?;
                 known_limits.prepare(&baseline, &state, &settings);
                 Ok(state)
             })

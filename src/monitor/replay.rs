@@ -19,7 +19,7 @@ use super::own_task::in_own_task;
 use super::references::References;
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
-use crate::store::{self, UndamagedRecord};
+use crate::store::{self, ReferenceRecord};
 
 /// Pause between two attempts to store results that could not be stored, for example on a full disk.
 const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
@@ -69,7 +69,7 @@ impl Replay {
         structure: &StructureId,
         batch_ids: Vec<String>,
         threshold_probability: f64,
-    ) -> Result<Arc<UndamagedRecord>, DeclareError> {
+    ) -> Result<Arc<ReferenceRecord>, DeclareError> {
         let (replay, structure) = (self.clone(), structure.clone());
         let place = self.assessor.compute.reserve().map_err(Error::from)?;
         in_own_task(async move {

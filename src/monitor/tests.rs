@@ -198,7 +198,7 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
         }
         tokio::time::sleep(std::time::Duration::from_millis(50)).await;
     }
-    panic!("the comparison with the undamaged state is not the current assessment");
+    panic!("the comparison with the undamaged reference is not the current assessment");
 }
 
 /// Batches that are assessed again.

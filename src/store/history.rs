@@ -175,9 +175,8 @@ impl History<'_> {
                and (q.model_digest, q.undamaged_version) = (
                    select model_digest, undamaged_version from assessment a
                    where a.structure_id = b.structure_id and a.batch_id = b.batch_id
-                   order by {} limit 1)
-             order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit $8",
-            CURRENT_FIRST
+                   order by {CURRENT_FIRST} limit 1)
+             order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit $8"
         );
         let rows: Vec<ExceedanceRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())

@@ -10,7 +10,7 @@ use sqlx::Connection as _;
 use super::file::APPLICATION_ID;
 use super::{schema_version, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
 use crate::assessment::Assessment;
-use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedState};
+use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedReference};
 use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 use crate::trust::Trust;
@@ -83,8 +83,8 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
     }
 }
 
-fn undamaged() -> UndamagedState {
-    UndamagedState {
+fn undamaged() -> UndamagedReference {
+    UndamagedReference {
         version: 0,
         threshold_probability: 0.05,
         measurements: 2,

@@ -11,14 +11,14 @@ use super::column::{bad_row, from_blob, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
 use super::transaction::Transaction;
-use crate::damage::{ChartReference, UndamagedQuantity, UndamagedState};
+use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// A stored undamaged reference.
 #[derive(Debug, Clone, PartialEq)]
-pub struct UndamagedRecord {
+pub struct ReferenceRecord {
     /// The reference.
-    pub state: UndamagedState,
+    pub state: UndamagedReference,
     /// Digest of the trained baseline with which it was computed.
     pub model_digest: Digest,
     /// When it was stored.
@@ -28,7 +28,7 @@ pub struct UndamagedRecord {
 }
 
 /// The newest undamaged references that were read, by structure.
-pub(super) type Newest = Mutex<BTreeMap<StructureId, Arc<UndamagedRecord>>>;
+pub(super) type Newest = Mutex<BTreeMap<StructureId, Arc<ReferenceRecord>>>;
 
 /// Undamaged references.
 #[derive(Clone, Copy)]
@@ -48,7 +48,7 @@ impl References<'_> {
     pub async fn insert_undamaged(
         self,
         structure: &StructureId,
-        state: &UndamagedState,
+        state: &UndamagedReference,
         model_digest: &Digest,
         batch_ids: &[String],
         now: Timestamp,
@@ -88,7 +88,7 @@ impl References<'_> {
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+    pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
         fault_point!("store::read", |_| Err(bad_row("undamaged reference")(&"a fault")));
         let (newest,): (Option<u32>,) =
             sqlx::query_as("select max(version) from undamaged_state where structure_id = $1")
@@ -111,18 +111,18 @@ impl References<'_> {
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn undamaged_as_read(self, structure: &StructureId) -> Result<Option<Arc<UndamagedRecord>>, Error> {
+    pub async fn undamaged_as_read(self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
         match self.known_undamaged(structure) {
             Some(record) => Ok(Some(record)),
             None => self.undamaged(structure).await,
         }
     }
 
-    fn known_undamaged(self, structure: &StructureId) -> Option<Arc<UndamagedRecord>> {
+    fn known_undamaged(self, structure: &StructureId) -> Option<Arc<ReferenceRecord>> {
         self.newest.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
     }
 
-    async fn read_undamaged(self, structure: &StructureId) -> Result<Option<UndamagedRecord>, Error> {
+    async fn read_undamaged(self, structure: &StructureId) -> Result<Option<ReferenceRecord>, Error> {
         let row: Option<(u32, String, i64, f64, i64, String, String)> = sqlx::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts
              from undamaged_state where structure_id = $1 order by version desc limit 1",
@@ -141,7 +141,7 @@ impl References<'_> {
         .bind(version)
         .fetch_all(&self.database.reader)
         .await?;
-        let quantities: Vec<UndamagedQuantityRow> = sqlx::query_as(
+        let quantities: Vec<ReferenceQuantityRow> = sqlx::query_as(
             "select quantity, mean, std, threshold, detail, mean_draws, std_draws from undamaged_quantity
              where structure_id = $1 and version = $2 order by position",
         )
@@ -151,8 +151,8 @@ impl References<'_> {
         .await?;
         let bad = bad_row("undamaged reference");
         let quantity = |row| quantity(row, measurements as usize);
-        Ok(Some(UndamagedRecord {
-            state: UndamagedState {
+        Ok(Some(ReferenceRecord {
+            state: UndamagedReference {
                 version,
                 threshold_probability,
                 measurements: measurements as usize,
@@ -177,7 +177,7 @@ fn to_json<T: Serialize>(value: &T) -> Result<String, Error> {
 async fn insert_state(
     transaction: &mut Transaction<'_>,
     (structure, version): Key<'_>,
-    state: &UndamagedState,
+    state: &UndamagedReference,
     model_digest: &Digest,
     now: Timestamp,
 ) -> Result<(), Error> {
@@ -261,7 +261,7 @@ async fn requeue(transaction: &mut Transaction<'_>, (structure, version): Key<'_
 }
 
 #[derive(FromRow)]
-struct UndamagedQuantityRow {
+struct ReferenceQuantityRow {
     quantity: String,
     mean: f64,
     std: f64,
@@ -271,7 +271,7 @@ struct UndamagedQuantityRow {
     std_draws: Option<Vec<u8>>,
 }
 
-fn quantity(row: UndamagedQuantityRow, measurements: usize) -> Result<UndamagedQuantity, Error> {
+fn quantity(row: ReferenceQuantityRow, measurements: usize) -> Result<UndamagedQuantity, Error> {
     let what = "undamaged quantity";
     let Some(detail) = row.detail else {
         // References of versions without the population model have no uncertainty.

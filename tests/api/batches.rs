@@ -69,7 +69,7 @@ async fn the_example_of_the_readme_is_taken() {
 }
 
 #[tokio::test]
-async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards() {
+async fn batches_from_before_the_undamaged_reference_are_compared_with_it_afterwards() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
     let damaged = service.post_batch("three-dof", &measurements([4.0, 4.0, 6.0], 20, 100_000)).await;
@@ -87,7 +87,7 @@ async fn batches_from_before_the_undamaged_state_are_compared_with_it_afterwards
 }
 
 #[tokio::test]
-async fn an_undamaged_state_declared_among_posts_misses_none_of_them() {
+async fn an_undamaged_reference_declared_among_posts_misses_none_of_them() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
     let bodies = (1..40).map(|i| json!({ "measurements": measurements([4.0, 5.0, 6.0], 5, i * 20_000) }));

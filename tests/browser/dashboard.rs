@@ -27,7 +27,7 @@ async fn post(service: &Service, k: [f64; 3], day: usize) -> String {
     answer["batch"].as_str().unwrap().to_owned()
 }
 
-/// An undamaged state, healthy days, a pause, a batch in another unit, and a loss of k1 that raises an alarm.
+/// An undamaged reference, healthy days, a pause, a batch in another unit, and a loss of k1 that raises an alarm.
 async fn watched_bridge(service: &Service) {
     let mut batches = vec![post(service, UNDAMAGED, 0).await, post(service, UNDAMAGED, 1).await];
     let baseline = json!({ "batches": batches });

@@ -20,7 +20,7 @@ fn database(folder: &Path) -> std::path::PathBuf {
     folder.join("modalwatch.sqlite")
 }
 
-/// A database with batches, assessments, an undamaged state and charts; and what was acknowledged.
+/// A database with batches, assessments, an undamaged reference and charts; and what was acknowledged.
 async fn filled(folder: &Path) -> Acknowledged {
     let mut service = Service::start(folder);
     let mut acknowledged = Acknowledged::default();

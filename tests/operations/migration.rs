@@ -52,7 +52,7 @@ fn content_digest(at_us: i64) -> String {
 }
 
 /// A database as a program with the first `schema` migrations left it, with rows of that time: a batch compared with an
-/// undamaged state.
+/// undamaged reference.
 #[expect(clippy::too_many_lines, reason = "one statement after another")]
 async fn of_schema(folder: &Path, schema: i64, (definition, digest): &(String, String)) {
     let options = database(folder).create_if_missing(true).foreign_keys(true);

@@ -202,7 +202,7 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
 }
 
 #[tokio::test]
-async fn a_reload_may_leave_the_undamaged_state_to_a_person() {
+async fn a_reload_may_leave_the_undamaged_reference_to_a_person() {
     let models = models();
     let folder = tempfile::tempdir().unwrap();
     let service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));

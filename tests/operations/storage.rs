@@ -127,7 +127,7 @@ async fn batches_are_deleted_only_where_it_was_asked_for_and_never_those_of_stat
     assert_eq!(all.len(), 10);
     let plan = service.read("/v1/retention").await;
     assert_eq!((&plan["measurements_days"], &plan["would_delete"]), (&json!(0), &json!([])), "{plan}");
-    // Of ten batches, two are the undamaged state and the damaged ones belong to the alarm that lasts.
+    // Of ten batches, two are the undamaged reference and the damaged ones belong to the alarm that lasts.
     let alarms = service.read("/v1/structures/three-dof/alarms").await;
     let opened = alarms["items"][0]["opened_batch"].as_str().unwrap().to_owned();
     let first_of_alarm = all.iter().position(|id| *id == opened).unwrap();

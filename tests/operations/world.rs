@@ -41,7 +41,7 @@ pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// A structure with an undamaged state, `later` batches of which the last are damaged, an acknowledged alarm and a maintenance
+/// A structure with an undamaged reference, `later` batches of which the last are damaged, an acknowledged alarm and a maintenance
 /// window.
 pub async fn with_past(service: &Service, later: usize) {
     let first = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;

@@ -139,7 +139,7 @@ async fn order_of_arrival_does_not_matter() {
 }
 
 #[tokio::test]
-async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_state_begins_anew() {
+async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_reference_begins_anew() {
     let (store, _folder) = opened().await;
     let window = MaintenanceWindow { from: at(1_500), to: at(2_500), reason: "bolts".to_owned() };
     store.alarms().insert_maintenance(&bridge(), window.clone(), at(0)).await.unwrap();

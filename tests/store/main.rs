@@ -171,7 +171,7 @@ async fn a_refused_batch_leaves_nothing_behind() {
 }
 
 #[tokio::test]
-async fn a_new_undamaged_state_sends_back_only_what_was_never_compared() {
+async fn a_new_undamaged_reference_sends_back_only_what_was_never_compared() {
     let (store, _folder) = open().await;
     let model = Digest::of(&[b"m"]);
     for (i, version) in [(0, None), (1, None), (2, Some(1))] {
@@ -204,8 +204,8 @@ async fn a_new_undamaged_state_sends_back_only_what_was_never_compared() {
     assert_eq!(store.reference().undamaged(&bridge()).await.unwrap().unwrap().state.version, 2);
 }
 
-fn undamaged() -> modalwatch::damage::UndamagedState {
-    modalwatch::damage::UndamagedState {
+fn undamaged() -> modalwatch::damage::UndamagedReference {
+    modalwatch::damage::UndamagedReference {
         version: 0,
         threshold_probability: 0.05,
         measurements: 2,

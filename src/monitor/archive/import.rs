@@ -38,7 +38,7 @@ pub struct Imported {
     pub batches: u64,
     /// Those of them that were new.
     pub batches_new: u64,
-    /// Undamaged states that were new.
+    /// Undamaged references that were new.
     pub undamaged_states: u64,
     /// Maintenance windows that were new.
     pub maintenance_windows: u64,
@@ -139,7 +139,7 @@ impl Import<'_> {
                     self.store_waiting().await?;
                 }
             }
-            Record::UndamagedState(state) => {
+            Record::UndamagedReference(state) => {
                 self.done.undamaged_states += u64::from(store.archive().import_undamaged(&structure, state).await?);
             }
             Record::Maintenance(window) => {

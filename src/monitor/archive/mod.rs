@@ -3,8 +3,6 @@
 //! An import stores what was measured and declared; the assessments are computed again. They are functions of measurements, trained
 //! baseline, undamaged reference and seed, all of which are in the archive, so they are the same to the last bit.
 
-#![expect(clippy::result_large_err, reason = "an import fails once, on a command line")]
-
 mod error;
 mod export;
 mod import;

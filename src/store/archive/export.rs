@@ -164,7 +164,7 @@ impl Archive<'_> {
                 batches: batches.into_iter().map(|(id,)| id).collect(),
                 quantities,
             };
-            records.send(Record::UndamagedState(state)).await.map_err(gone)?;
+            records.send(Record::UndamagedReference(state)).await.map_err(gone)?;
         }
         Ok(())
     }

@@ -33,7 +33,7 @@ pub enum Record {
     /// A batch.
     Batch(Batch),
     /// An undamaged reference.
-    UndamagedState(Undamaged),
+    UndamagedReference(Undamaged),
     /// A maintenance window.
     Maintenance(Maintenance),
     /// An acknowledgement of an alarm.
