@@ -1,4 +1,5 @@
-//! Values exchanged over HTTP, SQL or files. Their constructors check them, so that every existing value is valid.
+//! Quantities and identifiers that are exchanged over HTTP, SQL or files. Their constructors check them, so that every existing
+//! value is valid.
 
 use std::fmt;
 
@@ -8,7 +9,7 @@ use sha2::{Digest as _, Sha256};
 
 /// A value is outside the valid range of its quantity.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{value} {unit} is no {quantity}: it must be {must}")]
+#[error("{value} {unit} is not a valid {quantity}: it must be {must}")]
 pub struct OutOfRange {
     /// Name of the quantity.
     pub quantity: &'static str,
@@ -67,7 +68,7 @@ impl Probability {
         })
     }
 
-    /// The value.
+    /// The probability, in [0, 1].
     pub const fn get(self) -> f64 {
         self.0
     }
@@ -230,7 +231,7 @@ impl fmt::Display for Digest {
     }
 }
 
-/// Text from a client in quotation marks, for a message: at most 80 characters, with control characters escaped.
+/// Text from a client as it is shown in a message: in quotation marks, cut to 80 characters, with control characters escaped.
 pub fn shown(text: &str) -> String {
     let mut short: String = text.chars().take(80).flat_map(char::escape_debug).collect();
     if text.chars().nth(80).is_some() {

@@ -120,7 +120,7 @@ impl Series {
         settings.window.max(settings.recovery)
     }
 
-    /// Takes the next point.
+    /// Adds the next point of the series and returns the status after it.
     pub fn take(&mut self, point: &ChartPoint) -> ChartStatus {
         if point.held {
             return ChartStatus { ewma: self.ewma, above: false, state: self.state };
@@ -142,7 +142,7 @@ impl Series {
             true if lasting || near >= self.settings.needed => Event::Confirmed,
             true => Event::Exceeds,
             false if clear >= self.settings.recovery => Event::Cleared,
-            // A single point that no other confirmed ends when it leaves the window.
+            // A point above the limit that no other point confirmed has no effect any more once it has left the window.
             false if near == 0 && !self.state.in_episode() => Event::Cleared,
             false => Event::Clears,
         };

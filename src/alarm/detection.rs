@@ -93,7 +93,7 @@ pub fn detection(
         let one = |operation: usize| {
             let mut stream = stats::stream(seed, &format!("damaged operation {operation}, shift {shift}"));
             let mut operation = Operation::new(situation, settings, &mut stream);
-            // An operation with an alarm before the damage does not tell whether the damage is detected.
+            // An operation with an alarm before the damage is left out, because it does not show whether the damage is detected.
             let quiet = (0..BEFORE).all(|_| !operation.next(0.0, limits, &mut stream));
             quiet.then(|| {
                 (1..=LONGEST_WAIT).find(|_| operation.next(shift, limits, &mut stream)).unwrap_or(LONGEST_WAIT)

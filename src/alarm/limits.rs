@@ -18,7 +18,8 @@ const MOST_OPERATIONS: usize = 10_000;
 /// Batches simulated in total, over operations and charts.
 const BATCHES: usize = 6_000_000;
 
-/// Shifts are clipped at this value before they enter the moving average: a single extreme batch is left to the limit of one shift.
+/// Shifts are clipped at this value before they enter the moving average, because a single extreme batch is already detected by the
+/// limit of a single shift.
 pub const CLIP: f64 = 4.0;
 
 /// Charts of one structure that are simulated together; a structure with more is treated as several structures.
@@ -41,9 +42,9 @@ pub struct Situation {
 /// The limits of a chart.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
-    /// Of a single shift, in standard errors.
+    /// Limit of a single shift, in standard errors.
     pub single: f64,
-    /// Of the moving average of the shifts, in standard errors.
+    /// Limit of the moving average of the shifts, in standard errors; infinite without a moving average.
     pub ewma: f64,
 }
 
@@ -110,12 +111,12 @@ impl LimitCurve {
     /// The limits where a share ρ of the variance comes from the undamaged reference: cubic interpolation in θ through the four
     /// nearest simulated nodes, mirrored at θ = 0, because e and −e are equivalent.
     pub fn at(&self, shared: f64) -> Limits {
-        let place = shared.clamp(0.0, 1.0).sqrt().asin() / FRAC_PI_2 * (NODES - 1) as f64;
-        let first = (place as isize - 1).min(NODES as isize - 4);
+        let position = shared.clamp(0.0, 1.0).sqrt().asin() / FRAC_PI_2 * (NODES - 1) as f64;
+        let first = (position as isize - 1).min(NODES as isize - 4);
         let about = [0, 1, 2, 3].map(|k| first + k);
         let weights = about.map(|a| {
             let others = about.iter().filter(|b| **b != a);
-            others.map(|&b| (place - b as f64) / (a - b) as f64).product::<f64>()
+            others.map(|&b| (position - b as f64) / (a - b) as f64).product::<f64>()
         });
         let unshared = &self.nodes[0];
         let cubic = |of: fn(&Limits) -> f64| {
@@ -216,7 +217,7 @@ mod tests {
         let easy = limit(0.0, 10_000, 1);
         assert!(limit(0.0, 10_000, 5) > easy + 0.2);
         assert!(limit(0.0, 9, 1) > easy + 0.2);
-        // The less is known of the undamaged reference, the wider.
+        // The less precisely the undamaged reference is known, the wider the limits.
         let by_size: Vec<f64> = [(0.0, 1_000), (0.2, 120), (0.5, 29), (0.9, 9)].map(|(s, d)| limit(s, d, 2)).into();
         assert!(by_size.windows(2).all(|pair| pair[1] > pair[0]), "{by_size:?}");
     }
@@ -260,8 +261,8 @@ mod tests {
             // Of the operations here and of those behind the limits.
             let error = (wanted * (1.0 - wanted) * (1.0 / operations as f64 + 1.0 / MOST_OPERATIONS as f64)).sqrt();
             // In the middle between those that are simulated.
-            for place in [0.5, 1.5, 2.5, 4.5, 7.5, 10.5, 13.5, 14.5] {
-                let shared = (place / (NODES - 1) as f64 * FRAC_PI_2).sin().powi(2);
+            for position in [0.5, 1.5, 2.5, 4.5, 7.5, 10.5, 13.5, 14.5] {
+                let shared = (position / (NODES - 1) as f64 * FRAC_PI_2).sin().powi(2);
                 let limits = curve.at(shared);
                 let situation = Situation { shared, degrees_of_freedom: 60, charts: 2 };
                 let found = early(situation, &limits, &settings, operations, 30);

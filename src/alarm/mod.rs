@@ -12,7 +12,7 @@ pub mod machine;
 
 use serde::{Deserialize, Serialize};
 
-/// Kinds of alarms.
+/// Names of the kinds of alarms, as stored and as used in the API.
 pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
 
 /// How alarms are raised.
@@ -21,9 +21,9 @@ pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silenc
 pub struct AlarmSettings {
     /// Target mean number of healthy batches to a false alarm, over all parameters of a structure (ARL0).
     pub mean_run_batches: f64,
-    /// Points above the limit that make an alarm …
+    /// Number of points above the limit, among the last `window` points, that raise an alarm.
     pub needed: usize,
-    /// … among this many consecutive points.
+    /// Number of consecutive points among which `needed` points must be above the limit.
     pub window: usize,
     /// Weight of the newest batch in the exponentially weighted moving average (EWMA), which detects small lasting losses; 0
     /// switches it off.

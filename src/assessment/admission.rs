@@ -78,8 +78,8 @@ impl Reservations {
                 FindingCode::NoiseBelowRange,
                 self.below_noise_range,
                 format!(
-                    "measurements state less noise than {} times the structure's, the least this baseline was trained for: that \
-                     least noise is used",
+                    "measurements state less noise than {} times that of the structure, the least that the trained baseline \
+                     covers: this least noise is used for them",
                     range[0]
                 ),
             ),
@@ -87,8 +87,8 @@ impl Reservations {
                 FindingCode::NoiseAboveRange,
                 self.above_noise_range,
                 format!(
-                    "measurements have modes with more noise than {} times the structure's, the most this baseline was trained \
-                     for: those modes are left out",
+                    "measurements have modes with more noise than {} times that of the structure, the most that the trained \
+                     baseline covers: those modes are left out",
                     range[1]
                 ),
             ),

@@ -12,7 +12,7 @@ use crate::damage::{UndamagedQuantity, UndamagedReference};
 use crate::parameter::DamageDirection;
 use crate::trust::{FindingCode, FindingEffect};
 
-/// Degrees of freedom from which the undamaged standard deviation is taken as known.
+/// From this number of degrees of freedom on, the undamaged standard deviation is treated as known exactly.
 const MANY_DEGREES: usize = 2_000;
 
 /// A batch on one chart, before its neighbours in time are known.
@@ -30,8 +30,8 @@ pub struct NewChartPoint {
     pub settings: AlarmSettings,
 }
 
-/// Limits found so far, by degrees of freedom and number of charts: their simulation keeps all cores busy for some hundredths of a
-/// second, during which batches would wait.
+/// Cache of simulated limits, by degrees of freedom and number of charts. A simulation keeps all cores busy for some hundredths of
+/// a second, during which batches would wait.
 #[derive(Default)]
 pub struct KnownLimits {
     found: Mutex<HashMap<(usize, usize), LimitCurve>>,
@@ -39,8 +39,8 @@ pub struct KnownLimits {
 
 impl KnownLimits {
     /// Simulates the limits that batches compared with this reference will need, before one of them waits for it.
-    pub fn prepare(&self, baseline: &Baseline, state: &UndamagedReference, settings: &AlarmSettings) {
-        let charted = charted(baseline, state);
+    pub fn prepare(&self, baseline: &Baseline, undamaged: &UndamagedReference, settings: &AlarmSettings) {
+        let charted = charted(baseline, undamaged);
         for (quantity, _) in &charted {
             self.get(quantity.reference.degrees_of_freedom, charted.len(), settings);
         }
@@ -68,8 +68,8 @@ pub fn chart_points(
     known: &KnownLimits,
 ) -> Vec<NewChartPoint> {
     let mut points: Vec<NewChartPoint> = fit_point(assessment, settings).into_iter().collect();
-    let Some(state) = undamaged.filter(|_| assessment.trust.accepted()) else { return points };
-    let charted = charted(baseline, state);
+    let Some(undamaged) = undamaged.filter(|_| assessment.trust.accepted()) else { return points };
+    let charted = charted(baseline, undamaged);
     for (reference, direction) in &charted {
         let Some(quantity) = assessment.quantities.iter().find(|q| q.name == reference.name) else { continue };
         let (mean, within, n) = (quantity.pooled.mean, quantity.pooled.within, assessment.measurements_used);
@@ -78,7 +78,7 @@ pub fn chart_points(
         let limits = curve.at(chart::shared(&reference.reference, within, n));
         points.push(NewChartPoint {
             series: reference.name.clone(),
-            undamaged_version: state.version,
+            undamaged_version: undamaged.version,
             point: ChartPoint::damage(shift, &limits, !assessment.trust.moves_charts()),
             probability_limit: chart::probability_limit(reference, limits.single, within, n),
             settings: *settings,
@@ -87,8 +87,8 @@ pub fn chart_points(
     points
 }
 
-/// The point on the chart of the fit; `None` for a batch that was rejected because of its data, such as a sensor that hangs, which
-/// says nothing about the simulation.
+/// The point on the chart of the fit; `None` for a batch that was rejected because of its data, such as a sensor that repeats an
+/// old value: it does not show whether the simulation fits.
 fn fit_point(assessment: &Assessment, settings: &AlarmSettings) -> Option<NewChartPoint> {
     let misfit = |code: FindingCode| {
         use FindingCode::{ModesShifted, ModesSwapped, SimulationDoesNotFit, UnitSuspected};
@@ -107,7 +107,10 @@ fn fit_point(assessment: &Assessment, settings: &AlarmSettings) -> Option<NewCha
 
 /// Parameters and groups with a damage direction. A spring that follows a parameter is left out, because its chart would only
 /// repeat that of the parameter.
-fn charted<'a>(baseline: &Baseline, state: &'a UndamagedReference) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
+fn charted<'a>(
+    baseline: &Baseline,
+    undamaged: &'a UndamagedReference,
+) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
     let (space, groups) = (baseline.space(), baseline.groups());
     let direction = |name: &str| {
         let column = match groups.iter().find(|group| group.name == name) {
@@ -116,5 +119,5 @@ fn charted<'a>(baseline: &Baseline, state: &'a UndamagedReference) -> Vec<(&'a U
         };
         Some(space.as_slice()[column].damage).filter(|d| *d != DamageDirection::None)
     };
-    state.quantities.iter().filter_map(|quantity| Some((quantity, direction(&quantity.name)?))).collect()
+    undamaged.quantities.iter().filter_map(|quantity| Some((quantity, direction(&quantity.name)?))).collect()
 }

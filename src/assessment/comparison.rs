@@ -13,7 +13,7 @@ use crate::quantity::{Hertz, Timestamp};
 use crate::stats;
 use crate::trust::{standing_findings, Finding, FindingCode, FindingEffect, Trust};
 
-/// Share of samples at the prior bounds, or where a table has no runs, above which a finding warns the reader.
+/// Share of samples at the prior bounds, or in regions where a table has no runs, above which a finding warns the reader.
 const MUCH_MASS: f64 = 0.05;
 
 /// What a batch is compared with, and what came before it.
@@ -25,7 +25,7 @@ pub struct Context<'a> {
     pub previous: Option<&'a [Option<Hertz>]>,
 }
 
-/// Assesses the measurements of one batch; `assessed_at` is the time that is noted in the assessment.
+/// Assesses the measurements of one batch; `assessed_at` is the time that is stored in the assessment.
 ///
 /// # Errors
 /// [`Error`], see its variants.
@@ -38,8 +38,8 @@ pub fn assess(
 ) -> Result<Assessment, Error> {
     let mut samples = draw(baseline, measurements, context.previous, draws)?;
     let mut findings = std::mem::take(&mut samples.findings);
-    if let Some(state) = context.undamaged {
-        findings.extend(compare_conditions(measurements, &state.conditions));
+    if let Some(undamaged) = context.undamaged {
+        findings.extend(compare_conditions(measurements, &undamaged.conditions));
     }
     findings.extend(standing_findings(baseline));
     let sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
@@ -58,7 +58,7 @@ pub fn assess(
     Ok(Assessment {
         model_digest: baseline.digest().clone(),
         structure_digest: baseline.simulator().digest().clone(),
-        undamaged_version: context.undamaged.map(|state| state.version),
+        undamaged_version: context.undamaged.map(|undamaged| undamaged.version),
         seed: draws.seed,
         draws_per_measurement: draws.per_measurement,
         measurements_used: samples.observations.len(),
@@ -98,11 +98,11 @@ fn beyond_runs(baseline: &Baseline, posterior: &PosteriorSamples, asked: &[Obser
 ///  100 · (mean measured f_i − f_i(x̄)) / mean measured f_i,    x̄ the mean of all posterior samples
 /// ```
 ///
-/// One simulation for each batch, so that structures with hundreds of degrees of freedom stay fast. The curvature of f over the
-/// spread of x adds about (σ/x)²/8, which is below 0.1 % for a spread of 8 %.
+/// Only one simulation is run for each batch, so that structures with hundreds of degrees of freedom stay fast. The curvature of f
+/// over the spread of x adds about (σ/x)²/8, which is below 0.1 % for a spread of 8 %.
 fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Option<f64>>, Error> {
     let theta: Vec<f64> = samples.posterior.theta().row_mean().iter().copied().collect();
-    // At the mean sizes of the effects.
+    // The simulation is evaluated at the mean sizes of the effects.
     let count = samples.observations.len() as f64;
     let known: Vec<&Vec<f64>> =
         samples.observations.iter().map(|o| &o.effect_sizes).filter(|s| !s.is_empty()).collect();

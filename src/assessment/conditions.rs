@@ -51,8 +51,8 @@ pub(super) fn compare_conditions(
         }
         if let Some(example) = example {
             let message = format!(
-                "conditions outside those of the undamaged reference ({example}): they alone may explain a change, so this batch \
-                 raises no alarm"
+                "the conditions are outside those of the undamaged reference ({example}) and may alone explain a change, so \
+                 this batch raises no alarm"
             );
             outside.push(Finding::new(FindingCode::Extrapolated, FindingEffect::HoldAlarm, message).of(rows));
         }
@@ -66,7 +66,7 @@ pub(super) fn compare_conditions(
     outside.into_iter().chain(missing)
 }
 
-/// A value outside what the reference has, in words.
+/// Describes a value that is outside the range or the categories of the reference; `None` if it is inside.
 fn difference(name: &str, value: &CovariateValue, seen: &SeenCovariate) -> Option<String> {
     match (value, seen) {
         (CovariateValue::Number(x), SeenCovariate::Range([low, high])) => {

@@ -29,11 +29,11 @@ const REACH: f64 = 4.5;
 pub struct BatchDetail {
     /// Digest of the trained baseline that drew the samples.
     pub model_digest: Digest,
-    /// Measurements of the batch.
+    /// Number of measurements of the batch.
     pub measurements: usize,
-    /// Those whose values are shown.
+    /// Measurements whose values are shown.
     pub shown: usize,
-    /// Posterior samples that were simulated.
+    /// Number of posterior samples that were simulated.
     pub simulations: usize,
     /// One entry for each parameter.
     pub parameters: Vec<ParameterDetail>,
@@ -84,8 +84,8 @@ pub fn detail(
 ) -> Result<BatchDetail, Error> {
     let pooled = samples.posterior.first(per_measurement.min(samples.posterior.draws()));
     let parameter = |(column, parameter): (usize, &Parameter)| {
-        let state = undamaged.and_then(|state| state.quantities.iter().find(|q| q.name == parameter.name));
-        let population = state.map(|q| (q.mean, q.std)).filter(|(_, std)| *std > 0.0);
+        let reference = undamaged.and_then(|undamaged| undamaged.quantities.iter().find(|q| q.name == parameter.name));
+        let population = reference.map(|q| (q.mean, q.std)).filter(|(_, std)| *std > 0.0);
         let pool = pooled.column(column);
         let grid = grid(parameter, &pool, population);
         let height = 1.0 / (parameter.upper - parameter.lower);
@@ -97,7 +97,7 @@ pub fn detail(
             // Samples that are all equal have no density.
             posterior: density::kernel_at(&pool, &grid).unwrap_or_else(|| vec![0.0; grid.len()]),
             undamaged: population.map(|(mean, std)| grid.iter().map(|x| density::normal(*x, mean, std)).collect()),
-            threshold: state.and_then(|q| q.threshold),
+            threshold: reference.and_then(|q| q.threshold),
             grid,
         }
     };

@@ -24,8 +24,9 @@ const NOISE_DOMINATED: f64 = 0.56;
 /// proposal is normal, and a posterior may be far from normal.
 const POSTERIOR_BETTER: f64 = 2.0;
 
-/// The population behind posterior samples: estimated from an importance proposal whose samples are weighted by their posterior
-/// density, or from `draws` samples of each posterior where those have the larger effective share; these are returned then.
+/// Estimates the population behind posterior samples, either from an importance proposal whose samples are weighted by their
+/// posterior density, or from `draws` samples of each posterior if these have the larger effective share. Returns the posterior
+/// samples, with those drawn in addition, and the population.
 ///
 /// # Errors
 /// [`InferenceError`] when the flow fails on further samples.

@@ -1,4 +1,4 @@
-//! The undamaged reference made from several batches.
+//! The undamaged reference that is computed from several batches.
 
 use super::conditions::conditions;
 use super::quantities::monitored_quantities;
@@ -8,7 +8,7 @@ use crate::damage::{self, UndamagedReference};
 use crate::measurement::ModalMeasurement;
 use crate::trust::{FindingEffect, Trust};
 
-/// Why batches make no undamaged reference; `batch` is the index of the batch responsible.
+/// Why no undamaged reference could be computed from batches; `batch` is the index of the batch responsible.
 #[derive(Debug, thiserror::Error)]
 pub enum ReferenceError {
     /// A batch could not be used at all.
@@ -27,12 +27,12 @@ pub enum ReferenceError {
         /// What was found in it.
         reason: String,
     },
-    /// Together they are not enough.
+    /// The batches together have too few measurements, or the threshold probability is invalid.
     #[error(transparent)]
     State(#[from] damage::Error),
 }
 
-/// The undamaged reference made from several batches, each with its draws.
+/// Computes the undamaged reference from several batches, each with its draws.
 ///
 /// # Errors
 /// [`ReferenceError`].
@@ -59,7 +59,7 @@ pub fn undamaged_reference(
     };
     let samples = joined(baseline, parts, *draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
     let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
-    let mut state = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
-    state.conditions = conditions(batches.iter().flat_map(|(measurements, _)| *measurements));
-    Ok(state)
+    let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
+    reference.conditions = conditions(batches.iter().flat_map(|(measurements, _)| *measurements));
+    Ok(reference)
 }

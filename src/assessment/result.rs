@@ -1,4 +1,4 @@
-//! The result of one batch: what is stored, listed and answered.
+//! The result of one batch, as it is stored, listed and returned to clients.
 
 use serde::{Deserialize, Serialize};
 
@@ -29,7 +29,7 @@ impl BatchState {
     }
 }
 
-/// What one batch says about the structure: a pure function of data, trained baseline, undamaged reference and seed.
+/// The result of one batch: a pure function of data, trained baseline, undamaged reference and seed.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Assessment {
     /// Digest of the trained baseline that was used.

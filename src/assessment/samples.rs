@@ -32,10 +32,10 @@ pub enum Error {
         /// Measurements of the batch.
         measurements: usize,
     },
-    /// The flow failed: a bug or a damaged baseline.
+    /// The flow failed, because of a programming error or a damaged trained baseline.
     #[error(transparent)]
     Inference(#[from] InferenceError),
-    /// The simulation failed inside the prior: a bug, since the prior box was checked.
+    /// The simulation failed inside the prior. This is a programming error, because the prior box was checked.
     #[error("the simulation failed inside the prior: {0}")]
     Simulation(#[from] crate::physics::Error),
     /// The search for the cause of a misfit failed.
@@ -123,7 +123,7 @@ pub fn draw(
     if fit.rejected() {
         findings.extend(cause::suspect(baseline, &observations, draws.seed)?);
     }
-    // Gross outliers are left out, unless all measurements are.
+    // Gross outliers are left out, unless all measurements are gross outliers.
     let leave_out = fit.gross.len() < observations.len();
     let is_used = |row: &usize| !(leave_out && fit.gross.contains(row));
     let asked: Vec<Observation> =
@@ -132,8 +132,8 @@ pub fn draw(
     let (posterior, populations) = population_behind(baseline, posterior, &asked, draws.most(), draws.seed)?;
     if populations.effective_sample_size < FEW_EFFECTIVE_SAMPLES && posterior.measurements() > 1 {
         let message = format!(
-            "the hyperparameters rest on only {:.1} effective samples for each measurement, because the measurement noise is large \
-             against the spread of the parameters: read them as rough",
+            "the hyperparameters are estimated from only {:.1} effective samples for each measurement, because the \
+             measurement noise is large compared with the spread of the parameters: treat them as rough estimates",
             populations.effective_sample_size
         );
         findings.push(Finding::new(FindingCode::FewEffectiveSamples, FindingEffect::Note, message));
@@ -157,7 +157,7 @@ fn within_prior(observation: &Observation, row: usize, fit: &fit::Fit) -> Observ
     Observation { frequencies_hz, ..observation.clone() }
 }
 
-/// Several batches as one, with the population behind all of them; at least one.
+/// Joins several batches, at least one, into one, and estimates the population behind all of them.
 ///
 /// # Errors
 /// [`InferenceError`] when further samples cannot be drawn.

@@ -18,15 +18,16 @@ pub struct Damage {
     pub threshold: f64,
     /// Probability of damage P(x beyond δ) of the population behind the batch: its posterior median.
     pub probability_of_damage: f64,
-    /// Its 90 % credible interval, with the uncertainty of the population and of δ; `None` for one measurement.
+    /// 90 % credible interval of the probability of damage, with the uncertainty of the population and of δ; `None` for one
+    /// measurement.
     pub probability_interval: Option<[f64; 2]>,
     /// Share of the pool beyond the pool's δ (paper).
     pub pooled_probability: f64,
-    /// True when the probability of damage exceeds p of the reference's threshold.
+    /// True when the probability of damage exceeds the threshold probability p of the reference.
     pub exceeds: bool,
-    /// (μ − μ_ud)/μ_ud.
+    /// Relative change of the mean, (μ − μ_ud)/μ_ud.
     pub relative_change: f64,
-    /// Its 90 % credible interval.
+    /// 90 % credible interval of the relative change.
     pub relative_change_interval: Option<[f64; 2]>,
 }
 
@@ -37,15 +38,15 @@ pub struct QuantityAssessment {
     pub name: String,
     /// Unit of mean and standard deviation.
     pub unit: String,
-    /// Its kind.
+    /// Whether it is a parameter, a spring stiffness or a group.
     pub kind: QuantityKind,
-    /// Mean of the population behind the batch.
+    /// Mean of the population behind the batch, in `unit`.
     pub mean: f64,
-    /// Its 90 % credible interval; `None` in assessments stored by versions that did not compute it.
+    /// 90 % credible interval of the mean; `None` in assessments stored by versions that did not compute it.
     pub mean_interval: Option<[f64; 2]>,
     /// Standard deviation of the population; `None` for one measurement, which does not determine it.
     pub std: Option<f64>,
-    /// Its 90 % credible interval.
+    /// 90 % credible interval of the standard deviation; `None` for one measurement.
     pub std_interval: Option<[f64; 2]>,
     /// Mean and spread of the pool (paper).
     pub pooled: Hyperparameters,
@@ -64,7 +65,7 @@ pub struct QuantityAssessment {
 pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedReference>) -> Vec<QuantityAssessment> {
     let one = |sample: &QuantitySamples| {
         let population = &sample.population;
-        let damage = undamaged.filter(|_| sample.group.is_none()).and_then(|state| compare(sample, state));
+        let damage = undamaged.filter(|_| sample.group.is_none()).and_then(|undamaged| compare(sample, undamaged));
         QuantityAssessment {
             name: sample.name.clone(),
             unit: sample.unit.clone(),
@@ -82,11 +83,11 @@ pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedReference
     samples.par_iter().map(one).collect()
 }
 
-fn compare(sample: &QuantitySamples, state: &UndamagedReference) -> Option<Damage> {
-    let reference = state.quantities.iter().find(|q| q.name == sample.name)?;
+fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<Damage> {
+    let reference = undamaged.quantities.iter().find(|q| q.name == sample.name)?;
     let threshold_here = reference.threshold?;
     let pooled_probability = probability_of_damage(&sample.pool, reference.pooled_threshold?, sample.damage)?;
-    let draws = population_probabilities(&sample.population, reference, sample.damage, state.threshold_probability);
+    let draws = population_probabilities(&sample.population, reference, sample.damage, undamaged.threshold_probability);
     let (probability, probability_interval) = match draws {
         Some(draws) => (stats::quantile(&draws, 0.5), Some(interval(&draws))),
         // One measurement: its posterior includes the noise, and so must δ.
@@ -104,7 +105,7 @@ fn compare(sample: &QuantitySamples, state: &UndamagedReference) -> Option<Damag
         probability_of_damage: probability,
         probability_interval,
         pooled_probability,
-        exceeds: probability > state.threshold_probability,
+        exceeds: probability > undamaged.threshold_probability,
         relative_change: (sample.population.mean - reference.mean) / reference.mean,
         relative_change_interval: Some(interval(&changes)),
     })

@@ -30,7 +30,7 @@ pub struct Hyperparameters {
 }
 
 impl Hyperparameters {
-    /// From pooled samples, `[n·draws]`, those of one measurement together.
+    /// Computes them from pooled samples, `[n·draws]`, in which the `draws` samples of each measurement are adjacent.
     pub fn from_pool(pool: &[f64], draws: usize) -> Self {
         let measurements = pool.len() / draws;
         let means: Vec<f64> = pool.chunks(draws).map(stats::mean).collect();
@@ -65,13 +65,13 @@ pub struct QuantitySamples {
     pub name: String,
     /// Unit of the samples.
     pub unit: String,
-    /// Its kind.
+    /// Whether it is a parameter, a spring stiffness or a group.
     pub kind: QuantityKind,
     /// Which change indicates damage.
     pub damage: DamageDirection,
-    /// The pool, `[n·draws]`, the samples of one measurement together.
+    /// The pooled samples, `[n·draws]`; the samples of each measurement are adjacent.
     pub pool: Vec<f64>,
-    /// Samples for each measurement.
+    /// Number of samples of each measurement in the pool.
     pub draws: usize,
     /// The population behind the pool.
     pub population: PopulationEstimate,

@@ -16,9 +16,9 @@ use crate::stats;
 pub struct UndamagedQuantity {
     /// Name of the quantity.
     pub name: String,
-    /// Mean μ_ud of the population.
+    /// Mean μ_ud of the population, in the quantity's unit.
     pub mean: f64,
-    /// Standard deviation σ_ud of the population.
+    /// Standard deviation σ_ud of the population, in the quantity's unit.
     pub std: f64,
     /// Damage threshold δ; `None` when no change of this quantity indicates damage.
     pub threshold: Option<f64>,
@@ -60,7 +60,7 @@ pub struct ChartReference {
 pub struct UndamagedReference {
     /// Version, from 1.
     pub version: u32,
-    /// p of the threshold; a batch whose probability of damage is larger exceeds it.
+    /// Threshold probability p, which defines δ. A batch exceeds it when its probability of damage is larger.
     pub threshold_probability: f64,
     /// Number of measurements in it.
     pub measurements: usize,
@@ -68,7 +68,7 @@ pub struct UndamagedReference {
     pub quantities: Vec<UndamagedQuantity>,
     /// Range or categories of each covariate of its measurements.
     pub conditions: BTreeMap<String, SeenCovariate>,
-    /// Doubts about its data, in sentences.
+    /// Reasons to doubt its data, as sentences.
     pub doubts: Vec<String>,
 }
 
@@ -82,7 +82,7 @@ pub enum SeenCovariate {
     Categories(BTreeSet<String>),
 }
 
-/// Why samples make no undamaged reference.
+/// Why no undamaged reference can be computed from samples.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// Too few measurements to estimate a spread.
@@ -99,12 +99,12 @@ pub enum Error {
     /// A threshold probability outside (0, 0.5].
     #[error("threshold probability {0} must be above 0 and at most 0.5")]
     ThresholdProbability(f64),
-    /// Not a probability at all.
+    /// A threshold probability that is not in [0, 1].
     #[error(transparent)]
     OutOfRange(#[from] OutOfRange),
 }
 
-/// Fewest measurements of an undamaged reference: 10 give the standard deviation to ±24 %.
+/// Fewest measurements of an undamaged reference: with 10, the standard error of the standard deviation is 24 %.
 pub const MINIMUM_MEASUREMENTS: usize = 10;
 
 /// Significance level at which the data of an undamaged reference raise a doubt.
@@ -114,8 +114,8 @@ const CONTAMINATION_LEVEL: f64 = 0.001;
 const BETWEEN_LEVEL: f64 = 0.01;
 
 impl UndamagedReference {
-    /// The undamaged reference from the samples of several batches, pooled batch after batch; `sizes` are the numbers of
-    /// measurements of the batches, `probability` is p of the threshold. The version is 0 until it is stored.
+    /// Computes the undamaged reference from the samples of several batches, pooled batch after batch; `sizes` are the numbers of
+    /// measurements of the batches, `probability` is the threshold probability p. The version is 0 until the reference is stored.
     ///
     /// # Errors
     /// [`Error`] for too few measurements or a threshold probability outside (0, 0.5].
@@ -169,8 +169,8 @@ impl UndamagedReference {
 impl ChartReference {
     /// The reference of the alarm charts, and a doubt about its data if there is one.
     ///
-    /// Where batches differ (p < 0.01), the scatter between them enters the charts. Where they differ beyond doubt (p < 0.001), or
-    /// one measurement lies far from the others, the reader is warned that the reference may contain more than random scatter.
+    /// If the batches differ (p < 0.01), the scatter between them enters the charts. If they differ strongly (p < 0.001), or if one
+    /// measurement lies far from the others, a doubt warns that the reference may contain more than random scatter.
     fn new(sample: &QuantitySamples, sizes: &[usize]) -> (Self, Option<String>) {
         let means: Vec<f64> = sample.pool.chunks(sample.draws).map(stats::mean).collect();
         let analysis = Scatter::of(&means, sizes);

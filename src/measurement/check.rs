@@ -74,7 +74,7 @@ impl Problem {
 pub struct Expectation<'a> {
     /// Number of modes.
     pub modes: usize,
-    /// Frequencies outside these limits, Hz, are a wrong unit or a wrong column.
+    /// Limits of plausible frequencies, Hz. A frequency outside them is in a wrong unit or in a wrong column.
     pub frequency_limits_hz: (f64, f64),
     /// Declared covariates.
     pub covariates: &'a [Covariate],
@@ -180,7 +180,8 @@ pub fn check_measurements(
         return Err(vec![Problem::new("/measurements", "the batch is empty: send at least one measurement")]);
     }
     if raw.len() > expectation.max_measurements {
-        let message = format!("{} measurements: at most {} in a batch", raw.len(), expectation.max_measurements);
+        let message =
+            format!("{} measurements: a batch may contain at most {}", raw.len(), expectation.max_measurements);
         return Err(vec![Problem::new("/measurements", message)]);
     }
     let mut problems = Problems { found: Vec::new(), more: 0 };
@@ -308,7 +309,7 @@ fn check_covariates(raw: &RawMeasurement, declared: &[Covariate], problems: &mut
         let Some(covariate) = declared.iter().find(|c| c.name == *name) else {
             let names: Vec<&str> = declared.iter().map(|c| c.name.as_str()).collect();
             let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-            add(format!("{} is no covariate of this structure (declared: {known})", shown(name)));
+            add(format!("{} is not a covariate of this structure (declared: {known})", shown(name)));
             continue;
         };
         match (covariate.kind, value) {
@@ -335,7 +336,7 @@ fn check_covariates(raw: &RawMeasurement, declared: &[Covariate], problems: &mut
 fn check_settings(raw: &RawMeasurement, space: &ParameterSpace, problems: &mut Problems) {
     for (name, value) in &raw.settings {
         let message = match space.iter().find(|p| p.name == *name) {
-            None => format!("{} is no parameter of this structure", shown(name)),
+            None => format!("{} is not a parameter of this structure", shown(name)),
             Some(p) if !(p.lower..=p.upper).contains(value) => {
                 format!("{value} {} is outside the prior of {name}, {} to {}", p.unit, p.lower, p.upper)
             }

@@ -205,7 +205,7 @@ fn columns(
                 let known: Vec<&str> = covariates.iter().map(|c| c.name.as_str()).collect();
                 let known = if known.is_empty() { String::new() } else { format!(", {}", known.join(", ")) };
                 add(format!(
-                    "unknown column {}: known are measured_at, f1_hz to f{modes}_hz, std_f1_hz to std_f{modes}_hz, \
+                    "unknown column {}: the known columns are measured_at, f1_hz to f{modes}_hz, std_f1_hz to std_f{modes}_hz, \
                      set_<parameter>{known}; declare a covariate in the structure file, or ignore the column",
                     shown(name)
                 ));
@@ -316,11 +316,11 @@ fn row(
             }
         }
     }
-    // A row in which all standard deviations are missing has none.
+    // A row without any standard deviation gets `None`, as if the table had no such columns.
     raw.std_hz = raw.std_hz.filter(|stds| stds.iter().any(Option::is_some));
     if times == Times::RowNumber && !columns.contains(&Column::Time) {
-        let time =
-            Timestamp::from_micros(index as i64 * 1_000_000).expect("a table has fewer rows than years have seconds");
+        let time = Timestamp::from_micros(index as i64 * 1_000_000)
+            .expect("a table has far fewer rows than the calendar has seconds");
         raw.measured_at = Some(time.to_string());
     }
     Ok(raw)

@@ -38,7 +38,7 @@ fn json_error(bytes: &[u8], pointer: String, error: &serde_json::Error) -> JsonE
         Some(word) => format!("{word} is not a JSON number: send null for a mode that was not identified"),
         None => error.to_string(),
     };
-    let malformed = |message: &str| JsonError::Malformed(format!("the body is no JSON: {message}"));
+    let malformed = |message: &str| JsonError::Malformed(format!("the body is not valid JSON: {message}"));
     if !begins_as_object(bytes) {
         return malformed(&message);
     }

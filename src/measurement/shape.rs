@@ -22,15 +22,15 @@ impl InstrumentedPoints {
     /// The mode of the nominal structure (from 0) with the highest modal assurance criterion (MAC), and that MAC. Source: Allemang
     /// & Brown (1982).
     pub fn nearest(&self, shape: &[f64]) -> Option<(usize, f64)> {
-        let alike = self.nominal.iter().map(|own| squared_cosine(own, shape)).enumerate();
-        alike.max_by(|a, b| a.1.total_cmp(&b.1))
+        let macs = self.nominal.iter().map(|own| squared_cosine(own, shape)).enumerate();
+        macs.max_by(|a, b| a.1.total_cmp(&b.1))
     }
 
     /// What is wrong with a measured shape, and what would be right; `None` if the shape is valid.
     pub fn mistake(&self, shape: &[f64]) -> Option<String> {
         let points = self.names.len();
-        let some = self.names.iter().take(MOST_NAMES).cloned().collect::<Vec<_>>().join(", ");
-        let names = format!("{some}{}", if points > MOST_NAMES { ", …" } else { "" });
+        let first = self.names.iter().take(MOST_NAMES).cloned().collect::<Vec<_>>().join(", ");
+        let names = format!("{first}{}", if points > MOST_NAMES { ", …" } else { "" });
         if shape.len() != points {
             return Some(format!("{} numbers, expected {points}: one for each of {names}", shape.len()));
         }
@@ -42,10 +42,10 @@ impl InstrumentedPoints {
                 "all components are 0, or they are too large: send null for a shape that was not identified".to_owned(),
             );
         }
-        let (mode, alike) = self.nearest(shape)?;
-        (alike < LEAST_MAC).then(|| {
+        let (mode, mac) = self.nearest(shape)?;
+        (mac < LEAST_MAC).then(|| {
             format!(
-                "the shape resembles no mode of this structure: its highest MAC is {alike:.3}, with mode {}, and at least \
+                "the shape resembles no mode of this structure: its highest MAC is {mac:.3}, with mode {}, and at least \
                  {LEAST_MAC} is expected; check that its numbers are those of {names}, in this order",
                 mode + 1
             )

@@ -1,4 +1,4 @@
-//! Common mistakes behind a batch that does not fit: another unit, modes numbered wrongly.
+//! Search for common mistakes that explain why a batch does not fit: another unit, or wrongly numbered modes.
 
 use super::finding::{Finding, FindingCode, FindingEffect};
 use super::fit::fit;
@@ -6,8 +6,8 @@ use crate::baseline::observation::Observation;
 use crate::baseline::{Baseline, InferenceError};
 use crate::physics;
 
-/// Measurements that a suspected mistake is tested on.
-const TRIED: usize = 8;
+/// Largest number of measurements on which a suspected mistake is tested.
+const TESTED_MEASUREMENTS: usize = 8;
 
 /// Posterior draws whose mean is the starting point of a search.
 const DRAWS: usize = 16;
@@ -31,10 +31,10 @@ pub enum Error {
 /// # Errors
 /// [`Error`], which does not occur with a loaded baseline.
 pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> Result<Option<Finding>, Error> {
-    let step = observations.len().div_ceil(TRIED).max(1);
-    let some: Vec<&Observation> = observations.iter().step_by(step).collect();
-    let tried = |change: &dyn Fn(&Observation) -> Observation, must_be_tested: bool| -> Result<bool, Error> {
-        let changed: Vec<Observation> = some.iter().map(|o| change(o)).filter(|o| o.modes_present() > 0).collect();
+    let step = observations.len().div_ceil(TESTED_MEASUREMENTS).max(1);
+    let subset: Vec<&Observation> = observations.iter().step_by(step).collect();
+    let fits_after = |change: &dyn Fn(&Observation) -> Observation, must_be_tested: bool| -> Result<bool, Error> {
+        let changed: Vec<Observation> = subset.iter().map(|o| change(o)).filter(|o| o.modes_present() > 0).collect();
         if changed.is_empty() {
             return Ok(false);
         }
@@ -48,13 +48,13 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
             frequencies_hz: o.frequencies_hz.iter().map(|f| f.map(|f| f * factor)).collect(),
             ..o.clone()
         };
-        if tried(&in_hz, false)? {
+        if fits_after(&in_hz, false)? {
             let message = format!("the measurements fit when they are read as {unit} instead of Hz: send Hz");
             return Ok(Some(Finding::new(FindingCode::UnitSuspected, FindingEffect::Reject, message)));
         }
     }
-    // Mode j was missed and those above it were numbered one too low: what was sent as mode i is mode i + 1 from j on, and the
-    // last mode is unknown.
+    // If mode j was missed and the modes above it were numbered one too low, the value sent as mode i ≥ j belongs to mode i + 1,
+    // and mode j has no value.
     let modes = baseline.simulator().modes();
     for missed in 0..modes.saturating_sub(1) {
         let shifted = |o: &Observation| {
@@ -66,7 +66,7 @@ pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> 
             }
         };
         // With too few modes left for a test, any shift would fit.
-        if tried(&shifted, true)? {
+        if fits_after(&shifted, true)? {
             let message = format!(
                 "the measurements fit when mode {} is taken as missed and those above it as numbered one too low: send null for \
                  the missed mode",

@@ -1,4 +1,4 @@
-//! Findings about a batch: what the reader must know before relying on the figures.
+//! Findings about a batch, which its reader must know before relying on the results.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ pub enum FindingCode {
     ModesSwapped,
     /// A mode was missed, and those above it were numbered one too low.
     ModesShifted,
-    /// All measurements are the same: the sensor hangs.
+    /// All measurements are the same: the sensor or its gateway seems to repeat an old value.
     NoScatter,
     /// A measurement repeats an earlier one to the last digit.
     StaleRepeat,
@@ -65,13 +65,13 @@ pub enum FindingCode {
 /// One finding about a batch.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Finding {
-    /// Its kind.
+    /// Kind of the finding.
     pub code: FindingCode,
     /// Its effect on the assessment.
     pub effect: FindingEffect,
     /// A sentence for people.
     pub message: String,
-    /// Index of the measurements concerned; empty for the whole batch.
+    /// Indices of the measurements concerned; empty if the finding is about the whole batch.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub measurements: Vec<usize>,
 }
@@ -82,7 +82,7 @@ impl Finding {
         Self { code, effect, message: message.into(), measurements: Vec::new() }
     }
 
-    /// The same about some of its measurements.
+    /// Limits the finding to these measurements of the batch.
     #[must_use]
     pub fn of(mut self, measurements: Vec<usize>) -> Self {
         self.measurements = measurements;

@@ -1,4 +1,4 @@
-//! Plausibility of the measurements without any simulation: order, repeats, resolution, outliers.
+//! Plausibility checks of the measurements that need no simulation: order of the modes, repeated values, resolution, outliers.
 
 use super::finding::{too_many, Finding, FindingCode, FindingEffect};
 use crate::measurement::ModalMeasurement;
@@ -41,7 +41,7 @@ pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hert
 /// are sorted so that its figures can still be computed.
 fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
     let mut swapped = Vec::new();
-    let mut places = String::new();
+    let mut example = String::new();
     for (index, measurement) in kept.iter_mut() {
         let present: Vec<usize> =
             (0..measurement.frequencies_hz.len()).filter(|&i| measurement.frequencies_hz[i].is_some()).collect();
@@ -52,7 +52,7 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
         };
         if swapped.is_empty() {
             let (low, high) = (value(measurement, pair[0]), value(measurement, pair[1]));
-            places = format!("mode {} at {low} Hz is not below mode {} at {high} Hz", pair[0] + 1, pair[1] + 1);
+            example = format!("mode {} at {low} Hz is not below mode {} at {high} Hz", pair[0] + 1, pair[1] + 1);
         }
         swapped.push(*index);
         let mut order = present.clone();
@@ -71,7 +71,7 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
     if !swapped.is_empty() {
         let many = too_many(swapped.len(), kept.len());
         let message = format!(
-            "modes are out of order in {} of {} measurements (in the first, {places}) and seem to be swapped; {}",
+            "modes are out of order in {} of {} measurements (in the first, {example}) and seem to be swapped; {}",
             swapped.len(),
             kept.len(),
             if many { "the figures are computed with ascending frequencies" } else { "these are left out" }
@@ -117,6 +117,7 @@ fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) ->
     coarse > 0 && coarse == scattered
 }
 
+/// Leaves out measurements whose frequencies equal those of an earlier one. The batch is rejected if all are equal.
 fn drop_repeats(
     kept: &mut Vec<(usize, ModalMeasurement)>,
     previous: Option<&[Option<Hertz>]>,
@@ -136,11 +137,11 @@ fn drop_repeats(
         return;
     }
     let indices: Vec<usize> = repeats.iter().map(|&row| kept[row].0).collect();
-    // All repeat the measurement before the batch, or all repeat the first of the batch.
+    // Either all measurements repeat the one before the batch, or all repeat the first one of the batch.
     if repeats.len() == count || (count >= 3 && repeats.len() + 1 == count) {
         let message = match count {
             1 => {
-                "the frequencies equal those of the measurement before to the last digit: the sensor or its gateway hangs"
+                "the frequencies equal those of the previous measurement to the last digit: the sensor or its gateway hangs"
                     .to_owned()
             }
             _ => format!(

@@ -46,7 +46,7 @@ impl Trust {
         }
     }
 
-    /// For an assessment stored by a version of the program that did not judge trust.
+    /// The trust of an assessment that was stored by a version of the program without this check: accepted, without findings.
     pub fn unknown() -> Self {
         let verdict = TrustVerdict::Accepted;
         Self { verdict, p_value: None, distance: None, degrees_of_freedom: 0, findings: Vec::new() }
