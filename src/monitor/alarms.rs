@@ -1,4 +1,4 @@
-//! The alarms of the structures: read, acknowledged, published as events and logged.
+//! Reading and acknowledging the alarms of the structures, publishing them as events, and logging them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Mutex;
@@ -10,7 +10,7 @@ use super::events::{Events, News};
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{Acknowledgement, Episode, MaintenanceWindow, Store, StoredChartPoint};
 
-/// The alarms of the structures, and which of them subscribers and the log know already.
+/// The alarms of the structures, with a record of those that were already published and logged.
 pub struct Alarms {
     store: Store,
     events: Events,
@@ -22,7 +22,7 @@ pub struct Alarms {
 /// The alarms of a structure that were published.
 #[derive(Debug, Clone, Default)]
 struct Published {
-    /// Number of the newest.
+    /// Number of the newest alarm that was published.
     newest: i64,
     open: BTreeSet<i64>,
 }
@@ -46,7 +46,7 @@ impl Alarms {
         Ok(self.store.alarms().episodes(structure, before, open_only, limit).await?)
     }
 
-    /// Acknowledges an alarm; the first acknowledgement stays. `None` when there is no such alarm.
+    /// Acknowledges an alarm; only the first acknowledgement is kept. `None` when there is no such alarm.
     ///
     /// # Errors
     /// [`Error::Store`].
@@ -87,7 +87,7 @@ impl Alarms {
         Ok(self.store.alarms().maintenance(structure).await?)
     }
 
-    /// Publishes the alarms that changed since the last call, and logs those opened, each once.
+    /// Publishes the alarms that changed since the last call, and logs each open alarm once.
     pub(super) async fn report(&self, structure: &StructureId) {
         for episode in self.publish_changes(structure).await {
             let key = (structure.clone(), episode.number);
@@ -102,7 +102,7 @@ impl Alarms {
         }
     }
 
-    /// Publishes the alarms that were opened, ended or withdrawn since the last call. The open ones.
+    /// Publishes the alarms that were opened, ended or withdrawn since the last call, and returns the open alarms.
     pub(super) async fn publish_changes(&self, structure: &StructureId) -> Vec<Episode> {
         let (changes, open) = self.changes(structure).await;
         for news in changes {
@@ -111,14 +111,15 @@ impl Alarms {
         open
     }
 
-    /// The events for the alarms of a structure that changed since the last call, which are known from now on; and the open ones.
+    /// Returns the events for the alarms of a structure that changed since the last call, and the open alarms. The next call does
+    /// not return the same events again.
     pub(super) async fn changes(&self, structure: &StructureId) -> (Vec<News>, Vec<Episode>) {
         let published = || self.published.lock().expect("no holder of this lock panics");
         let Published { newest, open } = published().get(structure).cloned().unwrap_or_default();
         let open: Vec<i64> = open.into_iter().collect();
         match self.store.alarms().episodes_since(structure, newest, &open).await {
             Ok(mut episodes) => {
-                let changes = published().entry(structure.clone()).or_default().learn(structure, &episodes);
+                let changes = published().entry(structure.clone()).or_default().update(structure, &episodes);
                 episodes.retain(|episode| episode.state() == "open");
                 (changes, episodes)
             }
@@ -131,8 +132,8 @@ impl Alarms {
 }
 
 impl Published {
-    /// Updates what is known from stored alarms; the events for what is new.
-    fn learn(&mut self, structure: &StructureId, episodes: &[Episode]) -> Vec<News> {
+    /// Updates the record of published alarms from the stored ones, and returns the events for the changes.
+    fn update(&mut self, structure: &StructureId, episodes: &[Episode]) -> Vec<News> {
         let mut changes = Vec::new();
         for episode in episodes {
             let open = episode.state() == "open";

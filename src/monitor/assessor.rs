@@ -1,5 +1,5 @@
-//! The processing of one stored batch: its assessment is computed away from the async threads and stored; and again where its
-//! trained baseline or undamaged reference changed meanwhile.
+//! The processing of one stored batch. Its assessment is computed on a compute thread and stored; both are repeated if the trained
+//! baseline or the undamaged reference changed in the meantime.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ pub(super) struct Task {
     active: Arc<ActiveStructure>,
     baseline: Arc<Baseline>,
     record: Arc<BatchRecord>,
-    /// Frequencies of the measurement before it, of the same source.
+    /// Frequencies of the last measurement of the same source before the batch.
     previous: Arc<Option<Vec<Option<Hertz>>>>,
     place: Place,
 }
@@ -32,14 +32,14 @@ pub(super) struct Task {
 /// A batch whose assessment was computed.
 pub(super) struct Computed {
     task: Task,
-    /// Newest version of the undamaged reference at that time, 0 where there was none.
+    /// Version of the newest undamaged reference at the time of the computation; 0 if there was none.
     newest_undamaged: u32,
     seconds: f64,
     /// The assessment with its points on the charts, or why there is none.
     outcome: Result<(Assessment, Vec<NewChartPoint>), String>,
 }
 
-/// A batch whose result was stored, unless its structure has another version by now.
+/// A batch whose result was stored, or discarded because the structure has another version in the meantime.
 pub(super) struct Stored {
     task: Task,
     /// As in [`Computed`].
@@ -50,7 +50,7 @@ pub(super) struct Stored {
 enum Outcome {
     Assessed(Box<Assessment>, StoredAssessment),
     Failed,
-    /// Not stored.
+    /// Not stored, because the structure has another version in the meantime.
     OfAnotherVersion,
 }
 
@@ -68,12 +68,12 @@ pub(super) enum Finished {
 pub(super) enum Settled {
     /// It is final.
     Finished(Finished),
-    /// The trained baseline or the undamaged reference changed meanwhile: the batch has to be assessed again.
+    /// The trained baseline or the undamaged reference changed in the meantime: the batch has to be assessed again.
     Again(Task),
 }
 
 impl Task {
-    /// The task of a stored batch; `previous` are the frequencies of the measurement before it, of the same source.
+    /// The task of a stored batch; `previous` are the frequencies of the last measurement of the same source before the batch.
     pub(super) fn new(
         active: Arc<ActiveStructure>,
         record: BatchRecord,
@@ -126,7 +126,7 @@ impl Assessor {
         self.finish_computed(computed).await
     }
 
-    /// The rest of [`Self::finish`].
+    /// Stores a computed assessment, and assesses the batch again until its result is final.
     pub(super) async fn finish_computed(&self, mut computed: Computed) -> Result<Finished, Error> {
         loop {
             let stored = self.store_computed(computed).await?;
@@ -139,7 +139,7 @@ impl Assessor {
 
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
-        // If a newer reference is stored meanwhile, the batch is assessed again (`settle`).
+        // If a newer reference is stored in the meantime, the batch is assessed again (`settle`).
         let undamaged = self.store.reference().undamaged_as_read(&task.record.batch.structure).await?;
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
@@ -226,8 +226,8 @@ impl Assessor {
             task.baseline = newer;
             return Ok(Settled::Again(task));
         }
-        // A reference declared while this was computed did not find the batch assessed and so did not reset it: it is compared
-        // with that reference now.
+        // A reference that was declared during the computation did not mark the batch to be assessed again, because the batch was
+        // not assessed yet. It is therefore compared with that reference now.
         if stored.newest_undamaged != newest_undamaged {
             let present =
                 self.store.reference().undamaged(structure).await?.filter(|record| task.is_comparable(record));
@@ -246,7 +246,7 @@ impl Assessor {
         (present.simulator.digest() == active.simulator.digest()).then(|| Arc::clone(newer))
     }
 
-    /// Numbers of samples and seed for a batch.
+    /// The numbers of posterior samples and the seed for a batch.
     pub(super) fn draws(&self, baseline: &Baseline, record: &BatchRecord) -> Draws {
         Draws {
             per_measurement: self.settings.draws_per_measurement,

@@ -67,7 +67,7 @@ impl Backups {
     /// The trained baselines in use that are not in the database.
     async fn models_in_use(&self) -> Vec<backup::BackupModel> {
         let (in_use, library) = (self.structures.models_in_use(), self.structures.library());
-        // Reads and hashes files: not on an async thread.
+        // Reads and hashes files, which must not block an async thread.
         let found = tokio::task::spawn_blocking(move || {
             let model = |(structure, digest): (crate::quantity::StructureId, crate::quantity::Digest)| {
                 let files = library.files_of(&digest).ok().flatten()?;

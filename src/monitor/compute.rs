@@ -1,4 +1,4 @@
-//! The bounded queue in front of the processor: computations never run on the async threads, and their number is limited.
+//! The bounded queue of assessments. Computations never run on the async threads, and their number is limited.
 
 use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::Arc;
@@ -27,7 +27,7 @@ impl Default for ComputeSettings {
 #[error("the queue of assessments is full")]
 pub struct QueueFull;
 
-/// The computation panicked: a bug.
+/// The computation panicked, which is a programming error.
 #[derive(Debug, thiserror::Error)]
 #[error("the computation panicked")]
 pub struct Panicked;
@@ -64,7 +64,7 @@ impl Compute {
         }
     }
 
-    /// Takes a place without waiting.
+    /// Reserves a place in the queue without waiting.
     ///
     /// # Errors
     /// [`QueueFull`] when none is free.
@@ -73,7 +73,7 @@ impl Compute {
         Ok(Place { _place: place, _behind: None, threads: Arc::clone(&self.threads) })
     }
 
-    /// Waits for a place: for work whose sender cannot be asked to send it again.
+    /// Waits for a place in the queue. For batches whose sender cannot be asked to repeat the request.
     pub async fn wait(&self) -> Place {
         let place = Arc::clone(&self.places).acquire_owned().await.expect("the semaphore is never closed");
         Place { _place: place, _behind: None, threads: Arc::clone(&self.threads) }
@@ -90,7 +90,7 @@ impl Compute {
         self.places_behind
     }
 
-    /// Places free now.
+    /// Number of free places in the queue.
     pub fn free(&self) -> usize {
         self.places.available_permits()
     }
@@ -104,9 +104,10 @@ impl Place {
     pub async fn run<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, Panicked> {
         let _thread = self.threads.acquire().await.expect("the semaphore is never closed");
         let (found, answer) = oneshot::channel();
-        // On the thread pool that its parallel loops use: from any other thread, each loop would have to be handed over.
+        // `work` runs on the thread pool of rayon, which its parallel loops use: a loop that starts on another thread would first
+        // have to be handed over to the pool.
         rayon::spawn(move || {
-            // The caller may have been dropped.
+            // Sending fails if the caller was dropped.
             let _ = found.send(catch_unwind(AssertUnwindSafe(work)));
         });
         answer.await.ok().and_then(Result::ok).ok_or(Panicked)

@@ -1,4 +1,4 @@
-//! Why the monitor could not do what it was asked to do.
+//! The errors of the operations of the monitor.
 
 use super::compute::QueueFull;
 use crate::assessment;
@@ -7,7 +7,7 @@ use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::DefinitionError;
 use crate::store;
 
-/// A failure that several operations share.
+/// An error that several operations can return.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// No such structure.
@@ -66,12 +66,12 @@ pub enum Error {
     /// The database failed.
     #[error(transparent)]
     Store(#[from] store::Error),
-    /// A computation or a background task panicked: a bug.
+    /// A computation or a background task panicked, which is a programming error.
     #[error("a task panicked")]
     Panicked,
 }
 
-/// Why a batch was not taken.
+/// Why a batch was not accepted.
 #[derive(Debug, thiserror::Error)]
 pub enum IngestError {
     /// The key was used for other content.
@@ -92,7 +92,7 @@ pub enum IngestError {
         /// The batch that contains it.
         batch: String,
     },
-    /// Anything else.
+    /// Any other error.
     #[error(transparent)]
     Monitor(#[from] Error),
 }
@@ -103,7 +103,7 @@ pub enum DeclareError {
     /// A batch is listed twice.
     #[error("batch {0} is listed twice")]
     RepeatedBatch(String),
-    /// The batches together make no undamaged reference.
+    /// No undamaged reference can be computed from the batches.
     #[error(transparent)]
     Reference(#[from] damage::Error),
     /// An inference failed.
@@ -122,7 +122,7 @@ pub enum DeclareError {
         /// What was found in it.
         reason: String,
     },
-    /// Anything else.
+    /// Any other error.
     #[error(transparent)]
     Monitor(#[from] Error),
 }
@@ -136,23 +136,23 @@ pub enum JobError {
     /// A batch is listed twice.
     #[error("batch {0} is listed twice")]
     RepeatedBatch(String),
-    /// More measurements than a diagnosis takes.
-    #[error("{found} measurements are more than the {most} that one diagnosis takes: name fewer batches")]
+    /// More measurements than one diagnosis can use.
+    #[error("{found} measurements are more than the {most} that one diagnosis can use: name fewer batches")]
     TooManyMeasurements {
-        /// Measurements asked for.
+        /// Number of measurements of the requested batches.
         found: usize,
-        /// Most.
+        /// Largest number allowed.
         most: usize,
     },
     /// The structure cannot be extended by this diagnosis.
-    #[error("diagnosis {diagnosis} cannot be extended: {reason}")]
+    #[error("the structure cannot be extended by diagnosis {diagnosis}: {reason}")]
     NoExtension {
         /// The diagnosis.
         diagnosis: String,
         /// Why.
         reason: String,
     },
-    /// Anything else.
+    /// Any other error.
     #[error(transparent)]
     Monitor(#[from] Error),
 }
@@ -161,9 +161,9 @@ pub enum JobError {
 #[derive(Debug, thiserror::Error)]
 pub enum ReloadError {
     /// The new baseline may not replace the one in use.
-    #[error("the trained baseline for {structure} is refused, {}: {reason}", match kept {
-        Some(digest) => format!("{digest} stays in use"),
-        None => "there is none in use".to_owned(),
+    #[error("the new trained baseline for {structure} is refused ({}): {reason}", match kept {
+        Some(digest) => format!("the one with digest {digest} stays in use"),
+        None => "no other one is in use".to_owned(),
     })]
     Refused {
         /// The structure.
@@ -173,7 +173,7 @@ pub enum ReloadError {
         /// Digest of the one that stays in use.
         kept: Option<String>,
     },
-    /// Anything else.
+    /// Any other error.
     #[error(transparent)]
     Monitor(#[from] Error),
 }
@@ -182,12 +182,12 @@ pub enum ReloadError {
 #[derive(Debug, thiserror::Error)]
 pub enum BackupError {
     /// Another backup is running.
-    #[error("another backup is running: ask again when it is done")]
+    #[error("another backup is running: request the backup again when it has finished")]
     Running,
     /// The backup failed.
     #[error(transparent)]
     Failed(#[from] store::backup::Error),
-    /// Anything else.
+    /// Any other error.
     #[error(transparent)]
     Monitor(#[from] Error),
 }

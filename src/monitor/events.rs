@@ -10,14 +10,15 @@ use crate::assessment::BatchState;
 use crate::quantity::StructureId;
 use crate::store::{JobKind, JobState};
 
-/// Events buffered for a slow subscriber; one that falls further behind is notified and continues with the newest.
+/// Number of events buffered for a slow subscriber. A subscriber that falls further behind is notified and continues with the
+/// newest events.
 const KEPT: usize = 1_024;
 
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum News {
-    /// A batch was assessed, failed, or was stored and waits.
+    /// A batch was assessed, could not be assessed, or was stored and waits for its assessment.
     Batch {
         /// Its structure.
         structure: StructureId,

@@ -1,4 +1,4 @@
-//! From raw values to a stored and assessed batch: the rules are the same for every way in.
+//! From raw values to a stored and assessed batch. The rules are the same for HTTP and MQTT.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,13 +20,13 @@ use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{BatchRecord, InsertBatch};
 
-/// Source of a batch that names none.
+/// Source of a batch whose sender does not name one.
 const DEFAULT_SOURCE: &str = "default";
 
-/// Most missing covariates reported.
+/// Largest number of missing covariates that are reported.
 const MOST_MISSING: usize = 20;
 
-/// A batch that was taken.
+/// A batch that was accepted.
 pub struct Ingested {
     /// The batch.
     pub view: BatchView,
@@ -34,13 +34,13 @@ pub struct Ingested {
     pub replayed: bool,
 }
 
-/// The computation for a batch while it was being stored.
+/// What was computed for a batch while it was being stored.
 enum Begun {
     Computed(Box<Computed>),
-    Not(Place),
+    NotComputed(Place),
 }
 
-/// Takes batches: checks, stores and assesses them.
+/// Checks, stores and assesses batches.
 #[derive(Clone)]
 pub struct Ingest {
     assessor: Arc<Assessor>,
@@ -53,10 +53,10 @@ impl Ingest {
         Self { assessor, replay, records }
     }
 
-    /// Checks a batch against its structure. It computes: not for an async thread when the batch is large.
+    /// Checks a batch against its structure. For a large batch this takes milliseconds, so it should not run on an async thread.
     ///
     /// # Errors
-    /// Every mistake with its place, at most about 20.
+    /// Every mistake with its location in the input, at most about 20.
     pub fn check(&self, active: &ActiveStructure, raw: RawBatch) -> Result<MeasurementBatch, Vec<Problem>> {
         let RawBatch { source, idempotency_key, measurements: raw } = raw;
         let source = source.unwrap_or_else(|| DEFAULT_SOURCE.to_owned());
@@ -86,8 +86,8 @@ impl Ingest {
         self.take_with(batch, place).await
     }
 
-    /// As [`Self::take`], but waits at most `patience` for a place in the queue: for many batches in a row, none of which should
-    /// displace those of other senders or be refused.
+    /// As [`Self::take`], but waits at most `patience` for a place in the queue. For requests with many batches, which should
+    /// neither be refused nor displace the batches of other senders.
     ///
     /// # Errors
     /// As [`Self::take`].
@@ -96,7 +96,7 @@ impl Ingest {
         self.take_with(batch, waited.map_err(|_| Error::from(QueueFull))?).await
     }
 
-    /// As [`Self::take`], but waits for a place in the queue: for senders that cannot be asked to send again.
+    /// As [`Self::take`], but waits for a place in the queue. For senders that cannot be asked to repeat the request.
     ///
     /// # Errors
     /// As [`Self::take`], without [`Error::QueueFull`].
@@ -105,7 +105,7 @@ impl Ingest {
         self.take_with(batch, place).await
     }
 
-    /// Runs in a task of its own, so that a client that goes away does not interrupt it.
+    /// Stores and assesses a batch in a separate task, which continues when the client disconnects.
     async fn take_with(&self, batch: MeasurementBatch, place: Place) -> Result<Ingested, IngestError> {
         let (ingest, structure) = (self.clone(), batch.structure.clone());
         let task = tokio::spawn(async move { ingest.take_here(batch, place).await }.in_current_span());
@@ -120,8 +120,9 @@ impl Ingest {
         let structure = batch.structure.clone();
         let active = self.assessor.structures.get(&structure)?;
         let (batch_id, received_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
-        let (foreseen, outcome) = oneshot::channel();
-        let insert = self.assessor.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, foreseen);
+        let (speculative, outcome) = oneshot::channel();
+        let insert =
+            self.assessor.store.batches().insert_batch_speculative(&batch, &batch_id, received_at, speculative);
         let record = |batch: MeasurementBatch, content_digest: Digest| BatchRecord {
             batch_id: batch_id.clone(),
             batch,
@@ -130,14 +131,15 @@ impl Ingest {
             state: BatchState::Received,
             failure: None,
         };
-        // While the batch is written to disk. No result is stored or published before the batch itself is stored.
+        // The assessment is computed while the batch is written to disk. No result is stored or published before the batch itself
+        // is stored.
         let compute = async {
             match outcome.await {
                 Ok(InsertBatch::Inserted { content_digest, previous }) if active.baseline.is_ok() => {
                     let task = Task::new(Arc::clone(&active), record(batch.clone(), content_digest), previous, place)?;
                     Ok(Begun::Computed(Box::new(self.assessor.compute(task).await?)))
                 }
-                _ => Ok(Begun::Not(place)),
+                _ => Ok(Begun::NotComputed(place)),
             }
         };
         let (inserted, begun) = tokio::join!(insert, compute);
@@ -145,12 +147,12 @@ impl Ingest {
             InsertBatch::Inserted { content_digest, .. } => {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
-                // The record as it was stored, without reading it back.
+                // The record is returned as it was stored, without reading it from the database.
                 Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await?, replayed: false })
             }
             InsertBatch::Replayed(id) => {
                 let record = self.assessor.stored(&structure, &id).await?;
-                if let (BatchState::Received, true, Ok(Begun::Not(place))) =
+                if let (BatchState::Received, true, Ok(Begun::NotComputed(place))) =
                     (record.state, active.baseline.is_ok(), begun)
                 {
                     let finished =
@@ -172,7 +174,7 @@ impl Ingest {
         let structure = record.batch.structure.clone();
         let finished = match begun {
             Ok(Begun::Computed(computed)) => self.assessor.finish_computed(*computed).await,
-            Ok(Begun::Not(_)) => {
+            Ok(Begun::NotComputed(_)) => {
                 self.assessor.events.batch_changed(&structure, &record.batch_id, record.state);
                 return self.records.view(record).await;
             }
@@ -187,8 +189,8 @@ impl Ingest {
         }
     }
 
-    /// The result of a stored batch. Where there is none, the batch is attempted again later, because its sender may not send it
-    /// again.
+    /// Returns the given result of a stored batch. If the batch has no result, its assessment is attempted again later, because the
+    /// sender may not send it again.
     fn or_resumed(&self, structure: &StructureId, result: Result<Finished, Error>) -> Result<Finished, Error> {
         match &result {
             Ok(finished) => self.replay.resume_if_superseded(structure, finished),

@@ -41,7 +41,7 @@ const MEANINGS: [(&str, &str); 34] = [
 ];
 
 /// Declares the metrics that would otherwise appear only with their first event: a rate over a counter that starts at 1 misses that
-/// event, and an alert on a missing metric never fires. To be called after the recorder is installed.
+/// event, and an alert on a missing metric never fires. It must be called after the recorder is installed.
 pub fn declare_metrics(sqlite_version: &str) {
     for (name, meaning) in MEANINGS {
         match name {

@@ -211,7 +211,7 @@ impl Monitor {
         self.store.outbox()
     }
 
-    /// Messages that were refused and kept.
+    /// Messages from the broker that could not become a batch.
     pub fn quarantine(&self) -> Quarantine<'_> {
         self.store.quarantine()
     }

@@ -1,7 +1,8 @@
 //! Replacing the trained baseline in use by another, while batches arrive.
 //!
-//! The new one is loaded beside the old one, runs its self-test, and must have passed its calibration. Only then is it swapped in. A
-//! batch that was started with the old one either keeps its result or is assessed again: a result names one digest.
+//! The new trained baseline is loaded beside the old one, runs its self-test, and must have passed its calibration. Only then does
+//! it replace the old one. A batch whose assessment was started with the old one either keeps its result or is assessed again, so
+//! that each result was computed with one trained baseline, whose digest it names.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -25,9 +26,9 @@ pub struct Reloaded {
     pub structure: StructureId,
     /// The trained baseline in use now.
     pub model_digest: Digest,
-    /// The one before.
+    /// The trained baseline that was in use before, if any.
     pub previous_model_digest: Option<Digest>,
-    /// False when the files are those in use.
+    /// False when the files contain the trained baseline that was already in use.
     pub changed: bool,
     /// Version of the undamaged reference that was renewed with it.
     pub undamaged_version: Option<u32>,
@@ -58,8 +59,8 @@ impl Models {
         Self { store, structures, references, replay, reloading: Arc::default(), refused: Arc::default() }
     }
 
-    /// Reads the models folder again and puts its trained baseline for a structure into use; the one before stays in use when the
-    /// new one is refused. With `renew`, the undamaged reference is renewed with the new one.
+    /// Reads the models folder again and puts its trained baseline for a structure into use; the previous one stays in use when the
+    /// new one is refused. With `renew`, the undamaged reference is renewed with the new trained baseline.
     ///
     /// # Errors
     /// [`Error::UnknownStructure`]; [`ReloadError::Refused`] with the reason; [`Error::VersionChanged`].
@@ -78,7 +79,7 @@ impl Models {
                 refused.remove(structure);
             }
             Err(ReloadError::Refused { reason, .. }) => {
-                warn!(structure.id = %structure, "Kept the trained baseline of {structure}: {reason}");
+                warn!(structure.id = %structure, "Refused the new trained baseline of {structure}: {reason}");
                 refused.insert(structure.clone(), reason.clone());
             }
             Err(ReloadError::Monitor(_)) => {}
@@ -103,8 +104,8 @@ impl Models {
         };
         if self.store.structures().trained_baseline(structure, active.simulator.digest()).await?.is_some() {
             let reason =
-                "the service itself trained the present version, an extension, which no file replaces: undo the \
-                          extension first";
+                "the present version is an extension, whose trained baseline was made by the service and cannot be \
+                 replaced by a file: undo the extension first";
             return Err(refused(reason.to_owned()));
         }
         let library = self.structures.library();
@@ -140,8 +141,8 @@ impl Models {
     }
 }
 
-/// The trained baseline of a library for the present version of a structure, or why there is none. Stricter than at the start:
-/// whoever asks for a reload has just written a file and means that one.
+/// The trained baseline of a library for the present version of a structure, or why there is none. This is stricter than at the
+/// start of the service, because a user who requests a reload has just written a file and expects that file to be used.
 fn candidate(library: &Library, structure: &StructureId, active: &ActiveStructure) -> Result<Arc<Baseline>, String> {
     // A definition that cannot be read might be that of this structure; a shipped baseline must not silently be used instead.
     let blocking = |of: Option<&StructureId>| of.is_none() || of == Some(structure);
@@ -149,12 +150,12 @@ fn candidate(library: &Library, structure: &StructureId, active: &ActiveStructur
         return Err(format!("{}: {}", refusal.file, refusal.reason));
     }
     let Some(Entry { simulator, baseline }) = library.get(structure) else {
-        return Err("the models folder has none for it".to_owned());
+        return Err("the models folder does not contain this structure".to_owned());
     };
     if simulator.digest() != active.simulator.digest() {
         let (found, present) = (simulator.digest(), active.simulator.digest());
         return Err(format!(
-            "it is for another definition of the structure (digest {found}, the present one is {present})"
+            "it was trained for another definition of the structure (digest {found}; the present definition has {present})"
         ));
     }
     baseline.clone().ok_or_else(|| "the models folder has the structure, but no trained baseline for it".to_owned())

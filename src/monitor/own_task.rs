@@ -1,4 +1,4 @@
-//! Work that a client who goes away does not interrupt.
+//! Work that continues when its client disconnects.
 
 use std::future::Future;
 
@@ -6,7 +6,7 @@ use tracing::Instrument as _;
 
 use super::error::Error;
 
-/// Runs `work` in a task of its own, so that it comes to its end even when the caller is dropped.
+/// Runs `work` in a separate task, so that it completes even if the caller is dropped.
 ///
 /// # Errors
 /// Those of `work`; [`Error::Panicked`].

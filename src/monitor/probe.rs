@@ -1,6 +1,6 @@
 //! Whether the database can be written, tested at most once a second.
 //!
-//! Reading the health needs no token, so anyone can ask as often as they like, and each test is a transaction.
+//! The health can be read without a token and therefore any number of times, but each test is a transaction.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 struct Answer {
     at: Instant,
     finding: Option<Reason>,
-    /// Refused writes of the store after the test: when another write was refused since, the result is outdated.
+    /// Number of refused writes of the store after the test. If another write was refused since then, the result is outdated.
     refused_writes: u64,
 }
 
@@ -42,9 +42,10 @@ impl WriterProbe {
         self.finding_of(ask(self.store.clone())).await
     }
 
-    async fn finding_of(&self, question: impl Future<Output = Option<Reason>> + Send + 'static) -> Option<Reason> {
+    async fn finding_of(&self, test: impl Future<Output = Option<Reason>> + Send + 'static) -> Option<Reason> {
         let probe = self.clone();
-        // In a task of its own: otherwise a client that goes away before the result would make the next one test again.
+        // The test runs in a separate task: otherwise, if a client disconnected before the result, the next caller would have to
+        // repeat the test.
         let task = tokio::spawn(async move {
             let mut last = probe.last.lock().await;
             let refused_writes = probe.store.file().refused_writes();
@@ -52,7 +53,7 @@ impl WriterProbe {
             if let Some(answer) = last.as_ref().filter(fresh) {
                 return answer.finding.clone();
             }
-            let finding = question.await;
+            let finding = test.await;
             let refused_writes = probe.store.file().refused_writes();
             *last = Some(Answer { at: Instant::now(), finding: finding.clone(), refused_writes });
             finding
@@ -60,7 +61,7 @@ impl WriterProbe {
         task.await.unwrap_or_else(|_| Some(Reason::new("internal", "the test of the writer panicked: a bug")))
     }
 
-    /// True unless the writer hangs, which is a reason to restart the service; a full disk is none.
+    /// True unless the writer hangs. That is a reason to restart the service; a full disk is not.
     pub(super) async fn responds(&self) -> bool {
         self.finding().await.is_none_or(|reason| reason.code != STUCK)
     }
@@ -86,11 +87,11 @@ mod tests {
     use std::sync::atomic::{AtomicU64, Ordering};
 
     #[tokio::test]
-    async fn many_who_ask_are_answered_by_one_question_a_second_even_when_they_do_not_wait() {
+    async fn many_callers_share_one_test_a_second_even_when_they_do_not_wait() {
         let folder = tempfile::tempdir().unwrap();
         let probe = WriterProbe::new(Store::open(folder.path()).await.unwrap());
         let asked = Arc::new(AtomicU64::new(0));
-        let question = || {
+        let test = || {
             let asked = Arc::clone(&asked);
             async move {
                 tokio::time::sleep(Duration::from_millis(5)).await;
@@ -99,21 +100,21 @@ mod tests {
         };
         let started = Instant::now();
         for _ in 0..300 {
-            // Goes away before the answer.
-            let _ = tokio::time::timeout(Duration::from_millis(1), probe.finding_of(question())).await;
-            assert_eq!(probe.finding_of(question()).await.unwrap().code, "test");
+            // This caller stops waiting before the result.
+            let _ = tokio::time::timeout(Duration::from_millis(1), probe.finding_of(test())).await;
+            assert_eq!(probe.finding_of(test()).await.unwrap().code, "test");
         }
         let most = 1 + started.elapsed().as_secs();
         let times = asked.load(Ordering::SeqCst);
-        assert!((1..=most).contains(&times), "{times} questions, {most} would be right");
+        assert!((1..=most).contains(&times), "{times} tests, at most {most} are expected");
 
-        // An answer gets old.
+        // A result is used for a limited time only.
         tokio::time::sleep(FRESH_FOR).await;
-        assert_eq!(probe.finding_of(question()).await.unwrap().message, times.to_string());
+        assert_eq!(probe.finding_of(test()).await.unwrap().message, times.to_string());
     }
 
     #[tokio::test]
-    async fn a_write_that_was_refused_makes_the_answer_old_at_once() {
+    async fn a_refused_write_makes_the_result_outdated_at_once() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).await.unwrap();
         let probe = WriterProbe::new(store.clone());

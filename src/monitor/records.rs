@@ -1,4 +1,4 @@
-//! What is read of the stored batches and their assessments.
+//! Reading stored batches and their assessments.
 
 use std::fmt;
 use std::sync::Arc;
@@ -34,7 +34,7 @@ pub enum Missing {
     PartOfReference(u32),
     /// The reference of this version was made with another trained baseline: it has to be declared again.
     OutdatedReference(u32),
-    /// The comparison is still to come.
+    /// The comparison has not been computed yet.
     NotYet,
     /// The structure has no reference: it has to be declared.
     Reference,
@@ -45,13 +45,13 @@ impl fmt::Display for Missing {
         match self {
             Self::Model(reason) => f.write_str(reason),
             Self::PartOfReference(version) => {
-                write!(f, "part of the undamaged reference, version {version}: not compared with itself")
+                write!(f, "the batch is part of the undamaged reference, version {version}, and is not compared with it")
             }
             Self::OutdatedReference(version) => write!(
                 f,
                 "the undamaged reference, version {version}, was made with another trained baseline: declare undamaged batches again"
             ),
-            Self::NotYet => f.write_str("not compared with the undamaged reference yet"),
+            Self::NotYet => f.write_str("the batch has not been compared with the undamaged reference yet"),
             Self::Reference => f.write_str("there is no undamaged reference: declare undamaged batches"),
         }
     }
@@ -214,7 +214,7 @@ impl Records {
         let not_assessed = |reason: String| Error::NotAssessed { batch: batch_id.to_owned(), reason };
         match record.state {
             BatchState::Assessed => {}
-            BatchState::Received => return Err(not_assessed("it waits for its assessment".to_owned())),
+            BatchState::Received => return Err(not_assessed("it still waits for its assessment".to_owned())),
             BatchState::Failed => return Err(not_assessed(record.failure.unwrap_or_default())),
         }
         let place = compute.reserve()?;

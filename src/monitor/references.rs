@@ -21,26 +21,28 @@ impl References {
         Self { assessor }
     }
 
-    /// Renews the newest reference of a structure for the version in use, where it was made with another trained baseline: after a
-    /// switch of versions, also one that a stop of the service interrupted. Version of the new reference.
+    /// Renews the newest reference of a structure if it was made with another trained baseline than the one of the version in use.
+    /// This is the case after a switch of versions, including one that was interrupted by a stop of the service. Returns the
+    /// version of the new reference.
     pub(super) async fn renew_if_outdated(&self, structure: &StructureId) -> Option<u32> {
         let Assessor { store, structures, .. } = &*self.assessor;
         let newest = store.reference().undamaged(structure).await.ok()??;
         let active = structures.get(structure).ok()?;
         let baseline = active.baseline.as_ref().ok()?;
         let version = store.structures().structure_version(structure, active.simulator.digest()).await.ok()?;
-        // Only versions made by an extension are followed; after replacing a trained baseline, the user decides on the reference.
+        // Only after a switch to a version made by an extension is the reference renewed automatically; after a trained baseline
+        // was replaced, the user decides.
         if newest.model_digest == *baseline.digest() || version.is_none() {
             return None;
         }
         self.renew(structure).await
     }
 
-    /// Makes the newest reference of a structure again from its batches, with the trained baseline in use. Batches that cannot be
-    /// trusted now are left out. Version of the new reference.
+    /// Computes the newest reference of a structure again from its batches, with the trained baseline in use. Batches that cannot
+    /// be trusted with this trained baseline are left out. Returns the version of the new reference.
     pub(super) async fn renew(&self, structure: &StructureId) -> Option<u32> {
         let failed = |error: &dyn std::fmt::Display| {
-            warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present baseline: {error}");
+            warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
         };
         let newest = self.assessor.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
         let (mut batches, threshold) = (newest.batches.clone(), newest.state.threshold_probability);

@@ -24,7 +24,7 @@ use crate::store::{self, ReferenceRecord};
 /// Pause between two attempts to store results that could not be stored, for example on a full disk.
 const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
 
-/// Batches that are looked up at a time.
+/// Number of waiting batches that are read from the store at a time.
 const PAGE: usize = 500;
 
 /// The state of a waiting batch after an attempt to assess it.
@@ -92,8 +92,8 @@ impl Replay {
         });
     }
 
-    /// Attempts to assess the waiting batches of a structure until none is left, in the background: after a full disk, for example,
-    /// their senders may not send them again.
+    /// Attempts to assess the waiting batches of a structure until none is left, in the background. This is needed after a full
+    /// disk, for example, because their senders may not send them again.
     pub(super) fn resume_until_done(&self, structure: StructureId) {
         if !self.recovering.lock().expect("no holder of this lock panics").insert(structure.clone()) {
             return;
@@ -106,7 +106,7 @@ impl Replay {
                     Ok(()) => break,
                     Err(_) if replay.assessor.store.file().is_closed() => break,
                     Err(error) => {
-                        warn!(structure.id = %structure, %error, "Unassessed batches of {structure} still wait: {error}");
+                        warn!(structure.id = %structure, %error, "Could not assess the waiting batches of {structure}, trying again: {error}");
                     }
                 }
             }
@@ -128,13 +128,13 @@ impl Replay {
         }
     }
 
-    /// Assesses some batches; false when there is no trained baseline to assess them with.
+    /// Assesses some batches. Returns false when there is no trained baseline to assess them with.
     async fn assess_all(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
         let at_a_time = self.assessor.compute.places_behind();
         let has_baseline = AtomicBool::new(true);
         let computed = stream::iter(batches).map(|id| self.compute_waiting(structure, id)).buffered(at_a_time);
         let stored = computed.map_ok(|waiting| {
-            // The write is queued here, in the order of the stream, however long its completion takes.
+            // The write is queued here, and therefore in the order of the stream, however long it takes to complete.
             let queued = match waiting {
                 Waiting::Computed(computed) => Some(self.assessor.store_computed(*computed)),
                 Waiting::Done => None,

@@ -1,4 +1,4 @@
-//! Deletion of old batches, where the configuration asks for it.
+//! Deletion of old batches, which happens only if it is configured.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -90,7 +90,7 @@ pub async fn plan(
     Ok(RetentionPlan { measurements_days: settings.measurements_days, before, would_delete, last_run: None })
 }
 
-/// Deletes what is too old by the settings at the time `now`, a few batches at a time.
+/// Deletes the batches that are too old at the time `now` according to the settings, a few at a time.
 ///
 /// # Errors
 /// [`crate::store::Error`]; what was deleted before stays deleted.

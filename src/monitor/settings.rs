@@ -12,18 +12,19 @@ use crate::assessment::Draws;
 pub struct MonitorSettings {
     /// Posterior samples drawn for each measurement (paper §5.2: 10).
     pub draws_per_measurement: usize,
-    /// Posterior samples drawn for each measurement to estimate the population behind a batch: a third of them as a pilot sample,
-    /// and all where the batch is noise-dominated or an importance proposal is no better.
+    /// Posterior samples drawn for each measurement to estimate the population behind a batch. A third of them is the pilot sample;
+    /// the others are drawn only if the batch is noise-dominated or an importance proposal is not better.
     pub draws_for_population: usize,
-    /// Most measurements in one batch.
+    /// Largest number of measurements in one batch.
     pub max_measurements: usize,
-    /// Digests of trained baselines that may be used although they did not pass their calibration; every answer says so.
+    /// Digests of trained baselines that may be used although they did not pass their calibration; every assessment with them has a
+    /// finding about it.
     pub accept_uncalibrated: Vec<String>,
     /// How measurements are treated that lack a covariate which the simulation depends on.
     pub missing_covariate: MissingCovariate,
     /// How alarms are raised.
     pub alarm: AlarmSettings,
-    /// The queue in front of the processor.
+    /// Limits of the queue of assessments.
     pub compute: ComputeSettings,
 }
 
@@ -52,7 +53,7 @@ impl Default for MonitorSettings {
 }
 
 impl MonitorSettings {
-    /// The settings that change the answers for the same measurements.
+    /// The settings on which the assessments of given measurements depend.
     pub(super) fn of_answers(&self) -> serde_json::Value {
         serde_json::json!({
             "draws_per_measurement": self.draws_per_measurement,

@@ -12,7 +12,7 @@ use super::supervise::supervise;
 use crate::quantity::Timestamp;
 use crate::store::Store;
 
-/// Pause between two checks, and so the largest delay of an alarm.
+/// Pause between two checks, which is also the largest delay of an alarm.
 const EVERY: Duration = Duration::from_secs(5);
 
 /// Opens and ends alarms of silence.
@@ -53,7 +53,7 @@ impl Silence {
         });
     }
 
-    /// Opens and ends alarms of silence. A structure that never sent anything is not silent. The time before the service `started`
+    /// Opens and ends alarms of silence. A structure that never sent a batch is not silent. The time before the service `started`
     /// does not count, because nothing could be received then, and maintenance raises no alarm.
     async fn check(&self, started: Timestamp, clock: impl Fn() -> Timestamp) -> Result<(), Error> {
         let allowed = self.after_s as i64 * 1_000_000;

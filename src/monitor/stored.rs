@@ -1,4 +1,4 @@
-//! The records and errors of the store that the application passes on.
+//! The records and errors of the store that the application returns to its callers.
 
 pub use crate::store::{
     backup, schema_version, Acknowledgement, AuditEntry, AuditQuery, BatchRecord, ChartMark, ChartSeries, Delivery,

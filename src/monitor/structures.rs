@@ -124,7 +124,7 @@ impl ActiveStructures {
         Arc::clone(&self.library.read().expect("no holder of this lock panics"))
     }
 
-    /// Replaces what was read from disk.
+    /// Replaces the library by one that was read again from disk.
     pub(super) fn set_library(&self, library: Library) {
         *self.library.write().expect("no holder of this lock panics") = Arc::new(library);
     }
@@ -187,13 +187,14 @@ impl ActiveStructures {
         Ok(())
     }
 
-    /// The trained baseline for a version of a structure: one that the service trained for it, or that of the library.
+    /// The trained baseline for a version of a structure: the one that the service trained for it, otherwise the one of the
+    /// library.
     pub(super) async fn baseline_for(&self, simulator: &Simulator) -> Result<Result<Arc<Baseline>, String>, Error> {
         let Some(stored) = self.store.structures().trained_baseline(simulator.id(), simulator.digest()).await? else {
             return Ok(self.library_baseline(simulator));
         };
         let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);
-        let refused = |e: crate::baseline::LoadError| format!("the baseline that the service trained is refused: {e}");
+        let refused = |e: crate::baseline::LoadError| format!("the baseline trained by the service is refused: {e}");
         let usable = |baseline: &Baseline| if stored.accepted { Ok(()) } else { self.usable(baseline) };
         Ok(loaded.map_err(refused).and_then(|baseline| usable(&baseline).map(|()| Arc::new(baseline))))
     }
@@ -224,7 +225,7 @@ impl ActiveStructures {
         }
         Err(format!(
             "the trained baseline failed its calibration ({}): train again with more samples or epochs; to use it nevertheless, \
-             and have every answer say so, add its digest {digest} to monitor.accept_uncalibrated",
+             add its digest {digest} to monitor.accept_uncalibrated, and every assessment then has a finding about it",
             failures.join("; ")
         ))
     }

@@ -1,4 +1,4 @@
-//! The n-th call fails, for all n: whatever breaks on the way of a batch, a retry stores it once and assesses it.
+//! Faults at the n-th call, for all n: wherever the processing of a batch fails, a retry stores it once and assesses it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -19,7 +19,7 @@ fn structure() -> StructureId {
     StructureId::parse("three-dof").unwrap()
 }
 
-/// What the structure shows in measurement `row`: stiffnesses spread by ±2 %.
+/// Frequencies of the structure in measurement `row`, Hz, with stiffnesses spread by ±2 %.
 fn measured_hz(row: usize) -> Vec<Option<Hertz>> {
     static SIMULATOR: OnceLock<Simulator> = OnceLock::new();
     let simulator = SIMULATOR.get_or_init(|| Library::open(None).unwrap().get(&structure()).unwrap().simulator.clone());
@@ -31,7 +31,7 @@ fn measured_hz(row: usize) -> Vec<Option<Hertz>> {
 /// Measurements of a batch: more than are inserted by one statement.
 const MEASUREMENTS: usize = 33;
 
-/// Batch `number`, at times of its own.
+/// Batch `number`, whose measurement times differ from those of all other batches.
 fn batch(number: usize) -> MeasurementBatch {
     let one = |i: usize| ModalMeasurement {
         measured_at: Timestamp::from_micros(1_767_225_600_000_000 + (MEASUREMENTS * number + i) as i64 * 1_000_000)
@@ -68,7 +68,7 @@ async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
     Monitor::open(store, Library::open(None).unwrap(), settings).await.unwrap()
 }
 
-/// Ids of all batches, each of which must be assessed and whole.
+/// Ids of all batches, each of which must be assessed and complete.
 async fn stored(monitor: &Monitor) -> Vec<String> {
     let query = HistoryQuery { limit: 1_000, ..HistoryQuery::default() };
     let items = monitor.store().history().page(&structure(), &query).await.unwrap();
@@ -81,7 +81,7 @@ async fn stored(monitor: &Monitor) -> Vec<String> {
     items.into_iter().map(|item| item.batch_id).collect()
 }
 
-/// Posts a batch again until it is taken, as a client does that was answered with an error.
+/// Posts a batch again until it is accepted, as a client does after an error.
 async fn retried(monitor: &Monitor, number: usize, tries: usize) -> Ingested {
     for _ in 0..tries {
         if let Ok(taken) = monitor.ingest().take(batch(number)).await {
@@ -98,7 +98,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
     let monitor = open(folder.path()).await;
     let (mut number, mut failures) = (0, 0);
     for point in ["store::begin", "store::measurement", "store::commit", "store::committed", "store::read"] {
-        // Once as an error, once as a panic, and as an error that stays until somebody mends it.
+        // One error, one panic, and an error that persists until it is cleared.
         for (action, stays) in [("1*return", false), ("1*panic", false), ("return", true)] {
             let (mut call, mut elsewhere) = (0, 0);
             loop {
@@ -108,7 +108,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
                     faults.clear(point);
                     number += 1;
                     if call < 2 {
-                        // What goes on with batches two seconds after an earlier fault has met this one.
+                        // The background retry that begins two seconds after an earlier fault has met this fault instead.
                         elsewhere += 1;
                         assert!(elsewhere < 10, "{point} is called {call} times only");
                         continue;
@@ -139,7 +139,7 @@ async fn whichever_call_fails_a_retry_stores_the_batch_once_and_assesses_it() {
     drop(faults);
     monitor.store().close().await;
     drop(monitor);
-    // And so it is for whoever opens it next: opening checks the file.
+    // The same holds after the store is opened again, which checks the file.
     let monitor = open(folder.path()).await;
     assert_eq!(stored(&monitor).await, ids);
 }
@@ -204,7 +204,7 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
 /// Batches that are assessed again.
 const REPLAYED: usize = 40;
 
-/// What a replay on so many threads leaves of each batch: all numbers of its assessment and charts, but for ids and the time.
+/// What a replay on this number of threads stores for each batch: all numbers of its assessment and charts, without ids and times.
 async fn replayed(threads: usize) -> Vec<String> {
     let folder = tempfile::tempdir().unwrap();
     let compute = ComputeSettings { threads, ..ComputeSettings::default() };
@@ -215,14 +215,14 @@ async fn replayed(threads: usize) -> Vec<String> {
     }
     let mut news = monitor.events().watch().unwrap();
     monitor.replay().declare_reference(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
-    let mut told = Vec::new();
-    while told.len() < REPLAYED - 5 {
+    let mut assessed = Vec::new();
+    while assessed.len() < REPLAYED - 5 {
         if let News::Batch { batch, state, .. } = news.recv().await.unwrap() {
             assert_eq!(state, BatchState::Assessed);
-            told.push(batch);
+            assessed.push(batch);
         }
     }
-    assert_eq!(told, ids[5..], "in the order of arrival");
+    assert_eq!(assessed, ids[5..], "in the order of arrival");
     let mut left = Vec::new();
     let mut times = BTreeSet::new();
     for id in &ids {
@@ -233,7 +233,7 @@ async fn replayed(threads: usize) -> Vec<String> {
         for point in &mut charts {
             point.batch_id.clear();
         }
-        // The shortest text that gives the same float tells apart what differs in one bit.
+        // `Debug` prints the shortest text that parses to the same float, so the texts differ if a single bit differs.
         left.push(format!("{assessment:?} {charts:?}"));
     }
     assert!(times.len() > 1);

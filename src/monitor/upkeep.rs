@@ -78,7 +78,8 @@ impl Upkeep {
         self.sources.lock().expect("no holder of this lock panics").push(Box::new(source));
     }
 
-    /// Checks everything that a batch needs; whether the database can be written is at most one second old.
+    /// Checks everything that is needed to store and assess a batch. The test whether the database can be written is at most one
+    /// second old.
     pub async fn health(&self) -> Health {
         let mut reasons: Vec<Reason> = self.probe.finding().await.into_iter().collect();
         if self.baselines_in_use() == 0 {
@@ -111,7 +112,7 @@ impl Upkeep {
         }
         for (structure, reason) in self.models.refused() {
             let message =
-                format!("the last reload for {structure} was refused, the baseline before stays in use: {reason}");
+                format!("the last reload of the trained baseline of {structure} was refused, and the previous one stays in use: {reason}");
             findings.push(Reason::new("model_reload_refused", message));
         }
         let failed = self.retention.last_run().and_then(|run| run.failure);
@@ -141,7 +142,7 @@ impl Upkeep {
         findings
     }
 
-    /// Sets the gauges that are read from their source rather than counted.
+    /// Sets the gauges whose values are read from their source and not counted.
     ///
     /// # Errors
     /// [`Error::Store`].
@@ -162,9 +163,9 @@ impl Upkeep {
         metrics::gauge!("modalwatch_pending_batches").set(figures.pending_batches as f64);
         for kind in ALARM_KINDS {
             let found = figures.open_alarms.iter().find(|(name, ..)| name == kind);
-            let (open, unseen) = found.map_or((0, 0), |(_, open, unseen)| (*open, *unseen));
+            let (open, unacknowledged) = found.map_or((0, 0), |(_, open, unacknowledged)| (*open, *unacknowledged));
             metrics::gauge!("modalwatch_open_alarms", "kind" => kind).set(open as f64);
-            metrics::gauge!("modalwatch_unacknowledged_alarms", "kind" => kind).set(unseen as f64);
+            metrics::gauge!("modalwatch_unacknowledged_alarms", "kind" => kind).set(unacknowledged as f64);
         }
         Ok(())
     }

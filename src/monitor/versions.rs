@@ -1,4 +1,4 @@
-//! Switching between the versions of a structure: an extension, and the way back.
+//! Switching between the versions of a structure, by an extension or by undoing one.
 
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ impl Versions {
     }
 
     /// Undoes an extension: the version that the present one extends is put into use with its trained baseline, and all batches are
-    /// assessed again. Digest of that version.
+    /// assessed again. Returns the digest of that version.
     ///
     /// # Errors
     /// [`Error::NoStepBack`] when the present version is not an extension.
@@ -46,12 +46,13 @@ impl Versions {
 
     async fn step_back_here(&self, structure: &StructureId) -> Result<Digest, Error> {
         let active = self.structures.get(structure)?;
-        let none = || Error::NoStepBack(structure.clone());
+        let not_extended = || Error::NoStepBack(structure.clone());
         let present = active.simulator.digest().clone();
-        let (_, parent) = self.store.structures().structure_version(structure, &present).await?.ok_or_else(none)?;
-        let parent = parent.ok_or_else(none)?;
+        let (_, parent) =
+            self.store.structures().structure_version(structure, &present).await?.ok_or_else(not_extended)?;
+        let parent = parent.ok_or_else(not_extended)?;
         let (definition, grandparent) =
-            self.store.structures().structure_version(structure, &parent).await?.ok_or_else(none)?;
+            self.store.structures().structure_version(structure, &parent).await?.ok_or_else(not_extended)?;
         let simulator = Simulator::new(StructureDefinition::parse_json(&definition)?)?;
         let missing = |reason| Error::NoModel { structure: structure.clone(), reason };
         let baseline = self.structures.baseline_for(&simulator).await?.map_err(missing)?;
@@ -63,12 +64,12 @@ impl Versions {
             baseline: None,
         };
         self.switch(&present, version, simulator, baseline).await?;
-        info!(structure.id = %structure, "Went back to version {parent} of {structure}");
+        info!(structure.id = %structure, "Undid the extension of {structure}: version {parent} is in use again");
         Ok(parent)
     }
 
     /// Replaces the version `expected` by another; the undamaged reference is renewed for it, and all batches are assessed again.
-    /// Version of the renewed reference.
+    /// Returns the version of the renewed reference.
     pub(super) async fn switch(
         &self,
         expected: &Digest,

@@ -143,7 +143,10 @@ async fn a_batch_that_is_too_long_or_a_body_that_is_too_large_is_refused() {
     let row = |i: usize| json!({ "measured_at": time(i), "frequencies_hz": [0.41, 0.74, 0.93] });
     let rows: Vec<Value> = (0..10_000).map(row).collect();
     let answer = problem(service.post(BATCHES, &json!({ "measurements": rows })).await, 422, "invalid").await;
-    assert!(answer["detail"].as_str().unwrap().contains("10000 measurements: at most 5000"), "{answer}");
+    assert!(
+        answer["detail"].as_str().unwrap().contains("10000 measurements: a batch may contain at most 5000"),
+        "{answer}"
+    );
 
     let huge = vec![b' '; 5 << 20];
     problem(service.post_text(BATCHES, "application/json", huge.clone()).await, 413, "body_too_large").await;

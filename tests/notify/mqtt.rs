@@ -96,7 +96,7 @@ async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
     let items = page["items"].as_array().unwrap();
     assert_eq!(items.len(), 7, "{page}");
     for reason in [
-        "the body is no JSON",
+        "the body is not valid JSON",
         "/sorce: unknown field",
         "/measurements/1/frequencies_hz/2",
         "which has other content",

@@ -88,11 +88,11 @@ async fn an_archive_that_is_not_whole_or_not_true_is_refused_with_its_line() {
     let cut = refused(lines[..lines.len() - 1].join("\n") + "\n").await;
     assert!(cut.contains("its last line is missing"), "{cut}");
     let half = refused(whole[..whole.len() / 2].to_owned()).await;
-    assert!(half.contains("line ") && half.contains("no record of an archive"), "{half}");
+    assert!(half.contains("line ") && half.contains("not a record of an archive"), "{half}");
     let dropped = [&lines[..5], &lines[6..]].concat().join("\n") + "\n";
-    assert!(refused(dropped).await.contains("not whole"));
+    assert!(refused(dropped).await.contains("incomplete or was changed"));
     let empty = refused(String::new()).await;
-    assert!(empty.contains("not whole"), "{empty}");
+    assert!(empty.contains("incomplete or was changed"), "{empty}");
 
     let unknown = service.get("/v1/structures/bridge/export").send().await.unwrap();
     problem(unknown, 404, "unknown_structure").await;

@@ -43,7 +43,7 @@ async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
     let stored = history(&service).await;
     assert_eq!(refused.headers()["retry-after"], "30");
     let refused = problem(refused, 507, "disk_full").await;
-    assert!(refused["detail"].as_str().unwrap().contains("send it again"), "{refused}");
+    assert!(refused["detail"].as_str().unwrap().contains("repeat the request then"), "{refused}");
     let structure = json!({ "batches": ["x"] });
     assert_ne!(service.post("/v1/structures/three-dof/reference", &structure).await.status(), 500);
     problem(service.post("/v1/backups", &json!({})).await, 507, "disk_full").await;

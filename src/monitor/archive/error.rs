@@ -18,13 +18,13 @@ pub enum ImportError {
     /// An invalid line.
     #[error("line {line}: {reason}")]
     Line {
-        /// From 1.
+        /// Number of the line, from 1.
         line: u64,
         /// What is wrong.
         reason: String,
     },
     /// It is incomplete or was changed.
-    #[error("the archive is not whole: {0}; nothing was stored")]
+    #[error("the archive is incomplete or was changed: {0}; nothing was stored")]
     NotWhole(String),
     /// Its content does not fit this installation.
     #[error(transparent)]

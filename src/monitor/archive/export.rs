@@ -13,7 +13,7 @@ use crate::store::archive::{ArchivedModel, End, Head, Record, FORMAT, NOT_CARRIE
 /// Lines buffered between store and reader.
 const BUFFERED: usize = 64;
 
-/// The archive of a structure, line by line, each with its line end; when it is interrupted, the last of them is an error.
+/// Returns the lines of the archive of a structure, each with its line end. If the export fails, the last item is an error.
 pub(super) async fn export(
     assessor: &Assessor,
     structure: &StructureId,
@@ -47,7 +47,7 @@ pub(super) async fn export(
     tokio::spawn(async move {
         let sender = records.clone();
         let read = tokio::spawn(async move {
-            // The other task notices when the receiver is gone.
+            // An error means that the receiver was dropped, which the other task notices by itself.
             let _ = sender.send(head).await;
             store.archive().export(&id, models, &sender).await
         });

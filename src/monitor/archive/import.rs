@@ -34,15 +34,15 @@ pub struct Imported {
     pub versions: u64,
     /// Trained baselines that were new.
     pub models: u64,
-    /// Batches of the archive.
+    /// All batches of the archive.
     pub batches: u64,
-    /// Those of them that were new.
+    /// Batches of the archive that were not stored before.
     pub batches_new: u64,
     /// Undamaged references that were new.
     pub undamaged_states: u64,
     /// Maintenance windows that were new.
     pub maintenance_windows: u64,
-    /// Acknowledgements that found their alarm.
+    /// Acknowledgements whose alarm exists and was not acknowledged before.
     pub acknowledgements: u64,
     /// Warnings for the user.
     pub warnings: Vec<String>,
@@ -73,12 +73,12 @@ pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) ->
     };
     if head.settings != assessor.settings.of_answers() {
         let warning = format!(
-            "the archive was written with other settings ({}) than those here: answers may differ",
+            "the archive was written with settings that differ from those of this service ({}): assessments may differ",
             head.settings
         );
         import.done.warnings.push(warning);
     }
-    // A thread of its own reads the lines, so that a large file neither fills the memory nor blocks an async thread.
+    // A separate thread reads the lines, so that a large file neither fills the memory nor blocks an async thread.
     let (sender, mut lines) = channel(BUFFERED);
     let file = path.to_owned();
     let reader = tokio::task::spawn_blocking(move || {
@@ -96,7 +96,7 @@ pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) ->
     import.finish().await
 }
 
-/// The error for the thread that reads when the import stopped.
+/// The error that ends the reading thread when the import has stopped.
 fn stopped(line: u64) -> ImportError {
     ImportError::Line { line, reason: "the import was stopped".to_owned() }
 }
@@ -163,8 +163,8 @@ impl Import<'_> {
     async fn take_model(&mut self, model: ArchivedModel) -> Result<(), ImportError> {
         let structure = self.done.structure.clone();
         let library = self.assessor.structures.library();
-        let here = library.get(&structure).and_then(|entry| entry.baseline.as_ref());
-        if here.is_some_and(|baseline| baseline.digest().as_str() == model.model_digest) {
+        let in_library = library.get(&structure).and_then(|entry| entry.baseline.as_ref());
+        if in_library.is_some_and(|baseline| baseline.digest().as_str() == model.model_digest) {
             return Ok(());
         }
         let version = Digest::from_stored(model.structure_digest.clone());
@@ -190,7 +190,7 @@ impl Import<'_> {
         Ok(())
     }
 
-    /// Assesses the batches with the imported baseline, and stores the acknowledgements of the alarms that this raises.
+    /// Assesses the batches with the imported trained baseline, and stores the acknowledgements of the alarms that this raises.
     async fn finish(mut self) -> Result<Imported, ImportError> {
         self.store_waiting().await?;
         let structure = self.done.structure.clone();
@@ -204,16 +204,17 @@ impl Import<'_> {
         if let Some(state) = self.assessor.store.reference().undamaged(&structure).await? {
             if in_use.as_ref().is_some_and(|digest| *digest != state.model_digest) {
                 self.done.warnings.push(format!(
-                    "the undamaged reference {} was made with baseline {}, which is not in use here: batches are not compared with it",
+                    "the undamaged reference {} was made with the trained baseline {}, which is not in use here: batches are not \
+                     compared with it",
                     state.state.version, state.model_digest
                 ));
             }
         }
         self.replay.resume(&structure).await?;
-        let noted = std::mem::take(&mut self.acknowledgements);
-        for note in noted {
+        let acknowledgements = std::mem::take(&mut self.acknowledgements);
+        for acknowledgement in acknowledgements {
             self.done.acknowledgements +=
-                u64::from(self.assessor.store.archive().import_acknowledgement(&structure, note).await?);
+                u64::from(self.assessor.store.archive().import_acknowledgement(&structure, acknowledgement).await?);
         }
         Ok(self.done)
     }
@@ -228,7 +229,7 @@ fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Resu
     Ok(simulator)
 }
 
-/// A batch after the same checks as one that is sent to the service.
+/// Checks a batch of the archive in the same way as a batch that is sent to the service.
 fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBatch, Timestamp), Error> {
     let raw = |(index, m): (usize, &crate::store::archive::Measurement)| RawMeasurement {
         path: FieldPath::Json { index },
@@ -246,7 +247,7 @@ fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBat
         invalid(&format!("batch {}: {first}", batch.batch))
     })?;
     if uuid::Uuid::parse_str(&batch.batch).is_err() {
-        return Err(invalid(&format!("{} is no valid id of a batch", crate::quantity::shown(&batch.batch))));
+        return Err(invalid(&format!("{} is not a valid batch id", crate::quantity::shown(&batch.batch))));
     }
     let measured = MeasurementBatch {
         structure: simulator.id().clone(),

@@ -10,7 +10,7 @@ use sha2::{Digest as _, Sha256};
 use super::error::ImportError;
 use crate::store::archive::{Head, Record, FORMAT};
 
-/// Most bytes of a line; the weights of a trained baseline make the longest lines.
+/// Largest length of a line, bytes; the lines with the weights of a trained baseline are the longest.
 const LONGEST_LINE: usize = 1 << 30;
 
 /// A record as a line of JSON with its line end.
@@ -23,29 +23,29 @@ pub(super) fn line_of(record: &Record) -> Vec<u8> {
 /// Reads a whole archive and returns its head; checks the first and the last line, the number of lines, the SHA-256, and that each
 /// line is a record.
 pub(super) fn check_whole(path: &Path) -> Result<Head, ImportError> {
-    let not_whole = |what: &str| ImportError::NotWhole(what.to_owned());
+    let incomplete = |what: &str| ImportError::NotWhole(what.to_owned());
     let mut head = None;
     let mut ended = false;
     each_line(path, |number, record| {
         if ended {
-            return Err(not_whole("something follows its last line"));
+            return Err(incomplete("something follows its last line"));
         }
         match (number, record) {
             (1, Record::Archive(found)) if found.format == FORMAT => head = Some(found),
             (1, Record::Archive(found)) => {
-                let reason = format!("it has format {}, this program reads {FORMAT}", found.format);
+                let reason = format!("it has format {}, but this program reads format {FORMAT}", found.format);
                 return Err(ImportError::Line { line: 1, reason });
             }
-            (1, _) => return Err(not_whole("its first line is missing")),
+            (1, _) => return Err(incomplete("its first line is missing")),
             (_, Record::End(_)) => ended = true,
             _ => {}
         }
         Ok(())
     })?;
     if !ended {
-        return Err(not_whole("its last line is missing"));
+        return Err(incomplete("its last line is missing"));
     }
-    head.ok_or_else(|| not_whole("it is empty"))
+    head.ok_or_else(|| incomplete("it is empty"))
 }
 
 /// Passes each record of an archive to `take`; the last is checked against all before it.
@@ -64,13 +64,15 @@ pub(super) fn each_line(
             return Ok(());
         }
         number += 1;
-        let record: Record = serde_json::from_slice(&line)
-            .map_err(|e| ImportError::Line { line: number, reason: format!("no record of an archive: {e}") })?;
+        let record: Record = serde_json::from_slice(&line).map_err(|e| ImportError::Line {
+            line: number,
+            reason: format!("this is not a record of an archive: {e}"),
+        })?;
         if let Record::End(end) = &record {
             let found = HEXLOWER.encode(&hasher.finalize_reset());
             if end.lines != number - 1 || end.sha256 != found {
                 let difference = format!(
-                    "it has {} lines with SHA-256 {found}, its last line says {} and {}",
+                    "it has {} lines with SHA-256 {found}, but its last line states {} lines with SHA-256 {}",
                     number - 1,
                     end.lines,
                     end.sha256

@@ -32,7 +32,7 @@ impl Archive {
         Self { assessor, replay }
     }
 
-    /// The archive of a structure, line by line, each with its line end; when it is interrupted, the last of them is an error.
+    /// Returns the lines of the archive of a structure, each with its line end. If the export fails, the last item is an error.
     ///
     /// # Errors
     /// [`Error::UnknownStructure`], [`Error::Store`].
@@ -44,7 +44,7 @@ impl Archive {
     /// changes nothing, so an interrupted import is completed by repeating it.
     ///
     /// # Errors
-    /// [`ImportError`]; a file that is not whole is refused before anything is stored.
+    /// [`ImportError`]; an incomplete or changed file is refused before anything is stored.
     pub async fn import(&self, path: &Path) -> Result<Imported, ImportError> {
         import::import(&self.assessor, &self.replay, path).await
     }

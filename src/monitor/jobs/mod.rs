@@ -25,10 +25,10 @@ use crate::quantity::{shown, StructureId, Timestamp};
 use crate::simulator::Simulator;
 use crate::store::{DiagnosisRecord, JobKind, JobRecord, JobState, NewVersion, Store, StoredBaseline};
 
-/// Most measurements of one diagnosis.
+/// Largest number of measurements of one diagnosis.
 const MOST_MEASUREMENTS: usize = 200_000;
 
-/// Most jobs that run or wait.
+/// Largest number of jobs that run or wait.
 const MOST_JOBS: usize = 16;
 
 /// The result of an extension.
@@ -67,16 +67,16 @@ impl Jobs {
         Self { store, structures, versions, one_at_a_time, progress: Progress::new(events) }
     }
 
-    /// Marks the jobs that the end of an earlier run interrupted as failed.
+    /// Marks the jobs that were running when the service last stopped as failed.
     pub(super) async fn end_interrupted(&self) -> Result<(), Error> {
         let interrupted = self.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
         if interrupted > 0 {
-            warn!("{interrupted} diagnoses or extensions were interrupted by the end of the service before: marked as failed");
+            warn!("Marked {interrupted} diagnoses or extensions as failed, because they were running when the service stopped");
         }
         Ok(())
     }
 
-    /// Starts a diagnosis; without batches in the request, of all batches.
+    /// Starts a diagnosis of the requested batches, or of all batches if the request names none.
     ///
     /// # Errors
     /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::QueueFull`], [`JobError`].
@@ -134,13 +134,13 @@ impl Jobs {
         let active = self.structures.get(&record.structure)?;
         let refuse = |why: &str| JobError::NoExtension { diagnosis: id.to_owned(), reason: why.to_owned() };
         if record.state != JobState::Done {
-            return Err(refuse("it is not done"));
+            return Err(refuse("the diagnosis has not finished"));
         }
         if record.structure_digest != *active.simulator.digest() {
-            return Err(refuse("the structure has another version now: diagnose that one"));
+            return Err(refuse("the structure has another version now: diagnose the present version"));
         }
         if !self.store.diagnoses().begin_extension(id, Timestamp::now()).await? {
-            return Err(refuse("an extension by it is running"));
+            return Err(refuse("an extension by this diagnosis is running"));
         }
         let begun = self.diagnosis(id).await?.0;
         let (jobs, structure) = (self.clone(), record.structure.clone());
@@ -181,12 +181,12 @@ impl Jobs {
         });
     }
 
-    /// Waits until no other job runs.
+    /// Waits until no other job computes.
     async fn turn(&self) -> tokio::sync::SemaphorePermit<'_> {
         self.one_at_a_time.acquire().await.expect("the semaphore is never closed")
     }
 
-    /// The data of a job.
+    /// Reads the measurements on which a job computes.
     async fn study(
         &self,
         id: String,
@@ -210,7 +210,10 @@ impl Jobs {
         let (structure, parent) = (&record.structure, active.simulator.digest().clone());
         let _turn = self.turn().await;
         if *self.structures.get(structure).map_err(|e| text(&e))?.simulator.digest() != parent {
-            return Err("the structure changed to another version while this waited: diagnose that one".to_owned());
+            return Err(
+                "the structure changed to another version while the extension waited: diagnose the present version"
+                    .to_owned(),
+            );
         }
         let request: DiagnosisRequest = serde_json::from_str(&record.request).map_err(|e| text(&e))?;
         let study = self.study(record.id.clone(), structure, active.simulator.clone(), request).await?;
@@ -244,7 +247,8 @@ impl Jobs {
         Ok(serde_json::to_string(&result).expect("a result is plain data"))
     }
 
-    /// Whether a flow that failed its calibration is accepted by the request; an error when it may not be used.
+    /// Returns true if a flow that failed its calibration is accepted by the request, and false if the flow passed; an error if the
+    /// flow may not be used.
     fn accepted(&self, trained: &Trained, training: ExtensionTraining) -> Result<bool, String> {
         match self.structures.usable(&trained.baseline) {
             Ok(()) => Ok(false),
@@ -252,8 +256,8 @@ impl Jobs {
             Err(_) => {
                 let failures = &trained.baseline.manifest().calibration.failures;
                 Err(format!(
-                    "the new flow failed its calibration ({}): ask again with more samples or epochs, or with \
-                     \"accept_uncalibrated\": true to use it nevertheless, which every answer will say",
+                    "the new flow failed its calibration ({}): repeat the request with more samples or epochs; to use the flow \
+                     nevertheless, set \"accept_uncalibrated\" to true, and every assessment then has a finding about it",
                     failures.join("; ")
                 ))
             }

@@ -14,13 +14,13 @@ use crate::flow::FlowSettings;
 use crate::measurement::ModalMeasurement;
 use crate::simulator::Simulator;
 
-/// Simulated pairs for the extension of a structure that had no trained baseline.
+/// Number of simulated pairs for the extension of a structure that had no trained baseline.
 const SAMPLES: usize = 200_000;
 
-/// Epochs for the extension of a structure that had no trained baseline.
+/// Number of epochs for the extension of a structure that had no trained baseline.
 const EPOCHS: usize = 80;
 
-/// What is diagnosed.
+/// The measurements of a diagnosis, and how they are used.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DiagnosisRequest {
     /// Batches, by id.
@@ -34,11 +34,11 @@ pub struct DiagnosisRequest {
 /// How an extension is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ExtensionTraining {
-    /// Simulated pairs; `None` for as many as the trained baseline before.
+    /// Number of simulated pairs; `None` for the number of the present trained baseline.
     pub samples: Option<usize>,
-    /// Epochs; `None` for as many as the trained baseline before.
+    /// Number of epochs; `None` for the number of the present trained baseline.
     pub epochs: Option<usize>,
-    /// Use the flow even if it fails its calibration; every answer says so then.
+    /// Use the flow even if it fails its calibration; every assessment then has a finding about it.
     pub accept_uncalibrated: bool,
 }
 
@@ -67,7 +67,8 @@ impl Study {
         Ok((serde_json::to_string(&outcome.diagnosis).expect("a diagnosis is plain data"), html))
     }
 
-    /// Extends the structure by the causes of the diagnosis, and trains a flow for it like the one before, for the same noise.
+    /// Extends the structure by the causes of the diagnosis, and trains a flow for it with the size and the noise range of the
+    /// present one.
     pub(super) fn extend(
         &self,
         before: Option<&Baseline>,
@@ -79,7 +80,7 @@ impl Study {
         let epochs = training.epochs.or(before.map(|m| m.training.settings.epochs)).unwrap_or(EPOCHS);
         let mut flow = FlowSettings::default();
         flow.units = before.map_or(flow.units, |m| m.architecture.units);
-        // The fits are not stored: the same data and seed give them again.
+        // The fits of the diagnosis are not stored; they are computed again, with the same result, from the same data and seed.
         let (data, outcome) = self.outcome()?;
         let extended = extend(&self.simulator, &data, &outcome).map_err(|e| e.to_string())?;
         let simulator = Simulator::new(extended.definition.clone()).map_err(|e| e.to_string())?;
