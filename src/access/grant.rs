@@ -1,4 +1,4 @@
-//! Scopes, what a request needs, and the decision.
+//! Scopes, the requirements of a request, and the decision whether it is allowed.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::StructureId;
 
-/// Right of a token.
+/// A right of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 #[schema(as = TokenScope)]
@@ -102,7 +102,7 @@ pub enum Actor {
 }
 
 impl Actor {
-    /// Name in the audit and the log.
+    /// Name of the maker in the audit and the log: the id of the token, `local` or `nobody`.
     pub fn as_str(&self) -> &str {
         match self {
             Self::Local => "local",
@@ -166,7 +166,7 @@ impl Grant {
     }
 }
 
-/// Requirement of a route.
+/// What a route requires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Need {
     /// No token is needed.

@@ -16,15 +16,15 @@ use crate::quantity::{shown, StructureId, Timestamp};
 
 /// Prefix of every token, by which tools that search for leaked secrets can find it.
 const PREFIX: &str = "mw_";
-/// 80 bits: 16 characters of base32 (`0–9 a–v`, the alphabet that sorts like its bytes).
+/// Bytes of an id: 80 bits, 16 characters of base32 (`0–9 a–v`, the alphabet that sorts like its bytes).
 const ID_BYTES: usize = 10;
 /// Characters of an id.
 const ID_LENGTH: usize = 16;
-/// 256 bits: 52 characters.
+/// Bytes of a secret: 256 bits, 52 characters of base32.
 const SECRET_BYTES: usize = 32;
 /// Longest name of a token.
 const LONGEST_NAME: usize = 100;
-/// Most structures that a token is limited to.
+/// Largest number of structures to which a token can be limited.
 const MOST_STRUCTURES: usize = 1_000;
 
 /// The operating system provided no random bytes.
@@ -68,7 +68,7 @@ impl fmt::Display for TokenId {
 pub struct SecretDigest([u8; 32]);
 
 impl SecretDigest {
-    /// Differs from the digest of every known secret.
+    /// A digest that no known secret has, for comparisons with an unknown id.
     pub(super) const DUMMY: Self = Self([0; 32]);
 
     /// A digest that was read from the store.

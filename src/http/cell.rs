@@ -1,4 +1,4 @@
-//! Cells of a table, whatever file it is written to.
+//! The cells of a table, independent of the format of the file.
 
 use crate::quantity::Timestamp;
 
@@ -35,12 +35,12 @@ pub enum Cell {
 }
 
 impl Cell {
-    /// A number, or an empty cell.
+    /// A cell with a number, or an empty cell for `None`.
     pub fn number(value: Option<f64>) -> Self {
         value.map_or(Self::Empty, Self::Number)
     }
 
-    /// The cell as CSV has it.
+    /// The text of the cell in a CSV table; an empty cell is an empty text.
     pub fn into_text(self) -> String {
         match self {
             Self::Empty => String::new(),

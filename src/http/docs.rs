@@ -114,7 +114,8 @@ fn page(name: &str, markdown: &str) -> String {
     )
 }
 
-/// Comments and tags of the source; the pages are written without any that a reader should see.
+/// Whether an event is raw HTML of the source, such as a comment. Raw HTML is left out: the pages contain none that a
+/// reader should see.
 fn is_raw_html(event: &Event<'_>) -> bool {
     matches!(
         event,
@@ -154,16 +155,17 @@ fn anchor(words: &str) -> String {
     kept.flat_map(char::to_lowercase).map(|c| if c == ' ' { '-' } else { c }).collect()
 }
 
-/// The anchor, with a number behind it when an earlier heading has it.
+/// The anchor; with a number appended if an earlier heading has the same anchor.
 fn unused(anchor: &str, taken: &mut BTreeSet<String>) -> String {
     let numbered = (1..).map(|n| format!("{anchor}-{n}"));
     let free = std::iter::once(anchor.to_owned()).chain(numbered).find(|candidate| !taken.contains(candidate));
-    let free = free.expect("the numbers do not end");
+    let free = free.expect("there is always a further number");
     taken.insert(free.clone());
     free
 }
 
-/// What an event of the Markdown becomes in the page. `outside` says that the event is inside a link that leaves `docs/`.
+/// Converts an event of the Markdown into those of the page. `outside` is true while the events are inside a link that
+/// leaves `docs/`.
 fn adapt<'a>(event: Event<'a>, outside: &mut bool) -> Vec<Event<'a>> {
     match event {
         // The program serves no other files of the repository: the text of such a link stays, without the link.

@@ -26,7 +26,8 @@ pub fn json(document: &OpenApi) -> String {
 /// The routes that serve the document and the page; the document does not describe them.
 pub(super) fn router<S: Clone + Send + Sync + 'static>(document: &OpenApi) -> Router<S> {
     let json = Bytes::from(json(document));
-    // The path is relative, so that it also works behind a proxy that adds a prefix. No validator on the internet is asked.
+    // The path is relative, so that it also works behind a proxy that adds a prefix. No validator on the internet is
+    // used.
     let config = Config::from("../../openapi.json").validator_url("none").try_it_out_enabled(true).use_base_layout();
     let config = Arc::new(config);
     let file = move |name: String| {

@@ -197,7 +197,7 @@ impl Export {
         self.left = self.left.map(|left| left - found.len());
         let last = found.len() < self.page.limit || self.left == Some(0);
         self.page.after = found.last().map(|m| m.place.clone()).or(self.page.after);
-        // Writing thousands of rows takes milliseconds: on a blocking thread.
+        // Writing thousands of rows takes milliseconds, which must not block an async thread.
         let mut writer = self.writer;
         let write = move || {
             let bytes = writer.write(found)?;

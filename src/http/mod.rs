@@ -150,7 +150,7 @@ pub fn router(service: Service, settings: &HttpSettings) -> Router {
         .route("/assets/{*path}", get(dashboard::asset))
         .method_not_allowed_fallback(method_not_allowed)
         .fallback(not_found)
-        // Bodies are read by `request::read_body`, which has a limit and an error of its own.
+        // Bodies are read by `request::read_body`, which has its own limit and its own error.
         .layer(DefaultBodyLimit::disable())
         .layer(middleware::from_fn_with_state(access, access::guard))
         .layer(CatchPanicLayer::custom(panicked))
@@ -167,7 +167,7 @@ async fn method_not_allowed() -> ApiError {
     ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", "this path does not support this method")
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "the shape that CatchPanicLayer takes")]
+#[expect(clippy::needless_pass_by_value, reason = "the signature that CatchPanicLayer requires")]
 fn panicked(panic: Box<dyn std::any::Any + Send + 'static>) -> Response {
     let cause = panic.downcast_ref::<&str>().map(ToString::to_string);
     let cause = cause.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "a panic".to_owned());

@@ -47,9 +47,9 @@ pub const CODES: [(&str, StatusCode, &str); 63] = [
     ("no_model", StatusCode::CONFLICT, "the structure has no trained model in use"),
     ("structure_in_use", StatusCode::CONFLICT, "the structure has batches under another definition"),
     ("no_report", StatusCode::CONFLICT, "the diagnosis has no report yet"),
-    ("no_extension", StatusCode::CONFLICT, "the diagnosis cannot be extended"),
+    ("no_extension", StatusCode::CONFLICT, "the structure cannot be extended by this diagnosis"),
     ("version_changed", StatusCode::CONFLICT, "the structure was changed to another version in the meantime"),
-    ("no_step_back", StatusCode::CONFLICT, "the structure extends no earlier version"),
+    ("no_step_back", StatusCode::CONFLICT, "the present version of the structure is not an extension"),
     ("not_assessed", StatusCode::CONFLICT, "the batch has no assessment by the trained model in use"),
     ("model_refused", StatusCode::CONFLICT, "the new trained model was refused; the previous one stays in use"),
     ("definition_refused", StatusCode::CONFLICT, "this version of the program does not accept the stored definition"),
@@ -122,7 +122,7 @@ pub struct ProblemBody {
     /// Id of the request, as in the header `X-Request-Id` and in the log.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) request_id: Option<String>,
-    /// Only for a request with many batches that stopped early: what was done before.
+    /// Only for a request with many batches that stopped early: the outcome of the lines before.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) done: Option<Box<BulkAnswer>>,
 }

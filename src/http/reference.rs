@@ -20,7 +20,7 @@ const DEFAULT_THRESHOLD_PROBABILITY: f64 = 0.05;
 /// Marks an answer of a deprecated route with the date of its deprecation (RFC 9745): 2026-11-23.
 const DEPRECATION: (HeaderName, &str) = (HeaderName::from_static("deprecation"), "@1795392000");
 
-/// Batches that show the structure without damage.
+/// Batches that were measured while the structure was undamaged.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct ReferenceInput {
@@ -40,9 +40,10 @@ struct ReferenceInput {
 #[utoipa::path(
     put, path = "/v1/structures/{id}/reference", tag = "results", operation_id = "put_reference",
     summary = "Declare the undamaged reference",
-    description = "Makes a new version of the undamaged reference from the named batches. All batches, earlier ones too, are \
-                   then compared with it. Batches that cannot be used as a reference are answered with the code \
-                   `unusable_baseline`, whose name is older than the word reference.",
+    description = "Computes a new version of the undamaged reference from the named batches. Batches that were never compared \
+                   with a reference, and all batches measured after those of the reference, are then compared with it. \
+                   Batches that cannot be used as a reference are refused with the code `unusable_baseline`, which has kept \
+                   the earlier name.",
     params(StructurePath),
     request_body(content = ReferenceInput, example = json!({"batches": ["0199a0c6-7d5e-7c3a-a5b1-0d7e6a3f9b10"]})),
     responses(

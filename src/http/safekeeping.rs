@@ -69,17 +69,17 @@ struct BackupList {
 pub struct ReloadedBody {
     /// The structure.
     structure: StructureId,
-    /// The trained baseline in use now.
+    /// Digest of the trained baseline that is now in use.
     model_digest: Digest,
-    /// The one before.
+    /// Digest of the trained baseline that was in use before.
     #[schema(required)]
     previous_model_digest: Option<Digest>,
-    /// False when the files are those in use.
+    /// False if the files contain the trained baseline that was already in use.
     changed: bool,
     /// Version of the undamaged reference that was renewed with it.
     #[schema(required)]
     undamaged_version: Option<u32>,
-    /// What is left to do.
+    /// What the user has to do next, if anything.
     #[serde(skip_serializing_if = "Option::is_none")]
     next_step: Option<String>,
 }

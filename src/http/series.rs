@@ -337,7 +337,7 @@ fn time(micros: i64) -> Result<Timestamp, ApiError> {
     Timestamp::from_micros(micros).map_err(|e| ApiError::internal(&e))
 }
 
-/// JSON has no NaN.
+/// `None` for NaN and infinity, which JSON cannot represent.
 fn number(value: f64) -> Option<f64> {
     Some(value).filter(|value| value.is_finite())
 }

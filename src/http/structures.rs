@@ -192,7 +192,7 @@ fn utf8(bytes: &[u8]) -> Result<&str, ApiError> {
     std::str::from_utf8(bytes).map_err(|e| ApiError::new(StatusCode::BAD_REQUEST, "not_utf8", e.to_string()))
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "the shape that map_err takes")]
+#[expect(clippy::needless_pass_by_value, reason = "the signature that map_err requires")]
 fn refused(error: DefinitionError) -> ApiError {
     let problem = |p: &crate::simulator::definition::DefinitionProblem| Problem {
         pointer: p.line.map_or_else(|| p.pointer.clone(), |line| format!("line {line}, {}", p.pointer)),

@@ -34,7 +34,7 @@ impl Format {
             None => allowed.iter().copied().find(accepted).unwrap_or(Self::Json),
             Some(name) => allowed.iter().copied().find(|f| f.name() == name).ok_or_else(|| {
                 let names: Vec<&str> = allowed.iter().map(|f| f.name()).collect();
-                let message = format!("{} is none of {}", shown(name), names.join(", "));
+                let message = format!("{} is not one of {}", shown(name), names.join(", "));
                 ApiError::invalid_field("query/format", message)
             })?,
         };

@@ -1,4 +1,4 @@
-//! Panics where requests are answered: the client hears of it, and the next one is served.
+//! A panic while a request is answered: the client receives an error, and the next request is answered.
 
 use std::time::Duration;
 
@@ -41,7 +41,7 @@ async fn a_panic_is_a_500_with_the_requests_id_and_the_next_request_is_served() 
     let first: Value = client.post(&url).json(&row(0)).send().await.unwrap().json().await.unwrap();
     let path = format!("{url}/{}", first["batch"].as_str().unwrap());
 
-    // In the handler itself, and in the task that writes.
+    // The panic occurs in the handler itself, and then in the task that writes.
     for (point, second) in [("store::read", None), ("store::commit", Some(1))] {
         let ask = |id: &'static str| match second {
             Some(second) => client.post(&url).json(&row(second)).header("x-request-id", id).send(),

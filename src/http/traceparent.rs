@@ -24,6 +24,6 @@ impl Extractor for Headers<'_> {
 /// trace begins.
 pub fn continue_in(span: &tracing::Span, headers: &HeaderMap) {
     let parent = TraceContextPropagator::new().extract_with_context(&Context::new(), &Headers(headers));
-    // It fails if no layer records this span.
+    // An error means that no layer records this span.
     let _ = span.set_parent(parent);
 }

@@ -134,7 +134,8 @@ impl Link {
                     }
                 }
                 Err(failure) => {
-                    // First of all: messages of the next connection must not be acknowledged by packet ids of this one.
+                    // This comes first, because messages of the next connection must not be acknowledged by packet ids
+                    // of this one.
                     self.connection.fetch_add(1, Ordering::SeqCst);
                     self.lost(failure.to_string());
                     tokio::select! {
@@ -153,8 +154,8 @@ impl Link {
                 self.trouble = None;
                 self.status.set(false, Some("connected, not subscribed yet".to_owned()));
                 info!(broker = %self.url, "Connected to the MQTT broker {}", self.url);
-                // Subscribe in every case, not only without a session: the topic may have changed since the session
-                // began.
+                // The subscription is repeated even if the broker has kept the session, because the topic may have
+                // changed since the session began.
                 self.subscribe(Duration::ZERO);
             }
             Event::Incoming(Packet::SubAck(answer)) => {

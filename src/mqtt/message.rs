@@ -107,7 +107,7 @@ impl Intake {
             )));
         }
         let (monitor, payload) = (self.monitor.clone(), payload.to_vec());
-        // Parsing thousands of measurements takes milliseconds: on a blocking thread.
+        // Parsing thousands of measurements takes milliseconds, which must not block an async thread.
         let parse = move || {
             let raw = RawBatch::of_message(&payload).map_err(|error| match error {
                 JsonError::Malformed(reason) => reason,

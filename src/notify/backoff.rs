@@ -56,7 +56,7 @@ mod tests {
         Timestamp::from_micros(1_700_000_000_000_000 + seconds * 1_000_000).unwrap()
     }
 
-    /// Attempts of a message that nobody ever takes, seconds after the first.
+    /// Times of the attempts for a message that is never accepted, seconds after the first attempt.
     fn attempts(settings: &NotifySettings, u: f64) -> Vec<i64> {
         let mut times = vec![0];
         loop {

@@ -1,4 +1,4 @@
-//! Delivery: finds the webhooks with a due message, and sends to each one in a task of its own.
+//! Delivery: finds the webhooks with a due message, and sends to each one in a separate task.
 //!
 //! A webhook receives one request at a time. Each message is retried on its own schedule; in addition, after any
 //! failure the webhook receives no message for the shortest delay between attempts. A failing receiver therefore gets

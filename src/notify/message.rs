@@ -18,7 +18,7 @@ const TYPE_PREFIX: &str = "org.modalwatch.";
 /// Source of the events if the service has no public URL.
 const NAMELESS_SOURCE: &str = "urn:modalwatch";
 
-/// Why a stored event cannot be read. This means that the database was changed by hand, or a bug.
+/// Why a stored event cannot be read: the database was changed by another program, or there is a programming error.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// Its JSON has another form than the triggers write.
@@ -143,9 +143,9 @@ impl Message {
         Ok(Self::new(&event.message_id, &event.kind, subject, event.created_at, public_url, data))
     }
 
-    /// A message that only says that it is a test.
+    /// A test message, which is not about an alarm.
     pub fn test(id: &str, public_url: &str, now: Timestamp) -> Self {
-        let data = TestData { message: "This is a test: messages of alarms arrive as this one did." };
+        let data = TestData { message: "This is a test: messages about alarms are sent in the same way." };
         Self::new(id, "test", "test".to_owned(), now, public_url, data)
     }
 
@@ -169,7 +169,7 @@ impl Message {
         &self.id
     }
 
-    /// Its bytes.
+    /// Body of the request, JSON.
     pub fn body(&self) -> &str {
         &self.body
     }

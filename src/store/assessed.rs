@@ -55,7 +55,7 @@ struct Tracks {
     points: usize,
     quantities: Vec<Track>,
     /// Index of a quantity by its name.
-    places: HashMap<String, usize>,
+    indices: HashMap<String, usize>,
     /// Batches with p-value, 1 if rejected, and number of findings.
     trust: Reducer<String>,
 }
@@ -63,19 +63,19 @@ struct Tracks {
 impl Tracks {
     fn new(extent: Extent, points: usize) -> Self {
         let trust = Reducer::new(extent.span(), points, 3);
-        Self { extent, points, quantities: Vec::new(), places: HashMap::new(), trust }
+        Self { extent, points, quantities: Vec::new(), indices: HashMap::new(), trust }
     }
 
     /// Index of a quantity, which is added if its name is new.
-    fn place(&mut self, (name, unit, kind, position): (String, String, QuantityKind, i64)) -> usize {
-        if let Some(place) = self.places.get(&name) {
-            return *place;
+    fn index_of(&mut self, (name, unit, kind, position): (String, String, QuantityKind, i64)) -> usize {
+        if let Some(index) = self.indices.get(&name) {
+            return *index;
         }
-        let place = self.quantities.len();
-        self.places.insert(name.clone(), place);
+        let index = self.quantities.len();
+        self.indices.insert(name.clone(), index);
         let batches = Reducer::new(self.extent.span(), self.points, 2);
         self.quantities.push(Track { name, unit, kind, position, batches });
-        place
+        index
     }
 }
 
@@ -129,13 +129,13 @@ impl Series<'_> {
             let model: &str = row.try_get_unchecked(2)?;
             if !known.contains_key(model) {
                 let quantities = self.quantities_of(structure, batch, model, row.try_get_unchecked(3)?).await?;
-                let places = quantities.into_iter().map(|quantity| tracks.place(quantity)).collect();
-                known.insert(model.to_owned(), places);
+                let indices = quantities.into_iter().map(|quantity| tracks.index_of(quantity)).collect();
+                known.insert(model.to_owned(), indices);
             }
-            let places = &known[model];
-            let plotted = Plotted::read(row.try_get_unchecked(4)?, places.len())?;
+            let indices = &known[model];
+            let plotted = Plotted::read(row.try_get_unchecked(4)?, indices.len())?;
             tracks.trust.push(time, &plotted.trust(), || batch.to_owned());
-            for (position, place) in places.iter().enumerate() {
+            for (position, index) in indices.iter().enumerate() {
                 let quantity = plotted.quantity(position);
                 let mark = || QuantityMark {
                     batch: batch.to_owned(),
@@ -143,7 +143,7 @@ impl Series<'_> {
                     probability_interval: quantity.probability_interval,
                 };
                 let values = [quantity.mean, quantity.probability];
-                tracks.quantities[*place].batches.push(time, &values, mark);
+                tracks.quantities[*index].batches.push(time, &values, mark);
             }
         }
         Ok(())
@@ -217,9 +217,9 @@ impl Series<'_> {
             .fetch(&self.database.reader);
         while let Some(row) = rows.try_next().await? {
             let name: &str = row.try_get_unchecked(0)?;
-            let place = match tracks.places.get(name) {
-                Some(place) => *place,
-                None => tracks.place(named(&row)?),
+            let index = match tracks.indices.get(name) {
+                Some(index) => *index,
+                None => tracks.index_of(named(&row)?),
             };
             let number = |column: usize| row.try_get_unchecked::<Option<f64>, _>(column);
             let values = [row.try_get_unchecked(2)?, number(3)?.unwrap_or(f64::NAN)];
@@ -230,7 +230,7 @@ impl Series<'_> {
                     probability_interval: [number(7)?, number(8)?],
                 })
             };
-            let batches = &mut tracks.quantities[place].batches;
+            let batches = &mut tracks.quantities[index].batches;
             batches.try_push(row.try_get_unchecked(1)?, &values, mark).map_err(sqlx_error)?;
         }
         Ok(())

@@ -230,8 +230,8 @@ struct SlotRow {
     newest_undamaged: u32,
 }
 
-/// What must be known to store an assessment. `None` if it was made for a version of the structure that is not the present one,
-/// or if there is no such batch.
+/// Reads what must be known to store an assessment. `None` if it was made for a version of the structure that is not the present
+/// one, or if there is no such batch.
 async fn slot_of(
     transaction: &mut Transaction<'_>,
     structure: &str,

@@ -71,7 +71,7 @@ pub(super) struct ChartOutcome {
 struct Placed {
     undamaged_version: u32,
     row: PointRow,
-    /// Whether it is inserted, because it was not stored or had other values.
+    /// Whether the point is written, because it was not stored yet or had other values.
     new: bool,
     alarms_changed: bool,
 }

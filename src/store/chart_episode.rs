@@ -114,7 +114,7 @@ impl Episodes {
         self.stored.retain(|(_, at, batch, ..)| (*at, batch.clone().unwrap_or_default()) <= *position);
     }
 
-    /// Stores the episodes. Returns whether there are or were any.
+    /// Stores the episodes. Returns whether any episode exists or existed.
     pub async fn store(
         mut self,
         transaction: &mut Transaction<'_>,

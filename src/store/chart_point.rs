@@ -9,7 +9,7 @@ use crate::alarm::chart::{ChartPoint, Series};
 use crate::alarm::machine::State;
 use crate::quantity::{StructureId, Timestamp};
 
-/// Moving averages that differ by less are equal up to rounding.
+/// Moving averages that differ by less than this are treated as equal, because they differ by rounding only.
 const SAME: f64 = 1e-9;
 
 /// A stored point of a chart.
@@ -31,7 +31,7 @@ pub struct StoredChartPoint {
     pub ewma_limit: Option<f64>,
     /// Probability of damage that corresponds to the limit.
     pub probability_limit: Option<f64>,
-    /// True if the point does not count, as during maintenance.
+    /// True if the point does not change the chart, for example because of maintenance.
     pub held: bool,
     /// State of the chart after this point.
     pub state: String,

@@ -18,7 +18,7 @@ pub(super) fn from_blob(what: &'static str, blob: &[u8]) -> Result<Vec<f64>, Err
     if rest.is_empty() {
         Ok(chunks.iter().map(|chunk| f64::from_le_bytes(*chunk)).collect())
     } else {
-        Err(Error::Row { what, detail: format!("a vector of {} bytes", blob.len()) })
+        Err(Error::Row { what, detail: format!("a vector has {} bytes, which is not a multiple of 8", blob.len()) })
     }
 }
 
@@ -39,7 +39,7 @@ pub(super) fn list<T: Serialize>(values: &[T]) -> String {
 
 /// The elements of a [`list`] as a table of `key` (index from 0) and `value`, given the parameter of the statement.
 ///
-/// SQLite has no array parameters; a database that has them needs another text only here.
+/// SQLite has no array parameters. For a database that has them, only this macro would have to change.
 macro_rules! elements {
     ($parameter:literal) => {
         concat!("json_each(", $parameter, ")")

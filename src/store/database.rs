@@ -47,7 +47,7 @@ impl Database {
         if free >= minimum {
             return Ok(());
         }
-        Err(Error::DiskFull(format!("{free} bytes are free, store.min_free_bytes asks for {minimum}")))
+        Err(Error::DiskFull(format!("{free} bytes are free, but store.min_free_bytes requires {minimum}")))
     }
 
     /// Queues a write task and returns its result once it is committed.

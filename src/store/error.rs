@@ -81,8 +81,8 @@ pub enum Error {
     Migration(#[from] MigrateError),
     /// The data folder is on a network file system.
     #[error(
-        "{path} is on a network file system ({file_system}), whose locks cannot keep a database whole: give a --data-dir on a \
-         local disk, or set store.allow_network_filesystem = true"
+        "{path} is on a network file system ({file_system}), whose locks are not reliable enough for a database: give a --data-dir \
+         on a local disk, or set store.allow_network_filesystem = true"
     )]
     NetworkFileSystem {
         /// The folder.

@@ -19,7 +19,7 @@ pub struct FolderFigures {
 }
 
 impl FolderFigures {
-    /// The sizes of an existing data folder. A missing file counts as 0 bytes.
+    /// The sizes of an existing data folder. The size of a missing file is 0.
     ///
     /// # Errors
     /// The error of the operating system if the volume cannot be read.

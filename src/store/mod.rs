@@ -203,7 +203,7 @@ impl Store {
         Series { database: &self.database }
     }
 
-    /// Summary of all structures.
+    /// Summaries of all structures.
     pub fn overview(&self) -> Overview<'_> {
         Overview { database: &self.database }
     }

@@ -24,7 +24,7 @@ pub enum DeliveryState {
 }
 
 impl DeliveryState {
-    /// All of them.
+    /// All states.
     pub const ALL: [Self; 3] = [Self::Pending, Self::Delivered, Self::Dead];
 
     /// Its name, as stored and as answered.
@@ -42,13 +42,13 @@ impl DeliveryState {
 pub struct OutboxEvent {
     /// Id of the message, the same at every attempt.
     pub message_id: String,
-    /// Such as `alarm.opened`.
+    /// Kind of the event, such as `alarm.opened`.
     pub kind: String,
     /// The structure.
     pub structure: StructureId,
     /// Number of the alarm within the structure.
     pub alarm: i64,
-    /// The alarm at that time, JSON.
+    /// The properties of the alarm at that time, JSON.
     pub facts: String,
     /// When it happened.
     pub created_at: Timestamp,
@@ -168,7 +168,7 @@ pub struct Outbox<'s> {
 }
 
 impl Outbox<'_> {
-    /// Completes when something was written since the last call. For a single listener.
+    /// Completes when something was written since the last call. It must have one caller only.
     pub async fn written(self) {
         self.database.writer.written.notified().await;
     }

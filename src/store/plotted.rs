@@ -31,12 +31,12 @@ pub(super) fn pack(a: &Assessment) -> Vec<u8> {
     to_blob(trust.into_iter().chain(quantities))
 }
 
-/// A view of the column.
+/// The column of an assessment, without a copy of its values.
 pub(super) struct Plotted<'a> {
     values: &'a [[u8; 8]],
 }
 
-/// A quantity of the column.
+/// The values of a quantity in the column.
 pub(super) struct PlottedQuantity {
     pub(super) mean: f64,
     pub(super) mean_interval: [Option<f64>; 2],
@@ -45,13 +45,16 @@ pub(super) struct PlottedQuantity {
 }
 
 impl<'a> Plotted<'a> {
-    /// Views the column of an assessment with a number of quantities.
+    /// Checks the length of the column of an assessment with this number of quantities.
     pub(super) fn read(blob: &'a [u8], quantities: usize) -> Result<Self, Error> {
         let (values, rest) = blob.as_chunks::<8>();
         if rest.is_empty() && values.len() == OF_TRUST + OF_A_QUANTITY * quantities {
             Ok(Self { values })
         } else {
-            Err(bad_row("assessment")(&format!("{} bytes to plot for {quantities} quantities", blob.len())))
+            Err(bad_row("assessment")(&format!(
+                "the column for plots has {} bytes, which does not fit {quantities} quantities",
+                blob.len()
+            )))
         }
     }
 

@@ -36,7 +36,7 @@ pub struct Expired {
     pub newest: Timestamp,
 }
 
-/// Number of deleted data.
+/// What was deleted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, utoipa::ToSchema)]
 pub struct Deleted {
     /// Number of batches.
@@ -52,7 +52,7 @@ pub struct Retention<'s> {
 }
 
 impl Retention<'_> {
-    /// What would be deleted of the data measured before a time.
+    /// The batches that would be deleted among those measured before a time, by structure.
     ///
     /// # Errors
     /// [`Error::Sqlite`].

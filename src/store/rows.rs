@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::OnceLock;
 
-/// Rows of the largest statement.
+/// Number of rows of the largest statement.
 const MOST_ROWS: usize = 64;
 
 /// Up to this number, all rows go into one statement. Larger numbers are split into statements of [`MOST_ROWS`] and of half as
@@ -23,7 +23,7 @@ pub(super) struct InsertStatements {
 }
 
 impl InsertStatements {
-    /// Statements that begin with `into`, for rows of so many columns.
+    /// Statements that begin with `into`, for rows with this number of columns.
     pub const fn new(into: &'static str, columns: usize, common: &'static [usize]) -> Self {
         Self::with_clause(into, columns, common, "")
     }

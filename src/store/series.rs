@@ -96,7 +96,7 @@ pub struct ChartMark {
     pub shift_limit: f64,
     /// Limit of the moving average.
     pub ewma_limit: Option<f64>,
-    /// True if the point does not count, as during maintenance.
+    /// True if the point does not change the chart, for example because of maintenance.
     pub held: bool,
     /// State of the chart after this point.
     pub state: String,

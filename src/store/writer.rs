@@ -21,13 +21,13 @@ use super::error::Error;
 use super::file::OpenedFile;
 use super::transaction::Transaction;
 
-/// Most tasks of one group commit: the first of them waits for the last.
+/// Largest number of tasks in one group commit. The first of them is answered only after the last has run.
 const GROUP_LIMIT: usize = 64;
 
 /// The future of a write task.
 pub(super) type Work<'t, T> = Pin<Box<dyn Future<Output = Result<T, Error>> + Send + 't>>;
 
-/// A write task whose result is stored where its caller finds it.
+/// A write task that stores its result in a place shared with its caller.
 type Task = Box<dyn for<'t> FnOnce(&'t mut Transaction<'_>) -> Work<'t, ()> + Send>;
 
 /// A queued write task.
@@ -126,7 +126,7 @@ impl Writer {
     async fn drain(&self) {
         loop {
             let connection = self.pool.acquire().await.map_err(Error::from);
-            // Taken after the connection, so that tasks that arrived in the meantime share the transaction.
+            // The group is taken after the connection is free, so that tasks that arrived in the meantime share the transaction.
             let group: Vec<Queued> = {
                 let mut queue = self.lock();
                 if queue.waiting.is_empty() {
@@ -185,8 +185,8 @@ where
 
 /// Runs tasks one after another in one immediate transaction and commits those that did not fail.
 ///
-/// Immediate, because SQLite refuses at once, without waiting for the busy timeout, to upgrade a transaction that began with a
-/// read while another connection writes.
+/// The transaction is immediate, because SQLite refuses at once, without waiting for the busy timeout, to upgrade a transaction
+/// that began with a read while another connection writes.
 async fn run_group(
     connection: &mut SqliteConnection,
     group: Vec<Queued>,

@@ -3,7 +3,7 @@
 use tracing_subscriber::layer::{Identity, Layer};
 use tracing_subscriber::Registry;
 
-/// Sends nothing.
+/// The exporter of a program without the feature `otel`. It sends nothing.
 #[derive(Default)]
 pub struct Traces;
 

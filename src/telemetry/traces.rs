@@ -18,7 +18,7 @@ use tracing_subscriber::Registry;
 const STANDARD_VARIABLES: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT"];
 
 /// Time limit for sending the last spans when the service stops.
-const LAST_WORDS: Duration = Duration::from_secs(5);
+const FINAL_SEND_LIMIT: Duration = Duration::from_secs(5);
 
 /// The exporter of traces, if they are configured.
 #[derive(Default)]
@@ -73,7 +73,7 @@ impl Traces {
 
     /// Sends the remaining spans, for five seconds at most.
     pub fn end(self) {
-        if let Some(Err(failure)) = self.0.map(|provider| provider.shutdown_with_timeout(LAST_WORDS)) {
+        if let Some(Err(failure)) = self.0.map(|provider| provider.shutdown_with_timeout(FINAL_SEND_LIMIT)) {
             tracing::warn!(error = %failure, "Could not send the last spans: {failure}");
         }
     }

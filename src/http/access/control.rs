@@ -122,12 +122,12 @@ impl AccessControl {
         self.0.file_token.is_empty() && self.read_tokens(TokenTable::is_empty)
     }
 
-    /// What `read` returns for the stored tokens.
+    /// Calls `read` with the stored tokens and returns its result.
     pub fn read_tokens<T>(&self, read: impl FnOnce(&TokenTable) -> T) -> T {
         read(&self.0.tokens.read().expect("no holder of the lock panics"))
     }
 
-    /// The grant of a token.
+    /// The grant of the token that a client presents.
     fn holder(&self, text: &TokenText) -> Result<Grant, Refused> {
         let now = Timestamp::now();
         let from_file = self.0.file_token.authenticate(text, now).map(TokenRecord::grant);

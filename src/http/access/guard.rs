@@ -81,7 +81,7 @@ fn refuse_token_in_address(uri: &Uri) -> Result<(), ApiError> {
     Ok(())
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "the shape that map_err takes")]
+#[expect(clippy::needless_pass_by_value, reason = "the signature that map_err requires")]
 fn forbidden(denied: Denied) -> ApiError {
     let detail = denied.to_string();
     match denied {

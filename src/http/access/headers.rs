@@ -1,4 +1,4 @@
-//! Security headers of every answer, unless its handler sets them.
+//! Security headers of every answer. A header that the handler sets is kept.
 
 use axum::extract::Request;
 use axum::http::{header, HeaderMap, HeaderName, HeaderValue};
@@ -11,6 +11,7 @@ const PAGE_POLICY: &str = "default-src 'self'; style-src 'self' 'unsafe-inline';
 /// Content security policy of all other answers: a browser that shows them loads and runs nothing.
 const DATA_POLICY: &str = "default-src 'none'; frame-ancestors 'none'";
 
+/// Headers of every answer.
 const ALWAYS: [(HeaderName, &str); 5] = [
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),

@@ -1,4 +1,5 @@
-//! The scope that each route needs. It follows from rules, so that a new route is never open by accident.
+//! The scope that each route needs. It follows from rules, so that a new route does not become open to everybody by
+//! mistake.
 
 use axum::http::Method;
 
@@ -33,13 +34,13 @@ pub enum Subject {
 /// Scope that a route needs, and what it is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Class {
-    /// The scope.
+    /// The scope that a token needs, if any.
     pub need: Need,
-    /// The structure.
+    /// What the route is about.
     pub about: Subject,
 }
 
-/// Class of a route by method and pattern. An unknown path (404) needs nothing.
+/// Class of a route by method and pattern. An unknown path needs no token, because it is answered with 404.
 pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
     let Some(pattern) = pattern else {
         return Class { need: Need::Nothing, about: Subject::Service };

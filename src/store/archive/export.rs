@@ -43,9 +43,9 @@ type BatchRow = (String, String, Option<String>, String, i64);
 /// conditions, doubts.
 type StateRow = (u32, String, i64, f64, i64, String, String);
 
-/// The error of an export whose receiver was dropped.
-fn gone<T>(_: T) -> Error {
-    Error::Row { what: "archive", detail: "its reader is gone".to_owned() }
+/// The error of an export whose receiver was dropped while records were still to be sent.
+fn receiver_dropped<T>(_: T) -> Error {
+    Error::Row { what: "archive", detail: "the receiver of the export was dropped".to_owned() }
 }
 
 /// Digests of version and baseline, manifest, weights, and whether it is used although it failed its calibration check.
@@ -76,14 +76,14 @@ impl Archive<'_> {
             definition: present.definition_json,
             created_at: present.created_at.to_string(),
         };
-        records.send(Record::Structure(present)).await.map_err(gone)?;
+        records.send(Record::Structure(present)).await.map_err(receiver_dropped)?;
         for (digest, definition, parent_digest, created) in versions {
             let created_at = timestamp("version", created)?.to_string();
             let version = Version { digest, definition, parent_digest, created_at };
-            records.send(Record::Version(version)).await.map_err(gone)?;
+            records.send(Record::Version(version)).await.map_err(receiver_dropped)?;
         }
         for model in models {
-            records.send(Record::Model(model)).await.map_err(gone)?;
+            records.send(Record::Model(model)).await.map_err(receiver_dropped)?;
         }
         self.export_batches(structure, records).await?;
         self.export_states(structure, records).await?;
@@ -124,7 +124,7 @@ impl Archive<'_> {
                 let measurements = by_batch.remove(&batch).unwrap_or_default();
                 let received_at = timestamp("batch", received)?.to_string();
                 let record = Batch { batch, source, idempotency_key, content_digest, received_at, measurements };
-                records.send(Record::Batch(record)).await.map_err(gone)?;
+                records.send(Record::Batch(record)).await.map_err(receiver_dropped)?;
             }
         }
     }
@@ -164,7 +164,7 @@ impl Archive<'_> {
                 batches: batches.into_iter().map(|(id,)| id).collect(),
                 quantities,
             };
-            records.send(Record::UndamagedReference(state)).await.map_err(gone)?;
+            records.send(Record::UndamagedReference(state)).await.map_err(receiver_dropped)?;
         }
         Ok(())
     }
@@ -179,7 +179,7 @@ impl Archive<'_> {
         let time = |micros| timestamp("maintenance window", micros).map(|t| t.to_string());
         for (from, to, reason, created) in windows {
             let window = Maintenance { from: time(from)?, to: time(to)?, reason, created_at: time(created)? };
-            records.send(Record::Maintenance(window)).await.map_err(gone)?;
+            records.send(Record::Maintenance(window)).await.map_err(receiver_dropped)?;
         }
         let seen: Vec<(String, String, String, i64, String, Option<String>)> = sqlx::query_as(
             "select kind, series, opened_batch, acknowledged_at_us, acknowledged_by, acknowledgement_note
@@ -192,7 +192,7 @@ impl Archive<'_> {
         for (kind, series, opened_batch, at, by, note) in seen {
             let at = timestamp("acknowledgement", at)?.to_string();
             let record = Acknowledged { kind, series, opened_batch, at, by, note };
-            records.send(Record::Acknowledgement(record)).await.map_err(gone)?;
+            records.send(Record::Acknowledgement(record)).await.map_err(receiver_dropped)?;
         }
         Ok(())
     }

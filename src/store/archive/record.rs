@@ -80,9 +80,9 @@ pub struct Version {
 pub struct Structure {
     /// Digest of the definition.
     pub digest: String,
-    /// The definition, canonical JSON as text.
+    /// The definition as canonical JSON text, of which the digest was computed.
     pub definition: String,
-    /// When it was first put.
+    /// When the structure was created.
     pub created_at: String,
 }
 
@@ -90,7 +90,7 @@ pub struct Structure {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ArchivedModel {
-    /// Version of the structure it was trained for.
+    /// Digest of the version of the structure that it was trained for.
     pub structure_digest: String,
     /// Digest of the manifest.
     pub model_digest: String,
@@ -156,7 +156,7 @@ pub struct Undamaged {
     pub measurements: i64,
     /// Ranges of the covariates of its measurements, JSON text.
     pub conditions: String,
-    /// Doubts about it, a JSON list of sentences.
+    /// Reasons to doubt it, a JSON list of sentences.
     pub doubts: String,
     /// Its batches.
     pub batches: Vec<String>,
@@ -183,7 +183,7 @@ pub struct UndamagedQuantity {
     /// Posterior draws of the mean: f64, little-endian, base64.
     #[serde(with = "blob")]
     pub mean_draws: Option<Vec<u8>>,
-    /// Posterior draws of the standard deviation.
+    /// Posterior draws of the standard deviation, in the same encoding.
     #[serde(with = "blob")]
     pub std_draws: Option<Vec<u8>>,
 }

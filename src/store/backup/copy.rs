@@ -86,12 +86,12 @@ pub(super) async fn check_copy(database: &Path, manifest: &Manifest) -> Result<(
     let found = tokio::task::spawn_blocking(move || sha256(&file)).await;
     let found = found.map_err(|_| Error::Store(StoreError::Panicked))??;
     if found != manifest.sha256 {
-        return Err(damaged(format!("its SHA-256 is {found}, the manifest says {}", manifest.sha256)));
+        return Err(damaged(format!("its SHA-256 is {found}, but the manifest says {}", manifest.sha256)));
     }
     let contents = read_contents(database).await?;
     if contents.schema_version != manifest.schema_version {
         let (found, expected) = (contents.schema_version, manifest.schema_version);
-        return Err(damaged(format!("its schema is {found}, the manifest says {expected}")));
+        return Err(damaged(format!("its schema version is {found}, but the manifest says {expected}")));
     }
     if contents.rows != manifest.rows {
         return Err(damaged("its numbers of rows differ from those of the manifest".to_owned()));

@@ -1,4 +1,4 @@
-//! Making a backup.
+//! Making a backup: a copy in a temporary folder, which receives its name when it is complete.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};

@@ -43,7 +43,7 @@ pub enum Error {
         reason: String,
     },
     /// The copy does not match the manifest.
-    #[error("{path} is damaged: {reason}; take another backup, nothing was changed")]
+    #[error("{path} is damaged: {reason}; nothing was changed; use another backup")]
     Damaged {
         /// The copy.
         path: PathBuf,
@@ -59,7 +59,7 @@ pub enum Error {
         known: i64,
     },
     /// The data folder already has a database.
-    #[error("{0} has a database: give an empty --data-dir, or --replace, which keeps it aside")]
+    #[error("{0} has a database: give an empty --data-dir, or use --replace, which keeps the present database under another name")]
     NotEmpty(PathBuf),
     /// The database cannot be used.
     #[error(transparent)]

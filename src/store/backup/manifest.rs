@@ -83,7 +83,7 @@ pub fn read_manifest(backup: &Path) -> Result<Manifest, Error> {
     let text = fs::read(&path).map_err(|e| wrong(e.to_string()))?;
     let manifest: Manifest = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
     if manifest.format != FORMAT {
-        return Err(wrong(format!("it has format {}, this program reads {FORMAT}", manifest.format)));
+        return Err(wrong(format!("it has format {}, but this program reads format {FORMAT}", manifest.format)));
     }
     // The name was read from a file: it must not be a path out of the backup.
     if Path::new(&manifest.database).file_name() != Some(std::ffi::OsStr::new(&manifest.database)) {

@@ -18,7 +18,7 @@ const OLDEST_SQLITE: [u32; 3] = [3, 51, 3];
 /// flipped bit in a key hides a batch, and the quick check does not detect it.
 const FULL_CHECK_BYTES: u64 = 1 << 30;
 
-/// The log file is truncated to this size when it restarts. Without the limit, one long read would leave a large file for good.
+/// The log file is truncated to this size when it restarts. Without the limit, one long read would leave a large file permanently.
 const LOG_LIMIT_BYTES: &str = "67108864";
 
 const READERS: u32 = 8;
@@ -40,7 +40,7 @@ pub(in super::super) struct Opened {
     pub sqlite_version: String,
 }
 
-/// Opens a database: checks its integrity, marks it as ours, and migrates it to the newest schema.
+/// Opens a database: checks its integrity, sets the application id of this program, and migrates it to the newest schema.
 pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
     let options = SqliteConnectOptions::new()
         .filename(path)
@@ -62,7 +62,7 @@ pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
     if !safe {
         return Err(Error::LibraryTooOld(sqlite_version));
     }
-    // After the checks, because setting the application id is a write and a damaged file must stay as it is.
+    // The application id is set after the checks, because it is a write and a damaged file must stay as it is.
     let mark = format!("pragma application_id = {APPLICATION_ID}");
     sqlx::query(sqlx::AssertSqlSafe(mark)).execute(&writer).await?;
     MIGRATIONS.run(&writer).await.map_err(|error| match error {
@@ -72,7 +72,7 @@ pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
         other => Error::Migration(other),
     })?;
     // For larger savepoints SQLite copies pages to a temporary file, which would be created, written and removed in nearly every
-    // transaction. Set after the migrations, which may have to sort a whole table.
+    // transaction. It is set after the migrations, which may have to sort a whole table.
     sqlx::query("pragma temp_store = memory").execute(&writer).await?;
     writer.set_connect_options(options.clone().pragma("temp_store", "memory"));
     let reader = SqlitePoolOptions::new()
