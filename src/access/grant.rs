@@ -245,7 +245,8 @@ mod tests {
         Grant::new(actor, scopes.iter().copied().collect(), structures.map(Arc::new))
     }
 
-    /// Scopes, whether limited to "mine"; then what is allowed of (mine, other, list, service) for read, ingest, admin.
+    /// The scopes of a token, and whether it is limited to the structure "mine"; then, for read, ingest and admin,
+    /// whether a request about (mine, another structure, a list, the service) is allowed.
     type Row = (&'static [Scope], bool, [[bool; 4]; 3]);
 
     #[test]
@@ -279,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_scope_is_named_before_the_structure() {
+    fn a_missing_scope_is_reported_before_a_wrong_structure() {
         let denied = allow(&grant(&[Scope::Ingest], Some(&["a"])), Need::Scope(Scope::Read), About::Structure("b"));
         assert!(matches!(denied, Err(Denied::Scope { needed: Scope::Read, .. })), "{denied:?}");
     }

@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_secret_of_the_id_opens() {
+    fn only_the_secret_of_the_same_id_is_accepted() {
         let (text, record) = token(None);
         let (other, _) = token(None);
         let same_id = TokenText::with_id(text.id().clone()).unwrap();

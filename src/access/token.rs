@@ -302,14 +302,14 @@ mod tests {
     }
 
     #[test]
-    fn a_token_inside_a_text_is_seen() {
+    fn a_token_inside_a_text_is_recognised() {
         let good = TokenText::generate().unwrap().reveal();
         assert!(token_like(&good) && token_like(&format!("a=1&b={good}")) && token_like(&good[..30]));
         assert!(!token_like("source=mw_1&x=mw_abc_d") && !token_like("mw_") && !token_like("é"));
     }
 
     #[test]
-    fn what_cannot_be_a_token_is_named() {
+    fn invalid_properties_of_a_token_are_reported() {
         let now = Timestamp::now();
         let bad = NewToken {
             name: "\n".to_owned(),

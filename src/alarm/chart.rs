@@ -9,13 +9,14 @@ use crate::damage::{ChartReference, UndamagedQuantity};
 use crate::parameter::DamageDirection;
 use crate::stats;
 
-/// Least variance of a measurement in a batch, as a share of the undamaged variance, however exact its measurements claim to be.
+/// Smallest variance of a measurement in a batch, as a share of the undamaged variance, even if its measurements state a very small
+/// noise.
 const LEAST_VARIANCE: f64 = 0.1;
 
 /// Series of the chart of the simulation's fit; no parameter can have a colon in its name.
 pub const FIT_SERIES: &str = "simulation:fit";
 
-/// A batch on the chart of one series, before its neighbours in time are known.
+/// The point of a batch on the chart of one series, before the neighbouring points in time are known.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartPoint {
     /// Shift towards damage, in standard errors; for the fit, 1 when rejected and 0 otherwise.
@@ -206,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_series_taken_up_again_goes_on_as_if_it_had_never_stopped() {
+    fn a_resumed_series_continues_like_an_uninterrupted_one() {
         let settings = AlarmSettings { needed: 2, window: 3, ..AlarmSettings::default() };
         let shifts = [0.3, 4.0, 0.1, 3.5, 0.0, -1.0, 2.0, 0.0, 0.0, 0.0, 0.5, 3.1, 3.2];
         let point = |shift: f64| ChartPoint { shift, limit: 3.0, ewma_limit: 1.5, held: false };

@@ -12,10 +12,10 @@ use crate::stats::{self, Stream};
 /// Share of the target run length within which false alarms are counted.
 const EARLY: f64 = 0.1;
 
-/// Most operations simulated, each with its own undamaged reference.
+/// Largest number of operations that are simulated, each with its own undamaged reference.
 const MOST_OPERATIONS: usize = 10_000;
 
-/// Batches simulated in total, over operations and charts.
+/// Number of batches simulated in total, over all operations and charts.
 const BATCHES: usize = 6_000_000;
 
 /// Shifts are clipped at this value before they enter the moving average, because a single extreme batch is already detected by the
@@ -230,7 +230,8 @@ mod tests {
         assert!(two < one - 0.5 && two > 1.0, "{two} and {one}");
     }
 
-    /// Share of operations with an alarm within `longest` batches, by the charts themselves and random numbers of their own.
+    /// Share of operations with an alarm within `longest` batches, simulated with the charts themselves and with independent random
+    /// numbers.
     fn early(situation: Situation, limits: &Limits, settings: &AlarmSettings, operations: u64, longest: usize) -> f64 {
         let chi_squared = ChiSquared::new(situation.degrees_of_freedom as f64).unwrap();
         let alarms = |operation: u64| {
@@ -250,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn between_the_simulated_shared_parts_healthy_operation_alarms_as_rarely_as_wanted() {
+    fn between_the_simulated_shared_parts_the_rate_of_false_alarms_is_as_wanted() {
         let operations = 40_000;
         for settings in [
             AlarmSettings { mean_run_batches: 300.0, ..AlarmSettings::default() },
@@ -258,16 +259,17 @@ mod tests {
         ] {
             let curve = LimitCurve::simulate(60, 2, &settings);
             let wanted = 1.0 - (-EARLY).exp();
-            // Of the operations here and of those behind the limits.
+            // Standard error of the share, from the operations simulated here and from those behind the limits.
             let error = (wanted * (1.0 - wanted) * (1.0 / operations as f64 + 1.0 / MOST_OPERATIONS as f64)).sqrt();
-            // In the middle between those that are simulated.
+            // Positions in the middle between the simulated nodes.
             for position in [0.5, 1.5, 2.5, 4.5, 7.5, 10.5, 13.5, 14.5] {
                 let shared = (position / (NODES - 1) as f64 * FRAC_PI_2).sin().powi(2);
                 let limits = curve.at(shared);
                 let situation = Situation { shared, degrees_of_freedom: 60, charts: 2 };
                 let found = early(situation, &limits, &settings, operations, 30);
                 assert!(found < wanted + 4.0 * error, "{shared}: {found}");
-                // Where the limit of ρ = 0 is the higher one, single shifts alarm less often, and the moving average has its half.
+                // Where the limit of ρ = 0 is the higher one, single shifts raise fewer alarms; the moving average still
+                // contributes its half.
                 let least = if limits.single > curve.at(0.0).single { wanted } else { 0.5 * wanted };
                 assert!(found > least - 4.0 * error, "{shared}: {found}");
             }

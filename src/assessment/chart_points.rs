@@ -15,7 +15,7 @@ use crate::trust::{FindingCode, FindingEffect};
 /// From this number of degrees of freedom on, the undamaged standard deviation is treated as known exactly.
 const MANY_DEGREES: usize = 2_000;
 
-/// A batch on one chart, before its neighbours in time are known.
+/// The point of a batch on one chart, before the neighbouring points in time are known.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewChartPoint {
     /// Parameter or group of a damage chart, or [`FIT_SERIES`].

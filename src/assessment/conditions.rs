@@ -1,4 +1,4 @@
-//! Environmental and operational conditions: the covariates of a batch against those of the undamaged reference.
+//! Environmental and operational conditions: comparison of the covariates of a batch with those of the undamaged reference.
 
 use std::collections::BTreeMap;
 
@@ -30,7 +30,8 @@ pub(super) fn conditions<'a>(
     seen
 }
 
-/// Findings about covariates of a batch that lie outside those of the undamaged reference, and then about missing ones.
+/// Findings about values of covariates that lie outside those of the undamaged reference, followed by findings about missing
+/// covariates.
 pub(super) fn compare_conditions(
     measurements: &[ModalMeasurement],
     seen: &BTreeMap<String, SeenCovariate>,

@@ -54,7 +54,7 @@ mod tests {
     }
 
     #[test]
-    fn growth_is_damage_where_the_structure_says_so() {
+    fn an_increase_is_damage_if_the_direction_of_damage_says_so() {
         let pool = [1.0, 2.0, 3.0, 4.0];
         assert_eq!(probability_of_damage(&pool, 2.5, DamageDirection::Decrease), Some(0.5));
         assert_eq!(probability_of_damage(&pool, 3.5, DamageDirection::Increase), Some(0.25));

@@ -81,7 +81,8 @@ fn image_type(ending: &str) -> Option<&'static str> {
     }
 }
 
-/// A whole HTML page from its Markdown. Everything it refers to is relative, so that it also works behind a proxy that adds a prefix.
+/// Renders a complete HTML page from its Markdown. All addresses in it are relative, so that it also works behind a
+/// proxy that adds a prefix.
 fn page(name: &str, markdown: &str) -> String {
     let mut events: Vec<Event<'_>> =
         Parser::new_ext(markdown, Options::ENABLE_TABLES).filter(|event| !is_raw_html(event)).collect();

@@ -116,7 +116,7 @@ mod tests {
     use crate::monitor::events::Events;
 
     #[tokio::test]
-    async fn a_slow_watcher_is_told_so_once_and_goes_on_with_the_newest() {
+    async fn a_slow_subscriber_gets_one_resync_and_continues_with_the_newest_events() {
         let events = Events::default();
         let slow = events.watch().unwrap();
         let structure = |i: i32| StructureId::parse(&format!("s{i}")).unwrap();

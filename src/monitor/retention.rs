@@ -61,7 +61,7 @@ pub struct RetentionRun {
 /// What is kept, and what would be deleted.
 #[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
 pub struct RetentionPlan {
-    /// Days for which batches are kept; 0 = for ever.
+    /// Days for which batches are kept; 0 means that they are never deleted.
     pub measurements_days: u32,
     /// The time before which measurements would be deleted.
     #[schema(required)]
@@ -198,7 +198,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nothing_is_old_unless_days_are_given() {
+    fn nothing_expires_unless_days_are_configured() {
         let now = Timestamp::parse("2026-03-31T00:00:00Z").unwrap();
         assert_eq!(RetentionSettings::default().before(now), None);
         let thirty = RetentionSettings { measurements_days: 30, ..RetentionSettings::default() };

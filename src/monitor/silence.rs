@@ -54,7 +54,7 @@ impl Silence {
     }
 
     /// Opens and ends alarms of silence. A structure that never sent a batch is not silent. The time before the service `started`
-    /// does not count, because nothing could be received then, and maintenance raises no alarm.
+    /// is ignored, because nothing could be received then. During maintenance no alarm is opened.
     async fn check(&self, started: Timestamp, clock: impl Fn() -> Timestamp) -> Result<(), Error> {
         let allowed = self.after_s as i64 * 1_000_000;
         for structure in self.structures.ids() {

@@ -57,7 +57,7 @@ async fn open(folder: &Path) -> Monitor {
 async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
     let mut opened = Store::open(folder).await;
     for _ in 0..200 {
-        // Tasks of the monitor before this one may still hold it.
+        // Background tasks of the previous monitor may still hold the store open.
         if !matches!(opened, Err(store::Error::Locked(_))) {
             break;
         }
@@ -165,7 +165,7 @@ async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent
 }
 
 #[tokio::test]
-async fn a_model_that_cannot_be_loaded_is_named_and_the_others_serve() {
+async fn a_model_that_cannot_be_loaded_is_reported_and_the_others_stay_in_use() {
     let faults = Faults::arm();
     for call in 0..3 {
         faults.set("baseline::load", &format!("{call}*off->1*return"));

@@ -25,7 +25,7 @@ pub struct MqttSettings {
     pub url: String,
     /// Client id, under which the broker keeps messages; it must be unique among the clients of the broker.
     pub client_id: String,
-    /// Topic of the batches; the level `{structure}` stands for the structure id.
+    /// Topic of the batches; the level `{structure}` is replaced by the structure id.
     pub topic: String,
     /// User name at the broker; empty for none.
     pub username: String,

@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn two_services_do_not_come_back_at_the_same_moment() {
+    fn two_services_do_not_retry_at_the_same_time() {
         let (early, late) = (attempts(&NotifySettings::default(), 0.0), attempts(&NotifySettings::default(), 0.99));
         assert_eq!((early[1], late[1]), (4, 5));
         assert_eq!((early[6], late[6]), (1_456, 2_173));

@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn facts_of_every_kind_of_alarm_make_a_message() {
+    fn a_stored_event_of_an_alarm_becomes_a_message() {
         let event = |facts: &str| OutboxEvent {
             message_id: "msg_1".to_owned(),
             kind: "alarm.opened".to_owned(),

@@ -85,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_parts_are_all_rows_in_their_order() {
+    fn the_parts_cover_all_rows_in_order() {
         for rows in 0..300 {
             let mut next = 0;
             for part in parts(rows) {
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn common_columns_keep_their_parameter_and_the_others_count_on() {
+    fn common_columns_share_a_parameter_and_the_others_are_numbered_consecutively() {
         let statements = InsertStatements::new("insert into t", 3, &[0, 2]);
         assert_eq!(statements.of(1), "insert into t values ($1, $3, $2)");
         assert_eq!(statements.of(2), "insert into t values ($1, $3, $2), ($1, $4, $2)");

@@ -117,7 +117,7 @@ async fn refusal(folder: &Path) -> Error {
 }
 
 #[tokio::test]
-async fn what_is_not_our_database_is_refused_and_left_alone() {
+async fn a_file_that_is_not_our_database_is_refused_and_not_changed() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join(DATABASE_FILE);
     std::fs::write(&file, "some text that is longer than a header").unwrap();
@@ -232,7 +232,7 @@ async fn the_speculative_outcome_of_a_batch_holds_only_after_the_commit() {
 }
 
 #[tokio::test]
-async fn a_comparison_under_an_earlier_baseline_does_not_keep_a_batch_from_the_next() {
+async fn a_comparison_with_an_earlier_trained_baseline_does_not_prevent_the_next_one() {
     let (store, _folder) = open().await;
     for id in ["b0", "b1"] {
         store.batches().insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
@@ -254,7 +254,7 @@ async fn a_comparison_under_an_earlier_baseline_does_not_keep_a_batch_from_the_n
 }
 
 #[tokio::test]
-async fn pages_of_exceedances_walk_the_current_ones_once_and_newest_first() {
+async fn pages_of_exceedances_contain_each_current_one_once_and_newest_first() {
     let (store, _folder) = open().await;
     for i in 0..12 {
         let id = format!("b{i:02}");

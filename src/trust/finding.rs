@@ -46,9 +46,9 @@ pub enum FindingCode {
     NotUsable,
     /// More noise stated than the baseline was trained for; those modes are left out.
     NoiseAboveRange,
-    /// Covariates outside those of the undamaged reference.
+    /// Covariates outside those of the undamaged reference, or outside the range from which an effect was learnt.
     Extrapolated,
-    /// Parameters where the table behind an emulator has no runs.
+    /// Many posterior samples lie in a region where the table behind an emulator has no runs.
     BeyondRuns,
     /// The undamaged reference or the simulation has a covariate that measurements lack.
     CovariateMissing,

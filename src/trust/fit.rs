@@ -1,4 +1,4 @@
-//! Test of fit: the residuals of the simulation for a batch, against those that noise alone would leave.
+//! Test of fit: compares the residuals of the simulation for a batch with those that noise alone would cause.
 
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -43,8 +43,8 @@ pub struct Fit {
 ///  M = Rᵀ P⁺ R,   R = Σ_j r_j,   P = Σ_j P_j,   p_M = P(χ²_rank ≥ M),      p = 2·min(p_T, p_M)
 /// ```
 ///
-/// T detects measurements that misfit each in its own way. M detects a small misfit of a mode that is the same in all
-/// measurements; P_j is the projector on the residuals that the parameters cannot absorb.
+/// T detects misfits that differ between the measurements. M detects a small misfit of a mode that is the same in all measurements;
+/// P_j is the projector on the residuals that the parameters cannot absorb.
 ///
 /// A measurement with a p-value below 0.001/n does not enter T but is reported, so that one bad record does not reject the others.
 /// Measurements with no more modes than parameters do not enter T either: they have residuals only at a bound of the prior.
@@ -92,7 +92,7 @@ impl Fit {
         self.p_value.is_some_and(|p| p < LEVEL) || too_many(bad, self.nearest.len())
     }
 
-    /// The findings of the test; `indices` are those of the measurements in their batch.
+    /// The findings of the test; `indices` are the indices of the tested measurements in their batch.
     pub fn findings(&self, simulator: &Simulator, indices: &[usize]) -> Vec<Finding> {
         let mut findings = Vec::new();
         let count = self.nearest.len();

@@ -6,8 +6,7 @@ use crate::baseline::Baseline;
 /// Failures of a calibration that a finding quotes.
 const SHOWN_FAILURES: usize = 3;
 
-/// Findings about the trained baseline itself: that it did not pass its calibration, that it cannot distinguish parameters, that
-/// its emulator is doubtful.
+/// Findings about the trained baseline itself: a failed calibration, parameters that it cannot distinguish, a doubtful emulator.
 pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
     let record = &baseline.manifest().calibration;
     let uncalibrated = (!record.passed()).then(|| {

@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_trusted_proxy_is_believed_and_only_its_own_word() {
+    fn only_the_address_added_by_a_trusted_proxy_is_used() {
         let table: [(&[&str], &str, &[&str], &str); 8] = [
             (&[], "192.0.2.1", &["203.0.113.9"], "192.0.2.1"),
             (&["10.0.0.7"], "192.0.2.1", &["203.0.113.9"], "192.0.2.1"),
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_proxy_that_is_no_address_is_named() {
+    fn an_invalid_proxy_address_is_reported() {
         let error = Proxies::parse(&["proxy.local".to_owned()]).unwrap_err();
         assert!(error.to_string().contains("\"proxy.local\""), "{error}");
     }

@@ -1,4 +1,4 @@
-//! The middleware around every handler: lets a request in, or answers why not.
+//! The middleware around every handler: admits a request, or refuses it with the reason.
 
 use axum::extract::{FromRequestParts, MatchedPath, RawPathParams, Request, State};
 use axum::http::request::Parts;

@@ -91,7 +91,7 @@ impl Limit {
     fn take(&self, key: &Key, count: NonZeroU32) -> Result<(), ApiError> {
         self.purge();
         let key = if self.buckets.len() < MOST_KEYS { key } else { &Key::Others };
-        // A count above the burst size is reduced to it: the size of a batch has a limit of its own.
+        // A count above the burst size is reduced to it: the size of a batch has a separate limit.
         let count = count.min(self.quota.burst_size());
         let Ok(Err(not_until)) = self.buckets.check_key_n(key, count) else { return Ok(()) };
         let wait = not_until.wait_time_from(self.clock.now());
@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_batch_costs_its_measurements_and_the_largest_always_fits() {
+    fn a_batch_counts_its_measurements_and_the_largest_batch_is_always_accepted() {
         let limits = Limits::new(&RateLimitSettings { measurements_per_s: 10, ..Default::default() }, 5_000);
         assert!(limits.take_measurements(&Key::Others, 5_000).is_ok());
         assert!(limits.take_measurements(&Key::Others, 100).is_err());
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_stays_bounded_whoever_asks() {
+    fn memory_stays_bounded_with_any_number_of_clients() {
         let limits = Limits::new(&RateLimitSettings::default(), 10);
         for number in 0..2 * MOST_KEYS as u32 {
             let _ = limits.count_failure(Some(address(number)));

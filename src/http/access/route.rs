@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_route_that_nobody_thought_of_needs_a_token() {
+    fn a_route_without_a_rule_needs_a_token() {
         let admin = Need::Scope(Scope::Admin);
         let need = |method: Method, pattern| classify(&method, Some(pattern)).need;
         assert_eq!(need(Method::GET, "/secret"), admin);

@@ -85,7 +85,7 @@ pub fn read_manifest(backup: &Path) -> Result<Manifest, Error> {
     if manifest.format != FORMAT {
         return Err(wrong(format!("it has format {}, but this program reads format {FORMAT}", manifest.format)));
     }
-    // The name was read from a file: it must not be a path out of the backup.
+    // The name was read from a file. It must not lead out of the folder of the backup.
     if Path::new(&manifest.database).file_name() != Some(std::ffi::OsStr::new(&manifest.database)) {
         return Err(wrong(format!("{} is not a file name", crate::quantity::shown(&manifest.database))));
     }
