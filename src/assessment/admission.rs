@@ -7,7 +7,7 @@ use crate::baseline::Baseline;
 use crate::measurement::ModalMeasurement;
 use crate::trust::{Finding, FindingCode, FindingEffect};
 
-/// Measurements that a baseline can use only in part or not at all, as indices in their batch.
+/// Measurements that the trained baseline can use only in part or not at all, as indices in their batch.
 #[derive(Default)]
 struct Reservations {
     below_noise_range: Vec<usize>,
@@ -15,7 +15,7 @@ struct Reservations {
     unusable: Vec<usize>,
     /// By covariate: measurements that lack it, so that it is marginalised.
     marginalised: BTreeMap<String, Vec<usize>>,
-    /// By covariate: measurements whose value lies beyond the learnt range.
+    /// By covariate: measurements whose value lies outside the range from which its effect was learnt.
     beyond: BTreeMap<String, Vec<usize>>,
 }
 
@@ -95,7 +95,7 @@ impl Reservations {
             (
                 FindingCode::NotUsable,
                 self.unusable,
-                "measurements are left out: they lack a mode that this baseline needs, or have no mode within its noise range"
+                "measurements are left out: they lack a mode that the trained baseline needs, or have no mode within its noise range"
                     .to_owned(),
             ),
         ];

@@ -34,7 +34,7 @@ impl BatchState {
 pub struct Assessment {
     /// Digest of the trained baseline that was used.
     pub model_digest: Digest,
-    /// Digest of the structure that this baseline was trained for.
+    /// Digest of the version of the structure that the trained baseline was trained for.
     pub structure_digest: Digest,
     /// Version of the undamaged reference that the batch was compared with; `None` when there was none or when the batch is part
     /// of it.

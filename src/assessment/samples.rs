@@ -23,10 +23,10 @@ const FEW_EFFECTIVE_SAMPLES: f64 = 3.0;
 /// Why a batch was not assessed; the batch itself is kept.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No measurement that this baseline can use.
+    /// The trained baseline can use none of the measurements.
     #[error(
-        "none of {measurements} measurements can be used: each lacks a mode that this baseline needs, or states more noise \
-         than it was trained for"
+        "none of {measurements} measurements can be used: each lacks a mode that the trained baseline needs, or states more \
+         noise than it was trained for"
     )]
     NoUsableMeasurement {
         /// Measurements of the batch.
@@ -107,7 +107,8 @@ pub fn draw(
     if observations.is_empty() {
         return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
     }
-    // A single measurement, and a baseline that estimates the population of each parameter separately, need no pilot sample.
+    // A single measurement, and a trained baseline that estimates the population of each parameter separately, need no pilot
+    // sample.
     let piloted = observations.len() > 1 && !baseline.starts_at_fit();
     let first = if piloted { draws.per_measurement.max(draws.for_population / PILOT_DIVISOR) } else { draws.most() };
     let infer = |observations: &[Observation]| {

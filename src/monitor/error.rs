@@ -160,7 +160,7 @@ pub enum JobError {
 /// Why another trained baseline was not put into use.
 #[derive(Debug, thiserror::Error)]
 pub enum ReloadError {
-    /// The new baseline may not replace the one in use.
+    /// The new trained baseline may not replace the one in use.
     #[error("the new trained baseline for {structure} is refused ({}): {reason}", match kept {
         Some(digest) => format!("the one with digest {digest} stays in use"),
         None => "no other one is in use".to_owned(),

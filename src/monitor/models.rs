@@ -144,7 +144,8 @@ impl Models {
 /// The trained baseline of a library for the present version of a structure, or why there is none. This is stricter than at the
 /// start of the service, because a user who requests a reload has just written a file and expects that file to be used.
 fn candidate(library: &Library, structure: &StructureId, active: &ActiveStructure) -> Result<Arc<Baseline>, String> {
-    // A definition that cannot be read might be that of this structure; a shipped baseline must not silently be used instead.
+    // A definition that cannot be read might be that of this structure; a trained baseline that is shipped with the program must
+    // not silently be used instead.
     let blocking = |of: Option<&StructureId>| of.is_none() || of == Some(structure);
     if let Some(refusal) = library.refusals().iter().find(|refusal| blocking(refusal.structure.as_ref())) {
         return Err(format!("{}: {}", refusal.file, refusal.reason));

@@ -28,7 +28,7 @@ pub struct Inspection {
     pub dangling_rows: u64,
     /// When the newest batch arrived.
     pub newest_received: Option<Timestamp>,
-    /// Structures: id, definition, and the baseline that the service trained for the present version.
+    /// Structures: id, definition, and the trained baseline that the service made for the present version.
     pub structures: Vec<(String, String, Option<StoredBaseline>)>,
 }
 

@@ -133,7 +133,7 @@ impl Store {
         DatabaseFile { database: &self.database }
     }
 
-    /// Structures, their versions, and the baselines trained for these.
+    /// Structures, their versions, and the trained baselines that the service made for them.
     pub fn structures(&self) -> Structures<'_> {
         Structures { database: &self.database }
     }

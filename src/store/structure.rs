@@ -64,7 +64,7 @@ pub(super) async fn is_present(
     Ok(present)
 }
 
-/// Structures, their versions, and the baselines trained for these.
+/// Structures, their versions, and the trained baselines that the service made for them.
 #[derive(Clone, Copy)]
 pub struct Structures<'s> {
     pub(super) database: &'s Database,

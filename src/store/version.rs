@@ -1,4 +1,4 @@
-//! Versions of structures, and the baselines trained for them.
+//! Versions of structures, and the trained baselines that the service made for them.
 
 use sqlx::FromRow;
 
@@ -7,7 +7,7 @@ use super::structure::{is_present, Structures};
 use super::transaction::Transaction;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
-/// A new version of a structure, with the baseline trained for it.
+/// A new version of a structure, with the trained baseline for it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewVersion {
     /// Digest of the definition.
@@ -22,7 +22,7 @@ pub struct NewVersion {
     pub baseline: Option<StoredBaseline>,
 }
 
-/// A baseline that the service trained.
+/// A trained baseline that the service made.
 #[derive(Debug, Clone, PartialEq, FromRow)]
 pub struct StoredBaseline {
     /// Digest of the manifest.
@@ -117,7 +117,7 @@ impl Structures<'_> {
         Ok(row.map(|(definition, parent)| (definition, parent.map(Digest::from_stored))))
     }
 
-    /// The baseline that the service trained for a version.
+    /// The trained baseline that the service made for a version.
     ///
     /// # Errors
     /// [`Error::Sqlite`].

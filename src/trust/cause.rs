@@ -29,7 +29,7 @@ pub enum Error {
 /// Tests common mistakes on a rejected batch and reports the first whose correction makes it fit.
 ///
 /// # Errors
-/// [`Error`], which does not occur with a loaded baseline.
+/// [`Error`], which does not occur with a loaded trained baseline.
 pub fn suspect(baseline: &Baseline, observations: &[Observation], seed: u64) -> Result<Option<Finding>, Error> {
     let step = observations.len().div_ceil(TESTED_MEASUREMENTS).max(1);
     let subset: Vec<&Observation> = observations.iter().step_by(step).collect();

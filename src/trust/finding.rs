@@ -34,17 +34,17 @@ pub enum FindingCode {
     StaleRepeat,
     /// Frequencies are rounded to steps larger than their scatter.
     Quantised,
-    /// Single measurements far from the others or from anything the simulation gives; left out.
+    /// Single measurements lie far from the others, or far from anything that the simulation gives; they are left out.
     Outlier,
     /// Measurements slightly beyond the prior; the nearest point of the prior is used for them.
     OutsidePrior,
-    /// Many samples lie at a bound of a prior.
+    /// Many posterior samples lie at a bound of the prior of a parameter.
     PriorEdge,
-    /// Less noise stated than the baseline was trained for; the least trained noise is used.
+    /// Measurements state less noise than the trained baseline covers; the least noise that it covers is used.
     NoiseBelowRange,
-    /// Measurements that lack modes which the baseline needs; left out.
+    /// Measurements that lack modes which the trained baseline needs; they are left out.
     NotUsable,
-    /// More noise stated than the baseline was trained for; those modes are left out.
+    /// Modes have more noise than the trained baseline covers; these modes are left out.
     NoiseAboveRange,
     /// Covariates outside those of the undamaged reference, or outside the range from which an effect was learnt.
     Extrapolated,
@@ -52,9 +52,9 @@ pub enum FindingCode {
     BeyondRuns,
     /// The undamaged reference or the simulation has a covariate that measurements lack.
     CovariateMissing,
-    /// Too few effective samples for the hyperparameters.
+    /// The hyperparameters are estimated from few effective samples.
     FewEffectiveSamples,
-    /// The baseline in use did not pass its calibration and was accepted by configuration.
+    /// The trained baseline in use did not pass its calibration and was accepted by configuration.
     Uncalibrated,
     /// Parameters that these modes cannot distinguish.
     NotIdentifiable,

@@ -48,7 +48,7 @@ fn receiver_dropped<T>(_: T) -> Error {
     Error::Row { what: "archive", detail: "the receiver of the export was dropped".to_owned() }
 }
 
-/// Digests of version and baseline, manifest, weights, and whether it is used although it failed its calibration check.
+/// Digests of version and trained baseline, manifest, weights, and whether it is used although it failed its calibration check.
 type ModelRow = (String, String, Vec<u8>, Vec<u8>, bool);
 
 impl Archive<'_> {
@@ -197,7 +197,7 @@ impl Archive<'_> {
         Ok(())
     }
 
-    /// The baselines that the service trained for the versions of a structure.
+    /// The trained baselines that the service made for the versions of a structure.
     ///
     /// # Errors
     /// [`Error::Sqlite`].

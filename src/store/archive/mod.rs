@@ -4,7 +4,7 @@
 //!  {"record":"archive", …}            what the archive contains, and what it does not
 //!  {"record":"structure", …}          its present definition
 //!  {"record":"version", …}            earlier versions of it
-//!  {"record":"model", …}              baselines trained for it
+//!  {"record":"model", …}              trained baselines for it
 //!  {"record":"batch", …}              batches with measurements, in the order of arrival
 //!  {"record":"undamaged_state", …}
 //!  {"record":"maintenance", …}
