@@ -18,7 +18,7 @@ pub enum Error {
     UnknownBatch {
         /// The structure.
         structure: StructureId,
-        /// The batch asked for.
+        /// The id in the request, as it is shown in messages.
         batch: String,
     },
     /// The structure has no trained baseline in use.
@@ -106,7 +106,7 @@ pub enum DeclareError {
     /// No undamaged reference can be computed from the batches.
     #[error(transparent)]
     Reference(#[from] damage::Error),
-    /// An inference failed.
+    /// The assessment of a batch failed.
     #[error("batch {batch} could not be used: {source}")]
     Assess {
         /// The batch.

@@ -71,7 +71,7 @@ use crate::baseline::library::Library;
 use crate::quantity::StructureId;
 use crate::store::{Audit, Outbox, Quarantine, Store, Webhooks};
 
-/// The application: a cheap handle on its parts.
+/// The application. It gives access to its parts; cloning it is cheap.
 #[derive(Clone)]
 pub struct Monitor {
     store: Store,
@@ -146,57 +146,57 @@ impl Monitor {
         self.structures.get(id)
     }
 
-    /// The structures in use.
+    /// The structures in use, with their trained baselines and the library on disk.
     pub fn structures(&self) -> &ActiveStructures {
         &self.structures
     }
 
-    /// Takes batches.
+    /// Checks, stores and assesses new batches.
     pub fn ingest(&self) -> &Ingest {
         &self.ingest
     }
 
-    /// Declares references and assesses stored batches.
+    /// Declares undamaged references, and assesses stored batches that wait.
     pub fn replay(&self) -> &Replay {
         &self.replay
     }
 
-    /// Reads batches and results.
+    /// Reads stored batches, their assessments, and time series.
     pub fn records(&self) -> &Records {
         &self.records
     }
 
-    /// The alarms of the structures.
+    /// Reads and acknowledges alarms, and reads alarm charts and maintenance windows.
     pub fn alarms(&self) -> &Alarms {
         &self.alarms
     }
 
-    /// Diagnoses and extensions.
+    /// Starts diagnoses and extensions, and reads their results.
     pub fn jobs(&self) -> &Jobs {
         &self.jobs
     }
 
-    /// The versions of the structures.
+    /// Undoes extensions of structures.
     pub fn versions(&self) -> &Versions {
         &self.versions
     }
 
-    /// The trained baselines.
+    /// Replaces trained baselines by those of the models folder.
     pub fn models(&self) -> &Models {
         &self.models
     }
 
-    /// Health and background tasks.
+    /// The health of the service, its gauges, backups, retention and alarms of silence.
     pub fn upkeep(&self) -> &Upkeep {
         &self.upkeep
     }
 
-    /// Export and import.
+    /// Exports a structure as an archive, and imports archives.
     pub fn archive(&self) -> &Archive {
         &self.archive
     }
 
-    /// The live events.
+    /// The event bus, for subscribers to changes of batches, alarms, jobs and structures.
     pub fn events(&self) -> &Events {
         &self.events
     }

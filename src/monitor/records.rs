@@ -15,7 +15,7 @@ use crate::store::{
 
 /// A batch with its results.
 pub struct BatchView {
-    /// The batch as stored.
+    /// The batch as it is stored.
     pub record: BatchRecord,
     /// Its current assessment.
     pub assessment: Option<Assessment>,
@@ -61,13 +61,13 @@ impl fmt::Display for Missing {
 pub struct Series {
     /// Number and times of the batches in the window.
     pub extent: Extent,
-    /// Frequencies and covariates.
+    /// Frequencies in Hz and numeric covariates of the measurements.
     pub measured: Reduced<()>,
-    /// Estimates of each quantity.
+    /// Mean and probability of damage of each monitored quantity.
     pub quantities: Vec<QuantitySeries>,
-    /// Trust of each batch.
+    /// Verdict and findings of each batch.
     pub trust: Reduced<TrustMark>,
-    /// Alarm charts.
+    /// Points of the alarm charts.
     pub charts: Vec<ChartSeries>,
 }
 

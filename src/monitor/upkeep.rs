@@ -48,22 +48,22 @@ pub struct Upkeep {
 }
 
 impl Upkeep {
-    /// Backups.
+    /// Makes and lists backups.
     pub fn backups(&self) -> &Backups {
         &self.backups
     }
 
-    /// Deletion of old batches.
+    /// Deletes old batches if this is configured.
     pub fn retention(&self) -> &Retention {
         &self.retention
     }
 
-    /// Alarms for structures that send nothing.
+    /// Opens and ends alarms for structures that send no batches.
     pub fn silence(&self) -> &Silence {
         &self.silence
     }
 
-    /// Free places in the queue of assessments.
+    /// Number of free places in the queue of assessments.
     pub fn free_places(&self) -> usize {
         self.compute.free()
     }

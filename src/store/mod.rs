@@ -148,7 +148,7 @@ impl Store {
         Assessments { database: &self.database }
     }
 
-    /// Undamaged references.
+    /// The undamaged references of the structures.
     pub fn reference(&self) -> References<'_> {
         References { database: &self.database, newest: &self.newest_undamaged }
     }
@@ -163,17 +163,17 @@ impl Store {
         Diagnoses { database: &self.database }
     }
 
-    /// Webhooks.
+    /// The registered webhooks.
     pub fn webhooks(&self) -> Webhooks<'_> {
         Webhooks { database: &self.database }
     }
 
-    /// Messages to webhooks.
+    /// The messages to webhooks and their deliveries.
     pub fn outbox(&self) -> Outbox<'_> {
         Outbox { database: &self.database }
     }
 
-    /// Access tokens.
+    /// The access tokens, of whose secrets only digests are stored.
     pub fn tokens(&self) -> Tokens<'_> {
         Tokens { database: &self.database }
     }
@@ -188,7 +188,7 @@ impl Store {
         Quarantine { database: &self.database }
     }
 
-    /// Deletion of old batches.
+    /// Deletes old batches, and counts those that would be deleted.
     pub fn retention(&self) -> Retention<'_> {
         Retention { database: &self.database }
     }

@@ -38,11 +38,11 @@ pub struct ExtensionResult {
     pub added: Vec<String>,
     /// Causes that were left out, and why.
     pub left_out: Vec<String>,
-    /// The new version.
+    /// Digest of the new version of the structure.
     pub structure_digest: String,
-    /// The version that it extends.
+    /// Digest of the version that it extends.
     pub parent_digest: String,
-    /// Its trained baseline.
+    /// Digest of the trained baseline for the new version.
     pub model_digest: String,
     /// Version of the undamaged reference that was renewed with it.
     pub undamaged_version: Option<u32>,
