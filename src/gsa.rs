@@ -97,7 +97,7 @@ pub struct Sensitivity {
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error<E> {
     /// There are no inputs, or more than the sequence has dimensions for.
-    #[error("{inputs} inputs: from 1 to {MAX_INPUTS} are possible")]
+    #[error("{inputs} inputs: there must be 1 to {MAX_INPUTS}")]
     Inputs {
         /// Number of inputs.
         inputs: usize,
@@ -113,7 +113,7 @@ pub enum Error<E> {
         upper: f64,
     },
     /// The number of samples is not one for which the sequence is balanced.
-    #[error("{samples} samples: a power of two from 2 to {MAX_SAMPLES} is needed")]
+    #[error("{samples} samples: their number must be a power of two from 2 to {MAX_SAMPLES}")]
     Samples {
         /// Samples asked for.
         samples: usize,
@@ -205,7 +205,7 @@ where
     })
 }
 
-/// Checks inputs and settings.
+/// Checks the ranges of the inputs and the settings.
 fn check<E>(inputs: &[Input], settings: &Settings) -> Result<(), Error<E>> {
     let &Settings { samples, replicates, .. } = settings;
     if inputs.is_empty() || inputs.len() > MAX_INPUTS {
@@ -312,7 +312,8 @@ impl<F> Design<'_, F> {
 
     /// Inputs of one row, taken from the dimensions of the sequence starting with `dimension`, `[d]`.
     fn point(&self, row: usize, dimension: usize, scrambling: u32) -> Vec<f64> {
-        // The crate rounds down to one of 2²³ cells. Their centres are unbiased and never equal a bound.
+        // `sobol_burley` rounds each coordinate down to a multiple of 2⁻²³. The centre of this cell is unbiased and never equals a
+        // bound.
         const HALF_CELL: f64 = 1.0 / (1 << 24) as f64;
         let coordinate = |(column, input): (usize, &Input)| {
             let u = sobol_burley::sample(row as u32, (dimension + column) as u32, scrambling);

@@ -85,13 +85,14 @@ impl<T> Reducer<T> {
         place.clamp(0, self.buckets() as i128 - 1) as usize
     }
 
-    /// Adds a row. `tag` is called only when the row is kept, at least for now.
+    /// Adds a row with one value for each channel, `[channels]`. `tag` is called only if the row is kept; a later row can still replace
+    /// it.
     pub fn push(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> T) {
         let pushed: Result<(), std::convert::Infallible> = self.try_push(time_us, values, || Ok(tag()));
         pushed.unwrap_or_else(|never| match never {});
     }
 
-    /// Adds a row with a tag that can fail.
+    /// As [`Self::push`], for a tag whose creation can fail.
     ///
     /// # Errors
     /// The error of `tag`.
@@ -220,8 +221,8 @@ enum Role {
     Missing(usize),
 }
 
-/// Longest spacing that is not a gap, microseconds, from the ascending times of all rows; `None` with fewer than two
-/// different times.
+/// Longest spacing of rows that is not a gap, microseconds: [`GAP_SPACINGS`] times the median spacing of the ascending `times`,
+/// microseconds, `[n]`. `None` if there are fewer than two different times.
 pub fn longest_spacing(times: &[i64]) -> Option<i64> {
     let mut spacings: Vec<i64> =
         times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).filter(|spacing| *spacing > 0).collect();
@@ -237,12 +238,12 @@ pub fn longest_spacing(times: &[i64]) -> Option<i64> {
 fn gaps<T>(times: &[i64], rows: &[Row<T>]) -> Vec<(i64, usize)> {
     let Some(longest) = longest_spacing(times) else { return Vec::new() };
     let mut gaps = Vec::new();
-    let mut behind = times.iter().copied().peekable();
+    let mut upcoming = times.iter().copied().peekable();
     for (index, pair) in rows.windows(2).enumerate() {
         let (from, to) = (pair[0].time_us, pair[1].time_us);
-        while behind.next_if(|time| *time <= from).is_some() {}
+        while upcoming.next_if(|time| *time <= from).is_some() {}
         let (mut last, mut widest) = (from, (0, from));
-        while let Some(time) = behind.next_if(|time| *time <= to) {
+        while let Some(time) = upcoming.next_if(|time| *time <= to) {
             widest = widest.max((time.saturating_sub(last), last));
             last = time;
         }

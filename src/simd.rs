@@ -50,7 +50,7 @@ fn power_of_whole(shifted: f32) -> f32 {
 
 /// 1/x with a relative error below 2e-7, for x between 1 and 8e37.
 ///
-/// Three Newton steps from a first guess that negates the exponent. A vector division takes as long as the whole remainder
+/// Three Newton steps r ← r + r(1 − x r) from a first guess that negates the exponent. A vector division takes as long as the whole remainder
 /// of a logistic function.
 #[inline(always)]
 pub fn reciprocal(x: f32) -> f32 {

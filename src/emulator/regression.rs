@@ -34,7 +34,7 @@ impl Regression {
         Self::without(y, 0..0)
     }
 
-    /// [`Self::new`] fitted without the runs `held_out`, which are only predicted.
+    /// As [`Self::new`], but the rows `held_out` of `y`, `[n]`, are only predicted and not fitted.
     pub fn without(y: &[f64], held_out: Range<usize>) -> Self {
         Self {
             held_out,
@@ -99,7 +99,7 @@ impl Regression {
         self.projections.last().copied().unwrap_or(0.0)
     }
 
-    /// β = R⁻¹ Qᵀy.
+    /// Coefficients β = R⁻¹ Qᵀy of the columns, `[P]`.
     pub fn coefficients(&self) -> Vec<f64> {
         let mut coefficients = vec![0.0; self.terms()];
         for (column, projection) in self.inverse.iter().zip(&self.projections) {
@@ -110,7 +110,7 @@ impl Regression {
         coefficients
     }
 
-    /// y minus the prediction at the runs held out.
+    /// y minus the prediction at the runs held out, `[held_out]`.
     pub fn held_out_residual(&self) -> &[f64] {
         &self.residual[self.held_out.clone()]
     }
@@ -151,7 +151,7 @@ impl Regression {
         &self.leverage
     }
 
-    /// Columns of R⁻¹, each from its first row to the diagonal.
+    /// Columns of R⁻¹, `[P][row]`, each from its first row to the diagonal.
     pub fn into_inverse(self) -> Vec<Vec<f64>> {
         self.inverse
     }

@@ -13,7 +13,8 @@ pub fn stiffness_matrix(structure: &Structure) -> DMatrix<f64> {
     stiffness_matrix_with(structure, &[])
 }
 
-/// [`stiffness_matrix`] with some stiffnesses replaced, given as (index of the spring, value).
+/// [`stiffness_matrix`] with some stiffnesses replaced: K, `[n, n]`. `changes` holds the index of each changed spring and its
+/// stiffness in the unit of [`super::Spring::n_per_m`]; if an index occurs more than once, its last value is used.
 pub fn stiffness_matrix_with(structure: &Structure, changes: &[(usize, f64)]) -> DMatrix<f64> {
     let changed = |index: usize| changes.iter().rev().find(|(spring, _)| *spring == index).map(|(_, value)| *value);
     let springs = structure.springs().iter().enumerate();

@@ -65,8 +65,8 @@ pub struct Response {
     pub by_size: DMatrix<f64>,
 }
 
-/// The lowest `count` frequencies of a structure under effects of the sizes `sizes` (all sizes of the first target, then
-/// those of the next), and their derivatives.
+/// The lowest `count` frequencies of a structure under effects, Hz, `[count]`, and their derivatives. `sizes` holds the size g of
+/// each effect in the unit of its target, `[sizes]`: all sizes of the first target, then those of the next.
 ///
 /// ```text
 ///  ∂f/∂g:   k(1 + g):  Σ k ∂f/∂k      m(1 + g):  Σ m ∂f/∂m      f(1 + g):  f      f + g:  1      added spring:  ∂f/∂k

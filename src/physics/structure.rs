@@ -194,8 +194,8 @@ impl Structure {
         let point = |(dof, mass): (usize, &Mass)| AttachmentPoint { name: mass.name.clone(), dof };
         let points = masses.iter().enumerate().map(point).collect();
         let structure = Self::with_dofs(masses.len(), points, masses, springs)?;
-        let tied = structure.springs.iter().filter(|s| s.n_per_m > 0.0);
-        if let Some(index) = floating_mass(structure.dofs, tied) {
+        let stiff = structure.springs.iter().filter(|s| s.n_per_m > 0.0);
+        if let Some(index) = floating_mass(structure.dofs, stiff) {
             return Err(Error::Mechanism { mass: structure.masses[index].name.clone() });
         }
         Ok(structure)
@@ -251,7 +251,7 @@ impl Structure {
     /// Name of a node.
     ///
     /// # Panics
-    /// If no attachment point has this degree of freedom, which is a bug of the caller.
+    /// If no attachment point has this degree of freedom, which is a programming error in the caller.
     pub fn node_name(&self, node: Node) -> &str {
         match node {
             Node::Ground => "ground",
@@ -315,6 +315,8 @@ fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
 
 /// Index of a mass that `springs` do not connect to the ground, if there is one.
 ///
+/// `masses` is the number of masses, which have the degrees of freedom 0 to `masses` − 1.
+///
 /// Springs are one-dimensional, so that K is the Laplacian of a weighted graph with a grounded node: it is singular exactly
 /// if a part of the graph is not connected to the ground.
 pub fn floating_mass<'a>(masses: usize, springs: impl Iterator<Item = &'a Spring>) -> Option<usize> {
@@ -331,11 +333,11 @@ pub fn floating_mass<'a>(masses: usize, springs: impl Iterator<Item = &'a Spring
         neighbours[to].push(from);
     }
     let mut reached = vec![false; masses + 1];
-    let mut open = vec![ground];
-    while let Some(node) = open.pop() {
+    let mut to_visit = vec![ground];
+    while let Some(node) = to_visit.pop() {
         if !std::mem::replace(&mut reached[node], true) {
-            open.extend(&neighbours[node]);
+            to_visit.extend(&neighbours[node]);
         }
     }
-    reached[..masses].iter().position(|tied| !tied)
+    reached[..masses].iter().position(|connected| !connected)
 }

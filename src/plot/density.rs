@@ -10,7 +10,7 @@ const BARS: [usize; 2] = [6, 60];
 /// Number of points of a curve.
 const POINTS: usize = 161;
 
-/// Bars of a histogram: lower edge, upper edge and density (one over the unit of the values).
+/// Bars of a histogram of `values`, `[n]`: lower edge, upper edge and density (one over the unit of the values) of each bar.
 ///
 /// ```text
 ///  width = 2·IQR/∛n
@@ -34,8 +34,8 @@ pub fn histogram(values: &[f64]) -> Vec<(f64, f64, f64)> {
     counts.iter().enumerate().map(bar).collect()
 }
 
-/// Bars around each value that occurs, with edges halfway to the next: for values that take only a few positions. Lower edge,
-/// upper edge and density.
+/// Histogram of `values`, `[n]`, that take only a few different values: one bar around each of these, with edges halfway to the
+/// next. Returns lower edge, upper edge and density of each bar; empty if all values are equal.
 pub fn columns(values: &[f64]) -> Vec<(f64, f64, f64)> {
     let mut places: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
     let total = places.len() as f64;

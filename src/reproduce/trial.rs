@@ -1,4 +1,5 @@
-//! One repetition: what each method finds from the measurements of a state; and the summary of many repetitions as table rows.
+//! One repetition, in which each method estimates the population from the measurements of a state, and the summary of many
+//! repetitions as table rows.
 
 use std::time::Instant;
 
@@ -121,8 +122,8 @@ impl Bench<'_> {
     }
 
     fn cinn(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
-        // Times are those of the samples alone, without the service's checks; what is compared comes by its whole way, which moves
-        // measurements beyond the prior box to its nearest point first.
+        // The time is that of the inference alone, without the checks of the service. The samples that are compared come from the
+        // complete assessment, which first moves measurements beyond the prior box to the nearest point of the box.
         let rows: Vec<Vec<f64>> = data.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
         let measurements = at_intervals(&rows, Timestamp::from_micros(START_US)?, 1, None)?;
         let observations: Vec<Observation> =
@@ -144,7 +145,7 @@ fn of_samples(samples: Vec<Vec<f64>>, draws: usize, model_runs: Option<usize>) -
     Found { samples, mean, std, seconds: 0.0, model_runs }
 }
 
-/// Damage threshold δ = μ − 1.645 σ of each parameter, `[d]` (Eq. 21).
+/// Damage threshold δ = μ − 1.645 σ of each parameter, in parameter units, `[d]` (Eq. 21 of the paper).
 pub fn thresholds(undamaged: &Found) -> Vec<f64> {
     undamaged.mean.iter().zip(&undamaged.std).map(|(mean, std)| mean - DELTA * std).collect()
 }
@@ -157,7 +158,7 @@ pub fn probability_of_damage(method: Method, found: &Found, k: usize, threshold:
     }
 }
 
-/// Share of values below a threshold.
+/// Share of `values`, `[n]`, below a threshold in the same unit, from 0 to 1.
 pub fn share_below(values: &[f64], threshold: f64) -> f64 {
     values.iter().filter(|x| **x < threshold).count() as f64 / values.len() as f64
 }
@@ -268,7 +269,7 @@ impl Series {
     }
 }
 
-/// Median, 5 % and 95 % quantiles.
+/// Median, 5 % quantile and 95 % quantile of `values`, `[repetitions]`.
 pub fn spread(values: &[f64]) -> Spread {
     let at = |level| stats::quantile(values, level);
     Spread { median: at(0.5), low: at(0.05), high: at(0.95) }

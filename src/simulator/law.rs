@@ -100,7 +100,8 @@ impl Law {
     }
 
     /// Returns the size g of the effect at one value of the covariate for the coefficients `psi`, and writes its derivatives ∂g/∂ψ
-    /// to `slopes`. Both slices are as long as [`Self::numbers`]. The formulas are those of [`LawKind`].
+    /// to `slopes`. Both slices are as long as [`Self::numbers`], `[ψ]`. g is in the unit of the target of the effect. The formulas
+    /// are those of [`LawKind`].
     ///
     /// # Panics
     /// If `psi` or `slopes` is too short.

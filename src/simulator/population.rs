@@ -29,7 +29,7 @@ pub struct SimulatedMeasurements {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// A name is not that of a parameter.
-    #[error("{} is no parameter: the parameters are {known}", shown(.name))]
+    #[error("{} is not a parameter: the parameters are {known}", shown(.name))]
     Unknown {
         /// The name given.
         name: String,
@@ -80,7 +80,7 @@ impl Population {
         Ok(Self { mean, std })
     }
 
-    /// Draws `measurements` measurements with `noise_multiple` times the measurement noise of the structure; 0 gives exact
+    /// Draws parameters, `[n, d]`, and simulates their frequencies, Hz, `[n, m]`: n = `measurements` measurements with `noise_multiple` times the measurement noise of the structure; 0 gives exact
     /// frequencies. The draws are not truncated at the prior, because a damaged population can leave it.
     ///
     /// # Errors

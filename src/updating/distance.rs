@@ -103,12 +103,13 @@ impl Moments {
     }
 }
 
-/// [`Moments::bhattacharyya`] between the rows of two matrices, `[n, m]` and `[N, m]`.
+/// [`Moments::bhattacharyya`] of the normal distributions fitted to the rows of two matrices, `[n, m]` and `[N, m]`; `None` if a
+/// covariance is singular.
 pub fn bhattacharyya(measured: &DMatrix<f64>, simulated: &DMatrix<f64>) -> Option<f64> {
     Moments::from_matrix(measured).bhattacharyya(&Moments::from_matrix(simulated))
 }
 
-/// Log-likelihood of a Bhattacharyya distance D_B, nats.
+/// Log-likelihood of a Bhattacharyya distance D_B, nats, up to a constant.
 ///
 /// ```text
 ///  ln L = −D_B / ε²

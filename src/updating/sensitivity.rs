@@ -10,10 +10,10 @@ use crate::simulator::Simulator;
 const MOST_ITERATIONS: usize = 60;
 
 /// Root mean square of the relative residuals below which the frequencies are matched.
-const MET: f64 = 1e-9;
+const MATCHED_RESIDUAL: f64 = 1e-9;
 
 /// Step in the unit box below which the search has converged.
-const AT_REST: f64 = 1e-9;
+const CONVERGED_STEP: f64 = 1e-9;
 
 /// Result of updating the parameters by one measurement.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,9 +31,9 @@ pub struct Update {
 }
 
 impl Update {
-    /// Whether the frequencies at θ match the measured ones.
+    /// Whether the frequencies at θ match the measured ones: the residual is at most 1e-9.
     pub fn is_met(&self) -> bool {
-        self.residual <= MET
+        self.residual <= MATCHED_RESIDUAL
     }
 }
 
@@ -99,8 +99,8 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
         } else {
             damping *= 10.0;
         }
-        let met = root_mean_square(&residual) <= MET;
-        converged = met || moved <= AT_REST || damping > 1e10;
+        let matched = root_mean_square(&residual) <= MATCHED_RESIDUAL;
+        converged = matched || moved <= CONVERGED_STEP || damping > 1e10;
     }
     Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, starts: 1, converged })
 }

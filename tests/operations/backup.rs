@@ -187,7 +187,7 @@ async fn a_backup_that_is_not_whole_is_refused_and_nothing_is_touched() {
     let mut astray: Value = serde_json::from_str(&manifest).unwrap();
     astray["database"] = json!("../../etc/passwd");
     std::fs::write(&record, astray.to_string()).unwrap();
-    assert!(refused().await.contains("is no file name"));
+    assert!(refused().await.contains("is not a file name"));
     let mut fewer: Value = serde_json::from_str(&manifest).unwrap();
     fewer["rows"]["measurement"] = json!(4);
     std::fs::write(&record, fewer.to_string()).unwrap();

@@ -157,7 +157,7 @@ fn laws(laws: &[LawFit]) -> String {
         + &framed("fig18-table", "The constants of k = A·exp(B·p) + C in Figure 18", &head(&titles), &body)
 }
 
-/// A, B and C of a coupling, beside those of the paper.
+/// A, B and C of a coupling, compared with those of the paper.
 fn constants(law: &LawFit) -> String {
     let fitted: [(&str, &Estimate); 3] = [("A, N/m", &law.fit.a), ("B, 1/m", &law.fit.b), ("C, N/m", &law.fit.c)];
     let line = |((name, estimate), paper): ((&str, &Estimate), f64)| {
