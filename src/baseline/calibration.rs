@@ -1,5 +1,5 @@
-//! Calibration of the posterior: rank statistics, interval coverage and TARP, over the noise range of the model and the
-//! modes that may be missing.
+//! Calibration of the posterior: rank statistics, interval coverage and TARP (tests of accuracy with random points), over the
+//! noise range of the model and the modes that may be missing.
 
 use std::ops::Range;
 
@@ -43,9 +43,9 @@ const GOOD_COVERAGE: [f64; 2] = [0.89, 0.91];
 pub struct CellRanks {
     /// Title of the cell.
     pub title: String,
-    /// Rank of the truth among the draws, 0..=`DRAWS`, for each parameter and simulation.
+    /// Rank of the truth among the draws, 0..=`DRAWS`, `[parameter][simulation]`.
     pub ranks: Vec<Vec<usize>>,
-    /// Rank of the truth by its TARP distance, for each simulation.
+    /// Rank of the truth by its TARP distance, `[simulation]`.
     pub tarp_ranks: Vec<usize>,
 }
 
@@ -256,7 +256,7 @@ fn quantile_of_draws(draws: &[f64], level: f64) -> f64 {
     sorted[below] + (position - below as f64).clamp(0.0, 1.0) * (sorted[above] - sorted[below])
 }
 
-/// p-value of the χ² test that ranks between 0 and [`DRAWS`] are uniform, in [`BINS`] bins.
+/// p-value of the χ² test that `ranks`, `[n]`, which lie between 0 and [`DRAWS`], are uniform, in [`BINS`] bins.
 ///
 /// ```text
 ///  χ² = Σ_b (n_b − n/B)²/(n/B),    B − 1 degrees of freedom

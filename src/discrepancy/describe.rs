@@ -1,4 +1,4 @@
-//! Causes in words and numbers for a person.
+//! Causes as sentences and numbers for a reader of the diagnosis.
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};

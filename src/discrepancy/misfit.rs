@@ -44,7 +44,7 @@ pub struct Remainder {
 }
 
 /// Tests whether the residual of each mode and the best value of each free parameter depend on each covariate, and whether the
-/// mean residual of each mode differs from 0; the most significant first. `None` if the structure has no frequencies in some row.
+/// mean residual of each mode differs from 0; the most significant first. `None` if the frequencies cannot be computed in some row.
 pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfit>> {
     let views = study.view(rows, fit)?;
     let space = study.simulator.space();
@@ -166,7 +166,8 @@ fn constant(values: &[f64]) -> Option<(f64, f64)> {
     Some((mean, 2.0 * stats::normal_cdf(-z.abs())))
 }
 
-/// Values limited to five robust standard deviations, 1.4826 times the median absolute deviation, from the median.
+/// Values clamped to five robust standard deviations from the median; the robust standard deviation is 1.4826 times the median
+/// absolute deviation.
 fn clip(values: &[f64]) -> Vec<f64> {
     let middle = stats::quantile(values, 0.5);
     let off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
@@ -185,10 +186,10 @@ fn lag_one(values: &[f64]) -> f64 {
 }
 
 /// The most significant dependence of the residuals of a fit on a function of the covariates, including functions that no
-/// candidate has. The inner `None` means that there are no functions, the outer one that the structure has no frequencies.
+/// candidate has. The inner `None` means that there are no functions, the outer one that the frequencies cannot be computed.
 ///
 /// Each function is tested with an arbitrary response of each mode, and along the target of each cause found, since a cause with
-/// the wrong law leaves a residual there. Twice the promised gain of the score test, times the share of independent rows, is
+/// the wrong law leaves a residual there. Twice the estimated gain of the score test, times the share of independent rows, is
 /// compared with a χ² distribution.
 ///
 /// Source: Rao (1948), for score tests.

@@ -99,7 +99,7 @@ fn filled(column: &Column, values: &[f64], rows: &[usize], notes: &mut Vec<Strin
     if known.len() < rows.len() {
         let missing = rows.len() - known.len();
         notes.push(format!(
-            "{name} is missing in {missing} of {} rows: there, its effects are taken at their level",
+            "{name} is missing in {missing} of {} rows: in these rows each of its effects consists of its level alone",
             rows.len()
         ));
     }
@@ -135,7 +135,7 @@ fn outside_priors(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit)
         if !p.prior().contains(&fit.mean[k]) {
             notes.push(format!(
                 "the data give {} as {:.4} {}, outside its prior ({} to {}): the units, the nominal values or the simulation \
-                 are far from right",
+                 must be wrong",
                 p.name, fit.mean[k], p.unit, p.lower, p.upper
             ));
         }

@@ -68,7 +68,7 @@ impl Flow {
     /// Draws `draws` samples of x for each row of `context`, S(y) `[n, context]`. Returns x `[n·draws, d]` in the order of
     /// the rows, and the log-density of each sample, nats, `[n·draws]`.
     ///
-    /// Each call reads all weights; a [`Sampler`] that is kept gives the same samples without.
+    /// Each call converts all weights anew. A [`Sampler`] gives the same samples and converts the weights only once.
     ///
     /// # Errors
     /// A candle error when the shape of `context` is wrong.
@@ -113,7 +113,8 @@ impl Sampler {
         Ok(Some(Self { dimensions, units }))
     }
 
-    /// As [`Flow::sample`].
+    /// As [`Flow::sample`]: `context` is `[n, context]`; returns x, `[n·draws, d]`, and the log-density of each sample, nats,
+    /// `[n·draws]`.
     ///
     /// # Errors
     /// A candle error when the shape of `context` is wrong.
@@ -127,10 +128,10 @@ impl Sampler {
         Ok((x, log_density(&z, &log_det)?))
     }
 
-    /// Maps z to x in place. Returns ln|det ∂z/∂x| of each draw.
+    /// Maps z to x in place. Returns ln|det ∂z/∂x| of each draw, `[n·draws]`.
     ///
-    /// `values`: the d numbers of each draw in sequence, the draws of a measurement contiguous and the same number for
-    /// each; `context`: S(y) of each measurement in sequence, `features` numbers each.
+    /// `values`: z, row-major `[n·draws, d]`, with the draws of each measurement in contiguous rows; `context`: S(y) of each
+    /// measurement, row-major `[n, features]`.
     pub fn inverse(&self, values: &mut [f32], context: &[f32], features: usize) -> Vec<f32> {
         let d = self.dimensions;
         let draws = values.len() / d / (context.len() / features).max(1);

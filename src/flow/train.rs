@@ -119,7 +119,8 @@ trait Descent {
     type Copy;
 
     fn read(&self, pairs: &Pairs) -> Result<Self::Data, candle_core::Error>;
-    /// Makes one step on the `chosen` rows and returns their mean loss before it. If that is not finite, no step is made.
+    /// Makes one step on the rows with the indices `chosen` and returns their mean loss before the step. If that loss is not
+    /// finite, no step is made.
     fn step(&mut self, data: &Self::Data, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error>;
     /// Mean loss of all rows.
     fn loss(&mut self, data: &Self::Data) -> Result<f64, candle_core::Error>;

@@ -43,7 +43,7 @@ pub(super) struct Axis {
 }
 
 impl<'a> Drawn<'a> {
-    /// `None` if the structure has no frequencies in some row under one of the fits.
+    /// `None` if the frequencies cannot be computed in some row under one of the fits.
     pub(super) fn new(simulator: &'a Simulator, data: &'a Data, outcome: &Outcome) -> Option<Self> {
         let stride = (data.rows() as f64 / MOST_DRAWN as f64).max(1.0);
         let count = (data.rows() as f64 / stride).floor() as usize;
