@@ -246,14 +246,17 @@ struct Task {
 }
 
 impl<F> Design<'_, F> {
+    /// Number of tasks that the rows of one replicate are divided into.
     fn tasks_of_replicate(&self) -> usize {
         self.samples.div_ceil(TASK_ROWS)
     }
 
+    /// Number of model runs of all replicates, N(d + 2)R.
     fn runs(&self) -> usize {
         self.scramblings.len() * self.samples * (self.inputs.len() + 2)
     }
 
+    /// Runs all tasks in parallel; returns their results in order, or the error of the first task in order that fails.
     fn run<E>(&self, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Result<Vec<Task>, Error<E>>
     where
         F: Fn(&[f64]) -> Result<Vec<f64>, E> + Sync,
@@ -284,6 +287,7 @@ impl<F> Design<'_, F> {
         results.into_iter().flatten().collect()
     }
 
+    /// Runs the model for some rows of the replicate with this scrambling.
     fn task<E>(&self, scrambling: u32, rows: std::ops::Range<usize>) -> Result<Task, Error<E>>
     where
         F: Fn(&[f64]) -> Result<Vec<f64>, E>,
@@ -349,6 +353,7 @@ struct Replicate {
 }
 
 impl Replicate {
+    /// Computes the estimates from all tasks of the replicate.
     fn of(tasks: &[Task], inputs: usize, outputs: usize) -> Self {
         let rows: Vec<&[f64]> = tasks.iter().flat_map(|task| task.values.chunks(outputs)).collect();
         let variances: Vec<(f64, bool)> = (0..outputs)

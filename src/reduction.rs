@@ -190,6 +190,7 @@ impl<T> Bucket<T> {
         roles
     }
 
+    /// Gives a role to a row, in place of the row that has it now.
     fn put(&mut self, role: Role, row: &Arc<Numbered<T>>) {
         let row = Arc::clone(row);
         match role {
@@ -336,7 +337,7 @@ mod tests {
         #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
 
         #[test]
-        fn extremes_missing_values_and_gaps_stay(
+        fn extremes_missing_values_and_gaps_are_kept(
             (channels, input) in (1_usize..4).prop_flat_map(|channels| (Just(channels), series(channels))),
             points in 5_usize..150,
         ) {
@@ -344,12 +345,12 @@ mod tests {
         }
 
         #[test]
-        fn whatever_the_order_in_which_rows_come(input in series(2).prop_shuffle(), points in 5_usize..150) {
+        fn the_order_of_arrival_does_not_matter(input in series(2).prop_shuffle(), points in 5_usize..150) {
             check(&input, points, 2);
         }
 
         #[test]
-        fn a_short_series_stays_as_it_is(input in series(2)) {
+        fn a_short_series_is_unchanged(input in series(2)) {
             let (left, _) = reduce(&input, input.len(), 2);
             let tags: Vec<usize> = left.rows.iter().map(|row| row.tag).collect();
             prop_assert_eq!(tags, (0..input.len()).collect::<Vec<_>>());
@@ -357,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn one_spike_among_twenty_thousand_stays_and_little_else() {
+    fn one_spike_among_twenty_thousand_rows_is_kept() {
         let value = |i: i64| if i == 13_579 { 50.0 } else { (i as f64 * 0.37).sin() };
         let input: Vec<_> = (0..20_000).map(|i| (i * 600_000_000, vec![value(i)])).collect();
         let (left, _) = reduce(&input, 500, 1);

@@ -171,6 +171,7 @@ struct Drawn {
 }
 
 impl Drawn {
+    /// Draws for one simulation, `[DRAWS][parameter]`.
     fn of(&self, simulation: usize) -> &[Vec<f64>] {
         let rows: Range<usize> = simulation * DRAWS..(simulation + 1) * DRAWS;
         &self.draws[rows]
@@ -202,6 +203,7 @@ impl Drawn {
     }
 }
 
+/// Measures the calibration of one cell on new simulations, whose random stream is named `purpose`.
 fn measure_cell(
     baseline: &Baseline,
     situation: &Situation,

@@ -45,6 +45,7 @@ impl Baseline {
         Ok(baseline)
     }
 
+    /// Draws the posterior of a stored measurement with a stored seed and compares the draws with the stored ones.
     fn self_test(&self) -> Result<(), LoadError> {
         let SelfTest { frequencies_hz, shapes, seed, expected } = &self.manifest.self_test;
         let shapes = shapes.iter().cloned().map(Some).collect();

@@ -74,6 +74,7 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
     }
 }
 
+/// [`nearest`] for a measurement without mode shapes.
 fn nearest_by_frequencies(
     simulator: &Simulator,
     observation: &Observation,

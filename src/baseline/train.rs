@@ -214,6 +214,7 @@ impl Task<'_> {
         Ok(crate::flow::train::train(flow, weights, samples, epoch, &validation, self.settings, on_epoch)?)
     }
 
+    /// Simulated measurements of a training set, with noise and missing modes from the random stream named `purpose`.
     fn observed(&self, set: &TrainingSet, purpose: &str) -> Vec<Observation> {
         observe(self.simulator, self.conditions, set, &mut stats::stream(self.settings.seed, purpose))
     }
@@ -287,6 +288,7 @@ pub fn diverged(manifest: &Manifest) -> bool {
     matches!(manifest.training.stopped, Stopped::Diverged { .. })
 }
 
+/// Checks the ranges of all settings.
 fn check(samples: usize, noise_range: NoiseRange, flow: &FlowSettings, settings: &TrainSettings) -> Result<(), Error> {
     let NoiseRange { lowest, highest } = noise_range;
     if !(lowest > 0.0 && highest.is_finite() && lowest < highest && (lowest..=highest).contains(&1.0)) {

@@ -156,6 +156,7 @@ impl Column {
     }
 }
 
+/// The values of one covariate in all rows; of categories if `category` is true, otherwise of numbers.
 fn column(name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
     let values = || sorted.iter().map(|m| m.covariates.get(name));
     if !category {

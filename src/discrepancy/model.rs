@@ -172,6 +172,7 @@ impl Study<'_> {
         self.free.iter().map(mean).chain(numbers).collect()
     }
 
+    /// [`Self::view`] of one row, which has the index `place` in `responses`.
     fn row_view(&self, row: usize, fit: &Fit, density: &Density, responses: &Responses, place: usize) -> RowView {
         let y = &self.data.log_frequencies[row];
         let present = self.present[row].0.clone();

@@ -190,6 +190,7 @@ struct Afterwards {
 }
 
 impl Afterwards {
+    /// Divides the targets of a simulation.
     fn new(simulator: &Simulator, targets: &[Target]) -> Self {
         let springs = simulator.structure().map_or(0, |s| s.springs().len());
         let masses = simulator.structure().map_or(0, |s| s.masses().len());
@@ -368,7 +369,7 @@ mod tests {
 
     /// Compares the responses with the solution of one eigenproblem for each row.
     #[test]
-    fn responses_of_many_rows_are_those_of_each_row() {
+    fn interpolated_responses_equal_those_of_single_rows() {
         let text = include_str!("../../models/three-dof/structure.toml");
         let simulator = Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap();
         let all: Vec<usize> = (0..6).collect();

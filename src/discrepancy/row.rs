@@ -287,7 +287,7 @@ mod tests {
 
     /// Compares distance, ½ ln|V|, score and information of a row with dense matrices.
     #[test]
-    fn a_row_is_that_of_dense_matrices() {
+    fn score_and_information_equal_those_of_dense_matrices() {
         for (p, f, means, tails) in [(4, 2, 3, 5.0), (3, 3, 5, f64::INFINITY), (2, 4, 4, 3.0), (3, 0, 2, 10.0)] {
             let mut stream = stats::stream(p as u64, "a row");
             let mut random =

@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn leaving_one_out_by_formula_is_leaving_it_out() {
+    fn the_leave_one_out_formula_equals_a_fit_without_the_run() {
         let mut stream = stats::stream(3, "regression test");
         let (n, terms) = (25, 7);
         // Powers of one variable: far from orthogonal, so that R matters.
@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_column_that_repeats_another_stays_out() {
+    fn a_linearly_dependent_column_is_not_added() {
         let mut regression = Regression::new(&[1.0, 2.0, 4.0]);
         assert!(regression.push(&[1.0, 2.0, 3.0], None).is_some());
         assert!(regression.push(&[2.0, 4.0, 6.0], None).is_none());

@@ -159,6 +159,7 @@ impl Sampler {
         log_det
     }
 
+    /// Buffers that are large enough for every net of the flow.
     fn buffers(&self) -> Buffers {
         let nets = self.units.iter().flat_map(|unit| &unit.nets);
         let width = nets.map(|net| net.hidden.bias.len()).max().unwrap_or(0);
@@ -176,6 +177,7 @@ impl Sampler {
 }
 
 impl Net {
+    /// Reads the weights of a subnet that transforms the rows `active` as a function of the rows `passive`.
     fn new(subnet: &Subnet, passive: Range<usize>, active: Range<usize>) -> Result<Self> {
         Ok(Self {
             passive,

@@ -26,6 +26,7 @@ pub fn mass_matrix(structure: &Structure) -> DMatrix<f64> {
     assemble(structure.dofs(), structure.masses().iter().map(|m| (&m.form, m.kg)))
 }
 
+/// Sum of the patterns of all parts, each multiplied by its stiffness or mass, `[n, n]`.
 fn assemble<'a>(dofs: usize, parts: impl Iterator<Item = (&'a Form, f64)>) -> DMatrix<f64> {
     let mut matrix = DMatrix::zeros(dofs, dofs);
     for (form, value) in parts {

@@ -126,6 +126,8 @@ struct Changed {
 }
 
 impl Changed {
+    /// Applies the targets to the springs and masses of a structure. `count`: number of modes wanted; `columns`: each target with
+    /// the column of its first size in `sizes`.
     fn new(structure: &Structure, count: usize, columns: &[(usize, &Target)], sizes: &[f64]) -> Result<Self, Error> {
         let mut spring_factor = vec![1.0; structure.springs().len()];
         let mut mass_factor = vec![1.0; structure.masses().len()];

@@ -298,6 +298,7 @@ impl Structure {
         Ok(changed)
     }
 
+    /// Checks that new stiffnesses, given as (index of the spring, value), are finite and not negative.
     pub(super) fn check_changes(&self, changes: &[(usize, f64)]) -> Result<(), Error> {
         changes.iter().try_for_each(|(index, n_per_m)| check_stiffness(&self.springs[*index], *n_per_m))
     }
@@ -308,6 +309,7 @@ fn check_stiffness(spring: &Spring, n_per_m: f64) -> Result<(), Error> {
     valid.then_some(()).ok_or_else(|| Error::Stiffness { name: spring.name.clone(), n_per_m })
 }
 
+/// Checks that no name occurs twice.
 fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
     let mut seen = BTreeSet::new();
     names.into_iter().find(|name| !seen.insert(*name)).map_or(Ok(()), |name| Err(Error::DuplicateName(name.clone())))

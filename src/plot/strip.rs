@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_strip_stays_within_its_width_whatever_it_is_given() {
+    fn a_strip_stays_within_its_width_for_all_values() {
         let spans = [([1.0, 2.0, 3.0], 2.5, Some(9.0)), ([1.0; 3], 1.0, Some(1.0)), ([f64::NAN; 3], f64::NAN, None)];
         for (range, target, other) in spans {
             let svg = strip(range, target, other, 0.0);

@@ -94,6 +94,7 @@ impl Bench<'_> {
         Ok(found)
     }
 
+    /// Updates the parameters by each measurement; these parameters are the samples.
     fn sensitivity(&self, data: &Data) -> anyhow::Result<Found> {
         let rows: Vec<Vec<Option<f64>>> =
             data.frequencies_hz.row_iter().map(|row| row.iter().copied().map(Some).collect()).collect();
@@ -104,6 +105,7 @@ impl Bench<'_> {
         Ok(of_samples(samples, 1, Some(model_runs)))
     }
 
+    /// Samples the posterior of (μ, σ), and draws one parameter vector from the population of each sample.
     fn tmcmc(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
         let modes: Vec<usize> = (0..self.simulator().modes()).collect();
         let simulated = simulated_for(data.frequencies_hz.nrows());
@@ -121,6 +123,7 @@ impl Bench<'_> {
         Ok(Found { samples, mean, std, seconds: 0.0, model_runs: Some(estimate.model_runs) })
     }
 
+    /// Draws posterior samples of each measurement with the trained flow.
     fn cinn(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
         // The time is that of the inference alone, without the checks of the service. The samples that are compared come from the
         // complete assessment, which first moves measurements beyond the prior box to the nearest point of the box.
@@ -138,6 +141,7 @@ impl Bench<'_> {
     }
 }
 
+/// The result of a method that gives samples, `[d][samples]`, `draws` for each measurement.
 fn of_samples(samples: Vec<Vec<f64>>, draws: usize, model_runs: Option<usize>) -> Found {
     let moments = |pool: &Vec<f64>| Hyperparameters::from_pool(pool, draws);
     let mean = samples.iter().map(|pool| moments(pool).mean).collect();
@@ -275,6 +279,7 @@ pub fn spread(values: &[f64]) -> Spread {
     Spread { median: at(0.5), low: at(0.05), high: at(0.95) }
 }
 
+/// The distribution of `values` over the repetitions, with the target and the value of the paper.
 fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
     // Equal values count half, because a probability of 1 often occurs exactly.
     let percentile = |paper: f64| {

@@ -222,6 +222,7 @@ pub(super) fn check(
 /// The key of the effect definition that contains a mistake, and the error message.
 type Mistake = (&'static str, String);
 
+/// Checks one effect and builds it; the error names the key that is wrong.
 fn check_one(
     definition: &StructureDefinition,
     effect: &EffectDefinition,

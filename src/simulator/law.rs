@@ -207,7 +207,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn slopes_of_every_law_are_its_central_differences() {
+    fn derivatives_of_every_law_equal_central_differences() {
         let law = |kind: LawKind, with_level| Law {
             kind,
             covariate: None,
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lag_follows_a_step_exponentially_and_its_slope_is_the_difference() {
+    fn a_lagged_step_is_exponential_and_its_derivative_is_exact() {
         let times: Vec<f64> = (0..50).map(|i| f64::from(i) * 0.5).collect();
         let values: Vec<f64> = (0..50).map(|i| if i == 0 { 0.0 } else { 1.0 }).collect();
         for ((value, slope), time) in lagged(&times, &values, 4.0).into_iter().zip(&times) {

@@ -154,6 +154,7 @@ pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) 
     Ok(Table { emulator, runs: count })
 }
 
+/// The emulator with this key from the cache; if it is not there, it is fitted and added.
 fn cached_or_fitted(key: String, runs: &Runs) -> Result<Arc<Emulator>, FitError> {
     let cache = || CACHE.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(emulator) = cache().get(&key) {

@@ -297,6 +297,7 @@ impl ExponentialFit {
     }
 }
 
+/// Checks the points, and computes their weights and the range of their positions.
 fn checked<'a>(points: &'a [(f64, f64)], weighting: Weighting<'_>) -> Result<Data<'a>, FitError> {
     let stds: Vec<f64> = match weighting {
         Weighting::Absolute => vec![1.0; points.len()],
