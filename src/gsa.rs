@@ -15,8 +15,8 @@ pub const MAX_SAMPLES: usize = 1 << 16;
 /// Largest number of inputs: each needs two dimensions of the sequence.
 pub const MAX_INPUTS: usize = sobol_burley::NUM_DIMENSIONS as usize / 2;
 
-/// Number of rows of one parallel task. Sums are formed within each task and then over the tasks in order, which gives the same bits
-/// on any number of threads.
+/// Number of rows of one parallel task. Sums are formed within each task and then over the tasks in order, which gives the same
+/// bits on any number of threads.
 const TASK_ROWS: usize = 16;
 
 /// An output is constant up to rounding if its standard deviation is below this share of its largest magnitude.
@@ -39,7 +39,8 @@ pub struct Input {
 /// Number of model runs, and seed of their points.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Settings {
-    /// Number of rows N of one replicate: a power of two up to [`MAX_SAMPLES`]. Sobol' points are only balanced for powers of two.
+    /// Number of rows N of one replicate: a power of two up to [`MAX_SAMPLES`]. Sobol' points are only balanced for powers of
+    /// two.
     pub samples: usize,
     /// Number of independently scrambled replicates R, at least 2. Their spread gives the confidence intervals.
     pub replicates: usize,
@@ -166,9 +167,9 @@ pub enum Error<E> {
 ///
 /// A and B are `[N, d]`, the two halves of 2d-dimensional Owen-scrambled Sobol' points. A_B^i is A with column i from B. V is the
 /// variance of f over A and B together. Each replicate is scrambled independently, and an index is the mean over the replicates.
-/// `model` takes the inputs `[d]` in their units and returns the outputs. It runs on all threads of the rayon pool; the result has
-/// the same bits on any number of threads. `progress` is called from any thread with (runs completed, total runs), not necessarily
-/// in order.
+/// `model` takes the inputs `[d]` in their units and returns the outputs. It runs on all threads of the rayon pool; the result
+/// has the same bits on any number of threads. `progress` is called from any thread with (runs completed, total runs), not
+/// necessarily in order.
 ///
 /// Source: Jansen (1999) for both estimators; Saltelli et al. (2010), Table 2, for the design; Owen (1998) for
 /// replicates of scrambled points.
@@ -316,8 +317,8 @@ impl<F> Design<'_, F> {
 
     /// Inputs of one row, taken from the dimensions of the sequence starting with `dimension`, `[d]`.
     fn point(&self, row: usize, dimension: usize, scrambling: u32) -> Vec<f64> {
-        // `sobol_burley` rounds each coordinate down to a multiple of 2⁻²³. The centre of this cell is unbiased and never equals a
-        // bound.
+        // `sobol_burley` rounds each coordinate down to a multiple of 2⁻²³. The centre of this cell is unbiased and never
+        // equals a bound.
         const HALF_CELL: f64 = 1.0 / (1 << 24) as f64;
         let coordinate = |(column, input): (usize, &Input)| {
             let u = sobol_burley::sample(row as u32, (dimension + column) as u32, scrambling);

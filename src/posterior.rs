@@ -70,7 +70,8 @@ impl PosteriorSamples {
             .after(self.simulations)
     }
 
-    /// For each measurement, its samples followed by those of `further` for the same measurement, `[n·(draws + further draws), d]`.
+    /// For each measurement, its samples followed by those of `further` for the same measurement: `[n·k, d]`, where k is the sum of
+    /// both numbers of draws.
     ///
     /// # Panics
     /// If `further` has another number of measurements: a programming error in the caller.

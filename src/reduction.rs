@@ -85,8 +85,8 @@ impl<T> Reducer<T> {
         place.clamp(0, self.buckets() as i128 - 1) as usize
     }
 
-    /// Adds a row with one value for each channel, `[channels]`. `tag` is called only if the row is kept; a later row can still replace
-    /// it.
+    /// Adds a row with one value for each channel, `[channels]`. `tag` is called only if the row is kept; a later row can still
+    /// replace it.
     pub fn push(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> T) {
         let pushed: Result<(), std::convert::Infallible> = self.try_push(time_us, values, || Ok(tag()));
         pushed.unwrap_or_else(|never| match never {});

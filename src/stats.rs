@@ -1,4 +1,4 @@
-//! Moments, quantiles, importance weights, and the named random streams that every draw of the crate comes from.
+//! Moments, quantiles, importance weights, and the named random streams from which all random numbers of the crate are drawn.
 
 use std::sync::OnceLock;
 
@@ -225,7 +225,7 @@ mod tests {
         // Tables: 1.833 at 9, and the normal quantile in the limit.
         assert!((student_t_quantile(0.95, 9) - 1.833_112_93).abs() < 1e-7);
         assert!((student_t_quantile(0.95, 1_000_000_000) - normal_quantile(0.95)).abs() < 1e-8);
-        // The two methods agree where they meet: from 1,000 to 1,001 the quantile falls by (z³ + z)/4ν² = 1.5e-6.
+        // The two methods agree at the switch between them: from 1,000 to 1,001 the quantile falls by (z³ + z)/4ν² = 1.5e-6.
         assert!((student_t_quantile(0.95, 1000) - student_t_quantile(0.95, 1001) - 1.524e-6).abs() < 2e-8);
     }
 

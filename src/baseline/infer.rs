@@ -114,7 +114,7 @@ impl Baseline {
         for (chunk, rows) in marginalised.chunks(MARGINALISED_AT_A_TIME).enumerate() {
             let seed = seed.wrapping_add(1 + chunk as u64);
             let values = rows.iter().map(|row| observations[*row].sizes_to_marginalise.len()).max().unwrap_or(1);
-            // Each possible value gives an observation, and each observation its share of the draws.
+            // Each possible value of the covariate becomes one observation, which gets an equal share of the draws.
             let each = draws.div_ceil(values.min(draws.max(1)));
             let expanded: Vec<Observation> = rows.iter().flat_map(|row| observations[*row].at_each_size()).collect();
             let samples = self.infer_known(&expanded, each, proposals, seed)?;

@@ -11,8 +11,8 @@ use crate::quantity::Digest;
 use crate::simulator::Simulator;
 
 impl Baseline {
-    /// Reads a stored model from the contents of its manifest (JSON) and of its weight file (safetensors), and runs its self-test.
-    /// `simulator` is the structure that the model must have been trained for.
+    /// Reads a stored model from the contents of its manifest (JSON) and of its weight file (safetensors), and runs its
+    /// self-test. `simulator` is the structure that the model must have been trained for.
     ///
     /// # Errors
     /// [`LoadError`], with one variant for each way in which the files can be wrong.

@@ -83,7 +83,7 @@ fn nearest_by_frequencies(
     let simulator = &observation.simulator(simulator);
     let search = Search::new(simulator, observation, RESOLUTION);
     let (present, parameters) = (search.modes.len(), simulator.space().len());
-    // With a missing covariate the size of its effect is unknown, so that the measurement tests nothing.
+    // With a missing covariate the size of its effect is unknown, so that the measurement cannot be compared with the simulation.
     let known = !observation.is_marginalised();
     let determined = known && present > parameters;
     let mut found = search.at(search.unit(start))?;
@@ -118,8 +118,8 @@ fn nearest_by_frequencies(
         }
     }
     // With as many parameters as modes, no residual is expected. If one remains, the simulation cannot produce the measurement,
-    // because it lies beyond a fold of the map from parameters to frequencies. This is treated like a parameter at a bound: it
-    // adds one degree of freedom.
+    // because it lies beyond a fold of the map from parameters to frequencies. As for a parameter at a bound, at least one degree
+    // of freedom then remains.
     let beyond = usize::from(chi_squared > 0.0 && !search.reaches(&found));
     Ok(Nearest {
         chi_squared,

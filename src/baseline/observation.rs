@@ -68,8 +68,8 @@ impl Observation {
         self.frequencies_hz.iter().flatten().count()
     }
 
-    /// Shape of mode `mode` (counted from 0) at the instrumented points, of unit norm, `[points]`; `None` unless both the mode and
-    /// its shape were identified.
+    /// Shape of mode `mode` (counted from 0) at the instrumented points, of unit norm, `[points]`; `None` unless both the mode
+    /// and its shape were identified.
     pub fn shape(&self, mode: usize) -> Option<&[f64]> {
         self.frequencies_hz[mode]?;
         self.shapes.get(mode)?.as_deref()

@@ -130,7 +130,7 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
         for (position, (change, (lowest, highest))) in u.iter_mut().zip(step.iter().zip(&limits)) {
             *position = (*position + change).clamp(*lowest, *highest);
         }
-        // Written so that NaN ends the search too.
+        // With this form of the condition, NaN ends the search too.
         let goes_on = gain >= LEAST_GAIN || tempering < 1.0;
         if taken == STEPS || !goes_on {
             return Ok(located(u, residuals, &normal, &step));

@@ -141,7 +141,7 @@ pub fn train(
 ) -> Result<Trained, Error> {
     check(samples, noise_range, flow_settings, settings)?;
     let fitted = starts_at_fit(simulator);
-    // The normal distribution at a fit reaches beyond the prior by itself and needs no margin.
+    // The normal distribution at a fit extends beyond the prior already, so that no margin is needed.
     let space = if fitted { simulator.space().clone() } else { simulator.training_space() };
     let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
     let training = draw(samples, "training set")?;

@@ -200,8 +200,8 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
     pairs
 }
 
-/// Class and relative prior weight of a candidate. The weights differ by a factor of a few only, so that they rank candidates that
-/// data cannot distinguish, but do not outweigh data.
+/// Class and relative prior weight of a candidate. The weights differ by a factor of a few only, so that they rank candidates
+/// that data cannot distinguish, but do not outweigh data.
 fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
     let time = covariate == Some(TIME);
     match target {
@@ -229,7 +229,8 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
     }
 }
 
-/// Standard deviation of a numeric covariate over `rows`, in its own unit; 0 for a constant.
+/// Standard deviation of a numeric covariate over the rows with the indices `rows`, in the unit of the covariate; 0 for a
+/// constant.
 pub fn spread(column: &Column, rows: &[usize]) -> f64 {
     let numbers = column.numbers(rows);
     let std = stats::sample_std(&numbers).unwrap_or(0.0);

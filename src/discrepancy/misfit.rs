@@ -43,8 +43,9 @@ pub struct Remainder {
     pub p_value: f64,
 }
 
-/// Tests whether the residual of each mode and the best value of each free parameter depend on each covariate, and whether the
-/// mean residual of each mode differs from 0; the most significant first. `None` if the frequencies cannot be computed in some row.
+/// Tests in the rows with the indices `rows` whether the residual of each mode and the best value of each free parameter depend
+/// on each covariate, and whether the mean residual of each mode differs from 0; the most significant first. `None` if the
+/// frequencies cannot be computed in some row.
 pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfit>> {
     let views = study.view(rows, fit)?;
     let space = study.simulator.space();
@@ -84,8 +85,8 @@ pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfi
     Some(found)
 }
 
-/// Regressors of a covariate beside the constant, `[q][rows]`: the standardised covariate u and u², or an indicator of each
-/// category but one. Empty for a constant covariate.
+/// Regressors of a covariate in addition to the constant, `[q][rows]`: the standardised covariate u and u², or an indicator of
+/// each category but one. Empty for a constant covariate.
 fn regressors(values: &Values, rows: &[usize]) -> Vec<Vec<f64>> {
     match values {
         Values::Numbers(values) => {
@@ -251,8 +252,8 @@ fn play(values: &[f64], width: f64) -> Vec<f64> {
 /// A function of covariates at each row.
 type CovariateFunction = (String, Vec<String>, Vec<f64>);
 
-/// Name, covariates and values, `[rows]`, of the functions that a remainder is sought in: powers, kinks, hysteresis and rates of a
-/// number, indicators of categories, and products of two.
+/// Name, covariates and values, `[rows]`, of the functions that a remainder is sought in: powers, kinks, hysteresis and rates
+/// of a number, indicators of categories, and products of two.
 fn functions(data: &Data, rows: &[usize]) -> Vec<CovariateFunction> {
     let mut numeric: Vec<(String, Vec<f64>)> = Vec::new();
     let mut categories: Vec<(String, String, Vec<f64>)> = Vec::new();

@@ -5,8 +5,8 @@
 //!
 //! - [`data`]: measurements, covariates and settings by row; [`holdout`]: the rows held out;
 //! - [`grammar`]: the candidates; [`effect`]: an effect whose numbers are fitted;
-//! - [`model`]: the likelihood and its maximum, with `problem`, `row` and [`response`] below it; [`study`] and [`fit`]: what goes
-//!   in and what comes out;
+//! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
+//!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
 //! - [`misfit`]: deviations before and after; [`gain`]: errors before and after on rows held out;
 //! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its text; [`report`]: the HTML page;
@@ -101,9 +101,10 @@ pub enum Error {
 
 /// Finds the effects that a simulation lacks to explain measurements, with their probabilities and their gain on rows held out.
 ///
-/// Causes are found by forward selection on the rows that are not held out. Each candidate is a [`FittedEffect`] beside the
-/// free parameters of the structure, compared by its evidence (see [`model`] for the likelihood and [`rank::rank`] for the
-/// probabilities). The seed only affects the bootstrap intervals of the gain. `progress` is called at each step.
+/// Causes are found by forward selection on the rows that are not held out. Each candidate is a [`FittedEffect`] that is fitted
+/// together with the free parameters of the structure, and compared by its evidence (see [`model`] for the likelihood and
+/// [`rank::rank`] for the probabilities). The seed only affects the bootstrap intervals of the gain. `progress` is called at
+/// each step.
 ///
 /// # Errors
 /// Fewer than 30 rows to search; a hold-out that names a column or category that the data do not have; natural frequencies

@@ -55,7 +55,8 @@ pub struct RowView {
 }
 
 impl Study<'_> {
-    /// The posterior maximum for the rows with the indices `rows` and with `effects`, by Fisher scoring from `start` if it is given.
+    /// The posterior maximum for the rows with the indices `rows` and with `effects`, by Fisher scoring from `start` if it is
+    /// given.
     ///
     /// `None` if the frequencies cannot be computed at the start, or if the information at the maximum is singular.
     pub fn fit(&self, rows: &[usize], effects: &[FittedEffect], start: Option<&Start<'_>>) -> Option<Fit> {
@@ -112,8 +113,8 @@ impl Study<'_> {
         Some((point?, tails))
     }
 
-    /// Residual, covariance and density of each of the rows with the indices `rows` under a fit, `[rows]`; `None` if the frequencies
-    /// cannot be computed there.
+    /// Residual, covariance and density of each of the rows with the indices `rows` under a fit, `[rows]`; `None` if the
+    /// frequencies cannot be computed there.
     pub fn view(&self, rows: &[usize], fit: &Fit) -> Option<Vec<RowView>> {
         let problem = Problem::new(self, rows, &fit.effects);
         let responses = problem.responses(&fit.mean, &problem.sizes(&fit.psi).values, &[])?;

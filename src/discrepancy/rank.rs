@@ -67,16 +67,17 @@ impl Trial {
     }
 }
 
-/// Ranks all candidates for one cause beside those of `fit`, and estimates the share of independent rows under the best.
+/// Ranks all candidates for one cause in addition to the effects of `fit`, and estimates the share of independent rows under the
+/// best candidate. `rows`: indices of the rows that are used.
 ///
 /// ```text
 ///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) − cost ) − ln(number of laws) + ln prior,    r = (1 − ρ)/(1 + ρ)
 /// ```
 ///
 /// E: evidence by Laplace's method; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
-/// with the largest estimated gain in a score test are fitted. The first `known` effects of the fit belong to the structure: their
-/// numbers may be wrong, so that a further effect of the same kind is allowed for them. `None` if the frequencies cannot be
-/// computed.
+/// with the largest estimated gain in a score test are fitted. The first `known` effects of the fit belong to the structure:
+/// their numbers may be wrong, so that a further effect of the same kind is allowed for them. `None` if the frequencies cannot
+/// be computed.
 ///
 /// Source: Kass and Raftery (1995), JASA 90.
 pub fn rank(
@@ -249,7 +250,7 @@ fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64
     }
     let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);
     for values in &mut series {
-        // Without its mean: a constant deviation is not a correlation in time.
+        // The mean is subtracted, because a constant deviation is not a correlation in time.
         let mean = crate::stats::mean(values);
         for value in values.iter_mut() {
             *value -= mean;

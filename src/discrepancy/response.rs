@@ -345,8 +345,8 @@ impl Dimension {
     }
 }
 
-/// The size at which an effect changes its target by 100 %: 1 for relative targets. For other targets it is unknown; the tiny number
-/// returned for them makes their relative range large, so that the greatest number of nodes is used.
+/// The size at which an effect changes its target by 100 %: 1 for relative targets. For other targets it is unknown; the tiny
+/// number returned for them makes their relative range large, so that the greatest number of nodes is used.
 fn scale(size: usize, targets: &[Target]) -> f64 {
     let mut first = 0;
     for target in targets {

@@ -180,7 +180,8 @@ impl RowSums {
         for u in 0..count {
             let own = self.products[u * count + u];
             gradient[place(u)] += weight * self.score[u] * self.score[u] - own;
-            // The modes present ascend, so that the lower triangle here maps into the lower triangle there.
+            // The indices of the modes present ascend, so that the lower triangle for this row maps into the lower triangle of
+            // `information`.
             let (twice_a, b_own) = (2.0 * factor_a, factor_b * own);
             for v in 0..=u {
                 let shared = self.products[u * count + v];

@@ -79,7 +79,8 @@ pub struct ModeSums {
 
 /// The result of a score test.
 pub struct Score {
-    /// Estimated gain in log-likelihood, nats; twice the gain has a χ² distribution with [`Self::numbers`] degrees of freedom by chance.
+    /// Estimated gain in log-likelihood, nats; twice the gain has a χ² distribution with [`Self::numbers`] degrees of freedom
+    /// by chance.
     pub nats: f64,
     /// First guess of the numbers; 0 in directions that are not identifiable.
     pub psi: Vec<f64>,
@@ -227,8 +228,9 @@ impl Whitened {
     }
 }
 
-/// The score tests of every candidate under each of its laws. Candidates that are not identifiable beside the fit are omitted, as
-/// are oscillators and orders of modes, which have no derivative at size 0. `None` if the frequencies cannot be computed.
+/// The score tests of every candidate under each of its laws. Candidates that are not identifiable in addition to the numbers
+/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0. `None` if the
+/// frequencies cannot be computed.
 pub fn promises(
     study: &Study<'_>,
     rows: &[usize],

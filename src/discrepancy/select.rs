@@ -67,7 +67,7 @@ pub fn select(
         let Some(best) = ranked.first().filter(|_| total > ACCEPTED_NATS) else { break };
         // A cause that cannot be evaluated on the rows left out is not accepted.
         let cross_validation = cross_validate(study, rows, &fit, &best.fit).unwrap_or((f64::NEG_INFINITY, 0.0));
-        // Nor is a cause that clearly predicts them worse, whatever it explains in the other rows.
+        // A cause that clearly worsens their prediction is not accepted either, however much it explains in the other rows.
         if cross_validation.0 + 2.0 * cross_validation.1 <= 0.0 {
             break;
         }

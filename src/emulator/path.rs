@@ -38,8 +38,9 @@ pub(super) struct Path<'a> {
 }
 
 impl<'a> Path<'a> {
-    /// A selection from `set` (indices of candidates) that has no terms yet, fitted to `y`, `[n]`, at all runs except `held_out`. `set`
-    /// begins with the constant, which is chosen first; `correlations` holds φ_jᵀy of all candidates over all runs, `[candidates]`.
+    /// A selection from `set` (indices of candidates) that has no terms yet, fitted to `y`, `[n]`, at all runs except
+    /// `held_out`. `set` begins with the constant, which is chosen first; `correlations` holds φ_jᵀy of all candidates over all
+    /// runs, `[candidates]`.
     pub fn new(
         search: &'a Search<'a>,
         set: &'a [usize],

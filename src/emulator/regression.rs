@@ -68,7 +68,7 @@ impl Regression {
             upper.iter_mut().zip(&again).for_each(|(r, correction)| *r += correction);
             left = self.fitted_dot(&q, &q);
         }
-        // Written so that NaN is not added either.
+        // This form of the condition also rejects NaN.
         let independent = left > DEPENDENT * DEPENDENT * length;
         if !independent {
             return None;
@@ -115,7 +115,8 @@ impl Regression {
         &self.residual[self.held_out.clone()]
     }
 
-    /// Residual of each run in a fit to all other runs, e_i/(1 − h_i), `[n]`; infinite if the other runs do not determine the fit.
+    /// Residual of each run in a fit to all other runs, e_i/(1 − h_i), `[n]`; infinite if the other runs do not determine the
+    /// fit.
     pub fn leave_one_out(&self) -> Vec<f64> {
         let one = |(e, h): (&f64, &f64)| if 1.0 - h > DECISIVE { e / (1.0 - h) } else { f64::INFINITY };
         self.residual.iter().zip(&self.leverage).map(one).collect()

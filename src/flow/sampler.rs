@@ -136,7 +136,7 @@ impl Sampler {
         let d = self.dimensions;
         let draws = values.len() / d / (context.len() / features).max(1);
         let mut log_det = vec![0.0; values.len() / d];
-        // The size of the tiles does not depend on the number of threads, and so neither do the bits of the result.
+        // The size of the tiles does not depend on the number of threads, so that the bits of the result do not either.
         let tiles = values.par_chunks_mut(TILE * d).zip(log_det.par_chunks_mut(TILE)).enumerate();
         tiles.for_each_init(
             || self.buffers(),

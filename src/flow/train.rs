@@ -104,7 +104,7 @@ pub fn train(
     settings: &TrainSettings,
     on_epoch: impl FnMut(EpochReport),
 ) -> Result<TrainOutcome, Error> {
-    // Single precision on the CPU uses the fused implementation, everything else candle.
+    // The fused implementation is used for single precision on the CPU, candle in all other cases.
     match Fused::new(flow, weights)? {
         Some(fused) => run(ByFused { flow, weights, fused }, rows, training, validation, settings, on_epoch),
         None => run(ByCandle::new(flow, weights)?, rows, training, validation, settings, on_epoch),

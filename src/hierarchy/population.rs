@@ -36,8 +36,8 @@ impl PopulationEstimate {
         interval(&self.mean_draws)
     }
 
-    /// Lower and upper end of the central credible interval of σ with probability [`INTERVAL`], in the quantity's unit; `None` where
-    /// σ is unknown.
+    /// Lower and upper end of the central credible interval of σ with probability [`INTERVAL`], in the quantity's unit; `None`
+    /// where σ is unknown.
     pub fn std_interval(&self) -> Option<[f64; 2]> {
         (!self.std_draws.is_empty()).then(|| interval(&self.std_draws))
     }

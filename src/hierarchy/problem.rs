@@ -86,7 +86,8 @@ pub(super) fn within(columns: &[Vec<f64>], draws: usize) -> Vec<f64> {
 }
 
 impl Problem {
-    /// Arranges the posterior samples, `[n·draws, d]`, in lanes. `log_weights`: logarithms of their own weights, `[n·draws]`, nats.
+    /// Arranges the posterior samples, `[n·draws, d]`, in lanes. `log_weights`: logarithms of their own weights, `[n·draws]`,
+    /// nats.
     pub(super) fn new(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Self {
         let (draws, measurements) = (samples.draws(), samples.measurements());
         let columns = unit_columns(samples, space);

@@ -173,8 +173,8 @@ impl Changed {
                 Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
             }
         }
-        // Parts that targets added have no factor. The sizes were checked above, and an added spring of negative stiffness
-        // shows in the eigenvalues, so that the structure need not be checked again.
+        // Springs and masses that targets added follow those of the structure and have no factor. The sizes were checked above,
+        // and an added spring of negative stiffness shows in the eigenvalues, so that the structure need not be checked again.
         changed.springs.iter_mut().zip(&spring_factor).for_each(|(spring, factor)| spring.n_per_m *= factor);
         changed.masses.iter_mut().zip(&mass_factor).for_each(|(mass, factor)| mass.kg *= factor);
         Ok(Self { structure: changed, spring_factor, added, order })
@@ -250,7 +250,7 @@ pub fn measured(
         match target {
             Target::ModeOrder(modes) => order.clone_from(modes),
             Target::FrequencyScale(_) | Target::ParameterScale(_) | Target::SettingScale(_) => {
-                // Written so that NaN fails too.
+                // This form of the condition also rejects NaN.
                 let enough = 1.0 + size >= LEAST_FACTOR;
                 if !enough {
                     return Err(Error::Effect { number, size });

@@ -198,7 +198,7 @@ fn frequencies(sorted_eigenvalues: &[f64], count: usize) -> Result<Vec<f64>, Err
         return Err(Error::TooFewModes { asked: count, available });
     }
     let (smallest, largest) = (sorted_eigenvalues[0], sorted_eigenvalues[available - 1]);
-    // Written so that NaN fails too.
+    // This form of the condition also rejects NaN.
     let positive = smallest > SINGULAR * largest && largest.is_finite();
     if !positive {
         return Err(Error::NearMechanism { smallest, largest });

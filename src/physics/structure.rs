@@ -272,12 +272,12 @@ impl Structure {
         })
     }
 
-    /// The masses; in a structure of rigid bodies on springs, in the order of the degrees of freedom.
+    /// The masses, `[masses]`; in a structure of rigid bodies on springs, in the order of the degrees of freedom.
     pub fn masses(&self) -> &[Mass] {
         &self.masses
     }
 
-    /// The stiffnesses: springs, then beam spans.
+    /// The stiffnesses, `[springs]`: springs, then beam spans.
     pub fn springs(&self) -> &[Spring] {
         &self.springs
     }

@@ -13,8 +13,8 @@ pub fn table(header: &[&str], rows: &[Vec<String>]) -> String {
     table_of_html("", &header, &rows)
 }
 
-/// A table whose cells `rows`, `[rows][columns]`, are already HTML. `header` holds the title of each column and whether it contains
-/// text, which is left-aligned. A wide table scrolls horizontally.
+/// A table whose cells `rows`, `[rows][columns]`, are already HTML. `header` holds the title of each column and whether it
+/// contains text, which is left-aligned. A wide table scrolls horizontally.
 pub fn table_of_html(caption: &str, header: &[(&str, bool)], rows: &[Vec<String>]) -> String {
     let class = |words: bool| if words { " class=\"words\"" } else { "" };
     let title = |(title, words): &(&str, bool)| format!("<th scope=\"col\"{}>{}</th>", class(*words), escaped(title));

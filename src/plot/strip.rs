@@ -7,8 +7,8 @@ use super::panel::{key, Swatch};
 const WIDTH: f64 = 140.0;
 const EDGE: f64 = 8.0;
 
-/// A small figure as SVG: a bar from the low to the high end of a range with a line at its median, a dashed line at the target, and
-/// a diamond at another value.
+/// A small figure as SVG: a bar from the low to the high end of a range with a line at its median, a dashed line at the target,
+/// and a diamond at another value.
 ///
 /// The strip spans all these values, but at least a range of `least`, so that nearly equal values are drawn close together.
 pub fn strip([low, median, high]: [f64; 3], target: f64, other: Option<f64>, least: f64) -> String {

@@ -290,8 +290,8 @@ fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
     Compared { ours: spread(values), target, paper, paper_percentile: paper.map(percentile) }
 }
 
-/// Times of the methods and those of the paper. `training` is the duration (s) and the number of simulated samples of the training;
-/// `found` holds the duration (s) and the model runs of each method in each repetition, in the order of [`METHODS`].
+/// Times of the methods and those of the paper. `training` is the duration (s) and the number of simulated samples of the
+/// training; `found` holds the duration (s) and the model runs of each method in each repetition, in the order of [`METHODS`].
 pub fn times(training: (f64, usize), found: &[Vec<(f64, Option<usize>)>; 3], paper: [f64; 4], note: &str) -> Vec<Time> {
     let median = |method: usize| stats::quantile(&found[method].iter().map(|f| f.0).collect::<Vec<_>>(), 0.5);
     let runs = |method: usize| found[method].first().and_then(|f| f.1);

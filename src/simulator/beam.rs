@@ -143,7 +143,7 @@ fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: us
         }
     }
     if let (Some(from), Some(to)) = (x_m(&beam.from), x_m(&beam.to)) {
-        // Written so that NaN fails too.
+        // This form of the condition also rejects NaN.
         let long = (to - from).abs() > 0.0;
         if !long {
             wrong("to", format!("beam {name} has no length, because both ends are at {from} m: move one of its nodes"));

@@ -370,7 +370,8 @@ fn springs(
     springs.chain(spans).zip(forms).enumerate().map(nominal).collect()
 }
 
-/// Checks that no value of the prior gives a negative stiffness. Returns the springs, each at its smallest stiffness in the prior.
+/// Checks that no value of the prior gives a negative stiffness. Returns the springs, each at its smallest stiffness in the
+/// prior.
 fn check_priors(
     definition: &StructureDefinition,
     springs: &[Spring],

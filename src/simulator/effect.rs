@@ -69,7 +69,8 @@ impl SimulationEffect {
         }
     }
 
-    /// Sizes of this effect at one value of the covariate with the mean coefficients, in the unit of the target, `[target.sizes()]`.
+    /// Sizes of this effect at one value of the covariate with the mean coefficients, in the unit of the target,
+    /// `[target.sizes()]`.
     pub fn sizes(&self, input: Input) -> Vec<f64> {
         self.sizes_at(input, &self.psi)
     }
@@ -114,8 +115,8 @@ impl SimulationEffect {
     }
 }
 
-/// Sizes of all effects under the covariates of a measurement, `[sizes]`. An effect whose covariate is missing has the mean of its
-/// sizes over the values that it was fitted to.
+/// Sizes of all effects under the covariates of a measurement, `[sizes]`. An effect whose covariate is missing has the mean of
+/// its sizes over the values that it was fitted to.
 pub fn sizes(effects: &[SimulationEffect], covariates: &BTreeMap<String, CovariateValue>) -> Sizes {
     let mut found = Sizes::default();
     for effect in effects {
@@ -159,8 +160,9 @@ pub fn marginalised_sizes(
     (0..count).map(at).collect()
 }
 
-/// Draws the values of all covariates that effects depend on, for training. Numbers are uniform in the range that the effects
-/// were fitted to, with a margin. Categories are equally probable; all categories without a coefficient are treated as one.
+/// Draws the value of every covariate that an effect depends on, by its name, for training. Numbers are uniform in the range
+/// that the effects were fitted to, with a margin. Categories are equally probable; all categories without a coefficient are
+/// treated as one.
 pub fn draw_covariates(effects: &[SimulationEffect], stream: &mut Stream) -> BTreeMap<String, CovariateValue> {
     let mut names: Vec<&String> = effects.iter().filter_map(|e| e.law.covariate.as_ref()).collect();
     names.sort();

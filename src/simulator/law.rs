@@ -70,7 +70,8 @@ impl LawKind {
         }
     }
 
-    /// Names of the coefficients, the level first; empty for a law by category, whose coefficients are named after the categories.
+    /// Names of the coefficients, the level first; empty for a law by category, whose coefficients are named after the
+    /// categories.
     pub const fn numbers(self) -> &'static [&'static str] {
         match self {
             Self::Constant | Self::Step => &["size"],
@@ -99,9 +100,9 @@ impl Law {
         self.kind.numbers()[skipped..].iter().map(ToString::to_string).collect()
     }
 
-    /// Returns the size g of the effect at one value of the covariate for the coefficients `psi`, and writes its derivatives ∂g/∂ψ
-    /// to `slopes`. Both slices are as long as [`Self::numbers`], `[ψ]`. g is in the unit of the target of the effect. The formulas
-    /// are those of [`LawKind`].
+    /// Returns the size g of the effect at one value of the covariate for the coefficients `psi`, and writes its derivatives
+    /// ∂g/∂ψ to `slopes`. Both slices are as long as [`Self::numbers`], `[ψ]`. g is in the unit of the target of the effect.
+    /// The formulas are those of [`LawKind`].
     ///
     /// # Panics
     /// If `psi` or `slopes` is too short.

@@ -124,8 +124,8 @@ impl Simulator {
         &self.parts.checked.effects
     }
 
-    /// The simulation under effects of the sizes `sizes`, `[sizes]`, in the order of the effects and in the units of their targets;
-    /// if `sizes` is empty, under effects of their mean sizes.
+    /// The simulation under effects of the sizes `sizes`, `[sizes]`, in the order of the effects and in the units of their
+    /// targets; if `sizes` is empty, under effects of their mean sizes.
     ///
     /// # Panics
     /// If `sizes` is neither empty nor as long as the sizes of all effects.
@@ -189,8 +189,8 @@ impl Simulator {
         self.table().map_or_else(Vec::new, |table| table.warnings(self.modes()))
     }
 
-    /// Whether the simulation is an emulator that extrapolates at the parameters `theta` (`[d]`) under the effects, because the table
-    /// has no runs near them.
+    /// Whether the simulation is an emulator that extrapolates at the parameters `theta` (`[d]`) under the effects, because the
+    /// table has no runs near them.
     pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
         let Some(table) = self.table() else { return false };
         let mut moved = theta.to_vec();
@@ -344,9 +344,9 @@ impl Simulator {
         }
     }
 
-    /// The lowest `modes` frequencies at parameters `theta` (`[d]`, parameter units) under the effects of the structure file and the
-    /// further effects `targets`, and their derivatives with respect to the parameters and to the sizes of the further effects,
-    /// `sizes` (`[sizes]`, in the units of the targets).
+    /// The lowest `modes` frequencies at parameters `theta` (`[d]`, parameter units) under the effects of the structure file
+    /// and the further effects `targets`, and their derivatives with respect to the parameters and to the sizes of the further
+    /// effects, `sizes` (`[sizes]`, in the units of the targets).
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`] and [`respond`].
@@ -412,8 +412,8 @@ impl Simulator {
         self.parts.checked.nominal_frequencies_hz.clone()
     }
 
-    /// Smallest and largest plausible measured frequency, Hz: the nominal range, widened by a factor of 100 on both sides. A value
-    /// outside it has a wrong unit or is from a wrong column.
+    /// Smallest and largest plausible measured frequency, Hz: the nominal range, widened by a factor of 100 on both sides. A
+    /// value outside it has a wrong unit or is from a wrong column.
     ///
     /// Frequencies given in rad/s instead of Hz are within these limits; they are recognised later from the posterior.
     pub fn frequency_limits_hz(&self) -> (f64, f64) {

@@ -70,8 +70,9 @@ impl Table {
         (frequencies, jacobian)
     }
 
-    /// Whether the emulator would extrapolate at parameters `theta` (`[d]`): they lie outside the range of the runs by more than the
-    /// edge that a Latin hypercube leaves unsampled, or in a part of that range without runs ([`Emulator::is_outside`]).
+    /// Whether the emulator would extrapolate at parameters `theta` (`[d]`): they lie outside the range of the runs by more
+    /// than the edge that a Latin hypercube leaves unsampled, or in a part of that range without runs
+    /// ([`Emulator::is_outside`]).
     pub fn is_outside(&self, theta: &[f64]) -> bool {
         let ranges = || theta.iter().zip(self.emulator.ranges());
         let beyond = |(x, [low, high]): (&f64, [f64; 2])| {

@@ -86,11 +86,12 @@ pub enum ChainError {
 /// `masses_kg`: the three masses, kg; `ground_n_per_m`: the sum of the springs from each mass to the ground, N/m; `first_hz`,
 /// `second_hz`, `third_hz`: measured frequencies, Hz.
 ///
-/// The determinant is linear in each stiffness, so that eliminating k23 leaves a quadratic equation for k12 with up to two solutions. Solutions for which the given frequencies
-/// are not the second and third modes are discarded. If `first_hz` is given, the solution with the nearest first frequency comes
-/// first, otherwise the one with the smallest k12. There may be no solution because of measurement noise; near such frequencies
-/// two solutions almost coincide and their [`CouplingStiffness::std_n_per_m`] is large. A symmetric chain has mirrored pairs of
-/// solutions with the same first frequency, which cannot be distinguished.
+/// The determinant is linear in each stiffness, so that eliminating k23 leaves a quadratic equation for k12 with up to two
+/// solutions. Solutions for which the given frequencies are not the second and third modes are discarded. If `first_hz` is
+/// given, the solution with the nearest first frequency comes first, otherwise the one with the smallest k12. There may be no
+/// solution because of measurement noise; near such frequencies two solutions almost coincide and their
+/// [`CouplingStiffness::std_n_per_m`] is large. A symmetric chain has mirrored pairs of solutions with the same first
+/// frequency, which cannot be distinguished.
 ///
 /// Source: Wang et al. (2025), Eq. 24, which does not mention the second solution; on their rig it is often positive, too.
 ///

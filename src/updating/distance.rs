@@ -149,7 +149,7 @@ fn factorise(triangle: &mut [f64], size: usize) -> Option<f64> {
         }
         let variance = row[i];
         let pivot = variance - row[..i].iter().map(|l| l * l).sum::<f64>();
-        // Written so that NaN fails too.
+        // This form of the condition also rejects NaN.
         let regular = variance > 0.0 && pivot > SINGULAR * variance && pivot.is_finite();
         if !regular {
             return None;

@@ -54,8 +54,8 @@ pub struct ExponentialFit {
     pub b: Estimate,
     /// C, in the unit of the stiffness.
     pub c: Estimate,
-    /// Standard deviation of the weighted residuals: in the unit of the stiffness, as a share of the stiffness, or as a multiple of
-    /// the given standard deviations, depending on the [`Weighting`].
+    /// Standard deviation of the weighted residuals: in the unit of the stiffness, as a share of the stiffness, or as a
+    /// multiple of the given standard deviations, depending on the [`Weighting`].
     pub residual_std: f64,
     /// Number of points minus the three constants.
     pub degrees_of_freedom: usize,
@@ -287,8 +287,8 @@ impl ExponentialFit {
         self.shape.at(position)
     }
 
-    /// Pointwise 95 % confidence interval of the curve at a position, in the unit of the stiffness. It is not a simultaneous band and
-    /// not a prediction interval.
+    /// Pointwise 95 % confidence interval of the curve at a position, in the unit of the stiffness. It is not a simultaneous
+    /// band and not a prediction interval.
     pub fn band_95(&self, position: f64) -> [f64; 2] {
         let gradient = self.shape.gradient(position);
         let variance = (gradient.transpose() * self.covariance * gradient)[0];
@@ -348,7 +348,7 @@ fn best_shape(data: &Data<'_>) -> Result<Shape, FitError> {
         let Some(step) = normal.cholesky().map(|c| c.solve(&descent)) else { break };
         let next = shape.moved(&step);
         let sum = data.sum_of_squares(&next);
-        // False for NaN.
+        // The comparison is false for NaN, which rejects the step.
         if sum < least {
             let small = (next.beta - shape.beta).abs() < 1e-14 * shape.beta.abs();
             (shape, least) = (next, sum);

@@ -105,8 +105,8 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
     Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, starts: 1, converged })
 }
 
-/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the middle of the prior; while its frequencies are not
-/// matched, it starts again from the next of `further_starts` (`[starts][d]`), and the best result is kept.
+/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the middle of the prior; while its frequencies are
+/// not matched, it starts again from the next of `further_starts` (`[starts][d]`), and the best result is kept.
 ///
 /// # Errors
 /// As [`update`].
@@ -134,8 +134,8 @@ pub fn update_all(
     measurements.par_iter().map(one).collect()
 }
 
-/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box over the first six parameters, with
-/// the others at the middle of their priors, `[starts][d]`.
+/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box over the first six parameters,
+/// with the others at the middle of their priors, `[starts][d]`.
 pub fn prior_lattice(simulator: &Simulator) -> Vec<Vec<f64>> {
     const MOST: usize = 64;
     let space = simulator.space().as_slice();

@@ -52,8 +52,8 @@ pub struct Settings {
     /// In each stage the samples move until the correlation of every parameter with its start is at most this, from 0 to 1. With
     /// fewer steps, copies of the same sample would remain and the uncertainty of the results would be underestimated.
     pub correlation: f64,
-    /// Largest number of Metropolis steps of a sample in one stage; at least 1. It is reached for a posterior with separate modes,
-    /// for which the correlation remains high.
+    /// Largest number of Metropolis steps of a sample in one stage; at least 1. It is reached for a posterior with separate
+    /// modes, for which the correlation remains high.
     pub most_steps: usize,
 }
 
@@ -191,8 +191,8 @@ pub enum Error {
 /// `progress` is called after each stage.
 ///
 /// Source: Ching & Chen (2007) for stages, weights and evidence. Betz et al. (2016) for β, and for moving each resampled copy by
-/// several steps: in the original method, copies of the same sample form one chain, which is biased. Lee & Whiteley (2018) for the
-/// standard error, which requires multinomial resampling.
+/// several steps: in the original method, copies of the same sample form one chain, which is biased. Lee & Whiteley (2018) for
+/// the standard error, which requires multinomial resampling.
 ///
 /// # Errors
 /// [`Error`] for settings outside their range, and for a target that cannot be sampled.

@@ -152,8 +152,8 @@ pub fn damage_text(state: &State, wanted: impl Fn(&Quantity) -> bool) -> String 
     format!("{}: {}", capital(&state.name), texts.join(", "))
 }
 
-/// Figures 14 and 22: densities of a parameter by each method. `target` gives the normal curve that the values were drawn from, or
-/// `drawn` the values themselves.
+/// Figures 14 and 22: densities of a parameter by each method. `target` gives the normal curve that the values were drawn from,
+/// or `drawn` the values themselves.
 pub fn methods(
     methods: &[MethodSamples],
     k: usize,
