@@ -15,8 +15,8 @@ pub const MAX_SAMPLES: usize = 1 << 16;
 /// Largest number of inputs: each needs two dimensions of the sequence.
 pub const MAX_INPUTS: usize = sobol_burley::NUM_DIMENSIONS as usize / 2;
 
-/// Number of rows of one parallel task. Sums are formed within each task and then over the tasks in order, which gives the same bits
-/// on any number of threads.
+/// Number of rows of one parallel task. Sums are formed within each task and then over the tasks in order, which gives the same
+/// bits on any number of threads.
 const TASK_ROWS: usize = 16;
 
 /// An output is constant up to rounding if its standard deviation is below this share of its largest magnitude.
@@ -39,7 +39,8 @@ pub struct Input {
 /// Number of model runs, and seed of their points.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Settings {
-    /// Number of rows N of one replicate: a power of two up to [`MAX_SAMPLES`]. Sobol' points are only balanced for powers of two.
+    /// Number of rows N of one replicate: a power of two up to [`MAX_SAMPLES`]. Sobol' points are only balanced for powers of
+    /// two.
     pub samples: usize,
     /// Number of independently scrambled replicates R, at least 2. Their spread gives the confidence intervals.
     pub replicates: usize,
@@ -97,7 +98,7 @@ pub struct Sensitivity {
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error<E> {
     /// There are no inputs, or more than the sequence has dimensions for.
-    #[error("{inputs} inputs: from 1 to {MAX_INPUTS} are possible")]
+    #[error("{inputs} inputs: there must be 1 to {MAX_INPUTS}")]
     Inputs {
         /// Number of inputs.
         inputs: usize,
@@ -113,7 +114,7 @@ pub enum Error<E> {
         upper: f64,
     },
     /// The number of samples is not one for which the sequence is balanced.
-    #[error("{samples} samples: a power of two from 2 to {MAX_SAMPLES} is needed")]
+    #[error("{samples} samples: their number must be a power of two from 2 to {MAX_SAMPLES}")]
     Samples {
         /// Samples asked for.
         samples: usize,
@@ -166,9 +167,9 @@ pub enum Error<E> {
 ///
 /// A and B are `[N, d]`, the two halves of 2d-dimensional Owen-scrambled Sobol' points. A_B^i is A with column i from B. V is the
 /// variance of f over A and B together. Each replicate is scrambled independently, and an index is the mean over the replicates.
-/// `model` takes the inputs `[d]` in their units and returns the outputs. It runs on all threads of the rayon pool; the result has
-/// the same bits on any number of threads. `progress` is called from any thread with (runs completed, total runs), not necessarily
-/// in order.
+/// `model` takes the inputs `[d]` in their units and returns the outputs. It runs on all threads of the rayon pool; the result
+/// has the same bits on any number of threads. `progress` is called from any thread with (runs completed, total runs), not
+/// necessarily in order.
 ///
 /// Source: Jansen (1999) for both estimators; Saltelli et al. (2010), Table 2, for the design; Owen (1998) for
 /// replicates of scrambled points.
@@ -205,7 +206,7 @@ where
     })
 }
 
-/// Checks inputs and settings.
+/// Checks the ranges of the inputs and the settings.
 fn check<E>(inputs: &[Input], settings: &Settings) -> Result<(), Error<E>> {
     let &Settings { samples, replicates, .. } = settings;
     if inputs.is_empty() || inputs.len() > MAX_INPUTS {
@@ -246,14 +247,17 @@ struct Task {
 }
 
 impl<F> Design<'_, F> {
+    /// Number of tasks that the rows of one replicate are divided into.
     fn tasks_of_replicate(&self) -> usize {
         self.samples.div_ceil(TASK_ROWS)
     }
 
+    /// Number of model runs of all replicates, N(d + 2)R.
     fn runs(&self) -> usize {
         self.scramblings.len() * self.samples * (self.inputs.len() + 2)
     }
 
+    /// Runs all tasks in parallel; returns their results in order, or the error of the first task in order that fails.
     fn run<E>(&self, progress: Option<&(dyn Fn(usize, usize) + Sync)>) -> Result<Vec<Task>, Error<E>>
     where
         F: Fn(&[f64]) -> Result<Vec<f64>, E> + Sync,
@@ -284,6 +288,7 @@ impl<F> Design<'_, F> {
         results.into_iter().flatten().collect()
     }
 
+    /// Runs the model for some rows of the replicate with this scrambling.
     fn task<E>(&self, scrambling: u32, rows: std::ops::Range<usize>) -> Result<Task, Error<E>>
     where
         F: Fn(&[f64]) -> Result<Vec<f64>, E>,
@@ -312,7 +317,8 @@ impl<F> Design<'_, F> {
 
     /// Inputs of one row, taken from the dimensions of the sequence starting with `dimension`, `[d]`.
     fn point(&self, row: usize, dimension: usize, scrambling: u32) -> Vec<f64> {
-        // The crate rounds down to one of 2²³ cells. Their centres are unbiased and never equal a bound.
+        // `sobol_burley` rounds each coordinate down to a multiple of 2⁻²³. The centre of this cell is unbiased and never
+        // equals a bound.
         const HALF_CELL: f64 = 1.0 / (1 << 24) as f64;
         let coordinate = |(column, input): (usize, &Input)| {
             let u = sobol_burley::sample(row as u32, (dimension + column) as u32, scrambling);
@@ -348,6 +354,7 @@ struct Replicate {
 }
 
 impl Replicate {
+    /// Computes the estimates from all tasks of the replicate.
     fn of(tasks: &[Task], inputs: usize, outputs: usize) -> Self {
         let rows: Vec<&[f64]> = tasks.iter().flat_map(|task| task.values.chunks(outputs)).collect();
         let variances: Vec<(f64, bool)> = (0..outputs)

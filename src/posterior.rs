@@ -19,7 +19,7 @@ impl PosteriorSamples {
     /// `theta`: `[n·draws, d]` in parameter units; the rows of one measurement are contiguous.
     ///
     /// # Panics
-    /// When the number of rows is not a multiple of `draws`, which would be a bug.
+    /// If the number of rows is not a multiple of `draws`: a programming error in the caller.
     pub fn new(theta: DMatrix<f64>, draws: usize) -> Self {
         assert!(draws > 0 && theta.nrows().is_multiple_of(draws), "{} rows of {draws} draws each", theta.nrows());
         Self { theta, draws, simulations: 0 }
@@ -52,15 +52,15 @@ impl PosteriorSamples {
         &self.theta
     }
 
-    /// All samples of one parameter, `[n·draws]`.
+    /// All samples of one parameter, given by its column, `[n·draws]`, in the unit of the parameter.
     pub fn column(&self, parameter: usize) -> Vec<f64> {
         self.theta.column(parameter).iter().copied().collect()
     }
 
-    /// The first `draws` samples of each measurement.
+    /// The first `draws` samples of each of the n measurements, `[n·draws, d]`.
     ///
     /// # Panics
-    /// When there are fewer, which would be a bug.
+    /// If there are fewer: a programming error in the caller.
     #[must_use]
     pub fn first(&self, draws: usize) -> Self {
         assert!(draws <= self.draws, "{draws} of {} draws", self.draws);
@@ -70,10 +70,11 @@ impl PosteriorSamples {
             .after(self.simulations)
     }
 
-    /// The samples of each measurement, followed by those of `further` for the same measurement.
+    /// For each measurement, its samples followed by those of `further` for the same measurement: `[n·k, d]`, where k is the sum of
+    /// both numbers of draws.
     ///
     /// # Panics
-    /// When `further` has another number of measurements, which would be a bug.
+    /// If `further` has another number of measurements: a programming error in the caller.
     #[must_use]
     pub fn joined(&self, further: &Self) -> Self {
         assert!(self.measurements() == further.measurements(), "samples of the same measurements");
@@ -89,7 +90,7 @@ impl PosteriorSamples {
             .after(self.simulations + further.simulations)
     }
 
-    /// Posterior mean of each measurement, `[n, d]`.
+    /// Posterior mean of each measurement, `[n, d]`, parameter units.
     pub fn means(&self) -> DMatrix<f64> {
         DMatrix::from_fn(self.measurements(), self.theta.ncols(), |measurement, parameter| {
             self.theta.view((measurement * self.draws, parameter), (self.draws, 1)).mean()

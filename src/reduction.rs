@@ -85,13 +85,14 @@ impl<T> Reducer<T> {
         place.clamp(0, self.buckets() as i128 - 1) as usize
     }
 
-    /// Adds a row. `tag` is called only when the row is kept, at least for now.
+    /// Adds a row with one value for each channel, `[channels]`. `tag` is called only if the row is kept; a later row can still
+    /// replace it.
     pub fn push(&mut self, time_us: i64, values: &[f64], tag: impl FnOnce() -> T) {
         let pushed: Result<(), std::convert::Infallible> = self.try_push(time_us, values, || Ok(tag()));
         pushed.unwrap_or_else(|never| match never {});
     }
 
-    /// Adds a row with a tag that can fail.
+    /// As [`Self::push`], for a tag whose creation can fail.
     ///
     /// # Errors
     /// The error of `tag`.
@@ -189,6 +190,7 @@ impl<T> Bucket<T> {
         roles
     }
 
+    /// Gives a role to a row, in place of the row that has it now.
     fn put(&mut self, role: Role, row: &Arc<Numbered<T>>) {
         let row = Arc::clone(row);
         match role {
@@ -220,8 +222,8 @@ enum Role {
     Missing(usize),
 }
 
-/// Longest spacing that is not a gap, microseconds, from the ascending times of all rows; `None` with fewer than two
-/// different times.
+/// Longest spacing of rows that is not a gap, microseconds: [`GAP_SPACINGS`] times the median spacing of the ascending `times`,
+/// microseconds, `[n]`. `None` if there are fewer than two different times.
 pub fn longest_spacing(times: &[i64]) -> Option<i64> {
     let mut spacings: Vec<i64> =
         times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).filter(|spacing| *spacing > 0).collect();
@@ -237,12 +239,12 @@ pub fn longest_spacing(times: &[i64]) -> Option<i64> {
 fn gaps<T>(times: &[i64], rows: &[Row<T>]) -> Vec<(i64, usize)> {
     let Some(longest) = longest_spacing(times) else { return Vec::new() };
     let mut gaps = Vec::new();
-    let mut behind = times.iter().copied().peekable();
+    let mut upcoming = times.iter().copied().peekable();
     for (index, pair) in rows.windows(2).enumerate() {
         let (from, to) = (pair[0].time_us, pair[1].time_us);
-        while behind.next_if(|time| *time <= from).is_some() {}
+        while upcoming.next_if(|time| *time <= from).is_some() {}
         let (mut last, mut widest) = (from, (0, from));
-        while let Some(time) = behind.next_if(|time| *time <= to) {
+        while let Some(time) = upcoming.next_if(|time| *time <= to) {
             widest = widest.max((time.saturating_sub(last), last));
             last = time;
         }
@@ -335,7 +337,7 @@ mod tests {
         #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
 
         #[test]
-        fn extremes_missing_values_and_gaps_stay(
+        fn extremes_missing_values_and_gaps_are_kept(
             (channels, input) in (1_usize..4).prop_flat_map(|channels| (Just(channels), series(channels))),
             points in 5_usize..150,
         ) {
@@ -343,12 +345,12 @@ mod tests {
         }
 
         #[test]
-        fn whatever_the_order_in_which_rows_come(input in series(2).prop_shuffle(), points in 5_usize..150) {
+        fn the_order_of_arrival_does_not_matter(input in series(2).prop_shuffle(), points in 5_usize..150) {
             check(&input, points, 2);
         }
 
         #[test]
-        fn a_short_series_stays_as_it_is(input in series(2)) {
+        fn a_short_series_is_unchanged(input in series(2)) {
             let (left, _) = reduce(&input, input.len(), 2);
             let tags: Vec<usize> = left.rows.iter().map(|row| row.tag).collect();
             prop_assert_eq!(tags, (0..input.len()).collect::<Vec<_>>());
@@ -356,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn one_spike_among_twenty_thousand_stays_and_little_else() {
+    fn one_spike_among_twenty_thousand_rows_is_kept() {
         let value = |i: i64| if i == 13_579 { 50.0 } else { (i as f64 * 0.37).sin() };
         let input: Vec<_> = (0..20_000).map(|i| (i * 600_000_000, vec![value(i)])).collect();
         let (left, _) = reduce(&input, 500, 1);

@@ -26,7 +26,7 @@ pub fn exp(x: f32) -> f32 {
 }
 
 /// 2ˣ for x between −100 and 100, with a relative error below 3e-7. Arguments outside are clamped: 2⁻¹⁰⁰ is negligible
-/// beside a weight of 1, yet its products with squared deviations stay clear of slow subnormal numbers.
+/// compared with a weight of 1, but its products with squared deviations are not yet subnormal numbers, which are slow.
 ///
 /// The nearest integer goes into the exponent, the remainder |r| ≤ ½ through a polynomial of degree 5.
 #[inline(always)]
@@ -50,8 +50,8 @@ fn power_of_whole(shifted: f32) -> f32 {
 
 /// 1/x with a relative error below 2e-7, for x between 1 and 8e37.
 ///
-/// Three Newton steps from a first guess that negates the exponent. A vector division takes as long as the whole remainder
-/// of a logistic function.
+/// Three Newton steps r ← r + r(1 − x r) from a first guess that negates the exponent. A vector division takes as long as
+/// all other operations of a logistic function together.
 #[inline(always)]
 pub fn reciprocal(x: f32) -> f32 {
     let guess = f32::from_bits(0x7EF3_11C7_u32.wrapping_sub(x.to_bits()));

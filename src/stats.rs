@@ -1,4 +1,4 @@
-//! Moments, quantiles, importance weights, and the named random streams that every draw of the crate comes from.
+//! Moments, quantiles, importance weights, and the named random streams from which all random numbers of the crate are drawn.
 
 use std::sync::OnceLock;
 
@@ -21,7 +21,7 @@ pub fn stream(seed: u64, purpose: &str) -> Stream {
     ChaCha12Rng::from_seed(hasher.finalize().into())
 }
 
-/// Squared cosine of the angle between two vectors of the same length: 1 for parallel vectors, 0 for orthogonal ones and
+/// Squared cosine of the angle between two vectors of the same length, `[n]`: 1 for parallel vectors, 0 for orthogonal ones and
 /// where one of them is zero. For two mode shapes it is the modal assurance criterion (MAC).
 ///
 /// ```text
@@ -39,12 +39,12 @@ pub fn squared_cosine(a: &[f64], b: &[f64]) -> f64 {
     }
 }
 
-/// Arithmetic mean; NaN for an empty slice.
+/// Arithmetic mean of `values`, `[n]`, in their unit; NaN for an empty slice.
 pub fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// Sample standard deviation with the divisor n − 1; `None` for fewer than two values.
+/// Sample standard deviation of `values`, `[n]`, with the divisor n − 1, in their unit; `None` for fewer than two values.
 ///
 /// ```text
 ///  s = √( Σ (xᵢ − x̄)²/(n − 1) )
@@ -58,7 +58,7 @@ pub fn sample_std(values: &[f64]) -> Option<f64> {
     Some((squares / (values.len() - 1) as f64).sqrt())
 }
 
-/// Coefficient of determination of `estimate` for `truth`, two slices of the same length.
+/// Coefficient of determination of `estimate` for `truth`, both `[n]`.
 ///
 /// ```text
 ///  R² = 1 − Σ (truth − estimate)² / Σ (truth − mean(truth))²
@@ -70,8 +70,12 @@ pub fn r_squared(truth: &[f64], estimate: &[f64]) -> f64 {
     1.0 - residual / total
 }
 
-/// Quantile of unsorted values by linear interpolation between order statistics; NaN for an empty slice. `level` is clamped
-/// to the interval from 0 to 1.
+/// Quantile of unsorted values, `[n]`, by linear interpolation between order statistics; NaN for an empty slice. `level` is
+/// clamped to the interval from 0 to 1.
+///
+/// ```text
+///  h = level·(n − 1),    Q = x₍ₖ₎ + (h − k)(x₍ₖ₊₁₎ − x₍ₖ₎),    k = ⌊h⌋, order statistics counted from 0
+/// ```
 ///
 /// Source: R. J. Hyndman, Y. Fan (1996), Sample quantiles in statistical packages, The American Statistician 50, 361–365,
 /// definition 7.
@@ -98,8 +102,8 @@ pub fn normal_quantile(p: f64) -> f64 {
     Normal::standard().inverse_cdf(p)
 }
 
-/// Standard normal quantiles by linear interpolation in a table: accurate to 1e-5, in a tenth of the time of
-/// [`normal_quantile`], which is used for levels in the tails.
+/// Standard normal quantiles by linear interpolation in a table. They are accurate to 1e-5 and take a tenth of the time of
+/// [`normal_quantile`], which is still used for levels in the tails.
 pub struct NormalQuantiles {
     /// Quantiles at the levels i/`CELLS`.
     values: Vec<f64>,
@@ -151,14 +155,14 @@ pub fn student_t_quantile(p: f64, degrees_of_freedom: usize) -> f64 {
     StudentsT::new(0.0, 1.0, nu).expect("scale and degrees of freedom are positive").inverse_cdf(p)
 }
 
-/// Importance weights from their logarithms, scaled so that the largest is 1.
+/// Importance weights, `[n]`, from their logarithms `log_weights`, nats, `[n]`, scaled so that the largest is 1.
 ///
 /// ```text
 ///  w_s = exp(ln w_s − max ln w),    effective sample size (Σw)²/Σw²
 /// ```
 ///
-/// `None` where the effective sample size is less than the share `effective` of the number of samples, or where no
-/// logarithm is finite.
+/// Returns `None` if the effective sample size is below `effective`·n, or if no logarithm is finite. A logarithm of −∞ gives a
+/// weight of 0.
 pub fn weights(log_weights: &[f64], effective: f64) -> Option<Vec<f64>> {
     let largest = log_weights.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     if !largest.is_finite() {
@@ -169,8 +173,8 @@ pub fn weights(log_weights: &[f64], effective: f64) -> Option<Vec<f64>> {
     (sum * sum / squares >= effective * weights.len() as f64).then_some(weights)
 }
 
-/// Indices of `draws` samples by systematic resampling, in random order. Index i occurs `draws`·wᵢ/Σw times, rounded up or
-/// down to an integer.
+/// Indices of `draws` samples by systematic resampling with the weights w, `[n]`, in random order. Index i occurs `draws`·wᵢ/Σw
+/// times, rounded up or down to an integer.
 pub fn systematic(weights: &[f64], draws: usize, stream: &mut Stream) -> Vec<usize> {
     let step = weights.iter().sum::<f64>() / draws as f64;
     let offset: f64 = stream.random();
@@ -221,7 +225,7 @@ mod tests {
         // Tables: 1.833 at 9, and the normal quantile in the limit.
         assert!((student_t_quantile(0.95, 9) - 1.833_112_93).abs() < 1e-7);
         assert!((student_t_quantile(0.95, 1_000_000_000) - normal_quantile(0.95)).abs() < 1e-8);
-        // The two methods agree where they meet: from 1,000 to 1,001 the quantile falls by (z³ + z)/4ν² = 1.5e-6.
+        // The two methods agree at the switch between them: from 1,000 to 1,001 the quantile falls by (z³ + z)/4ν² = 1.5e-6.
         assert!((student_t_quantile(0.95, 1000) - student_t_quantile(0.95, 1001) - 1.524e-6).abs() < 2e-8);
     }
 
@@ -232,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn systematic_draws_come_as_often_as_their_weights_say() {
+    fn systematic_resampling_draws_each_index_in_proportion_to_its_weight() {
         let weights = [0.5, 0.0, 2.0, 1.0, 0.5];
         for seed in 0..20 {
             let chosen = systematic(&weights, 400, &mut stream(seed, "test"));
@@ -253,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_count_only_where_they_leave_half_of_the_draws() {
+    fn weights_are_rejected_if_the_effective_sample_size_is_too_small() {
         let usual = weights(&[0.0, 0.1, -0.1], 0.5).unwrap();
         assert!((usual[1] / usual[2] - 0.2_f64.exp()).abs() < 1e-12);
         // A few draws in a spurious mode have negligible weight and do not affect the others.

@@ -44,7 +44,7 @@ pub struct Volume {
     pub network: bool,
 }
 
-/// The volume of an existing folder or file.
+/// The file system that contains an existing folder or file.
 ///
 /// # Errors
 /// The error of the operating system.

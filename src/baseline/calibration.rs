@@ -1,5 +1,5 @@
-//! Calibration of the posterior: rank statistics, interval coverage and TARP, over the noise range of the model and the
-//! modes that may be missing.
+//! Calibration of the posterior: rank statistics, interval coverage and TARP (tests of accuracy with random points), over the
+//! noise range of the model and the modes that may be missing.
 
 use std::ops::Range;
 
@@ -43,9 +43,9 @@ const GOOD_COVERAGE: [f64; 2] = [0.89, 0.91];
 pub struct CellRanks {
     /// Title of the cell.
     pub title: String,
-    /// Rank of the truth among the draws, 0..=`DRAWS`, for each parameter and simulation.
+    /// Rank of the truth among the draws, 0..=`DRAWS`, `[parameter][simulation]`.
     pub ranks: Vec<Vec<usize>>,
-    /// Rank of the truth by its TARP distance, for each simulation.
+    /// Rank of the truth by its TARP distance, `[simulation]`.
     pub tarp_ranks: Vec<usize>,
 }
 
@@ -171,6 +171,7 @@ struct Drawn {
 }
 
 impl Drawn {
+    /// Draws for one simulation, `[DRAWS][parameter]`.
     fn of(&self, simulation: usize) -> &[Vec<f64>] {
         let rows: Range<usize> = simulation * DRAWS..(simulation + 1) * DRAWS;
         &self.draws[rows]
@@ -202,6 +203,7 @@ impl Drawn {
     }
 }
 
+/// Measures the calibration of one cell on new simulations, whose random stream is named `purpose`.
 fn measure_cell(
     baseline: &Baseline,
     situation: &Situation,
@@ -256,7 +258,7 @@ fn quantile_of_draws(draws: &[f64], level: f64) -> f64 {
     sorted[below] + (position - below as f64).clamp(0.0, 1.0) * (sorted[above] - sorted[below])
 }
 
-/// p-value of the χ² test that ranks between 0 and [`DRAWS`] are uniform, in [`BINS`] bins.
+/// p-value of the χ² test that `ranks`, `[n]`, which lie between 0 and [`DRAWS`], are uniform, in [`BINS`] bins.
 ///
 /// ```text
 ///  χ² = Σ_b (n_b − n/B)²/(n/B),    B − 1 degrees of freedom

@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::stats::Stream;
 
-/// Share of the training measurements that contain all modes.
+/// Share of the training measurements in which no mode is missing.
 const SHARE_COMPLETE: f64 = 0.6;
 /// Share of the training measurements without any mode shape, for a structure with instrumented points.
 const SHARE_WITHOUT_SHAPES: f64 = 0.2;
-/// Probability that a single shape is missing in the others.
+/// Probability that a single shape is missing in the other training measurements.
 const SHARE_SHAPE_MISSING: f64 = 0.02;
 /// Share of the training measurements whose modes all have the same noise multiple.
 const SHARE_COMMON_NOISE: f64 = 0.6;

@@ -103,7 +103,7 @@ impl Baseline {
 /// flow at that fit.
 ///
 /// # Errors
-/// [`InferenceError::Simulation`], which a checked prior rules out.
+/// [`InferenceError::Simulation`], which cannot occur inside a checked prior.
 pub(super) fn fitted_pairs(
     simulator: &Simulator,
     set: &TrainingSet,

@@ -70,7 +70,7 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
     Ok(IdentifiabilityRecord { parameters, groups })
 }
 
-/// One complete measurement of each pair, with the structure's noise or exact.
+/// One complete measurement of each pair of a training set, with the structure's noise or, if `noisy` is false, without noise.
 fn observe(simulator: &Simulator, set: &TrainingSet, noisy: bool, seed: u64) -> Vec<Observation> {
     let mut stream = stats::stream(seed, "identifiability");
     let one = |(row, sizes): (usize, &Vec<f64>)| {
@@ -133,7 +133,8 @@ fn groups(space: &ParameterSpace, confused: impl Fn(usize, usize) -> bool) -> Ve
 /// prior, by the Fisher information; see [`fisher_covariance`]. Mode shapes are included where the structure has
 /// instrumented points.
 ///
-/// `theta`: `[d]`, parameter units; `exact_hz`: its frequencies. A relative noise below 1e-5 is taken as 1e-5.
+/// `theta`: `[d]`, parameter units; `exact_hz`: its frequencies without noise, Hz, `[m]`. A relative noise below 1e-5 is replaced
+/// by 1e-5.
 ///
 /// # Errors
 /// [`physics::Error`] where the simulation fails.
@@ -157,9 +158,9 @@ pub fn local_covariance(
 ///  C = (Jᵀ R⁻¹ J + 12·1)⁻¹,    J: derivatives of frequencies and shapes by u,   R: variances of their noise
 /// ```
 ///
-/// `frequency_slopes`: ∂f/∂θ `[modes, d]`, Hz per parameter unit; `std_hz`: noise of each mode, Hz; `shape_slopes`: ∂φ/∂θ
-/// of each mode, `[points, d]`, empty without shapes. `None` where the sum is not positive definite, which needs values
-/// that are not finite.
+/// `frequency_slopes`: ∂f/∂θ, `[modes, d]`, Hz per parameter unit; `std_hz`: standard deviation of each frequency, Hz, `[modes]`;
+/// `shape_slopes`: ∂φ/∂θ of each mode, `[points, d]`, per parameter unit; empty without shapes. Returns `None` only if a value is
+/// not finite.
 pub fn fisher_covariance(
     simulator: &Simulator,
     frequency_slopes: &DMatrix<f64>,

@@ -19,8 +19,8 @@ const PROPOSALS: usize = 2;
 /// draw.
 const MOST_DOFS_RESAMPLED: usize = 80;
 
-/// Measurements with a missing covariate that are inferred at a time. Each is expanded into one observation per possible
-/// value.
+/// Number of measurements with a missing covariate that are inferred together. Each is expanded into one observation per
+/// possible value of the covariate.
 const MARGINALISED_AT_A_TIME: usize = 64;
 
 /// Seed of the draws for a batch: the same data and model always give the same draws.
@@ -53,8 +53,8 @@ impl Baseline {
         self.infer_from(observations, draws, PROPOSALS, seed)
     }
 
-    /// As [`Self::infer`], in almost half the time: where draws are resampled, the flow proposes only one draw per sample,
-    /// so that draws with a large weight occur repeatedly.
+    /// As [`Self::infer`], `[n·draws, d]` in parameter units, in almost half the time: where draws are resampled, the flow
+    /// proposes only one draw per sample, so that draws with a large weight occur repeatedly.
     ///
     /// # Errors
     /// As [`Self::infer`].
@@ -114,7 +114,7 @@ impl Baseline {
         for (chunk, rows) in marginalised.chunks(MARGINALISED_AT_A_TIME).enumerate() {
             let seed = seed.wrapping_add(1 + chunk as u64);
             let values = rows.iter().map(|row| observations[*row].sizes_to_marginalise.len()).max().unwrap_or(1);
-            // Each possible value gives an observation, and each observation its share of the draws.
+            // Each possible value of the covariate becomes one observation, which gets an equal share of the draws.
             let each = draws.div_ceil(values.min(draws.max(1)));
             let expanded: Vec<Observation> = rows.iter().flat_map(|row| observations[*row].at_each_size()).collect();
             let samples = self.infer_known(&expanded, each, proposals, seed)?;
@@ -164,10 +164,10 @@ impl Baseline {
         self.manifest.conditions.noise_range.is_some() && self.is_corrected()
     }
 
-    /// Whether the simulation corrects the flow's draws. It does not
-    /// - where the effects depend on coefficients that are themselves uncertain: the flow has learnt to average over them;
-    /// - where solving the eigenproblem for every draw would take too long;
-    /// - where the flow starts at the best fit, which comes from the simulation already. With a hundred parameters, importance
+    /// Whether the simulation corrects the flow's draws. There is no correction in three cases:
+    /// - the coefficients of the effects are uncertain, and the flow was trained to average over them;
+    /// - solving the eigenproblem for every draw would take too long;
+    /// - the flow starts at the best fit, which is computed by the simulation already. With a hundred parameters, importance
     ///   weights would leave a single draw.
     fn is_corrected(&self) -> bool {
         let certain = self.simulator.effects().iter().all(|effect| effect.psi_std().iter().all(|std| *std <= 0.0));

@@ -186,6 +186,7 @@ impl Library {
         Some(id)
     }
 
+    /// Records that a file cannot be used.
     fn refuse(&mut self, file: String, structure: Option<&StructureId>, reason: &dyn std::fmt::Display) {
         self.refusals.push(Refusal { file, structure: structure.cloned(), reason: reason.to_string() });
     }
@@ -252,6 +253,7 @@ fn in_folder(files: &Folder, file: &str) -> std::io::Result<String> {
     String::from_utf8(bytes.clone()).map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e))
 }
 
+/// Reads a structure file from memory; `beside` returns the text of another file in the same folder.
 fn read_definition(
     name: &str,
     bytes: &[u8],
@@ -271,10 +273,12 @@ fn has_extension(name: &str, extension: &str) -> bool {
     Path::new(name).extension().is_some_and(|found| found == extension)
 }
 
+/// Whether a file name is that of a structure file in a folder of the library.
 fn is_definition(name: &str) -> bool {
     name == "structure.toml" || name == "structure.json"
 }
 
+/// The folders that are embedded in the program, by name.
 fn shipped_folders() -> BTreeMap<String, Folder> {
     let mut folders = BTreeMap::<String, Folder>::new();
     for path in Shipped::iter() {

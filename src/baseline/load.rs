@@ -11,7 +11,8 @@ use crate::quantity::Digest;
 use crate::simulator::Simulator;
 
 impl Baseline {
-    /// Reads a stored model and runs its self-test.
+    /// Reads a stored model from the contents of its manifest (JSON) and of its weight file (safetensors), and runs its
+    /// self-test. `simulator` is the structure that the model must have been trained for.
     ///
     /// # Errors
     /// [`LoadError`], with one variant for each way in which the files can be wrong.
@@ -44,6 +45,7 @@ impl Baseline {
         Ok(baseline)
     }
 
+    /// Draws the posterior of a stored measurement with a stored seed and compares the draws with the stored ones.
     fn self_test(&self) -> Result<(), LoadError> {
         let SelfTest { frequencies_hz, shapes, seed, expected } = &self.manifest.self_test;
         let shapes = shapes.iter().cloned().map(Some).collect();

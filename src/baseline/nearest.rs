@@ -29,22 +29,22 @@ const ITERATIONS: usize = 40;
 /// The point of the prior box that fits a measurement best.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Nearest {
-    /// Frequencies at that point, all modes, Hz.
+    /// Simulated frequencies of all modes at that point, Hz, `[m]`.
     pub frequencies_hz: Vec<f64>,
     /// Σ over the modes present of ((ln f_i − ln f_i(x))/s_i)², s_i the relative standard deviation of the noise.
     pub chi_squared: f64,
-    /// Expected value of `chi_squared`: modes present less the directions in which parameters away from the bounds absorb
-    /// noise.
+    /// Expected value of `chi_squared`: the number of modes present minus the number of directions in which parameters away from
+    /// the bounds absorb noise.
     pub degrees_of_freedom: usize,
-    /// (ln f_i − ln f_i(x))/s_i of each mode, 0 where it is missing.
+    /// (ln f_i − ln f_i(x))/s_i of each mode, `[m]`; 0 where it is missing.
     pub standardised_residuals: DVector<f64>,
     /// Covariance of these residuals under noise alone, `[m, m]`: the projector on the directions that the parameters
     /// cannot absorb.
     pub projector: DMatrix<f64>,
 }
 
-/// The result where mode shapes are measured too: the fit that the flow starts at. Only the sum of the squared residuals of
-/// frequencies and shapes is used; residuals of single modes are not reported.
+/// The result for measured mode shapes, which is the fit that the flow starts at. It contains the sum of the squared residuals of
+/// frequencies and shapes, but no residuals of single modes.
 fn of_fit(fit: Located, modes: usize) -> Nearest {
     Nearest {
         frequencies_hz: fit.frequencies_hz,
@@ -65,7 +65,7 @@ fn of_fit(fit: Located, modes: usize) -> Nearest {
 /// the parameters that are free at the minimum. If the truth lies inside the box, the minimum is at most that.
 ///
 /// # Errors
-/// [`physics::Error`], which a checked prior rules out.
+/// [`physics::Error`], which cannot occur inside a checked prior.
 pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) -> Result<Nearest, physics::Error> {
     if observation.has_shapes() {
         locate(simulator, observation).map(|fit| of_fit(fit, simulator.modes()))
@@ -74,6 +74,7 @@ pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) 
     }
 }
 
+/// [`nearest`] for a measurement without mode shapes.
 fn nearest_by_frequencies(
     simulator: &Simulator,
     observation: &Observation,
@@ -82,7 +83,7 @@ fn nearest_by_frequencies(
     let simulator = &observation.simulator(simulator);
     let search = Search::new(simulator, observation, RESOLUTION);
     let (present, parameters) = (search.modes.len(), simulator.space().len());
-    // With a missing covariate the size of its effect is unknown, so that the measurement tests nothing.
+    // With a missing covariate the size of its effect is unknown, so that the measurement cannot be compared with the simulation.
     let known = !observation.is_marginalised();
     let determined = known && present > parameters;
     let mut found = search.at(search.unit(start))?;
@@ -116,8 +117,9 @@ fn nearest_by_frequencies(
             expanded[(mode, other)] = projector[(row, column)];
         }
     }
-    // A residual where none is expected means that the simulation cannot produce the measurement (beyond a fold of the map
-    // rather than a bound of the box): it is reported like a bound.
+    // With as many parameters as modes, no residual is expected. If one remains, the simulation cannot produce the measurement,
+    // because it lies beyond a fold of the map from parameters to frequencies. As for a parameter at a bound, at least one degree
+    // of freedom then remains.
     let beyond = usize::from(chi_squared > 0.0 && !search.reaches(&found));
     Ok(Nearest {
         chi_squared,
@@ -194,6 +196,7 @@ impl<'a> Search<'a> {
         self.simulator.space().iter().zip(u).map(|(p, u)| p.from_unit(*u)).collect()
     }
 
+    /// Simulates the point at a position `u` of the unit box, `[d]`.
     fn at(&self, u: DVector<f64>) -> Result<Point, physics::Error> {
         let frequencies_hz = self.simulator.frequencies_hz(&self.theta(&u))?;
         let one = |(i, measured): (usize, &f64)| (measured / frequencies_hz[self.modes[i]]).ln() / self.relative_std[i];
@@ -258,7 +261,7 @@ impl<'a> Search<'a> {
     /// Descends from parameters `theta` (`[d]`) to a local minimum of the squared errors.
     ///
     /// # Errors
-    /// [`physics::Error`], which a checked prior rules out.
+    /// [`physics::Error`], which cannot occur inside a checked prior.
     pub(super) fn descend_from(&self, theta: &[f64]) -> Result<Descent, physics::Error> {
         let point = self.descend(self.at(self.unit(theta))?)?;
         let residual =

@@ -31,7 +31,7 @@ pub struct Observation {
 }
 
 impl Observation {
-    /// A measurement of all modes, each with the structure's noise.
+    /// A measurement of all modes, `frequencies_hz` in Hz, `[m]`, each with the structure's noise.
     pub fn complete(frequencies_hz: &[f64]) -> Self {
         Self {
             frequencies_hz: frequencies_hz.iter().copied().map(Some).collect(),
@@ -68,7 +68,8 @@ impl Observation {
         self.frequencies_hz.iter().flatten().count()
     }
 
-    /// Shape of mode `mode`, where both the mode and its shape were identified.
+    /// Shape of mode `mode` (counted from 0) at the instrumented points, of unit norm, `[points]`; `None` unless both the mode
+    /// and its shape were identified.
     pub fn shape(&self, mode: usize) -> Option<&[f64]> {
         self.frequencies_hz[mode]?;
         self.shapes.get(mode)?.as_deref()
@@ -79,7 +80,7 @@ impl Observation {
         (0..self.frequencies_hz.len()).any(|mode| self.shape(mode).is_some())
     }
 
-    /// Standard deviation of mode `mode`, Hz; `None` where it is missing.
+    /// Standard deviation of the measured frequency of mode `mode` (counted from 0), Hz; `None` where it is missing.
     pub fn std_hz(&self, simulator: &Simulator, mode: usize) -> Option<f64> {
         Some(simulator.std_hz(mode, self.frequencies_hz[mode]?) * self.noise_multiple[mode])
     }
@@ -91,8 +92,8 @@ impl Observation {
 ///  f̃_i = f_i + a_i·s_i(f_i)·N(0, 1),    a_i the noise multiple, s_i the standard deviation of the structure's noise, Hz
 /// ```
 ///
-/// `exact_hz` and `multiples`: one entry per mode, a multiple `None` for a missing mode; `effect_sizes`: sizes of all
-/// effects.
+/// `exact_hz`: frequencies without noise, Hz, `[m]`; `multiples`: noise multiple of each mode, `[m]`, `None` for a missing mode;
+/// `effect_sizes`: sizes of all effects in the units of their targets, `[sizes]`.
 pub fn measure(
     simulator: &Simulator,
     exact_hz: &[f64],
@@ -116,8 +117,8 @@ pub fn measure(
     }
 }
 
-/// Adds noisy mode shapes to a simulated measurement, except for those that `missing` marks, one entry per mode.
-/// `exact`: `[points, modes]`, columns of unit norm.
+/// Adds noisy mode shapes to a simulated measurement. `exact`: shapes without noise, `[points, m]`, columns of unit norm;
+/// `missing`: whether each shape is missing, `[m]`.
 ///
 /// ```text
 ///  φ̃ = (φ + s·N(0, 1))/|…|,    s: standard deviation of each component of a shape of unit norm

@@ -43,7 +43,7 @@ impl Baseline {
         for round in 1..=ROUNDS {
             let pending: Vec<u32> =
                 (0..observations.len() as u32).filter(|&row| filled[row as usize] < draws).collect();
-            // After the first round few draws are missing: twice as many as the worst row lacks are enough.
+            // After the first round few draws are missing: twice the largest number that any observation lacks is enough.
             let Some(missing) = pending.iter().map(|&row| draws - filled[row as usize]).max() else { break };
             let count = draws.min(2 * missing);
             let (mut real, mut log_q) = (Vec::new(), Vec::new());

@@ -86,8 +86,8 @@ pub(super) fn log_likelihoods(simulator: &Simulator, observations: &[Observation
     observations.par_iter().with_min_len(LEAST_PER_TASK).enumerate().flat_map_iter(of).collect()
 }
 
-/// ln p(y | x) up to a constant. `frequencies_hz`: the simulated frequencies of x; NaN where the simulation failed, which
-/// gives −∞.
+/// ln p(y | x) up to a constant, nats. `frequencies_hz`: the simulated frequencies of x, Hz, `[m]`; if the simulation failed they
+/// are NaN, and the result is −∞.
 fn log_likelihood(simulator: &Simulator, observation: &Observation, frequencies_hz: &[f64]) -> f64 {
     if frequencies_hz.iter().any(|f| f.is_nan()) {
         return f64::NEG_INFINITY;

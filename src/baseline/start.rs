@@ -88,18 +88,25 @@ struct Residuals {
     frequencies_hz: Vec<f64>,
 }
 
-/// Fits each measurement, in parallel; the result does not depend on the number of threads.
+/// [`locate`] for n measurements in parallel, `[n]`. The result does not depend on the number of threads.
 ///
 /// # Errors
-/// [`physics::Error`], which a checked prior rules out.
+/// [`physics::Error`], which cannot occur inside a checked prior.
 pub fn locate_all(simulator: &Simulator, observations: &[Observation]) -> Result<Vec<Located>, physics::Error> {
     observations.par_iter().map(|observation| locate(simulator, observation)).collect()
 }
 
-/// Fits one measurement by Gauss–Newton steps on the tempered posterior, see the module.
+/// Finds the best fit û of one measurement and the normal distribution about it, by Gauss–Newton steps on the tempered posterior.
+///
+/// ```text
+///  û    = argmin ½ |r(u)|² + 6 |u − ½|²
+///  R Rᵀ = JᵀJ/a² + 12·1,    J = −∂r/∂u at û
+/// ```
+///
+/// r: residuals in standard deviations of the noise; u: position in the prior box, `[d]`; a: see the module.
 ///
 /// # Errors
-/// [`physics::Error`], which a checked prior rules out.
+/// [`physics::Error`], which cannot occur inside a checked prior.
 pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Located, physics::Error> {
     let simulator = &observation.simulator(simulator);
     let prior = simulator.space().as_slice();
@@ -123,7 +130,7 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
         for (position, (change, (lowest, highest))) in u.iter_mut().zip(step.iter().zip(&limits)) {
             *position = (*position + change).clamp(*lowest, *highest);
         }
-        // Written so that NaN ends the search too.
+        // With this form of the condition, NaN ends the search too.
         let goes_on = gain >= LEAST_GAIN || tempering < 1.0;
         if taken == STEPS || !goes_on {
             return Ok(located(u, residuals, &normal, &step));
@@ -131,7 +138,7 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
     }
 }
 
-/// The normal distribution at the end of the search. The derivatives are still valid after the last, small step.
+/// The normal distribution at the end of the search. The derivatives before the last step are used, because that step is small.
 fn located(unit: DVector<f64>, residuals: Residuals, normal: &DMatrix<f64>, step: &DVector<f64>) -> Located {
     let left = residuals.values - &residuals.slopes * step;
     let chi_squared = left.norm_squared();

@@ -27,19 +27,19 @@ use crate::quantity::Digest;
 use crate::simulator::{Simulator, TrainingSet};
 use crate::stats::{self, Stream};
 
-/// Pairs that select the best epoch.
+/// Number of validation pairs, which select the best epoch.
 const VALIDATION_SAMPLES: usize = 1_000;
-/// Pairs that select the best epoch where the flow starts at the best fit.
+/// Number of validation pairs where the flow starts at the best fit.
 const VALIDATION_FITTED: usize = 500;
-/// Pairs on which the accuracy in the manifest is measured.
+/// Number of held-out pairs, on which the accuracy in the manifest is measured.
 const HELD_OUT_SAMPLES: usize = 2_000;
-/// The same where the flow starts at the best fit: a fit takes 0.2 s with three hundred parameters.
+/// Number of held-out pairs where the flow starts at the best fit: a fit takes 0.2 s with three hundred parameters.
 const HELD_OUT_FITTED: usize = 300;
 /// Draws per held-out pair.
 const HELD_OUT_DRAWS: usize = 10;
 /// Draws of the self-test.
 const SELF_TEST_DRAWS: usize = 4;
-/// Fewest training samples. With fewer, the covariance of the frequencies is too uncertain.
+/// Smallest number of training samples. With fewer, the covariance of the frequencies is too uncertain.
 pub const MINIMUM_SAMPLES: usize = 100;
 
 /// Default number of training samples. Where the flow starts at the best fit, each sample takes milliseconds and the flow
@@ -65,7 +65,7 @@ pub fn default_epochs(simulator: &Simulator) -> usize {
 /// Why a training gave no model.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Too few samples asked for.
+    /// The number of training samples is too small.
     #[error("{0} training samples are too few: at least {MINIMUM_SAMPLES} are needed")]
     TooFewSamples(usize),
     /// A setting that must be positive is not.
@@ -141,7 +141,7 @@ pub fn train(
 ) -> Result<Trained, Error> {
     check(samples, noise_range, flow_settings, settings)?;
     let fitted = starts_at_fit(simulator);
-    // The normal distribution at a fit reaches beyond the prior by itself and needs no margin.
+    // The normal distribution at a fit extends beyond the prior already, so that no margin is needed.
     let space = if fitted { simulator.space().clone() } else { simulator.training_space() };
     let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
     let training = draw(samples, "training set")?;
@@ -214,6 +214,7 @@ impl Task<'_> {
         Ok(crate::flow::train::train(flow, weights, samples, epoch, &validation, self.settings, on_epoch)?)
     }
 
+    /// Simulated measurements of a training set, with noise and missing modes from the random stream named `purpose`.
     fn observed(&self, set: &TrainingSet, purpose: &str) -> Vec<Observation> {
         observe(self.simulator, self.conditions, set, &mut stats::stream(self.settings.seed, purpose))
     }
@@ -287,6 +288,7 @@ pub fn diverged(manifest: &Manifest) -> bool {
     matches!(manifest.training.stopped, Stopped::Diverged { .. })
 }
 
+/// Checks the ranges of all settings.
 fn check(samples: usize, noise_range: NoiseRange, flow: &FlowSettings, settings: &TrainSettings) -> Result<(), Error> {
     let NoiseRange { lowest, highest } = noise_range;
     if !(lowest > 0.0 && highest.is_finite() && lowest < highest && (lowest..=highest).contains(&1.0)) {
@@ -393,7 +395,7 @@ pub fn validate(
     })
 }
 
-/// Largest |u − u'| after x → z → x', where u is the position in the training box.
+/// Error of the numerical inverse of the flow: largest |u − u'| after x → z → x', where u is the position in the training box.
 fn inverse_error(
     baseline: &Baseline,
     theta: &DMatrix<f64>,

@@ -57,7 +57,8 @@ pub struct Data {
 }
 
 impl Data {
-    /// Sorts measurements by time and converts them to rows.
+    /// Sorts n measurements by time and converts them to rows. Frequencies become logarithms, and a noise that a measurement
+    /// does not state is that of the structure.
     pub fn new(simulator: &Simulator, measurements: &[ModalMeasurement]) -> Self {
         let mut sorted: Vec<&ModalMeasurement> = measurements.iter().collect();
         sorted.sort_by_key(|m| m.measured_at);
@@ -145,7 +146,8 @@ impl Data {
 }
 
 impl Column {
-    /// Its known numbers in `rows`, in that order; empty for categories.
+    /// Its finite numbers in the rows with the indices `rows`, in that order and in the unit of the covariate, `[≤ rows]`;
+    /// empty for categories.
     pub fn numbers(&self, rows: &[usize]) -> Vec<f64> {
         match &self.values {
             Values::Numbers(values) => rows.iter().map(|r| values[*r]).filter(|v| v.is_finite()).collect(),
@@ -154,6 +156,7 @@ impl Column {
     }
 }
 
+/// The values of one covariate in all rows; of categories if `category` is true, otherwise of numbers.
 fn column(name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
     let values = || sorted.iter().map(|m| m.covariates.get(name));
     if !category {

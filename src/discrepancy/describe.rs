@@ -1,4 +1,4 @@
-//! Causes in words and numbers for a person.
+//! Causes as sentences and numbers for a reader of the diagnosis.
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
@@ -102,6 +102,7 @@ pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
     TargetName { kind: kind.to_owned(), name, between, level: candidate.level.clone() }
 }
 
+/// Name of an order of modes: which mode was overlooked, or which modes were swapped.
 fn order_name(order: &[usize]) -> String {
     if let Some(skipped) = (0..order.len()).find(|m| order[*m] == m + 1 && !order.contains(m)) {
         return format!("mode {} overlooked", skipped + 1);
@@ -283,7 +284,7 @@ struct Wording<'a> {
 }
 
 impl Wording<'_> {
-    /// The sentence of an effect of this size or range, with its standard deviation.
+    /// The sentence that describes the effect, given its size or effect range and the standard deviation of that value.
     fn sentence(&self, (value, std): (f64, f64)) -> String {
         let what = phrase(self.name);
         let covariate = self.effect.law.covariate.as_deref().unwrap_or_default();
@@ -320,6 +321,7 @@ impl Wording<'_> {
         self.name.kind == "added_spring"
     }
 
+    /// The verb for a change of this sign.
     fn changes(&self, value: f64) -> &'static str {
         match value {
             _ if self.adds_spring() => "changes by",
@@ -337,6 +339,7 @@ impl Wording<'_> {
         }
     }
 
+    /// The sentence of a constant effect.
     fn constant(&self, what: &str, value: f64, size: &str) -> String {
         if self.name.kind == "oscillator" {
             let (f, std) = rounded(self.psi[1], self.covariance[(1, 1)].max(0.0).sqrt());
@@ -349,6 +352,7 @@ impl Wording<'_> {
         format!("{what} is {size} {more} than in the simulation")
     }
 
+    /// The size of the effect for each category.
     fn each_category(&self) -> String {
         let each = |(i, level): (usize, &String)| {
             let std = self.covariance[(i, i)].max(0.0).sqrt();
@@ -358,6 +362,7 @@ impl Wording<'_> {
         self.effect.law.levels.iter().enumerate().map(each).collect::<Vec<_>>().join(", ")
     }
 
+    /// The sentence of a linear effect, with or without a lag.
     fn slope(&self, what: &str, covariate: &str) -> String {
         let place = self.effect.numbers.iter().position(|n| n.name == "slope_per_unit").unwrap_or_default();
         let (slope, std) = (self.psi[place], self.covariance[(place, place)].max(0.0).sqrt());
@@ -369,6 +374,7 @@ impl Wording<'_> {
         format!("{what} {} {} of {covariate}{later}", self.changes(slope), self.plus_minus(slope, std, &per))
     }
 
+    /// The sentence of a bilinear effect.
     fn two_slopes(&self, what: &str, covariate: &str) -> String {
         let first = self.effect.numbers.len() - 3;
         let (below, above, knee) = (self.psi[first], self.psi[first + 1], self.psi[first + 2]);

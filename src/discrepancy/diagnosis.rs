@@ -114,6 +114,7 @@ impl Diagnosis {
         text
     }
 
+    /// The verdict in words, with the causes and their probabilities.
     fn finding_in_words(&self) -> String {
         let sure = |p: f64| if p > 0.9995 { "above 0.999".to_owned() } else { format!("{p:.3}") };
         match self.verdict {
@@ -158,7 +159,8 @@ impl Diagnosis {
     }
 }
 
-/// What the mode with the largest improvement and the alarms gain; `None` without a measured mode.
+/// The gain in words: change of the error of the mode that improves most, and of the false alarms. `None` if no mode was measured
+/// in the rows held out.
 fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
     let rms = &gain.rms_error_percent;
     let finite = |m: &usize| rms.before[*m].is_finite() && rms.after[*m].is_finite();

@@ -7,7 +7,7 @@ use super::rank::Ranked;
 use crate::physics::effect::Target;
 use crate::simulator::Simulator;
 
-/// Modes above those measured that may be worth measuring.
+/// Greatest number of further modes, above those measured, that are considered for a measurement.
 const FURTHER_MODES: usize = 5;
 
 /// Difference between the frequencies that two causes predict above which a further mode is recommended, per cent.

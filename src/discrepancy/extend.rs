@@ -26,7 +26,7 @@ pub struct Extended {
     pub definition: StructureDefinition,
     /// What was added, in words.
     pub added: Vec<String>,
-    /// Causes that were not added, and why.
+    /// Causes that were not added, each with the reason.
     pub left_out: Vec<String>,
 }
 
@@ -45,7 +45,7 @@ pub enum Error {
     /// The causes cannot be fitted in the form that a structure takes.
     #[error("the causes cannot be fitted in a form that an assessment can use")]
     NoFit,
-    /// The new structure is invalid: with its effects it has no frequencies somewhere.
+    /// The new structure is not valid: under its effects, the frequencies cannot be computed for some parameters.
     #[error("the extended structure is refused: {0}")]
     Definition(#[from] DefinitionError),
 }
@@ -56,7 +56,8 @@ pub enum Error {
 /// batch contains neither what came before it nor what was set. A lagged effect is replaced by its best form without a lag.
 ///
 /// # Errors
-/// [`Error`].
+/// [`Error`] if no cause can be added, if the causes do not explain the data, if they cannot be fitted in this form, or if the
+/// extended structure is not valid.
 pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<Extended, Error> {
     if outcome.diagnosis.verdict == DiagnosisVerdict::NoneOfThese {
         return Err(Error::Unexplained);
@@ -93,7 +94,7 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
     // The causes were chosen without the rows held out; their numbers may be fitted to all rows.
     let fit = study.fit(&all, &effects, Some(&Start { fit: &outcome.after, psi })).ok_or(Error::NoFit)?;
     let definition = extended_definition(simulator, &bare, data, &fit, &added);
-    // Checks the whole structure: with an effect it may have no frequencies for some parameters.
+    // Checks the whole structure: under an effect, the frequencies may not exist for some parameters.
     Simulator::new(definition.clone())?;
     Ok(Extended { definition, added, left_out })
 }

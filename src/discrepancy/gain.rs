@@ -69,7 +69,7 @@ pub struct Gain {
 }
 
 /// The figures of one fit.
-struct Side {
+struct FitFigures {
     rms: Vec<f64>,
     densities: Vec<f64>,
     coverage: f64,
@@ -79,11 +79,12 @@ struct Side {
     errors: Vec<Vec<f64>>,
 }
 
-/// The gain of `after` over `before` on the rows of `holdout`; the scatter over `training` sets the alarm limits.
+/// The gain of the fit `after` over the fit `before` on the rows with the indices `holdout`; the scatter over the rows `training`
+/// sets the alarm limits.
 ///
 /// The standard error of the difference in log density is that of the mean over blocks of successive rows, and the intervals of
-/// the errors come from a bootstrap over the same blocks, because successive rows are correlated. `None` if the structure has
-/// no frequencies in some row.
+/// the errors come from a bootstrap over the same blocks, because successive rows are correlated. `None` if the
+/// frequencies cannot be computed in some row.
 pub fn gain(
     study: &Study<'_>,
     training: &[usize],
@@ -92,7 +93,7 @@ pub fn gain(
     after: &Fit,
     seed: u64,
 ) -> Option<Gain> {
-    let (a, b) = (side(study, training, holdout, before)?, side(study, training, holdout, after)?);
+    let (a, b) = (figures_of(study, training, holdout, before)?, figures_of(study, training, holdout, after)?);
     let n = holdout.len();
     let differences: Vec<f64> = b.densities.iter().zip(&a.densities).map(|(b, a)| b - a).collect();
     let mean = stats::mean(&differences);
@@ -141,7 +142,8 @@ pub fn gain(
     })
 }
 
-fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> Option<Side> {
+/// The figures of one fit on the rows `holdout`, with alarm limits from the rows `training`.
+fn figures_of(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> Option<FitFigures> {
     let views = study.view(holdout, fit)?;
     let modes = study.simulator.modes();
     let error = |view: &RowView| {
@@ -170,11 +172,11 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
 
     let space = study.simulator.space().as_slice();
     let shifts = shifts(study, &views);
-    let healthy = study.view(training, fit)?;
-    let own = self::shifts(study, &healthy);
+    let training_views = study.view(training, fit)?;
+    let training_shifts = self::shifts(study, &training_views);
     let level = ALARM_RATE / study.free().len().max(1) as f64;
     let limit = -stats::normal_quantile(level);
-    let undamaged = reference(&own);
+    let undamaged = reference(&training_shifts);
     let damaging = |k: usize, value: f64| match space[k].damage {
         DamageDirection::Decrease => -value,
         DamageDirection::Increase => value,
@@ -199,11 +201,11 @@ fn side(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> 
         let share = |s: &Vec<(usize, f64, f64)>| s[place].1 * of_stiffness;
         let held: Vec<f64> = shifts.iter().map(share).collect();
         spread.insert(space[k].name.clone(), 100.0 * stats::sample_std(&held).unwrap_or(f64::NAN));
-        let known: Vec<f64> = own.iter().map(share).map(|s| s * s).collect();
+        let known: Vec<f64> = training_shifts.iter().map(share).map(|s| s * s).collect();
         let scatter = stats::mean(&known).sqrt();
         detectable = detectable.max(100.0 * (limit + stats::normal_quantile(0.9)) * scatter);
     }
-    Some(Side {
+    Some(FitFigures {
         rms: (0..modes).map(rms).collect(),
         densities: views.iter().map(|v| v.log_density).collect(),
         coverage,

@@ -47,13 +47,13 @@ pub struct Candidate {
     pub level: Option<String>,
     /// Kind of cause.
     pub class: Class,
-    /// For a target of springs or masses, their number in the structure.
+    /// For a target of springs or masses, the number of springs or masses in the structure; otherwise 0.
     pub of: usize,
     /// Prior probability among the candidates. Those of different candidates differ by a factor of a few only.
     pub weight: f64,
 }
 
-/// All candidates for a structure and its data; their prior probabilities sum to 1.
+/// All candidates for a structure and the rows with the indices `rows` of its data; their prior probabilities sum to 1.
 pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Candidate> {
     let mut all = Vec::new();
     for target in targets(simulator, data) {
@@ -162,11 +162,11 @@ fn part_targets(simulator: &Simulator, structure: &Structure) -> Vec<Target> {
 
 /// Stiffness of each spring that acts on translations only, N/m: between two places, or a place and the ground.
 fn translational_n_per_m(structure: &Structure) -> Vec<f64> {
-    let sideways = |node: &Node| match node {
+    let translates = |node: &Node| match node {
         Node::Ground => true,
         Node::Dof(dof) => structure.attachment_points().iter().any(|point| point.dof == *dof),
     };
-    let between = |s: &&Spring| matches!(&s.form, Form::Spring(a, b) if sideways(a) && sideways(b));
+    let between = |s: &&Spring| matches!(&s.form, Form::Spring(a, b) if translates(a) && translates(b));
     structure.springs().iter().filter(between).map(|s| s.n_per_m).collect()
 }
 
@@ -200,8 +200,8 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
     pairs
 }
 
-/// Class and relative prior weight of a candidate. The weights differ by a factor of a few only, so that they rank candidates that
-/// data cannot distinguish, but do not outweigh data.
+/// Class and relative prior weight of a candidate. The weights differ by a factor of a few only, so that they rank candidates
+/// that data cannot distinguish, but do not outweigh data.
 fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
     let time = covariate == Some(TIME);
     match target {
@@ -229,7 +229,8 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
     }
 }
 
-/// Standard deviation of a numeric covariate over `rows`, in its own unit; 0 for a constant.
+/// Standard deviation of a numeric covariate over the rows with the indices `rows`, in the unit of the covariate; 0 for a
+/// constant.
 pub fn spread(column: &Column, rows: &[usize]) -> f64 {
     let numbers = column.numbers(rows);
     let std = stats::sample_std(&numbers).unwrap_or(0.0);
@@ -270,7 +271,7 @@ impl Candidate {
         vec![LawKind::Linear, LawKind::Quadratic, LawKind::Bilinear, LawKind::Exponential, LawKind::Lagged]
     }
 
-    /// Categories that have a number; the most frequent category is the reference and has none.
+    /// Names of the categories that have a coefficient; the most frequent category in `rows` is the reference and has none.
     pub fn levels(&self, data: &Data, rows: &[usize]) -> Vec<String> {
         let column = self.covariate.as_deref().and_then(|name| data.column(name));
         let Some(Values::Categories(names, indices)) = column.map(|c| &c.values) else { return Vec::new() };
@@ -359,8 +360,8 @@ impl Candidate {
             }
             Target::AddedSpring(..) => {
                 let structure = simulator.structure();
-                let sideways: Vec<f64> = structure.map_or_else(Vec::new, translational_n_per_m);
-                let mean = if sideways.is_empty() { 0.0 } else { stats::mean(&sideways) };
+                let stiffnesses: Vec<f64> = structure.map_or_else(Vec::new, translational_n_per_m);
+                let mean = if stiffnesses.is_empty() { 0.0 } else { stats::mean(&stiffnesses) };
                 // For a beam without springs, the stiffness k = m ω² of its mass at its lowest frequency.
                 let lowest = std::f64::consts::TAU * simulator.nominal_frequencies_hz()[0];
                 let kg: f64 = structure.map_or(0.0, |s| s.masses().iter().map(|m| m.kg).sum());

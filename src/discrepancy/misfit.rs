@@ -43,8 +43,9 @@ pub struct Remainder {
     pub p_value: f64,
 }
 
-/// Tests whether the residual of each mode and the best value of each free parameter depend on each covariate, and whether the
-/// mean residual of each mode differs from 0; the most significant first. `None` if the structure has no frequencies in some row.
+/// Tests in the rows with the indices `rows` whether the residual of each mode and the best value of each free parameter depend
+/// on each covariate, and whether the mean residual of each mode differs from 0; the most significant first. `None` if the
+/// frequencies cannot be computed in some row.
 pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfit>> {
     let views = study.view(rows, fit)?;
     let space = study.simulator.space();
@@ -84,8 +85,8 @@ pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfi
     Some(found)
 }
 
-/// Regressors of a covariate beside the constant, `[q][rows]`: the standardised covariate u and u², or an indicator of each
-/// category but one. Empty for a constant covariate.
+/// Regressors of a covariate in addition to the constant, `[q][rows]`: the standardised covariate u and u², or an indicator of
+/// each category but one. Empty for a constant covariate.
 fn regressors(values: &Values, rows: &[usize]) -> Vec<Vec<f64>> {
     match values {
         Values::Numbers(values) => {
@@ -166,7 +167,8 @@ fn constant(values: &[f64]) -> Option<(f64, f64)> {
     Some((mean, 2.0 * stats::normal_cdf(-z.abs())))
 }
 
-/// Values limited to five robust standard deviations, 1.4826 times the median absolute deviation, from the median.
+/// Values clamped to five robust standard deviations from the median; the robust standard deviation is 1.4826 times the median
+/// absolute deviation.
 fn clip(values: &[f64]) -> Vec<f64> {
     let middle = stats::quantile(values, 0.5);
     let off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
@@ -185,10 +187,10 @@ fn lag_one(values: &[f64]) -> f64 {
 }
 
 /// The most significant dependence of the residuals of a fit on a function of the covariates, including functions that no
-/// candidate has. The inner `None` means that there are no functions, the outer one that the structure has no frequencies.
+/// candidate has. The inner `None` means that there are no functions, the outer one that the frequencies cannot be computed.
 ///
 /// Each function is tested with an arbitrary response of each mode, and along the target of each cause found, since a cause with
-/// the wrong law leaves a residual there. Twice the promised gain of the score test, times the share of independent rows, is
+/// the wrong law leaves a residual there. Twice the estimated gain of the score test, times the share of independent rows, is
 /// compared with a χ² distribution.
 ///
 /// Source: Rao (1948), for score tests.
@@ -250,8 +252,8 @@ fn play(values: &[f64], width: f64) -> Vec<f64> {
 /// A function of covariates at each row.
 type CovariateFunction = (String, Vec<String>, Vec<f64>);
 
-/// Name, covariates and values, `[rows]`, of the functions that a remainder is sought in: powers, kinks, hysteresis and rates of a
-/// number, indicators of categories, and products of two.
+/// Name, covariates and values, `[rows]`, of the functions that a remainder is sought in: powers, kinks, hysteresis and rates
+/// of a number, indicators of categories, and products of two.
 fn functions(data: &Data, rows: &[usize]) -> Vec<CovariateFunction> {
     let mut numeric: Vec<(String, Vec<f64>)> = Vec::new();
     let mut categories: Vec<(String, String, Vec<f64>)> = Vec::new();

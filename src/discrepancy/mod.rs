@@ -1,16 +1,32 @@
-//! Diagnosis: which effect does a simulation lack, how sure is that, and what would including it gain?
+//! Diagnosis: which effect a simulation lacks, with what probability, and how much the predictions improve with it.
 //!
 //! [`diagnose`] fits the simulation to measurements, ranks every combination of target, law and covariate as a possible cause of
 //! the deviations, and measures on rows held out what the causes gain.
 //!
 //! - [`data`]: measurements, covariates and settings by row; [`holdout`]: the rows held out;
 //! - [`grammar`]: the candidates; [`effect`]: an effect whose numbers are fitted;
-//! - [`model`]: the likelihood and its maximum, with `problem`, `row` and [`response`] below it; [`study`] and [`fit`]: what goes
-//!   in and what comes out;
+//! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
+//!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
 //! - [`misfit`]: deviations before and after; [`gain`]: errors before and after on rows held out;
-//! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its words; [`report`]: the HTML page;
+//! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its text; [`report`]: the HTML page;
 //! - [`extend`]: a new version of the structure with the causes as effects.
+//!
+//! # Words
+//!
+//! | word | here |
+//! |---|---|
+//! | row | one measurement: its frequencies, covariates and settings |
+//! | modes present | the modes that were measured in a row |
+//! | setting | value of a parameter that the experimenter set; a parameter that is not set in every row is free |
+//! | cause | an effect that the simulation lacks; a candidate is a possible cause |
+//! | numbers ψ | the coefficients of the law of an effect, and the tuning frequency of an oscillator |
+//! | known effects | the effects that the structure file has already; they come first in every fit |
+//! | spread | standard deviation of a parameter between rows |
+//! | tails | degrees of freedom ν of the t distribution of the residuals |
+//!
+//! The frequencies cannot be computed where the structure is a mechanism, or where an effect leaves less than 2 % of a stiffness,
+//! mass or frequency. A fit that needs them there returns `None`.
 
 pub mod data;
 pub mod describe;
@@ -75,8 +91,8 @@ pub enum Error {
     /// The rows to hold out are not in the data.
     #[error("the hold-out {0}")]
     Holdout(String),
-    /// The structure has no frequencies near the data.
-    #[error("the simulation cannot be fitted to these data: it has no natural frequencies for parameters near their best values")]
+    /// The natural frequencies cannot be computed for parameters near the best fit.
+    #[error("the simulation cannot be fitted to these data: its natural frequencies cannot be computed for parameters near the best fit")]
     NoFit,
     /// Threads cannot be started.
     #[error("the threads to compute on cannot be started: {0}")]
@@ -85,13 +101,14 @@ pub enum Error {
 
 /// Finds the effects that a simulation lacks to explain measurements, with their probabilities and their gain on rows held out.
 ///
-/// Causes are found by forward selection on the rows that are not held out. Each candidate is a [`FittedEffect`] beside the
-/// free parameters of the structure, compared by its evidence (see [`model`] for the likelihood and [`rank::rank`] for the
-/// probabilities). The seed only affects the bootstrap intervals of the gain. `progress` is called at each step.
+/// Causes are found by forward selection on the rows that are not held out. Each candidate is a [`FittedEffect`] that is fitted
+/// together with the free parameters of the structure, and compared by its evidence (see [`model`] for the likelihood and
+/// [`rank::rank`] for the probabilities). The seed only affects the bootstrap intervals of the gain. `progress` is called at
+/// each step.
 ///
 /// # Errors
-/// Fewer than 30 rows to search; a hold-out that names a column or category that the data do not have; a structure without
-/// frequencies near the data; threads that cannot be started.
+/// Fewer than 30 rows to search; a hold-out that names a column or category that the data do not have; natural frequencies
+/// that cannot be computed near the best fit; threads that cannot be started.
 ///
 /// # Example
 /// The second spring of a chain of three masses softens with temperature, which the structure file does not know:
@@ -227,6 +244,7 @@ fn run(
     })
 }
 
+/// The verdict for a number of causes, whether one of them is ambiguous, and a deviation that they do not explain.
 fn verdict(causes: usize, ambiguous: bool, remainder: Option<&Remainder>) -> DiagnosisVerdict {
     match causes {
         _ if remainder.is_some() => DiagnosisVerdict::NoneOfThese,
@@ -237,11 +255,12 @@ fn verdict(causes: usize, ambiguous: bool, remainder: Option<&Remainder>) -> Dia
     }
 }
 
+/// The note that says why the gain was not measured.
 fn why_no_gain(held_out: usize) -> &'static str {
     if held_out < 2 {
         "no rows are held out: the gain is not measured"
     } else {
-        "the causes cannot be extrapolated to the rows held out, where their covariates would leave no stiffness or mass: the gain \
-         is not measured"
+        "the causes cannot be extrapolated to the rows held out, because at their covariates a stiffness or mass would not be positive: \
+         the gain is not measured"
     }
 }

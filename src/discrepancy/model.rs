@@ -31,7 +31,7 @@ const MOST_STEPS: usize = 40;
 const MANY_ROWS: usize = 1_200;
 const FEW_ROWS: usize = 400;
 
-/// A fit ends when a step promises less than this, nats.
+/// A fit ends when the expected gain in log posterior of a step is below this, nats.
 const ENOUGH_NATS: f64 = 5e-3;
 
 /// One row under a fit; shapes are `[present modes]` unless said otherwise.
@@ -55,9 +55,10 @@ pub struct RowView {
 }
 
 impl Study<'_> {
-    /// The posterior maximum over `rows` with `effects`, started from `start` if given.
+    /// The posterior maximum for the rows with the indices `rows` and with `effects`, by Fisher scoring from `start` if it is
+    /// given.
     ///
-    /// `None` if the structure has no frequencies at the start, or if the information at the maximum is singular.
+    /// `None` if the frequencies cannot be computed at the start, or if the information at the maximum is singular.
     pub fn fit(&self, rows: &[usize], effects: &[FittedEffect], start: Option<&Start<'_>>) -> Option<Fit> {
         let problem = Problem::new(self, rows, effects);
         let (mut here, mut tails) = self.first_point(&problem, start)?;
@@ -112,7 +113,8 @@ impl Study<'_> {
         Some((point?, tails))
     }
 
-    /// Residual, covariance and density of each of `rows` under a fit; `None` if the structure has no frequencies there.
+    /// Residual, covariance and density of each of the rows with the indices `rows` under a fit, `[rows]`; `None` if the
+    /// frequencies cannot be computed there.
     pub fn view(&self, rows: &[usize], fit: &Fit) -> Option<Vec<RowView>> {
         let problem = Problem::new(self, rows, &fit.effects);
         let responses = problem.responses(&fit.mean, &problem.sizes(&fit.psi).values, &[])?;
@@ -171,6 +173,7 @@ impl Study<'_> {
         self.free.iter().map(mean).chain(numbers).collect()
     }
 
+    /// [`Self::view`] of one row, which has the index `place` in `responses`.
     fn row_view(&self, row: usize, fit: &Fit, density: &Density, responses: &Responses, place: usize) -> RowView {
         let y = &self.data.log_frequencies[row];
         let present = self.present[row].0.clone();

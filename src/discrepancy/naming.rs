@@ -1,4 +1,4 @@
-//! The candidates that an answer names, and the alternatives that it reports.
+//! Selection of the candidates that a diagnosis names as causes, and of the alternatives that it reports.
 
 use super::data::Data;
 use super::describe::{self, Cause};

@@ -71,6 +71,7 @@ pub(super) fn notes(
     notes
 }
 
+/// Notes on modes that were measured in few rows or in none.
 fn modes_seldom_measured(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<String> {
     let note = |mode: usize| {
         let measured = rows.iter().filter(|r| data.log_frequencies[**r][mode].is_finite()).count();
@@ -99,7 +100,7 @@ fn filled(column: &Column, values: &[f64], rows: &[usize], notes: &mut Vec<Strin
     if known.len() < rows.len() {
         let missing = rows.len() - known.len();
         notes.push(format!(
-            "{name} is missing in {missing} of {} rows: there, its effects are taken at their level",
+            "{name} is missing in {missing} of {} rows: in these rows each of its effects consists of its level alone",
             rows.len()
         ));
     }
@@ -107,6 +108,7 @@ fn filled(column: &Column, values: &[f64], rows: &[usize], notes: &mut Vec<Strin
     Some(rows.iter().map(|r| if values[*r].is_finite() { values[*r] } else { mean }).collect())
 }
 
+/// A note on a covariate with too few or too many categories.
 fn unusable_categories(name: &str, names: &[String], indices: &[Option<usize>], rows: &[usize]) -> Option<String> {
     let mut used: Vec<usize> = rows.iter().filter_map(|r| indices[*r]).collect();
     used.sort_unstable();
@@ -121,6 +123,7 @@ fn unusable_categories(name: &str, names: &[String], indices: &[Option<usize>], 
     }
 }
 
+/// Notes on settings and estimated parameters outside their priors.
 fn outside_priors(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit) -> Vec<String> {
     let mut notes = Vec::new();
     for (k, p) in simulator.space().iter().enumerate() {
@@ -135,7 +138,7 @@ fn outside_priors(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit)
         if !p.prior().contains(&fit.mean[k]) {
             notes.push(format!(
                 "the data give {} as {:.4} {}, outside its prior ({} to {}): the units, the nominal values or the simulation \
-                 are far from right",
+                 must be wrong",
                 p.name, fit.mean[k], p.unit, p.lower, p.upper
             ));
         }

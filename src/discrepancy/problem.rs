@@ -57,7 +57,7 @@ pub(super) struct Point {
 pub(super) struct ScoringStep {
     /// Change of the unknowns, `[unknowns]`.
     pub(super) by: DVector<f64>,
-    /// Half the product of step and gradient: the gain in log posterior if it were quadratic, nats.
+    /// Half the product of step and gradient: the expected gain in log posterior, which is exact for a quadratic one, nats.
     pub(super) promised_nats: f64,
 }
 
@@ -78,6 +78,7 @@ impl<'a> Problem<'a> {
         self.effects.iter().flat_map(|e| &e.numbers)
     }
 
+    /// Number of unknowns of the mean: free means and all ψ.
     fn means(&self) -> usize {
         self.study.free.len() + self.numbers().count()
     }
@@ -86,6 +87,7 @@ impl<'a> Problem<'a> {
         self.means() + self.study.free.len() + self.modes()
     }
 
+    /// The prior means of all unknowns, `[unknowns]`.
     pub(super) fn origin(&self) -> DVector<f64> {
         DVector::zeros(self.unknowns())
     }
@@ -96,7 +98,7 @@ impl<'a> Problem<'a> {
         (f64::midpoint(p.lower, p.upper), 0.5 * (p.upper - p.lower))
     }
 
-    /// Sets the unknowns to those of a start.
+    /// Sets the unknowns `eta` to the values of a start.
     pub(super) fn set_out(&self, eta: &mut DVector<f64>, start: &Start<'_>) {
         let free = &self.study.free;
         for (column, k) in free.iter().enumerate() {
@@ -207,8 +209,8 @@ impl<'a> Problem<'a> {
         Sizes { values, slopes, moved }
     }
 
-    /// Responses of all rows under the effects and `further` targets; `sizes`: `[sizes, rows]`. `None` if the structure has no
-    /// frequencies in some row.
+    /// Responses of all rows under the effects and `further` targets; `sizes`: `[sizes, rows]`. `None` if the frequencies
+    /// cannot be computed in some row.
     pub(super) fn responses(&self, mean: &[f64], sizes: &DMatrix<f64>, further: &[Target]) -> Option<Responses> {
         let targets: Vec<Target> = self.effects.iter().map(|e| &e.target).chain(further).cloned().collect();
         let settings = &self.study.data.settings;
@@ -217,7 +219,7 @@ impl<'a> Problem<'a> {
         Responses::new(self.study.simulator, &targets, &theta, sizes)
     }
 
-    /// Value, gradient and information at a point; `None` if the structure has no frequencies in some row.
+    /// Value, gradient and information at a point; `None` if the frequencies cannot be computed in some row.
     pub(super) fn point(&self, eta: &DVector<f64>, tails: f64) -> Option<Point> {
         let (mean, spread, noise, psi) = self.unpack(eta);
         let data = self.study.data;
@@ -250,9 +252,9 @@ impl<'a> Problem<'a> {
                     of_row.slopes[i * means + column] = inverse * by_size[*moved] * slope * scales[column];
                 }
             }
-            let (distance, log_stretch) = of_row.solve(present.len());
+            let (distance, half_log_det_scaled) = of_row.solve(present.len());
             let log_noise = log_noise + present.iter().map(|mode| log_factors[*mode]).sum::<f64>();
-            distances.push((distance, present.len(), log_noise + log_stretch));
+            distances.push((distance, present.len(), log_noise + half_log_det_scaled));
             of_row.add(present, distance, tails, &mut gradient, &mut information);
         }
         let log_likelihood = Density::new(tails, self.modes()).total(&distances);

@@ -11,7 +11,7 @@ use super::study::Study;
 use crate::physics::effect::Target;
 use crate::simulator::law::LawKind;
 
-/// Candidates that are fitted in each search: the most promising, and the best of each kind of target.
+/// Candidates that are fitted in each search: those with the largest estimated gain, and the best of each kind of target.
 const FITTED: usize = 16;
 const OF_EACH_KIND: usize = 1;
 
@@ -21,13 +21,13 @@ const REFINED: usize = 5;
 /// Evidence that a covariate must add to a constant effect on the same target, nats.
 const COVARIATE_NATS: f64 = 3.0;
 
-/// Promised gain of an arbitrary constant for each mode; below it, no constant effect can be accepted. Nats.
+/// If an arbitrary constant for each mode has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
-/// Greatest number of hosts at which an oscillator is tried.
+/// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
 const MOST_HOSTS: usize = 12;
 
-/// Number of times of a step that data can distinguish: the prior of its time.
+/// Number of times of a step that data can distinguish. The prior of the time of a step is uniform over them.
 const STEP_TIMES: f64 = 20.0;
 
 /// A candidate with its best law.
@@ -51,12 +51,12 @@ struct Trial {
     candidate: usize,
     law: LawKind,
     fit: Fit,
-    /// What numbers that are not fitted, such as the time of a step, cost, nats.
+    /// Penalty for numbers that are chosen but not fitted, such as the time of a step, nats.
     cost_nats: f64,
 }
 
 impl Trial {
-    /// Fits what a score test promises; `None` if the fit fails.
+    /// Fits the effect of a score test, starting from its first guess; `None` if the fit fails.
     fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, candidate: &Candidate, promise: &Promise) -> Option<Self> {
         let effect =
             candidate.effect(study.simulator, study.data, rows, promise.law, promise.with_level, promise.step_days);
@@ -67,15 +67,17 @@ impl Trial {
     }
 }
 
-/// Ranks all candidates for one cause beside those of `fit`, and estimates the share of independent rows under the best.
+/// Ranks all candidates for one cause in addition to the effects of `fit`, and estimates the share of independent rows under the
+/// best candidate. `rows`: indices of the rows that are used.
 ///
 /// ```text
 ///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) − cost ) − ln(number of laws) + ln prior,    r = (1 − ρ)/(1 + ρ)
 /// ```
 ///
 /// E: evidence by Laplace's method; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
-/// that promise most in a score test are fitted. The first `known` effects of the fit belong to the structure: their numbers
-/// may be wrong, so a further effect of the same kind is allowed for them. `None` if the structure has no frequencies.
+/// with the largest estimated gain in a score test are fitted. The first `known` effects of the fit belong to the structure:
+/// their numbers may be wrong, so that a further effect of the same kind is allowed for them. `None` if the frequencies cannot
+/// be computed.
 ///
 /// Source: Kass and Raftery (1995), JASA 90.
 pub fn rank(
@@ -120,8 +122,8 @@ pub fn rank(
     Some((by_probability(study, fit, candidates, &tried, share), share))
 }
 
-/// The promises that are fitted, the best of each candidate only: the first [`FITTED`], and further ones of kinds of target
-/// that are not among them.
+/// The score tests whose effects are fitted, only the best of each candidate: the first [`FITTED`], and further ones for kinds of
+/// target that are not among them.
 fn most_promising<'a>(promised: &'a [Promise], candidates: &[Candidate]) -> Vec<&'a Promise> {
     let mut chosen: Vec<&Promise> = Vec::new();
     let mut kinds: Vec<(std::mem::Discriminant<Target>, usize)> = Vec::new();
@@ -199,7 +201,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
     tunings.extend(f.windows(2).flat_map(|w| [0.7 * w[0] + 0.3 * w[1], 0.3 * w[0] + 0.7 * w[1]]));
     tunings.extend([1.1 * f[f.len() - 1], 1.5 * f[f.len() - 1]]);
     let ordered = fit.effects.iter().any(|e| matches!(e.target, Target::ModeOrder(_)));
-    // Trying hundreds of hosts would take hours: every so-manyth host represents its neighbours.
+    // Fits for hundreds of attachment points would take hours: only every n-th point is tried and represents its neighbours.
     let hosts = study.simulator.structure().map_or(0, |s| s.attachment_points().len());
     let every = hosts.div_ceil(MOST_HOSTS);
     let mut jobs: Vec<(usize, Option<Vec<f64>>)> = Vec::new();
@@ -235,7 +237,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
 }
 
 /// Effective number of independent rows as a share of all rows: (1 − ρ)/(1 + ρ), with ρ the correlation of successive whitened
-/// residuals; 1 if ρ is within three standard errors of 0. `None` if the structure has no frequencies in some row.
+/// residuals; 1 if ρ is within three standard errors of 0. `None` if the frequencies cannot be computed in some row.
 fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64> {
     let views = study.view(rows, fit)?;
     let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.simulator.modes()];
@@ -248,7 +250,7 @@ fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64
     }
     let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);
     for values in &mut series {
-        // Without its mean: a constant deviation is not a correlation in time.
+        // The mean is subtracted, because a constant deviation is not a correlation in time.
         let mean = crate::stats::mean(values);
         for value in values.iter_mut() {
             *value -= mean;
@@ -261,6 +263,7 @@ fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64
     let chance = 3.0 / f64::max(pairs, 1.0).sqrt();
     Some(if correlation > chance { (1.0 - correlation) / (1.0 + correlation) } else { 1.0 })
 }
+
 /// ln Σ exp(values); −∞ for no values.
 pub(super) fn log_sum(values: impl Iterator<Item = f64>) -> f64 {
     let values: Vec<f64> = values.collect();

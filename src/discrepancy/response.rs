@@ -1,6 +1,6 @@
 //! Frequencies and their derivatives for many rows that differ in a few numbers.
 //!
-//! Rows differ in the sizes of effects and in settings, and the frequencies depend smoothly on both. The eigenproblem is
+//! Rows differ in the sizes of effects and in settings, and the frequencies are smooth functions of both. The eigenproblem is
 //! therefore solved only at Chebyshev nodes of these numbers, between which the results are interpolated. Numbers with few
 //! different values (categories, steps) are used exactly. Effects that multiply all frequencies by one factor, and effects of the
 //! instrument, need no eigenproblem and are applied afterwards. If interpolation saves nothing, every different row is solved.
@@ -60,7 +60,7 @@ impl Responses {
     }
 
     /// The responses for parameters `theta`, `[d, rows]`, and sizes of all targets in turn, `[sizes, rows]`; `None` if the
-    /// structure has no frequencies in some row.
+    /// frequencies cannot be computed in some row.
     pub fn new(simulator: &Simulator, targets: &[Target], theta: &DMatrix<f64>, sizes: &DMatrix<f64>) -> Option<Self> {
         let after = Afterwards::new(simulator, targets);
         if after.steps.is_empty() {
@@ -181,7 +181,7 @@ struct Known {
     key: Vec<u64>,
 }
 
-/// Targets that are applied after the eigenproblem is solved.
+/// Division of the targets into those that are applied after the eigenproblem is solved and those that are part of it.
 struct Afterwards {
     /// Index of each such target, and index of its size.
     steps: Vec<(usize, usize)>,
@@ -190,6 +190,7 @@ struct Afterwards {
 }
 
 impl Afterwards {
+    /// Divides the targets of a simulation.
     fn new(simulator: &Simulator, targets: &[Target]) -> Self {
         let springs = simulator.structure().map_or(0, |s| s.springs().len());
         let masses = simulator.structure().map_or(0, |s| s.masses().len());
@@ -344,8 +345,8 @@ impl Dimension {
     }
 }
 
-/// The size that changes a target by its own value: 1 for relative targets. For other targets it is unknown, and a tiny number makes
-/// the relative range large, so that the greatest number of nodes is used.
+/// The size at which an effect changes its target by 100 %: 1 for relative targets. For other targets it is unknown; the tiny
+/// number returned for them makes their relative range large, so that the greatest number of nodes is used.
 fn scale(size: usize, targets: &[Target]) -> f64 {
     let mut first = 0;
     for target in targets {
@@ -368,7 +369,7 @@ mod tests {
 
     /// Compares the responses with the solution of one eigenproblem for each row.
     #[test]
-    fn responses_of_many_rows_are_those_of_each_row() {
+    fn interpolated_responses_equal_those_of_single_rows() {
         let text = include_str!("../../models/three-dof/structure.toml");
         let simulator = Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap();
         let all: Vec<usize> = (0..6).collect();

@@ -128,7 +128,7 @@ impl RowSums {
     ) {
         let (p, f, means) = (present.len(), self.free, self.means);
         let weight = weight(distance, p, tails);
-        let (flat, deep) = information_shares(p, tails);
+        let (factor_a, factor_b) = information_factors(p, tails);
         self.slopes_absorbed.fill(0.0);
         for i in 0..p {
             let line = &self.slopes[i * means..(i + 1) * means];
@@ -141,17 +141,17 @@ impl RowSums {
             }
             for (a, slope) in line.iter().enumerate() {
                 gradient[a] += weight * slope * self.solved[i];
-                let flat_slope = flat * slope;
+                let scaled_slope = factor_a * slope;
                 for (sum, other) in information.column_mut(a).as_mut_slice()[a..means].iter_mut().zip(&line[a..]) {
-                    *sum += flat_slope * other;
+                    *sum += scaled_slope * other;
                 }
             }
         }
         for line in self.slopes_absorbed.chunks_exact(means.max(1)) {
             for (a, slope) in line.iter().enumerate() {
-                let flat_slope = flat * slope;
+                let scaled_slope = factor_a * slope;
                 for (sum, other) in information.column_mut(a).as_mut_slice()[a..means].iter_mut().zip(&line[a..]) {
-                    *sum -= flat_slope * other;
+                    *sum -= scaled_slope * other;
                 }
             }
         }
@@ -180,11 +180,12 @@ impl RowSums {
         for u in 0..count {
             let own = self.products[u * count + u];
             gradient[place(u)] += weight * self.score[u] * self.score[u] - own;
-            // The modes present ascend, so that the lower triangle here maps into the lower triangle there.
-            let (flat, deep) = (2.0 * flat, deep * own);
+            // The indices of the modes present ascend, so that the lower triangle for this row maps into the lower triangle of
+            // `information`.
+            let (twice_a, b_own) = (2.0 * factor_a, factor_b * own);
             for v in 0..=u {
                 let shared = self.products[u * count + v];
-                information[(place(u), place(v))] += flat * shared * shared - deep * self.products[v * count + v];
+                information[(place(u), place(v))] += twice_a * shared * shared - b_own * self.products[v * count + v];
             }
         }
     }
@@ -201,7 +202,7 @@ pub(super) fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
 
 /// Factors of the expected information of a t distribution: a = (ν + p)/(ν + p + 2) and b = 2/(ν + p + 2); 1 and 0 for a normal
 /// distribution.
-fn information_shares(modes: usize, tails: f64) -> (f64, f64) {
+fn information_factors(modes: usize, tails: f64) -> (f64, f64) {
     if tails.is_finite() {
         let total = tails + modes as f64;
         (total / (total + 2.0), 2.0 / (total + 2.0))
@@ -287,7 +288,7 @@ mod tests {
 
     /// Compares distance, ½ ln|V|, score and information of a row with dense matrices.
     #[test]
-    fn a_row_is_that_of_dense_matrices() {
+    fn score_and_information_equal_those_of_dense_matrices() {
         for (p, f, means, tails) in [(4, 2, 3, 5.0), (3, 3, 5, f64::INFINITY), (2, 4, 4, 3.0), (3, 0, 2, 10.0)] {
             let mut stream = stats::stream(p as u64, "a row");
             let mut random =
@@ -299,7 +300,7 @@ mod tests {
             row.residual[..p].copy_from_slice(e.as_slice());
             row.slopes[..p * means].copy_from_slice(d.transpose().as_slice());
             row.spreads[..p * f].copy_from_slice(u.transpose().as_slice());
-            let (distance, log_stretch) = row.solve(p);
+            let (distance, half_log_det) = row.solve(p);
             let unknowns = means + f + 6;
             let (mut gradient, mut information) = (DVector::zeros(unknowns), DMatrix::zeros(unknowns, unknowns));
             row.add(&present, distance, tails, &mut gradient, &mut information);
@@ -307,11 +308,11 @@ mod tests {
             let v = DMatrix::identity(p, p) + &u * u.transpose();
             let inverse = v.clone().try_inverse().unwrap();
             assert!((distance - (e.transpose() * &inverse * &e)[(0, 0)]).abs() < 1e-12);
-            assert!((log_stretch - 0.5 * v.determinant().ln()).abs() < 1e-12);
+            assert!((half_log_det - 0.5 * v.determinant().ln()).abs() < 1e-12);
             let weight = weight(distance, p, tails);
-            let (flat, deep) = information_shares(p, tails);
+            let (factor_a, factor_b) = information_factors(p, tails);
             let of_means = d.transpose() * &inverse * &e * weight;
-            let between = d.transpose() * &inverse * &d * flat;
+            let between = d.transpose() * &inverse * &d * factor_a;
             let g = DMatrix::from_fn(p, f + p, |i, k| if k < f { u[(i, k)] } else { f64::from(u8::from(i == k - f)) });
             let (h, b) = (g.transpose() * &inverse * &e, g.transpose() * &inverse * &g);
             let mut expected = DVector::zeros(unknowns);
@@ -328,7 +329,7 @@ mod tests {
                 for l in 0..=k {
                     let shared = b[(k, l)];
                     expected_information[(place(k), place(l))] =
-                        flat * 2.0 * shared * shared - deep * b[(k, k)] * b[(l, l)];
+                        factor_a * 2.0 * shared * shared - factor_b * b[(k, k)] * b[(l, l)];
                 }
             }
             assert!((gradient - expected).amax() < 1e-12, "{p} modes, {f} parameters");

@@ -1,10 +1,10 @@
-//! Score tests: the gain in log likelihood that each candidate promises, without fitting it.
+//! Score tests: an estimate of the gain in log-likelihood of each candidate, from derivatives at size 0 and without fitting it.
 //!
 //! e: residual of the present fit; D: derivative of the mean by the numbers ψ of a candidate, at size 0; N: derivative by the
 //! numbers that are fitted already; w: weight of a row; V: covariance of its residual; ⟨a, b⟩ = Σ_j w_j aᵀ V_j⁻¹ b:
 //!
 //! ```text
-//!  S = ⟨D, e⟩,   I = ⟨D, D⟩ − ⟨D, N⟩⟨N, N⟩⁻¹⟨N, D⟩,    promised gain = ½ Sᵀ I⁻¹ S  nats,    first guess ψ = I⁻¹ S
+//!  S = ⟨D, e⟩,   I = ⟨D, D⟩ − ⟨D, N⟩⟨N, N⟩⁻¹⟨N, D⟩,    estimated gain = ½ Sᵀ I⁻¹ S  nats,    first guess ψ = I⁻¹ S
 //! ```
 //!
 //! Source: Rao (1948), Proc. Cambridge Phil. Soc. 44.
@@ -36,7 +36,7 @@ pub struct Promise {
     pub law: LawKind,
     /// Whether the law has a level.
     pub with_level: bool,
-    /// Promised gain, nats.
+    /// Estimated gain in log-likelihood, nats.
     pub nats: f64,
     /// Number of linear numbers that are identifiable.
     pub numbers: usize,
@@ -58,7 +58,8 @@ pub struct Whitened {
     factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
 }
 
-/// Products of one direction T in each row: w TᵀV⁻¹e, w TᵀV⁻¹T, w TᵀV⁻¹N.
+/// Products of one direction T in the space of frequencies with residual and derivatives, for each row: w TᵀV⁻¹e, `[rows]`;
+/// w TᵀV⁻¹T, `[rows]`; w TᵀV⁻¹N, `[rows, N]`.
 pub struct Sums {
     along: DVector<f64>,
     square: DVector<f64>,
@@ -78,7 +79,8 @@ pub struct ModeSums {
 
 /// The result of a score test.
 pub struct Score {
-    /// Promised gain, nats; twice the gain has a χ² distribution with [`Self::numbers`] degrees of freedom by chance.
+    /// Estimated gain in log-likelihood, nats; twice the gain has a χ² distribution with [`Self::numbers`] degrees of freedom
+    /// by chance.
     pub nats: f64,
     /// First guess of the numbers; 0 in directions that are not identifiable.
     pub psi: Vec<f64>,
@@ -87,7 +89,7 @@ pub struct Score {
 }
 
 impl Whitened {
-    /// Whitens the rows of a fit; `None` if a covariance is singular or the structure has no frequencies in some row.
+    /// Whitens the rows of a fit; `None` if a covariance is singular or the frequencies cannot be computed in some row.
     pub fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, views: &[RowView]) -> Option<Self> {
         let slopes = study.nuisance(rows, fit)?;
         let mut factors = Vec::with_capacity(rows.len());
@@ -121,7 +123,7 @@ impl Whitened {
         Some(Self { residual, nuisance, inverse, factors })
     }
 
-    /// Products of the direction `direction(index of the row, mode)`.
+    /// Products of the direction whose component is `direction(index of the row, mode)`, in ln f per unit of the number.
     pub fn sums(&self, direction: impl Fn(usize, usize) -> f64) -> Sums {
         let rows = self.factors.len();
         let mut sums = Sums {
@@ -226,8 +228,9 @@ impl Whitened {
     }
 }
 
-/// The score tests of every candidate under each of its laws. Candidates that are not identifiable beside the fit are omitted, as
-/// are oscillators and orders of modes, which have no derivative at size 0. `None` if the structure has no frequencies.
+/// The score tests of every candidate under each of its laws. Candidates that are not identifiable in addition to the numbers
+/// of the fit are omitted, as are oscillators and orders of modes, which have no derivative at size 0. `None` if the
+/// frequencies cannot be computed.
 pub fn promises(
     study: &Study<'_>,
     rows: &[usize],

@@ -9,7 +9,7 @@ use super::progress::{Progress, Step};
 use super::rank::{log_sum, rank, Ranked};
 use super::study::Study;
 
-/// A further cause is accepted if the odds of all candidates together against none exceed this, nats.
+/// A further cause is accepted if the log odds of all candidates together against no further cause exceed this, nats.
 const ACCEPTED_NATS: f64 = 3.0;
 
 /// Greatest number of causes.
@@ -42,11 +42,11 @@ pub struct Selection {
     pub independent_share: f64,
 }
 
-/// Searches for causes one after another, then for each again with the others in place.
+/// Searches for causes in the rows with the indices `rows`, one after another, then for each again with the others in place.
 ///
 /// A cause is accepted if the candidates together have odds above exp(3) against no further cause, and if it does not clearly
-/// worsen the prediction of rows left out. `known`: the effects that the structure already has. `None` if the structure has no
-/// frequencies in some row.
+/// worsen the prediction of rows left out. `known`: the effects that the structure already has. `None` if the frequencies
+/// cannot be computed in some row.
 pub fn select(
     study: &Study<'_>,
     rows: &[usize],
@@ -67,7 +67,7 @@ pub fn select(
         let Some(best) = ranked.first().filter(|_| total > ACCEPTED_NATS) else { break };
         // A cause that cannot be evaluated on the rows left out is not accepted.
         let cross_validation = cross_validate(study, rows, &fit, &best.fit).unwrap_or((f64::NEG_INFINITY, 0.0));
-        // Nor is a cause that clearly predicts them worse, whatever it explains in the other rows.
+        // A cause that clearly worsens their prediction is not accepted either, however much it explains in the other rows.
         if cross_validation.0 + 2.0 * cross_validation.1 <= 0.0 {
             break;
         }
@@ -75,13 +75,14 @@ pub fn select(
         slots.push(Slot { ranked, cross_validation });
     }
     if slots.len() > 1 {
-        fit = look_again(study, rows, candidates, known.len(), fit, &mut slots, progress)?;
+        fit = reselect_each(study, rows, candidates, known.len(), fit, &mut slots, progress)?;
     }
     Some(Selection { base, fit, slots, tried, independent_share })
 }
 
-/// Removes each cause in turn and searches for it again: the first was chosen while the others still added to the scatter.
-fn look_again(
+/// Removes each cause in turn and searches for it again with the others in place, because the first causes were chosen while the
+/// effects of the later ones still added to the scatter.
+fn reselect_each(
     study: &Study<'_>,
     rows: &[usize],
     candidates: &[Candidate],
@@ -122,7 +123,7 @@ fn refit_without(study: &Study<'_>, rows: &[usize], fit: &Fit, effect: usize) ->
 }
 
 /// Mean gain in log predictive density of rows left out, second fit minus first, nats per row, and its standard error over
-/// blocks. `None` if either model has no frequencies in some row.
+/// blocks. `None` if the frequencies of either model cannot be computed in some row.
 fn cross_validate(study: &Study<'_>, rows: &[usize], before: &Fit, after: &Fit) -> Option<(f64, f64)> {
     let block = |place: usize| place * BLOCKS / rows.len();
     let fold = |number: usize| {

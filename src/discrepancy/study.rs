@@ -30,7 +30,7 @@ impl<'a> Study<'a> {
         Self { simulator, data, free, present }
     }
 
-    /// Indices of the parameters that are not set in every row.
+    /// Columns of the free parameters, which are not set in every row, `[free]`.
     pub fn free(&self) -> &[usize] {
         &self.free
     }

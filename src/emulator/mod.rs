@@ -204,7 +204,8 @@ impl Emulator {
         self.hull.is_outside(&x)
     }
 
-    /// Neighbouring modes that probably cross or veer between the runs, one entry per pair, by ascending mode.
+    /// Neighbouring modes that probably cross or veer sharply between the runs: at most one entry for each pair of neighbouring
+    /// modes, by ascending mode.
     pub fn crossings(&self) -> &[Crossing] {
         &self.crossings
     }
@@ -215,11 +216,11 @@ fn scaled(theta: f64, lower: f64, upper: f64) -> f64 {
     ((theta - lower) - (upper - theta)) / (upper - lower)
 }
 
-/// Coefficient of determination for a mean square error.
+/// Coefficient of determination of a prediction of `y`, `[n]`, with the mean square error `error`: 1 − error/var(y).
 fn r_squared(y: &[f64], error: f64) -> f64 {
     let centre = stats::mean(y);
     let variance = y.iter().map(|y| (y - centre).powi(2)).sum::<f64>() / y.len() as f64;
-    // A variance of the size of rounding errors counts as none.
+    // A variance of the size of rounding errors is treated as zero.
     if variance.sqrt() <= f64::EPSILON * centre.abs() {
         return 1.0;
     }

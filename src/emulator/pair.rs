@@ -12,7 +12,7 @@ use super::select::Fit;
 pub(super) struct Pair {
     /// The lower one of the two modes, from 0.
     pub lower: usize,
-    /// Smallest squared gap: its root mean square error.
+    /// Lower limit of the predicted squared gap: the root mean square error of its expansion.
     floor: f64,
 }
 
@@ -29,7 +29,7 @@ pub(super) struct PairFit {
 }
 
 impl Pair {
-    /// Replaces the mean and the squared gap D of the pair in `values` by ln f of its two modes.
+    /// Replaces the mean and the squared gap D of the pair in `values`, `[m]`, by ln f of its two modes.
     ///
     /// ```text
     ///  ln f = mean ∓ √D / 2

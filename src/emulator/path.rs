@@ -38,8 +38,9 @@ pub(super) struct Path<'a> {
 }
 
 impl<'a> Path<'a> {
-    /// A selection from `set` without any term yet, fitted to all runs except `held_out`. `set` begins with the constant, which is
-    /// chosen first; `correlations` holds φ_jᵀy of all candidates over all runs.
+    /// A selection from `set` (indices of candidates) that has no terms yet, fitted to `y`, `[n]`, at all runs except
+    /// `held_out`. `set` begins with the constant, which is chosen first; `correlations` holds φ_jᵀy of all candidates over all
+    /// runs, `[candidates]`.
     pub fn new(
         search: &'a Search<'a>,
         set: &'a [usize],
@@ -79,7 +80,7 @@ impl<'a> Path<'a> {
         false
     }
 
-    /// y minus the prediction at the runs held out.
+    /// y minus the prediction at the runs held out, `[held_out]`.
     pub fn held_out_residual(&self) -> &[f64] {
         self.regression.held_out_residual()
     }

@@ -34,7 +34,7 @@ impl Regression {
         Self::without(y, 0..0)
     }
 
-    /// [`Self::new`] fitted without the runs `held_out`, which are only predicted.
+    /// As [`Self::new`], but the rows `held_out` of `y`, `[n]`, are only predicted and not fitted.
     pub fn without(y: &[f64], held_out: Range<usize>) -> Self {
         Self {
             held_out,
@@ -68,7 +68,7 @@ impl Regression {
             upper.iter_mut().zip(&again).for_each(|(r, correction)| *r += correction);
             left = self.fitted_dot(&q, &q);
         }
-        // Written so that NaN is not added either.
+        // This form of the condition also rejects NaN.
         let independent = left > DEPENDENT * DEPENDENT * length;
         if !independent {
             return None;
@@ -99,7 +99,7 @@ impl Regression {
         self.projections.last().copied().unwrap_or(0.0)
     }
 
-    /// β = R⁻¹ Qᵀy.
+    /// Coefficients β = R⁻¹ Qᵀy of the columns, `[P]`.
     pub fn coefficients(&self) -> Vec<f64> {
         let mut coefficients = vec![0.0; self.terms()];
         for (column, projection) in self.inverse.iter().zip(&self.projections) {
@@ -110,12 +110,13 @@ impl Regression {
         coefficients
     }
 
-    /// y minus the prediction at the runs held out.
+    /// y minus the prediction at the runs held out, `[held_out]`.
     pub fn held_out_residual(&self) -> &[f64] {
         &self.residual[self.held_out.clone()]
     }
 
-    /// Residual of each run in a fit to all other runs, e_i/(1 − h_i), `[n]`; infinite if the other runs do not determine the fit.
+    /// Residual of each run in a fit to all other runs, e_i/(1 − h_i), `[n]`; infinite if the other runs do not determine the
+    /// fit.
     pub fn leave_one_out(&self) -> Vec<f64> {
         let one = |(e, h): (&f64, &f64)| if 1.0 - h > DECISIVE { e / (1.0 - h) } else { f64::INFINITY };
         self.residual.iter().zip(&self.leverage).map(one).collect()
@@ -151,7 +152,7 @@ impl Regression {
         &self.leverage
     }
 
-    /// Columns of R⁻¹, each from its first row to the diagonal.
+    /// Columns of R⁻¹, `[P][row]`, each from its first row to the diagonal.
     pub fn into_inverse(self) -> Vec<Vec<f64>> {
         self.inverse
     }
@@ -235,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn leaving_one_out_by_formula_is_leaving_it_out() {
+    fn the_leave_one_out_formula_equals_a_fit_without_the_run() {
         let mut stream = stats::stream(3, "regression test");
         let (n, terms) = (25, 7);
         // Powers of one variable: far from orthogonal, so that R matters.
@@ -268,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn a_column_that_repeats_another_stays_out() {
+    fn a_linearly_dependent_column_is_not_added() {
         let mut regression = Regression::new(&[1.0, 2.0, 4.0]);
         assert!(regression.push(&[1.0, 2.0, 3.0], None).is_some());
         assert!(regression.push(&[2.0, 4.0, 6.0], None).is_none());

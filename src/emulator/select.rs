@@ -94,7 +94,7 @@ impl Search<'_> {
             self.folds.iter().map(|fold| Path::new(self, set, y, correlations, fold.clone())).collect();
         let mut best = Choice { set, selected: Some(1), held_out: y.to_vec(), error: f64::INFINITY };
         for terms in 1..=most {
-            // Not `any`, which would stop at the first selection that advances.
+            // All selections must advance; `any` would stop at the first one that does.
             let moved = paths.iter_mut().map(Path::advance).fold(false, |any, moved| any | moved);
             if !moved {
                 break;

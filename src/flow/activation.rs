@@ -7,7 +7,7 @@ use candle_core::{bail, CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape,
 
 use super::kernel::sigmoid;
 
-/// silu(x) = x / (1 + exp(−x)), element by element; a tensor of the same shape.
+/// Sigmoid linear unit silu(x) = x / (1 + exp(−x)), element by element. The result has the shape of `x`.
 ///
 /// # Errors
 /// A candle error when `x` is neither f32 nor f64, or is not contiguous in the memory of the CPU.

@@ -66,7 +66,7 @@ pub fn to_bytes(weights: &Weights) -> Result<Vec<u8>, Error> {
     Ok(safetensors::serialize(views, None)?)
 }
 
-/// Reads a flow from the contents of a safetensors file, in the requested precision.
+/// Reads a flow from `bytes`, the contents of a safetensors file with f32 weights, and converts the weights to `dtype`.
 ///
 /// # Errors
 /// [`Error`], with one variant for each way a file can be wrong: truncated, of another architecture, not finite.

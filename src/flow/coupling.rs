@@ -89,6 +89,7 @@ impl CouplingUnit {
         self.on_first.as_ref()
     }
 
+    /// Splits the columns of `x` `[n, d]` into x₁ and x₂.
     fn halves(&self, x: &Tensor) -> Result<(Tensor, Tensor)> {
         Ok((x.narrow(1, 0, self.first)?, x.narrow(1, self.first, self.second)?))
     }
@@ -137,6 +138,7 @@ impl Subnet {
         self.clamp
     }
 
+    /// Log-scale s and shift t, both `[n, active]`, for `input`, `[n, inputs]`.
     fn scale_and_shift(&self, input: &Tensor) -> Result<(Tensor, Tensor)> {
         let hidden = silu(&self.hidden.forward(&silu(&self.input.forward(input)?)?)?)?;
         let output = self.output.forward(&hidden)?;

@@ -19,7 +19,7 @@ pub struct Permutation {
 }
 
 impl Permutation {
-    /// Builds the permutation from the order of source columns.
+    /// Builds the permutation from `order`, `[d]`: entry j is the source of column j.
     ///
     /// # Errors
     /// A candle error when `order` is not a permutation of `0..order.len()`.
@@ -43,7 +43,7 @@ impl Permutation {
         x.index_select(&self.order, D::Minus1)
     }
 
-    /// The inverse of [`Self::forward`].
+    /// The inverse of [`Self::forward`]: column `order[j]` of the result is column j of `x` `[n, d]`.
     ///
     /// # Errors
     /// A candle error when the number of columns is wrong.

@@ -68,7 +68,7 @@ impl Flow {
     /// Draws `draws` samples of x for each row of `context`, S(y) `[n, context]`. Returns x `[n·draws, d]` in the order of
     /// the rows, and the log-density of each sample, nats, `[n·draws]`.
     ///
-    /// Each call reads all weights; a [`Sampler`] that is kept gives the same samples without.
+    /// Each call converts all weights anew. A [`Sampler`] gives the same samples and converts the weights only once.
     ///
     /// # Errors
     /// A candle error when the shape of `context` is wrong.
@@ -113,7 +113,8 @@ impl Sampler {
         Ok(Some(Self { dimensions, units }))
     }
 
-    /// As [`Flow::sample`].
+    /// As [`Flow::sample`]: `context` is `[n, context]`; returns x, `[n·draws, d]`, and the log-density of each sample, nats,
+    /// `[n·draws]`.
     ///
     /// # Errors
     /// A candle error when the shape of `context` is wrong.
@@ -127,15 +128,15 @@ impl Sampler {
         Ok((x, log_density(&z, &log_det)?))
     }
 
-    /// Maps z to x in place. Returns ln|det ∂z/∂x| of each draw.
+    /// Maps z to x in place. Returns ln|det ∂z/∂x| of each draw, `[n·draws]`.
     ///
-    /// `values`: the d numbers of each draw in sequence, the draws of a measurement contiguous and the same number for
-    /// each; `context`: S(y) of each measurement in sequence, `features` numbers each.
+    /// `values`: z, row-major `[n·draws, d]`, with the draws of each measurement in contiguous rows; `context`: S(y) of each
+    /// measurement, row-major `[n, features]`.
     pub fn inverse(&self, values: &mut [f32], context: &[f32], features: usize) -> Vec<f32> {
         let d = self.dimensions;
         let draws = values.len() / d / (context.len() / features).max(1);
         let mut log_det = vec![0.0; values.len() / d];
-        // The size of the tiles does not depend on the number of threads, and so neither do the bits of the result.
+        // The size of the tiles does not depend on the number of threads, so that the bits of the result do not either.
         let tiles = values.par_chunks_mut(TILE * d).zip(log_det.par_chunks_mut(TILE)).enumerate();
         tiles.for_each_init(
             || self.buffers(),
@@ -158,6 +159,7 @@ impl Sampler {
         log_det
     }
 
+    /// Buffers that are large enough for every net of the flow.
     fn buffers(&self) -> Buffers {
         let nets = self.units.iter().flat_map(|unit| &unit.nets);
         let width = nets.map(|net| net.hidden.bias.len()).max().unwrap_or(0);
@@ -175,6 +177,7 @@ impl Sampler {
 }
 
 impl Net {
+    /// Reads the weights of a subnet that transforms the rows `active` as a function of the rows `passive`.
     fn new(subnet: &Subnet, passive: Range<usize>, active: Range<usize>) -> Result<Self> {
         Ok(Self {
             passive,

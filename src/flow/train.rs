@@ -104,7 +104,7 @@ pub fn train(
     settings: &TrainSettings,
     on_epoch: impl FnMut(EpochReport),
 ) -> Result<TrainOutcome, Error> {
-    // Single precision on the CPU uses the fused implementation, everything else candle.
+    // The fused implementation is used for single precision on the CPU, candle in all other cases.
     match Fused::new(flow, weights)? {
         Some(fused) => run(ByFused { flow, weights, fused }, rows, training, validation, settings, on_epoch),
         None => run(ByCandle::new(flow, weights)?, rows, training, validation, settings, on_epoch),
@@ -118,16 +118,20 @@ trait Descent {
     /// A copy of all weights.
     type Copy;
 
+    /// Converts pairs to the form that this implementation uses.
     fn read(&self, pairs: &Pairs) -> Result<Self::Data, candle_core::Error>;
-    /// Makes one step on the `chosen` rows and returns their mean loss before it. If that is not finite, no step is made.
+    /// Makes one step on the rows with the indices `chosen` and returns their mean loss before the step. If that loss is not
+    /// finite, no step is made.
     fn step(&mut self, data: &Self::Data, chosen: &[u32], learning_rate: f64) -> Result<f64, candle_core::Error>;
     /// Mean loss of all rows.
     fn loss(&mut self, data: &Self::Data) -> Result<f64, candle_core::Error>;
+    /// Copies the current weights.
     fn copy(&self) -> Result<Self::Copy, candle_core::Error>;
     /// Writes the weights of `copy` to the flow.
     fn finish(self, copy: &Self::Copy) -> Result<(), candle_core::Error>;
 }
 
+/// [`train`] with one implementation of gradient descent.
 fn run<D: Descent>(
     mut descent: D,
     rows: usize,

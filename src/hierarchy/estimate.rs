@@ -23,9 +23,9 @@ use crate::stats;
 /// corresponds to the restricted likelihood of a normal population: it restores the variance that the fitted mean absorbs,
 /// which is σ²/n for data without noise.
 ///
-/// `samples`: x, `[n·draws, d]` in parameter units. `log_weights`: n·draws values ln q(x_js | y_j) − ln r_j(x_js), up to a
-/// constant for each measurement, where the samples were drawn from densities r_j instead of q(· | y_j). They multiply each
-/// w_js and enter L.
+/// `samples`: x, `[n·draws, d]` in parameter units. `log_weights`: ln q(x_js | y_j) − ln r_j(x_js), nats, `[n·draws]`, up to a
+/// constant for each measurement, if the samples were drawn from densities r_j instead of q(· | y_j). Their exponentials
+/// multiply each w_js and each term of L.
 ///
 /// Source: D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
 /// 2166–2175; prior of σ: A. Gelman (2006), Prior distributions for variance parameters in hierarchical models, Bayesian
@@ -86,7 +86,7 @@ pub fn populations(
 ///  L_k(μ_k, σ_k) ∝ Π_j 1/S Σ_s N(x_jsk; μ_k, σ_k²)
 /// ```
 ///
-/// The effective sample size is the smallest of all parameters.
+/// `samples`: `[n·draws, d]`, parameter units. The effective sample size is the smallest of all parameters.
 pub fn populations_of_each(samples: &PosteriorSamples, space: &ParameterSpace, seed: u64) -> Populations {
     let one = |(column, parameter): (usize, &Parameter)| {
         let own = DMatrix::from_iterator(samples.theta().nrows(), 1, samples.theta().column(column).iter().copied());
@@ -103,7 +103,8 @@ pub fn populations_of_each(samples: &PosteriorSamples, space: &ParameterSpace, s
     Populations { parameters: each.into_iter().flat_map(|p| p.parameters).collect(), effective_sample_size }
 }
 
-/// The point estimate of [`populations`] and its effective sample size, without draws.
+/// The point estimate of [`populations`] and its effective sample size, without draws of (μ, σ). `samples`: `[n·draws, d]`,
+/// parameter units; `log_weights`: `[n·draws]`, nats, as in [`populations`].
 pub fn estimate(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Populations {
     let problem = Problem::new(samples, log_weights, space);
     let point = problem.maximise();

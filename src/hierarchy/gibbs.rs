@@ -26,8 +26,11 @@ const GRID: usize = 64;
 /// [`DRAWS`] states of Gibbs samplers that start at `point`.
 ///
 /// ```text
-///  s_j ~ w_j·,   σ | s ∝ σ^{1−n} exp(−Σ_j (x_j − x̄)²/2σ²),   μ | σ, s ~ N(x̄, σ²/n)
+///  s_j ~ w_j,   σ | s ∝ σ^{1−n} exp(−Σ_j (x_j − x̄)²/2σ²),   μ | σ, s ~ N(x̄, σ²/n)
 /// ```
+///
+/// s_j: the sample selected for measurement j with probability proportional to its weight w_js; x_j: its value; x̄: mean of the
+/// x_j.
 ///
 /// For noise-dominated parameters the selected samples s_j determine σ almost completely, so that the sampler hardly moves.
 /// Every second sweep is therefore followed by a Metropolis step on L(μ, σ) for each of these parameters, with the samples

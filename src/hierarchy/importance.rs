@@ -226,10 +226,10 @@ mod tests {
     }
 
     #[test]
-    fn posteriors_far_from_normal_are_left_to_the_chain() {
+    fn posteriors_far_from_normal_give_no_importance_draws() {
         // With noise of ten times the spread, any spread from zero up to a part of the noise is equally likely.
-        let hidden = problem(20, [0.2, 0.2, 0.2], 0.02);
-        assert!(draws(&hidden, &hidden.maximise(), 1).is_none());
+        let noise_dominated = problem(20, [0.2, 0.2, 0.2], 0.02);
+        assert!(draws(&noise_dominated, &noise_dominated.maximise(), 1).is_none());
         let few = problem(FEWEST - 1, [0.001, 0.02, 0.04], 0.05);
         assert!(draws(&few, &few.maximise(), 1).is_none());
     }

@@ -31,12 +31,13 @@ pub struct Populations {
 }
 
 impl PopulationEstimate {
-    /// Credible interval of μ, with probability [`INTERVAL`].
+    /// Lower and upper end of the central credible interval of μ with probability [`INTERVAL`], in the quantity's unit.
     pub fn mean_interval(&self) -> [f64; 2] {
         interval(&self.mean_draws)
     }
 
-    /// Credible interval of σ, with probability [`INTERVAL`]; `None` where σ is unknown.
+    /// Lower and upper end of the central credible interval of σ with probability [`INTERVAL`], in the quantity's unit; `None`
+    /// where σ is unknown.
     pub fn std_interval(&self) -> Option<[f64; 2]> {
         (!self.std_draws.is_empty()).then(|| interval(&self.std_draws))
     }
@@ -68,7 +69,7 @@ impl PopulationEstimate {
         Self { mean, std: Some(std), mean_draws, std_draws }
     }
 
-    /// The population of the mean of several quantities that vary independently of each other.
+    /// The population of the mean of K quantities of the same unit, `parts`, that vary independently of each other.
     ///
     /// ```text
     ///  μ = 1/K Σ μ_k,    σ² = 1/K² Σ σ_k²
@@ -89,7 +90,7 @@ impl PopulationEstimate {
     }
 }
 
-/// The central interval of draws, with probability [`INTERVAL`].
+/// Lower and upper end of the central interval of `draws`, `[n]`, with probability [`INTERVAL`], in their unit.
 pub fn interval(draws: &[f64]) -> [f64; 2] {
     [stats::quantile(draws, 0.5 * (1.0 - INTERVAL)), stats::quantile(draws, 0.5 * (1.0 + INTERVAL))]
 }

@@ -86,6 +86,8 @@ pub(super) fn within(columns: &[Vec<f64>], draws: usize) -> Vec<f64> {
 }
 
 impl Problem {
+    /// Arranges the posterior samples, `[n·draws, d]`, in lanes. `log_weights`: logarithms of their own weights, `[n·draws]`,
+    /// nats.
     pub(super) fn new(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Self {
         let (draws, measurements) = (samples.draws(), samples.measurements());
         let columns = unit_columns(samples, space);
@@ -136,6 +138,7 @@ impl Problem {
         Self { centres, lane_centres, deviations, offsets, blocks, measurements, draws, floor, within, noisy }
     }
 
+    /// Means of the samples of one measurement, `[d]`, in the unit box.
     pub(super) fn centres(&self, measurement: usize) -> &[f64] {
         let d = self.deviations.len();
         &self.centres[measurement * d..(measurement + 1) * d]

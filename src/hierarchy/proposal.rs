@@ -17,8 +17,8 @@ const TURNS: [usize; 8] = [0, 1, 0, 1, 0, 1, 0, 2];
 
 /// Draws importance proposals for noise-dominated batches, where few samples of a posterior have a significant weight under
 /// the population. The proposal density is the product of the posterior and the population in normal approximation,
-/// widened. Returns the proposals, `draws` per measurement, and the logarithms of their densities in the unit box, n·draws
-/// values.
+/// widened. Returns the proposals, `[n·draws, d]` in parameter units, and the logarithms of their densities in the unit box,
+/// nats, `[n·draws]`.
 ///
 /// ```text
 ///  r_j = Σ_w share_w N(x; c_j, w² C_j),    C_j = (V_j⁻¹ + Σ⁻¹)⁻¹,    c_j = C_j (V_j⁻¹ m_j + Σ⁻¹ μ)
@@ -91,5 +91,5 @@ pub fn proposals(
     (PosteriorSamples::new(theta, draws), log_density.concat())
 }
 
-/// Log-density that gives a sample zero weight.
+/// Log-density so large that the importance weight of the sample is zero.
 const IMPOSSIBLE: f64 = 1e9;

@@ -11,7 +11,8 @@ pub(super) struct Widths<const COUNT: usize> {
 }
 
 impl<const COUNT: usize> Widths<COUNT> {
-    /// A mixture for `draws` draws in `dimensions` dimensions.
+    /// A mixture of the given relative `widths` for `draws` draws in `dimensions` dimensions. `turns`: index of the width of
+    /// each of eight draws in a row, `[8]`.
     pub fn new(widths: [f64; COUNT], turns: [usize; 8], draws: usize, dimensions: usize) -> Self {
         let density = |own: usize| {
             let count = (0..draws).filter(|draw| turns[draw % turns.len()] == own).count();

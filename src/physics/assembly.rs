@@ -13,7 +13,8 @@ pub fn stiffness_matrix(structure: &Structure) -> DMatrix<f64> {
     stiffness_matrix_with(structure, &[])
 }
 
-/// [`stiffness_matrix`] with some stiffnesses replaced, given as (index of the spring, value).
+/// [`stiffness_matrix`] with some stiffnesses replaced: K, `[n, n]`. `changes` holds the index of each changed spring and its
+/// stiffness in the unit of [`super::Spring::n_per_m`]; if an index occurs more than once, its last value is used.
 pub fn stiffness_matrix_with(structure: &Structure, changes: &[(usize, f64)]) -> DMatrix<f64> {
     let changed = |index: usize| changes.iter().rev().find(|(spring, _)| *spring == index).map(|(_, value)| *value);
     let springs = structure.springs().iter().enumerate();
@@ -25,6 +26,7 @@ pub fn mass_matrix(structure: &Structure) -> DMatrix<f64> {
     assemble(structure.dofs(), structure.masses().iter().map(|m| (&m.form, m.kg)))
 }
 
+/// Sum of the patterns of all parts, each multiplied by its stiffness or mass, `[n, n]`.
 fn assemble<'a>(dofs: usize, parts: impl Iterator<Item = (&'a Form, f64)>) -> DMatrix<f64> {
     let mut matrix = DMatrix::zeros(dofs, dofs);
     for (form, value) in parts {

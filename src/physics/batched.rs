@@ -72,7 +72,8 @@ impl BatchedEigensolver {
     /// stiffnesses is negative or not finite, or if the structure is a mechanism.
     ///
     /// # Panics
-    /// If no spring changes, or if the length of `n_per_m` is not a multiple of the number of springs: a bug of the caller.
+    /// If no spring changes, or if the length of `n_per_m` is not a multiple of the number of springs: a programming error in the
+    /// caller.
     pub fn frequencies_hz(&self, n_per_m: &[f64]) -> Vec<f64> {
         let springs = self.units.len();
         assert!(n_per_m.len().is_multiple_of(springs), "{} stiffnesses for {springs} springs", n_per_m.len());

@@ -65,8 +65,8 @@ pub struct Response {
     pub by_size: DMatrix<f64>,
 }
 
-/// The lowest `count` frequencies of a structure under effects of the sizes `sizes` (all sizes of the first target, then
-/// those of the next), and their derivatives.
+/// The lowest `count` frequencies of a structure under effects, Hz, `[count]`, and their derivatives. `sizes` holds the size g of
+/// each effect in the unit of its target, `[sizes]`: all sizes of the first target, then those of the next.
 ///
 /// ```text
 ///  ∂f/∂g:   k(1 + g):  Σ k ∂f/∂k      m(1 + g):  Σ m ∂f/∂m      f(1 + g):  f      f + g:  1      added spring:  ∂f/∂k
@@ -126,6 +126,8 @@ struct Changed {
 }
 
 impl Changed {
+    /// Applies the targets to the springs and masses of a structure. `count`: number of modes wanted; `columns`: each target with
+    /// the column of its first size in `sizes`.
     fn new(structure: &Structure, count: usize, columns: &[(usize, &Target)], sizes: &[f64]) -> Result<Self, Error> {
         let mut spring_factor = vec![1.0; structure.springs().len()];
         let mut mass_factor = vec![1.0; structure.masses().len()];
@@ -171,8 +173,8 @@ impl Changed {
                 Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
             }
         }
-        // Parts that targets added have no factor. The sizes were checked above, and an added spring of negative stiffness
-        // shows in the eigenvalues, so that the structure need not be checked again.
+        // Springs and masses that targets added follow those of the structure and have no factor. The sizes were checked above,
+        // and an added spring of negative stiffness shows in the eigenvalues, so that the structure need not be checked again.
         changed.springs.iter_mut().zip(&spring_factor).for_each(|(spring, factor)| spring.n_per_m *= factor);
         changed.masses.iter_mut().zip(&mass_factor).for_each(|(mass, factor)| mass.kg *= factor);
         Ok(Self { structure: changed, spring_factor, added, order })
@@ -248,7 +250,7 @@ pub fn measured(
         match target {
             Target::ModeOrder(modes) => order.clone_from(modes),
             Target::FrequencyScale(_) | Target::ParameterScale(_) | Target::SettingScale(_) => {
-                // Written so that NaN fails too.
+                // This form of the condition also rejects NaN.
                 let enough = 1.0 + size >= LEAST_FACTOR;
                 if !enough {
                     return Err(Error::Effect { number, size });

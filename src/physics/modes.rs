@@ -48,16 +48,18 @@ pub struct FrequencySensitivity {
 /// ```
 ///
 /// # Errors
-/// [`Error::TooFewModes`], [`Error::NearMechanism`], [`Error::Massless`].
+/// [`Error::TooFewModes`] if `count` exceeds the number of degrees of freedom, [`Error::NearMechanism`] if an eigenvalue is
+/// zero within rounding, [`Error::Massless`] if a degree of freedom has no mass.
 pub fn natural_frequencies_hz(structure: &Structure, count: usize) -> Result<Vec<f64>, Error> {
     natural_frequencies_with(structure, &[], count)
 }
 
-/// [`natural_frequencies_hz`] with some stiffnesses replaced, given as (index of the spring, value). The structure is not
-/// copied, because stochastic model updating calls this millions of times.
+/// [`natural_frequencies_hz`] with some stiffnesses replaced: Hz, ascending, `[count]`. `changes` holds the index of each changed
+/// spring and its stiffness in the unit of [`super::Spring::n_per_m`]. The structure is not copied, because stochastic model
+/// updating calls this millions of times.
 ///
 /// # Errors
-/// As [`natural_frequencies_hz`], and [`Error::Stiffness`].
+/// As [`natural_frequencies_hz`], and [`Error::Stiffness`] for a stiffness that is negative or not finite.
 pub fn natural_frequencies_with(
     structure: &Structure,
     changes: &[(usize, f64)],
@@ -68,7 +70,11 @@ pub fn natural_frequencies_with(
     frequencies(&eigenvalues(&scaled.stiffness), count)
 }
 
-/// The lowest `count` modes with their shapes.
+/// The lowest `count` modes: natural frequencies, Hz, `[count]`, and mass-normalised mode shapes, kg^-½, `[n, count]`.
+///
+/// ```text
+///  K φ = λ M φ,    f = √λ / 2π,    φᵀ M φ = 1
+/// ```
 ///
 /// # Errors
 /// As [`natural_frequencies_hz`].
@@ -142,6 +148,11 @@ enum MassRoot {
 }
 
 impl Scaled {
+    /// Assembles K with the stiffnesses `changes` (index of the spring, value) and M, and reduces the eigenproblem to standard
+    /// form.
+    ///
+    /// # Errors
+    /// [`Error::Massless`] if M is not positive definite.
     pub fn new(structure: &Structure, changes: &[(usize, f64)]) -> Result<Self, Error> {
         let mut stiffness = stiffness_matrix_with(structure, changes);
         let mass = mass_matrix(structure);
@@ -187,7 +198,7 @@ fn frequencies(sorted_eigenvalues: &[f64], count: usize) -> Result<Vec<f64>, Err
         return Err(Error::TooFewModes { asked: count, available });
     }
     let (smallest, largest) = (sorted_eigenvalues[0], sorted_eigenvalues[available - 1]);
-    // Written so that NaN fails too.
+    // This form of the condition also rejects NaN.
     let positive = smallest > SINGULAR * largest && largest.is_finite();
     if !positive {
         return Err(Error::NearMechanism { smallest, largest });

@@ -44,10 +44,10 @@ pub fn shape_sensitivity(
     let transposed = shapes.transpose();
     let at_points = shapes.select_rows(points);
     let of_mode = |mode: usize| {
-        let own = modes.eigenvalues[mode];
+        let eigenvalue = modes.eigenvalues[mode];
         let weight = |other: usize| {
-            let gap = own - modes.eigenvalues[other];
-            if gap.abs() > REPEATED * own {
+            let gap = eigenvalue - modes.eigenvalues[other];
+            if gap.abs() > REPEATED * eigenvalue {
                 1.0 / gap
             } else {
                 0.0

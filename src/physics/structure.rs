@@ -194,8 +194,8 @@ impl Structure {
         let point = |(dof, mass): (usize, &Mass)| AttachmentPoint { name: mass.name.clone(), dof };
         let points = masses.iter().enumerate().map(point).collect();
         let structure = Self::with_dofs(masses.len(), points, masses, springs)?;
-        let tied = structure.springs.iter().filter(|s| s.n_per_m > 0.0);
-        if let Some(index) = floating_mass(structure.dofs, tied) {
+        let stiff = structure.springs.iter().filter(|s| s.n_per_m > 0.0);
+        if let Some(index) = floating_mass(structure.dofs, stiff) {
             return Err(Error::Mechanism { mass: structure.masses[index].name.clone() });
         }
         Ok(structure)
@@ -251,7 +251,7 @@ impl Structure {
     /// Name of a node.
     ///
     /// # Panics
-    /// If no attachment point has this degree of freedom, which is a bug of the caller.
+    /// If no attachment point has this degree of freedom, which is a programming error in the caller.
     pub fn node_name(&self, node: Node) -> &str {
         match node {
             Node::Ground => "ground",
@@ -272,12 +272,12 @@ impl Structure {
         })
     }
 
-    /// The masses; in a structure of rigid bodies on springs, in the order of the degrees of freedom.
+    /// The masses, `[masses]`; in a structure of rigid bodies on springs, in the order of the degrees of freedom.
     pub fn masses(&self) -> &[Mass] {
         &self.masses
     }
 
-    /// The stiffnesses: springs, then beam spans.
+    /// The stiffnesses, `[springs]`: springs, then beam spans.
     pub fn springs(&self) -> &[Spring] {
         &self.springs
     }
@@ -298,6 +298,7 @@ impl Structure {
         Ok(changed)
     }
 
+    /// Checks that new stiffnesses, given as (index of the spring, value), are finite and not negative.
     pub(super) fn check_changes(&self, changes: &[(usize, f64)]) -> Result<(), Error> {
         changes.iter().try_for_each(|(index, n_per_m)| check_stiffness(&self.springs[*index], *n_per_m))
     }
@@ -308,12 +309,15 @@ fn check_stiffness(spring: &Spring, n_per_m: f64) -> Result<(), Error> {
     valid.then_some(()).ok_or_else(|| Error::Stiffness { name: spring.name.clone(), n_per_m })
 }
 
+/// Checks that no name occurs twice.
 fn unique<'a>(names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
     let mut seen = BTreeSet::new();
     names.into_iter().find(|name| !seen.insert(*name)).map_or(Ok(()), |name| Err(Error::DuplicateName(name.clone())))
 }
 
 /// Index of a mass that `springs` do not connect to the ground, if there is one.
+///
+/// `masses` is the number of masses, which have the degrees of freedom 0 to `masses` − 1.
 ///
 /// Springs are one-dimensional, so that K is the Laplacian of a weighted graph with a grounded node: it is singular exactly
 /// if a part of the graph is not connected to the ground.
@@ -331,11 +335,11 @@ pub fn floating_mass<'a>(masses: usize, springs: impl Iterator<Item = &'a Spring
         neighbours[to].push(from);
     }
     let mut reached = vec![false; masses + 1];
-    let mut open = vec![ground];
-    while let Some(node) = open.pop() {
+    let mut to_visit = vec![ground];
+    while let Some(node) = to_visit.pop() {
         if !std::mem::replace(&mut reached[node], true) {
-            open.extend(&neighbours[node]);
+            to_visit.extend(&neighbours[node]);
         }
     }
-    reached[..masses].iter().position(|tied| !tied)
+    reached[..masses].iter().position(|connected| !connected)
 }

@@ -10,7 +10,7 @@ const BARS: [usize; 2] = [6, 60];
 /// Number of points of a curve.
 const POINTS: usize = 161;
 
-/// Bars of a histogram: lower edge, upper edge and density (one over the unit of the values).
+/// Bars of a histogram of `values`, `[n]`: lower edge, upper edge and density (one over the unit of the values) of each bar.
 ///
 /// ```text
 ///  width = 2·IQR/∛n
@@ -34,8 +34,8 @@ pub fn histogram(values: &[f64]) -> Vec<(f64, f64, f64)> {
     counts.iter().enumerate().map(bar).collect()
 }
 
-/// Bars around each value that occurs, with edges halfway to the next: for values that take only a few positions. Lower edge,
-/// upper edge and density.
+/// Histogram of `values`, `[n]`, that take only a few different values: one bar around each of these, with edges halfway to the
+/// next. Returns lower edge, upper edge and density of each bar; empty if all values are equal.
 pub fn columns(values: &[f64]) -> Vec<(f64, f64, f64)> {
     let mut places: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
     let total = places.len() as f64;
@@ -81,6 +81,7 @@ pub fn kernel_at(values: &[f64], places: &[f64]) -> Option<Vec<f64>> {
     Some(places.iter().map(|x| density(*x)).collect())
 }
 
+/// The kernel density estimate as a function of x.
 fn kernel_density(mut spread: Spread) -> impl Fn(f64) -> f64 {
     let h = spread.bandwidth();
     spread.values.sort_by(f64::total_cmp);
@@ -128,6 +129,7 @@ impl Spread {
         0.9 * scale * (self.values.len() as f64).powf(-0.2)
     }
 
+    /// `None` if there are no two different finite values.
     fn of(values: &[f64]) -> Option<Self> {
         let values: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
         let std = stats::sample_std(&values)?;
@@ -165,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_stand_about_the_values_and_have_area_one() {
+    fn columns_surround_the_values_and_have_area_one() {
         let columns = columns(&[0.2, 0.1, 0.1 + 1e-15, 0.4]);
         let edges: Vec<f64> = columns.iter().map(|c| c.0).collect();
         assert!(edges.iter().zip([0.05, 0.15, 0.3]).all(|(a, b)| (a - b).abs() < 1e-9), "{edges:?}");
@@ -174,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn values_without_a_spread_have_no_shape() {
+    fn constant_values_have_no_histogram_and_no_density() {
         for values in [vec![], vec![1.0], vec![2.0; 9], vec![f64::NAN; 5]] {
             assert!(
                 columns(&values).is_empty() && histogram(&values).is_empty() && kernel(&values).is_empty(),

@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn cells_carry_their_numbers() {
+    fn cells_contain_their_numbers() {
         let heat = Heat {
             title: "shares".to_owned(),
             columns: vec!["a".to_owned(), "b".to_owned()],

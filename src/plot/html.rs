@@ -6,14 +6,15 @@ pub fn anchor(heading: &str) -> String {
     words.map(str::to_lowercase).collect::<Vec<_>>().join("-")
 }
 
-/// A table as HTML; the first cell of each row is its heading.
+/// A table as HTML. `rows` is `[rows][columns]`; the first cell of each row is its heading.
 pub fn table(header: &[&str], rows: &[Vec<String>]) -> String {
     let header: Vec<(&str, bool)> = header.iter().map(|title| (*title, false)).collect();
     let rows: Vec<Vec<String>> = rows.iter().map(|row| row.iter().map(|cell| escaped(cell)).collect()).collect();
     table_of_html("", &header, &rows)
 }
 
-/// A table whose cells are already HTML; columns of text (`true`) are left-aligned. A wide table scrolls horizontally.
+/// A table whose cells `rows`, `[rows][columns]`, are already HTML. `header` holds the title of each column and whether it
+/// contains text, which is left-aligned. A wide table scrolls horizontally.
 pub fn table_of_html(caption: &str, header: &[(&str, bool)], rows: &[Vec<String>]) -> String {
     let class = |words: bool| if words { " class=\"words\"" } else { "" };
     let title = |(title, words): &(&str, bool)| format!("<th scope=\"col\"{}>{}</th>", class(*words), escaped(title));

@@ -47,7 +47,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plot_of_nothing_is_still_a_plot() {
+    fn an_empty_plot_is_valid_svg() {
         assert!(Plot::default().svg().starts_with("<svg"));
     }
 }

@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panel_of_nothing_and_points_that_are_no_numbers_are_drawn_without_harm() {
+    fn an_empty_panel_and_points_that_are_not_finite_give_valid_svg() {
         let cloud = Cloud { points: vec![(f64::NAN, 1.0), (1.0, f64::INFINITY), (0.5, 0.5)], ..Cloud::default() };
         for panel in [Panel::default(), Panel { clouds: vec![cloud], ..Panel::default() }] {
             let svg = panel.svg();

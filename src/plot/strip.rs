@@ -7,7 +7,8 @@ use super::panel::{key, Swatch};
 const WIDTH: f64 = 140.0;
 const EDGE: f64 = 8.0;
 
-/// Low end, median and high end as a bar; a dashed line at the target, a diamond at another value.
+/// A small figure as SVG: a bar from the low to the high end of a range with a line at its median, a dashed line at the target,
+/// and a diamond at another value.
 ///
 /// The strip spans all these values, but at least a range of `least`, so that nearly equal values are drawn close together.
 pub fn strip([low, median, high]: [f64; 3], target: f64, other: Option<f64>, least: f64) -> String {
@@ -60,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_strip_stays_within_its_width_whatever_it_is_given() {
+    fn a_strip_stays_within_its_width_for_all_values() {
         let spans = [([1.0, 2.0, 3.0], 2.5, Some(9.0)), ([1.0; 3], 1.0, Some(1.0)), ([f64::NAN; 3], f64::NAN, None)];
         for (range, target, other) in spans {
             let svg = strip(range, target, other, 0.0);

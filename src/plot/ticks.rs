@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ticks_are_round_and_their_labels_tell_them_apart() {
+    fn ticks_are_round_and_their_labels_differ() {
         let labels = |low, high, most| {
             let ticks = Ticks::between(low, high, most);
             ticks.at.iter().map(|t| ticks.label(*t)).collect::<Vec<_>>().join(" ")

@@ -1,4 +1,5 @@
-//! One repetition: what each method finds from the measurements of a state; and the summary of many repetitions as table rows.
+//! One repetition, in which each method estimates the population from the measurements of a state, and the summary of many
+//! repetitions as table rows.
 
 use std::time::Instant;
 
@@ -93,6 +94,7 @@ impl Bench<'_> {
         Ok(found)
     }
 
+    /// Updates the parameters by each measurement; these parameters are the samples.
     fn sensitivity(&self, data: &Data) -> anyhow::Result<Found> {
         let rows: Vec<Vec<Option<f64>>> =
             data.frequencies_hz.row_iter().map(|row| row.iter().copied().map(Some).collect()).collect();
@@ -103,6 +105,7 @@ impl Bench<'_> {
         Ok(of_samples(samples, 1, Some(model_runs)))
     }
 
+    /// Samples the posterior of (μ, σ), and draws one parameter vector from the population of each sample.
     fn tmcmc(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
         let modes: Vec<usize> = (0..self.simulator().modes()).collect();
         let simulated = simulated_for(data.frequencies_hz.nrows());
@@ -120,9 +123,10 @@ impl Bench<'_> {
         Ok(Found { samples, mean, std, seconds: 0.0, model_runs: Some(estimate.model_runs) })
     }
 
+    /// Draws posterior samples of each measurement with the trained flow.
     fn cinn(&self, data: &Data, seed: u64) -> anyhow::Result<Found> {
-        // Times are those of the samples alone, without the service's checks; what is compared comes by its whole way, which moves
-        // measurements beyond the prior box to its nearest point first.
+        // The time is that of the inference alone, without the checks of the service. The samples that are compared come from the
+        // complete assessment, which first moves measurements beyond the prior box to the nearest point of the box.
         let rows: Vec<Vec<f64>> = data.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
         let measurements = at_intervals(&rows, Timestamp::from_micros(START_US)?, 1, None)?;
         let observations: Vec<Observation> =
@@ -137,6 +141,7 @@ impl Bench<'_> {
     }
 }
 
+/// The result of a method that gives samples, `[d][samples]`, `draws` for each measurement.
 fn of_samples(samples: Vec<Vec<f64>>, draws: usize, model_runs: Option<usize>) -> Found {
     let moments = |pool: &Vec<f64>| Hyperparameters::from_pool(pool, draws);
     let mean = samples.iter().map(|pool| moments(pool).mean).collect();
@@ -144,7 +149,7 @@ fn of_samples(samples: Vec<Vec<f64>>, draws: usize, model_runs: Option<usize>) -
     Found { samples, mean, std, seconds: 0.0, model_runs }
 }
 
-/// Damage threshold δ = μ − 1.645 σ of each parameter, `[d]` (Eq. 21).
+/// Damage threshold δ = μ − 1.645 σ of each parameter, in parameter units, `[d]` (Eq. 21 of the paper).
 pub fn thresholds(undamaged: &Found) -> Vec<f64> {
     undamaged.mean.iter().zip(&undamaged.std).map(|(mean, std)| mean - DELTA * std).collect()
 }
@@ -157,7 +162,7 @@ pub fn probability_of_damage(method: Method, found: &Found, k: usize, threshold:
     }
 }
 
-/// Share of values below a threshold.
+/// Share of `values`, `[n]`, below a threshold in the same unit, from 0 to 1.
 pub fn share_below(values: &[f64], threshold: f64) -> f64 {
     values.iter().filter(|x| **x < threshold).count() as f64 / values.len() as f64
 }
@@ -268,12 +273,13 @@ impl Series {
     }
 }
 
-/// Median, 5 % and 95 % quantiles.
+/// Median, 5 % quantile and 95 % quantile of `values`, `[repetitions]`.
 pub fn spread(values: &[f64]) -> Spread {
     let at = |level| stats::quantile(values, level);
     Spread { median: at(0.5), low: at(0.05), high: at(0.95) }
 }
 
+/// The distribution of `values` over the repetitions, with the target and the value of the paper.
 fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
     // Equal values count half, because a probability of 1 often occurs exactly.
     let percentile = |paper: f64| {
@@ -284,8 +290,8 @@ fn compared(values: &[f64], target: f64, paper: Option<f64>) -> Compared {
     Compared { ours: spread(values), target, paper, paper_percentile: paper.map(percentile) }
 }
 
-/// Times of the methods and those of the paper. `training` is the duration (s) and the number of simulated samples of the training;
-/// `found` holds the duration (s) and the model runs of each method in each repetition, in the order of [`METHODS`].
+/// Times of the methods and those of the paper. `training` is the duration (s) and the number of simulated samples of the
+/// training; `found` holds the duration (s) and the model runs of each method in each repetition, in the order of [`METHODS`].
 pub fn times(training: (f64, usize), found: &[Vec<(f64, Option<usize>)>; 3], paper: [f64; 4], note: &str) -> Vec<Time> {
     let median = |method: usize| stats::quantile(&found[method].iter().map(|f| f.0).collect::<Vec<_>>(), 0.5);
     let runs = |method: usize| found[method].first().and_then(|f| f.1);

@@ -85,7 +85,7 @@ fn check_spans(definition: &StructureDefinition, problems: &mut Problems) {
     }
 }
 
-/// Checks the rigid bodies and attaches them to their nodes.
+/// Checks the rigid bodies. Returns them, attached to their nodes.
 fn bodies(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, problems: &mut Problems) -> Vec<Mass> {
     let mut masses = Vec::new();
     for (index, mass) in definition.masses.iter().enumerate() {
@@ -95,7 +95,7 @@ fn bodies(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, pr
             found => {
                 let name = shown(&mass.name);
                 let message = match found {
-                    None => format!("mass {name} is attached to {}, which is no node", shown(at)),
+                    None => format!("mass {name} is attached to {}, which is not a node", shown(at)),
                     Some(_) => {
                         format!("mass {name} is attached to a support that does not move: attach it to a free node")
                     }
@@ -139,11 +139,11 @@ fn check_beam(definition: &StructureDefinition, beam: &BeamDefinition, index: us
     let x_m = |node: &str| definition.nodes.iter().find(|n| n.name == node).map(|n| n.x_m);
     for (key, node) in [("from", &beam.from), ("to", &beam.to)] {
         if x_m(node).is_none() {
-            wrong(key, format!("beam {name} goes to {}, which is no node", shown(node)));
+            wrong(key, format!("beam {name} goes to {}, which is not a node", shown(node)));
         }
     }
     if let (Some(from), Some(to)) = (x_m(&beam.from), x_m(&beam.to)) {
-        // Written so that NaN fails too.
+        // This form of the condition also rejects NaN.
         let long = (to - from).abs() > 0.0;
         if !long {
             wrong("to", format!("beam {name} has no length, because both ends are at {from} m: move one of its nodes"));
@@ -182,7 +182,7 @@ fn span(
     Span { elements: elements.collect() }
 }
 
-/// Checks the springs; the pattern of each.
+/// Checks the springs. Returns the stiffness pattern of each.
 fn springs(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, problems: &mut Problems) -> Vec<Form> {
     let mut forms = Vec::new();
     for (index, spring) in definition.springs.iter().enumerate() {
@@ -192,10 +192,10 @@ fn springs(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, p
                 return Node::Ground;
             }
             let wrong = match nodes.get(name) {
-                None => "which is no node and not \"ground\"",
+                None => "which is neither a node nor \"ground\"",
                 Some(dofs) => match dofs[usize::from(rotation)] {
                     Some(dof) => return Node::Dof(dof),
-                    None => "but the support holds it already",
+                    None => "but its support fixes this degree of freedom already",
                 },
             };
             let message = format!("spring {} goes to {}, {wrong}", shown(&spring.name), shown(name));

@@ -39,7 +39,7 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
     let mut problems = Problems::new();
     let id =
         StructureId::parse(&definition.id).map_err(|e| problems.push(DefinitionProblem::new("/id", e.to_string())));
-    check_head(definition, &mut problems);
+    check_counts_and_noise(definition, &mut problems);
     check_sections(definition, &mut problems);
     check_covariates(definition, &mut problems);
     let layout = layout(definition, &mut problems);
@@ -100,7 +100,7 @@ fn assemble(definition: &StructureDefinition, layout: Layout, bindings: &[Bindin
     let springs = springs(definition, layout.forms, bindings, &mut problems);
     let weakest = check_priors(definition, &springs, bindings, &mut problems);
     if definition.simulation == SimulationKind::SpringMass && problems.is_empty() {
-        check_tied(definition, &springs, &weakest, bindings, &mut problems);
+        check_connected_to_ground(definition, &springs, &weakest, bindings, &mut problems);
     }
     if !problems.is_empty() {
         return Err(problems);
@@ -149,7 +149,7 @@ fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
     }
     if d.simulation == SimulationKind::SpringMass {
         for (index, _) in d.masses.iter().enumerate().filter(|(_, m)| m.at.is_some()) {
-            let message = "a mass has a node only in a simulation \"beam\": remove at";
+            let message = "a mass has a node only in a simulation \"beam\": remove the key at";
             problems.push(DefinitionProblem::new(format!("/mass/{index}/at"), message));
         }
         for (index, _) in d.springs.iter().enumerate().filter(|(_, s)| s.n_m_per_rad.is_some()) {
@@ -160,7 +160,7 @@ fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
 }
 
 /// Checks the number of masses and modes, the measurement noise, and that there is a parameter.
-fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
+fn check_counts_and_noise(definition: &StructureDefinition, problems: &mut Problems) {
     let masses = definition.masses.len();
     let bodies = definition.simulation == SimulationKind::SpringMass;
     if bodies && (masses == 0 || masses > MOST_MASSES) {
@@ -189,7 +189,7 @@ fn check_head(definition: &StructureDefinition, problems: &mut Problems) {
     }
 }
 
-/// Checks the masses; index of each by its name.
+/// Checks the masses. Returns the index of each mass by its name.
 fn check_masses<'a>(definition: &'a StructureDefinition, problems: &mut Problems) -> BTreeMap<&'a str, usize> {
     check_names("mass", definition.masses.iter().map(|m| &m.name), problems);
     let mut by_name = BTreeMap::new();
@@ -204,7 +204,7 @@ fn check_masses<'a>(definition: &'a StructureDefinition, problems: &mut Problems
     by_name
 }
 
-/// Checks the springs between masses; the pattern of each.
+/// Checks the springs between masses. Returns the stiffness pattern of each.
 fn check_springs(
     definition: &StructureDefinition,
     masses: &BTreeMap<&str, usize>,
@@ -218,7 +218,8 @@ fn check_springs(
             Some(dof) => Node::Dof(*dof),
             None => {
                 let spring = shown(&spring.name);
-                let message = format!("spring {spring} goes to {}, which is no mass and not \"ground\"", shown(name));
+                let message =
+                    format!("spring {spring} goes to {}, which is neither a mass nor \"ground\"", shown(name));
                 problems.push(DefinitionProblem::new(format!("/spring/{index}/{key}"), message));
                 Node::Ground
             }
@@ -247,7 +248,7 @@ fn check_covariates(definition: &StructureDefinition, problems: &mut Problems) {
     }
 }
 
-/// Checks the parameters; which of them sets which stiffness.
+/// Checks the parameters. Returns which parameter sets which stiffness.
 fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -> Vec<Binding> {
     check_names("parameter", definition.parameters.iter().map(|p| &p.name), problems);
     let mut bindings: Vec<Binding> = Vec::new();
@@ -304,7 +305,7 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
     bindings
 }
 
-/// Index of a stiffness: springs first, then beam spans.
+/// Index of the stiffness that an entry of `sets` names: springs come first, then beam spans.
 fn stiffness_index(definition: &StructureDefinition, sets: &Sets) -> Result<usize, String> {
     match (&sets.spring, &sets.beam) {
         (Some(name), None) => {
@@ -322,12 +323,12 @@ fn stiffness_index(definition: &StructureDefinition, sets: &Sets) -> Result<usiz
 /// The parameter of a checked definition, with the unit of the stiffness that it sets unless the file gives one.
 fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) -> Parameter {
     let Prior::Uniform([lower, upper]) = definition.prior;
-    let plain = |sets: &Sets| sets.law.is_none();
+    let without_law = |sets: &Sets| sets.law.is_none();
     let rotation = |sets: &Sets| {
         structure.springs.iter().any(|s| Some(&s.name) == sets.spring.as_ref() && s.n_m_per_rad.is_some())
     };
     let unit = match definition.sets.first() {
-        Some(_) if !definition.sets.iter().all(plain) => "–",
+        Some(_) if !definition.sets.iter().all(without_law) => "–",
         None => "–",
         Some(sets) if sets.beam.is_some() => "N·m²",
         Some(sets) if rotation(sets) => "N·m/rad",
@@ -369,7 +370,8 @@ fn springs(
     springs.chain(spans).zip(forms).enumerate().map(nominal).collect()
 }
 
-/// Checks that no value of the prior gives a negative stiffness; the stiffnesses at their smallest value in the prior.
+/// Checks that no value of the prior gives a negative stiffness. Returns the springs, each at its smallest stiffness in the
+/// prior.
 fn check_priors(
     definition: &StructureDefinition,
     springs: &[Spring],
@@ -400,7 +402,7 @@ fn check_priors(
 }
 
 /// Checks that no value of the prior disconnects a mass from the ground.
-fn check_tied(
+fn check_connected_to_ground(
     definition: &StructureDefinition,
     springs: &[Spring],
     weakest: &[Spring],

@@ -1,4 +1,4 @@
-//! The structure file: the definition of a structure as TOML or JSON. Unknown keys are mistakes.
+//! The structure file: the definition of a structure as TOML or JSON. Unknown keys are rejected.
 //!
 //! `models/three-dof/structure.toml` is an example.
 
@@ -96,7 +96,7 @@ pub struct EffectDefinition {
     /// Covariance of the coefficients, in alphabetical order of their names; none if they are exact.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub covariance: Vec<Vec<f64>>,
-    /// Values of a numeric covariate that the effect was learnt from: at least two quantiles at equal steps, from the minimum to
+    /// Values of a numeric covariate that the effect was fitted to: at least two quantiles at equal steps, from the minimum to
     /// the maximum. Training draws between the extremes; a measurement without the covariate is marginalised over all values.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub seen: Vec<f64>,

@@ -16,8 +16,8 @@ use crate::physics::{Node, Structure};
 use crate::quantity::shown;
 use crate::stats::Stream;
 
-/// Share of the range of a covariate by which a value may lie outside the values that the effect was learnt from before it is
-/// reported and clamped.
+/// Margin around the values of a covariate that an effect was fitted to, as a share of their range. A value beyond this margin is
+/// clamped to it and reported.
 const BEYOND: f64 = 0.1;
 
 /// A checked effect of a structure file.
@@ -33,18 +33,18 @@ pub struct SimulationEffect {
     pub psi: Vec<f64>,
     /// Cholesky factor of the covariance of the coefficients; `None` if they are exact.
     factor: Option<DMatrix<f64>>,
-    /// Values of a numeric covariate that the effect was learnt from, ascending.
+    /// Values of a numeric covariate that the effect was fitted to, ascending.
     seen: Vec<f64>,
 }
 
 /// Sizes of the effects of one measurement.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Sizes {
-    /// All sizes, those of the first effect first.
+    /// Sizes of all effects in the order of the effects, each in the unit of its target, `[sizes]`.
     pub values: Vec<f64>,
     /// Covariates that an effect needs but that are missing in the measurement.
     pub missing: Vec<String>,
-    /// Covariates whose value lies outside the range that an effect was learnt from.
+    /// Covariates whose value lies outside the range that an effect was fitted to.
     pub beyond: Vec<String>,
 }
 
@@ -54,7 +54,7 @@ impl SimulationEffect {
         self.law.covariate.is_some()
     }
 
-    /// Standard deviation of each coefficient; 0 if it is exact.
+    /// Standard deviation of each coefficient of the law, in the unit of the coefficient, `[ψ]`; 0 if it is exact.
     pub fn psi_std(&self) -> Vec<f64> {
         let of = |i: usize| self.factor.as_ref().map_or(0.0, |factor| factor.row(i).norm());
         (0..self.psi.len()).map(of).collect()
@@ -69,13 +69,14 @@ impl SimulationEffect {
         }
     }
 
-    /// Sizes at one value of the covariate with the mean coefficients.
+    /// Sizes of this effect at one value of the covariate with the mean coefficients, in the unit of the target,
+    /// `[target.sizes()]`.
     pub fn sizes(&self, input: Input) -> Vec<f64> {
         self.sizes_at(input, &self.psi)
     }
 
     /// The values of the covariate over which the effect is marginalised if the covariate is missing: those that the effect was
-    /// learnt from.
+    /// fitted to.
     pub fn inputs_seen(&self) -> Vec<Input> {
         if self.law.covariate.is_none() {
             return vec![Input::Number(0.0)];
@@ -86,7 +87,7 @@ impl SimulationEffect {
         self.seen.iter().map(|v| Input::Number(*v)).collect()
     }
 
-    /// Sizes at one value of the covariate with coefficients drawn from their normal distribution.
+    /// As [`Self::sizes`], with coefficients drawn from their normal distribution.
     pub fn draw_sizes(&self, input: Input, stream: &mut Stream) -> Vec<f64> {
         let Some(factor) = &self.factor else { return self.sizes(input) };
         let normal = DVector::from_fn(self.psi.len(), |_, _| stream.sample::<f64, _>(StandardNormal));
@@ -94,8 +95,8 @@ impl SimulationEffect {
         self.sizes_at(input, psi.as_slice())
     }
 
-    /// The covariate of a measurement as an input of the law, clamped to the range that the effect was learnt from; and whether
-    /// it lies outside this range.
+    /// The covariate of a measurement as an input of the law, clamped to the range that the effect was fitted to; and whether it
+    /// lies outside this range.
     fn input(&self, covariates: &BTreeMap<String, CovariateValue>) -> (Input, bool) {
         let Some(name) = &self.law.covariate else { return (Input::Number(0.0), false) };
         match covariates.get(name) {
@@ -114,8 +115,8 @@ impl SimulationEffect {
     }
 }
 
-/// Sizes of all effects under the covariates of a measurement. An effect whose covariate is missing has the mean of its sizes
-/// over the values that it was learnt from.
+/// Sizes of all effects under the covariates of a measurement, `[sizes]`. An effect whose covariate is missing has the mean of
+/// its sizes over the values that it was fitted to.
 pub fn sizes(effects: &[SimulationEffect], covariates: &BTreeMap<String, CovariateValue>) -> Sizes {
     let mut found = Sizes::default();
     for effect in effects {
@@ -159,8 +160,9 @@ pub fn marginalised_sizes(
     (0..count).map(at).collect()
 }
 
-/// Draws the values of all covariates that effects depend on, for training. Numbers are uniform in the range that the effects
-/// were learnt from, with a margin. Categories are equally probable; all categories without a coefficient count as one.
+/// Draws the value of every covariate that an effect depends on, by its name, for training. Numbers are uniform in the range
+/// that the effects were fitted to, with a margin. Categories are equally probable; all categories without a coefficient are
+/// treated as one.
 pub fn draw_covariates(effects: &[SimulationEffect], stream: &mut Stream) -> BTreeMap<String, CovariateValue> {
     let mut names: Vec<&String> = effects.iter().filter_map(|e| e.law.covariate.as_ref()).collect();
     names.sort();
@@ -184,7 +186,7 @@ pub fn draw_covariates(effects: &[SimulationEffect], stream: &mut Stream) -> BTr
     names.into_iter().map(draw).collect()
 }
 
-/// Sizes of all effects under given covariates, with coefficients drawn from their normal distributions.
+/// Sizes of all effects under given covariates, `[sizes]`, with coefficients drawn from their normal distributions.
 pub fn draw_sizes(
     effects: &[SimulationEffect],
     covariates: &BTreeMap<String, CovariateValue>,
@@ -193,12 +195,12 @@ pub fn draw_sizes(
     effects.iter().flat_map(|effect| effect.draw_sizes(effect.input(covariates).0, stream)).collect()
 }
 
-/// Mean sizes of all effects over the covariate values that they were learnt from.
+/// Mean sizes of all effects over the covariate values that they were fitted to, `[sizes]`.
 pub fn typical_sizes(effects: &[SimulationEffect]) -> Vec<f64> {
     effects.iter().flat_map(mean_sizes).collect()
 }
 
-/// Mean sizes of one effect over the covariate values that it was learnt from.
+/// Mean sizes of one effect over the covariate values that it was fitted to, `[target.sizes()]`.
 fn mean_sizes(effect: &SimulationEffect) -> Vec<f64> {
     let all: Vec<Vec<f64>> = effect.inputs_seen().into_iter().map(|input| effect.sizes(input)).collect();
     (0..effect.target.sizes()).map(|i| all.iter().map(|s| s[i]).sum::<f64>() / all.len() as f64).collect()
@@ -219,9 +221,10 @@ pub(super) fn check(
     definition.effects.iter().enumerate().filter_map(one).collect()
 }
 
-/// Key of the effect that is wrong, and the message.
+/// The key of the effect definition that contains a mistake, and the error message.
 type Mistake = (&'static str, String);
 
+/// Checks one effect and builds it; the error names the key that is wrong.
 fn check_one(
     definition: &StructureDefinition,
     effect: &EffectDefinition,
@@ -238,7 +241,7 @@ fn check_one(
         return Err(("law", message));
     }
     if !constant && matches!(target, Target::Oscillator(_) | Target::ModeOrder(_)) {
-        return Err(("law", "an oscillator and an order of modes need the law constant".to_owned()));
+        return Err(("law", "the targets oscillator and mode_order need the law constant".to_owned()));
     }
     let covariate = effect.covariate.as_ref();
     let declared = covariate.map(|name| covariates.iter().find(|c| c.name == *name));
@@ -297,17 +300,17 @@ fn check_one(
     Ok(SimulationEffect { name: effect.name.clone(), target, law, psi, factor, seen })
 }
 
-/// Checks the covariate values that the effect was learnt from; `none` for a law that has none.
-fn check_seen(effect: &EffectDefinition, none: bool) -> Result<Vec<f64>, Mistake> {
+/// Checks the key `seen`, the covariate values that the effect was fitted to. `must_be_absent`: the law has no numeric covariate.
+fn check_seen(effect: &EffectDefinition, must_be_absent: bool) -> Result<Vec<f64>, Mistake> {
     let seen = &effect.seen;
-    if none {
-        let message = || "only an effect of a numeric covariate has seen: remove it".to_owned();
+    if must_be_absent {
+        let message = || "only an effect of a numeric covariate has the key seen: remove it".to_owned();
         return if seen.is_empty() { Ok(Vec::new()) } else { Err(("seen", message())) };
     }
     let ascending = seen.windows(2).all(|w| w[0] <= w[1]) && seen.iter().all(|v| v.is_finite());
     let wide = seen.len() >= 2 && seen[0] < seen[seen.len() - 1];
     if !(ascending && wide) {
-        let message = "seen needs at least two finite values of the covariate in ascending order: those that the effect was learnt from";
+        let message = "seen must list at least two different finite values of the covariate in ascending order: those that the effect was fitted to";
         return Err(("seen", message.to_owned()));
     }
     Ok(seen.clone())
@@ -377,7 +380,9 @@ fn check_target(
         }
         _ => match model {
             SimulationModel::Matrices { structure, .. } => check_part(target, structure).map_err(wrong),
-            SimulationModel::Table(_) => Err(wrong("a table has no springs or masses: name a parameter".to_owned())),
+            SimulationModel::Table(_) => {
+                Err(wrong("a simulation \"table\" has no springs or masses: name a parameter as the target".to_owned()))
+            }
         },
     }
 }
@@ -399,14 +404,14 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
             .ok_or_else(|| format!("there is no mass or free node {} to attach to", shown(name)))
     };
     let node = |name: &String| if name == "ground" { Ok(Node::Ground) } else { dof(name).map(Node::Dof) };
-    let some = |count: usize| if count > 0 { Ok(()) } else { Err("name at least one spring or mass".to_owned()) };
+    let not_empty = |count: usize| if count > 0 { Ok(()) } else { Err("name at least one spring or mass".to_owned()) };
     match target {
         TargetDefinition::Springs(names) => {
-            some(names.len())?;
+            not_empty(names.len())?;
             Ok(Target::Springs(names.iter().map(spring).collect::<Result<_, _>>()?))
         }
         TargetDefinition::Masses(names) => {
-            some(names.len())?;
+            not_empty(names.len())?;
             Ok(Target::Masses(names.iter().map(mass).collect::<Result<_, _>>()?))
         }
         TargetDefinition::AddedSpring([a, b]) if a == b => {
@@ -426,7 +431,7 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
 /// A target as it is written in a structure file. `None` for a setting, which is not part of the structure.
 ///
 /// # Panics
-/// If the target acts on a part and `structure` is `None`, as for a table: a bug of the caller.
+/// If the target acts on a spring or mass and `structure` is `None`, as for a table: a programming error in the caller.
 pub fn target_definition(
     target: &Target,
     structure: Option<&Structure>,

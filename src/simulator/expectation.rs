@@ -1,4 +1,4 @@
-//! What the measurements of a structure must look like.
+//! The rules that measurements of a structure must satisfy.
 
 use super::Simulator;
 use crate::measurement::check::Expectation;

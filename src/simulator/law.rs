@@ -70,7 +70,8 @@ impl LawKind {
         }
     }
 
-    /// Names of the coefficients, the level first; empty for a law by category, whose coefficients are named after the categories.
+    /// Names of the coefficients, the level first; empty for a law by category, whose coefficients are named after the
+    /// categories.
     pub const fn numbers(self) -> &'static [&'static str] {
         match self {
             Self::Constant | Self::Step => &["size"],
@@ -99,8 +100,9 @@ impl Law {
         self.kind.numbers()[skipped..].iter().map(ToString::to_string).collect()
     }
 
-    /// Returns the size g of the effect at one value of the covariate for the coefficients `psi`, and writes its derivatives ∂g/∂ψ
-    /// to `slopes`. Both slices are as long as [`Self::numbers`]. The formulas are those of [`LawKind`].
+    /// Returns the size g of the effect at one value of the covariate for the coefficients `psi`, and writes its derivatives
+    /// ∂g/∂ψ to `slopes`. Both slices are as long as [`Self::numbers`], `[ψ]`. g is in the unit of the target of the effect.
+    /// The formulas are those of [`LawKind`].
     ///
     /// # Panics
     /// If `psi` or `slopes` is too short.
@@ -206,7 +208,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn slopes_of_every_law_are_its_central_differences() {
+    fn derivatives_of_every_law_equal_central_differences() {
         let law = |kind: LawKind, with_level| Law {
             kind,
             covariate: None,
@@ -244,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lag_follows_a_step_exponentially_and_its_slope_is_the_difference() {
+    fn a_lagged_step_is_exponential_and_its_derivative_is_exact() {
         let times: Vec<f64> = (0..50).map(|i| f64::from(i) * 0.5).collect();
         let values: Vec<f64> = (0..50).map(|i| if i == 0 { 0.0 } else { 1.0 }).collect();
         for ((value, slope), time) in lagged(&times, &values, 4.0).into_iter().zip(&times) {

@@ -26,7 +26,7 @@ pub(super) fn check_names<'a>(section: &str, names: impl Iterator<Item = &'a Str
         let pointer = format!("/{section}/{index}/name");
         let allowed = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
         if name.is_empty() || name.len() > 64 || !name.chars().all(allowed) {
-            let message = format!("the name {} must be 1 to 64 of letters, digits, '_', '-', '.'", shown(name));
+            let message = format!("the name {} must consist of 1 to 64 letters, digits, '_', '-' or '.'", shown(name));
             problems.push(DefinitionProblem::new(&pointer, message));
         }
         if let Some(first) = seen.insert(name, index) {

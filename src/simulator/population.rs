@@ -29,7 +29,7 @@ pub struct SimulatedMeasurements {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// A name is not that of a parameter.
-    #[error("{} is no parameter: the parameters are {known}", shown(.name))]
+    #[error("{} is not a parameter: the parameters are {known}", shown(.name))]
     Unknown {
         /// The name given.
         name: String,
@@ -55,7 +55,8 @@ pub enum Error {
 }
 
 impl Population {
-    /// Builds a population from (name, mean, standard deviation) of every parameter, in any order, in parameter units.
+    /// Builds a population from the `moments` (name, mean, standard deviation) of every parameter, `[d]`, in any order and in
+    /// parameter units.
     ///
     /// # Errors
     /// [`Error`] with the name of the parameter.
@@ -80,8 +81,9 @@ impl Population {
         Ok(Self { mean, std })
     }
 
-    /// Draws `measurements` measurements with `noise_multiple` times the measurement noise of the structure; 0 gives exact
-    /// frequencies. The draws are not truncated at the prior, because a damaged population can leave it.
+    /// Draws parameters, `[n, d]`, and simulates their frequencies, Hz, `[n, m]`: n = `measurements` measurements with
+    /// `noise_multiple` times the measurement noise of the structure; 0 gives exact frequencies. The draws are not truncated at
+    /// the prior, because a damaged population can leave it.
     ///
     /// # Errors
     /// [`SimulationError`] for a draw that gives a negative stiffness or a mechanism, and for noise that leaves no positive

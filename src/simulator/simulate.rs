@@ -50,7 +50,7 @@ pub enum Error {
 #[derive(Debug, Clone)]
 pub struct Simulator {
     parts: Arc<Parts>,
-    /// Sizes of the effects: those given, or else their means over the covariate values that they were learnt from.
+    /// Sizes of the effects: those given, or else their means over the covariate values that they were fitted to.
     sizes: Arc<[f64]>,
 }
 
@@ -124,8 +124,8 @@ impl Simulator {
         &self.parts.checked.effects
     }
 
-    /// The simulation under effects of the sizes `sizes` (all sizes of the first effect first); if `sizes` is empty, under effects
-    /// of their mean sizes.
+    /// The simulation under effects of the sizes `sizes`, `[sizes]`, in the order of the effects and in the units of their
+    /// targets; if `sizes` is empty, under effects of their mean sizes.
     ///
     /// # Panics
     /// If `sizes` is neither empty nor as long as the sizes of all effects.
@@ -138,7 +138,7 @@ impl Simulator {
         Self { sizes: sizes.into(), ..self.clone() }
     }
 
-    /// Sizes of the effects under the covariates of a measurement.
+    /// Sizes of the effects under the covariates of a measurement, in the units of their targets, `[sizes]`.
     pub fn effect_sizes(&self, covariates: &BTreeMap<String, CovariateValue>) -> effect::Sizes {
         effect::sizes(self.effects(), covariates)
     }
@@ -189,7 +189,8 @@ impl Simulator {
         self.table().map_or_else(Vec::new, |table| table.warnings(self.modes()))
     }
 
-    /// Whether the simulation is an emulator that has no runs near the parameters `theta` (`[d]`) under the effects.
+    /// Whether the simulation is an emulator that extrapolates at the parameters `theta` (`[d]`) under the effects, because the
+    /// table has no runs near them.
     pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
         let Some(table) = self.table() else { return false };
         let mut moved = theta.to_vec();
@@ -318,7 +319,7 @@ impl Simulator {
         self.frequencies_and_jacobian(theta).map(|(_, jacobian)| jacobian)
     }
 
-    /// [`Self::frequencies_hz`] and [`Self::jacobian`] from a single eigenproblem.
+    /// [`Self::frequencies_hz`], `[m]`, and [`Self::jacobian`], `[m, d]`, from a single eigenproblem.
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`].
@@ -343,8 +344,9 @@ impl Simulator {
         }
     }
 
-    /// The lowest `modes` frequencies at parameters `theta` (`[d]`) under the effects of the structure file and the further effects
-    /// `targets`, and their derivatives with respect to the parameters and to the sizes `sizes` of the further effects.
+    /// The lowest `modes` frequencies at parameters `theta` (`[d]`, parameter units) under the effects of the structure file
+    /// and the further effects `targets`, and their derivatives with respect to the parameters and to the sizes of the further
+    /// effects, `sizes` (`[sizes]`, in the units of the targets).
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`] and [`respond`].
@@ -410,10 +412,10 @@ impl Simulator {
         self.parts.checked.nominal_frequencies_hz.clone()
     }
 
-    /// Smallest and largest plausible measured frequency, Hz: the nominal range, widened by a factor of 100 on both sides. Values
-    /// outside are a wrong unit or a wrong column.
+    /// Smallest and largest plausible measured frequency, Hz: the nominal range, widened by a factor of 100 on both sides. A
+    /// value outside it has a wrong unit or is from a wrong column.
     ///
-    /// rad/s instead of Hz is still accepted here and recognised later from the posterior.
+    /// Frequencies given in rad/s instead of Hz are within these limits; they are recognised later from the posterior.
     pub fn frequency_limits_hz(&self) -> (f64, f64) {
         let nominal = self.nominal_frequencies_hz();
         let first = nominal.first().copied().unwrap_or(f64::MIN_POSITIVE);

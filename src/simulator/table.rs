@@ -54,7 +54,7 @@ impl Table {
         self.frequencies_and_jacobian(theta).0
     }
 
-    /// [`Self::frequencies_hz`] and their derivatives, Hz per parameter unit, `[modes, d]`.
+    /// [`Self::frequencies_hz`], `[modes]`, and their derivatives, Hz per parameter unit, `[modes, d]`.
     pub fn frequencies_and_jacobian(&self, theta: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
         if self.within(theta) {
             return self.emulator.frequencies_and_jacobian(theta);
@@ -70,8 +70,9 @@ impl Table {
         (frequencies, jacobian)
     }
 
-    /// Whether there are no runs near parameters `theta` (`[d]`): outside their range by more than a Latin hypercube leaves
-    /// unsampled, or outside their convex hull by more than the emulator allows.
+    /// Whether the emulator would extrapolate at parameters `theta` (`[d]`): they lie outside the range of the runs by more
+    /// than the edge that a Latin hypercube leaves unsampled, or in a part of that range without runs
+    /// ([`Emulator::is_outside`]).
     pub fn is_outside(&self, theta: &[f64]) -> bool {
         let ranges = || theta.iter().zip(self.emulator.ranges());
         let beyond = |(x, [low, high]): (&f64, [f64; 2])| {
@@ -122,7 +123,7 @@ impl Table {
     }
 }
 
-/// The emulator of the table of a definition.
+/// Reads the runs in the table of a definition, checks them and fits the emulator.
 pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) -> Result<Table, DefinitionProblem> {
     let wrong = |pointer: &str, message: String| DefinitionProblem::new(pointer, message);
     let Some(table) = &definition.table else {
@@ -154,6 +155,7 @@ pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) 
     Ok(Table { emulator, runs: count })
 }
 
+/// The emulator with this key from the cache; if it is not there, it is fitted and added.
 fn cached_or_fitted(key: String, runs: &Runs) -> Result<Arc<Emulator>, FitError> {
     let cache = || CACHE.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(emulator) = cache().get(&key) {
@@ -188,7 +190,7 @@ fn read_runs(csv: &str, space: &ParameterSpace, modes: usize) -> Result<Runs, St
     if let Some(unknown) = (0..headers.len()).find(|c| !wanted.contains(c) && headers[*c] != RUN_COLUMN) {
         let name = shown(&headers[unknown]);
         return Err(format!(
-            "the column {name} is no parameter, no frequency (f1_hz, f2_hz, …) and not \"{RUN_COLUMN}\": remove or rename it"
+            "the column {name} is neither a parameter nor a frequency (f1_hz, f2_hz, …) nor \"{RUN_COLUMN}\": remove or rename it"
         ));
     }
     if space.len() > MOST_COLUMNS || mode_columns.len() > MOST_COLUMNS {

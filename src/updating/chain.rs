@@ -39,6 +39,10 @@ pub struct CouplingStiffness {
 impl CouplingStiffness {
     /// Standard deviations of k12 and k23, N/m, to first order, for independent noise of both frequencies with the relative
     /// standard deviation `relative_noise`.
+    ///
+    /// ```text
+    ///  std(k)² = relative_noise² Σ_i (∂k/∂ln f_i)²,    i = 2, 3
+    /// ```
     pub fn std_n_per_m(&self, relative_noise: f64) -> [f64; 2] {
         self.sensitivity_n_per_m.map(|row| relative_noise * row[0].hypot(row[1]))
     }
@@ -79,12 +83,15 @@ pub enum ChainError {
 ///  P = d1 d2 d3,    Q = d3 (d1 + d2),    R = d1 (d2 + d3),    S = d1 + d2 + d3
 /// ```
 ///
-/// `ground_n_per_m` is the sum of the springs from each mass to the ground. The determinant is linear in each stiffness, so
-/// that eliminating k23 leaves a quadratic equation for k12 with up to two solutions. Solutions for which the given frequencies
-/// are not the second and third modes are discarded. If `first_hz` is given, the solution with the nearest first frequency comes
-/// first, otherwise the one with the smallest k12. There may be no solution because of measurement noise; near such frequencies
-/// two solutions almost coincide and their [`CouplingStiffness::std_n_per_m`] is large. A symmetric chain has mirrored pairs of
-/// solutions with the same first frequency, which cannot be distinguished.
+/// `masses_kg`: the three masses, kg; `ground_n_per_m`: the sum of the springs from each mass to the ground, N/m; `first_hz`,
+/// `second_hz`, `third_hz`: measured frequencies, Hz.
+///
+/// The determinant is linear in each stiffness, so that eliminating k23 leaves a quadratic equation for k12 with up to two
+/// solutions. Solutions for which the given frequencies are not the second and third modes are discarded. If `first_hz` is
+/// given, the solution with the nearest first frequency comes first, otherwise the one with the smallest k12. There may be no
+/// solution because of measurement noise; near such frequencies two solutions almost coincide and their
+/// [`CouplingStiffness::std_n_per_m`] is large. A symmetric chain has mirrored pairs of solutions with the same first
+/// frequency, which cannot be distinguished.
 ///
 /// Source: Wang et al. (2025), Eq. 24, which does not mention the second solution; on their rig it is often positive, too.
 ///

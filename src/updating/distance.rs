@@ -103,12 +103,13 @@ impl Moments {
     }
 }
 
-/// [`Moments::bhattacharyya`] between the rows of two matrices, `[n, m]` and `[N, m]`.
+/// [`Moments::bhattacharyya`] of the normal distributions fitted to the rows of two matrices, `[n, m]` and `[N, m]`; `None` if a
+/// covariance is singular.
 pub fn bhattacharyya(measured: &DMatrix<f64>, simulated: &DMatrix<f64>) -> Option<f64> {
     Moments::from_matrix(measured).bhattacharyya(&Moments::from_matrix(simulated))
 }
 
-/// Log-likelihood of a Bhattacharyya distance D_B, nats.
+/// Log-likelihood of a Bhattacharyya distance D_B, nats, up to a constant.
 ///
 /// ```text
 ///  ln L = −D_B / ε²
@@ -148,7 +149,7 @@ fn factorise(triangle: &mut [f64], size: usize) -> Option<f64> {
         }
         let variance = row[i];
         let pivot = variance - row[..i].iter().map(|l| l * l).sum::<f64>();
-        // Written so that NaN fails too.
+        // This form of the condition also rejects NaN.
         let regular = variance > 0.0 && pivot > SINGULAR * variance && pivot.is_finite();
         if !regular {
             return None;

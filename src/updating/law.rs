@@ -54,8 +54,8 @@ pub struct ExponentialFit {
     pub b: Estimate,
     /// C, in the unit of the stiffness.
     pub c: Estimate,
-    /// Standard deviation of the weighted residuals: in the unit of the stiffness, as a share of the stiffness, or as a multiple of
-    /// the given standard deviations, depending on the [`Weighting`].
+    /// Standard deviation of the weighted residuals: in the unit of the stiffness, as a share of the stiffness, or as a
+    /// multiple of the given standard deviations, depending on the [`Weighting`].
     pub residual_std: f64,
     /// Number of points minus the three constants.
     pub degrees_of_freedom: usize,
@@ -157,7 +157,7 @@ impl Shape {
     }
 }
 
-/// g(z) and ∂g/∂β; g(z) = z for β = 0.
+/// g(z) and ∂g/∂β of [`Shape`]; g(z) = z for β = 0.
 fn rising(beta: f64, z: f64) -> (f64, f64) {
     if beta == 0.0 {
         return (z, 0.5 * z * (z - 1.0));
@@ -198,7 +198,7 @@ impl Data<'_> {
 
     /// The heteroscedasticity-consistent covariance HC3.
     fn robust_covariance(&self, shape: &Shape, residuals: &[f64]) -> Result<Matrix3<f64>, FitError> {
-        // A point that determines the curve alone has leverage 1 and residual 0: this makes 0/0 become 0.
+        // A point that alone determines a constant has leverage 1 and residual 0: with this limit, 0/0 becomes 0.
         const LEAST_REMAINDER: f64 = 1e-9;
         let inverse = self.inverse_normal(shape)?;
         let weighted = |(row, residual): (&Vector3<f64>, &f64)| {
@@ -230,7 +230,7 @@ impl Data<'_> {
     }
 }
 
-/// Fits k(p) = A·exp(B·p) + C to points (p, k).
+/// Fits k(p) = A·exp(B·p) + C to n `points` (p, k), p: position, k: stiffness; the constants are in the units of p and k.
 ///
 /// ```text
 ///  minimise Σ r_i²,    r_i = (k_i − k(p_i))/s_i,    s_i by `weighting`
@@ -282,12 +282,13 @@ pub fn fit_exponential(points: &[(f64, f64)], weighting: Weighting<'_>) -> Resul
 }
 
 impl ExponentialFit {
-    /// Fitted stiffness at a position.
+    /// Fitted stiffness k(p) at a position, in the unit of the stiffnesses that were given.
     pub fn curve(&self, position: f64) -> f64 {
         self.shape.at(position)
     }
 
-    /// Pointwise 95 % confidence interval of the curve at a position. It is not a simultaneous band and not a prediction interval.
+    /// Pointwise 95 % confidence interval of the curve at a position, in the unit of the stiffness. It is not a simultaneous
+    /// band and not a prediction interval.
     pub fn band_95(&self, position: f64) -> [f64; 2] {
         let gradient = self.shape.gradient(position);
         let variance = (gradient.transpose() * self.covariance * gradient)[0];
@@ -296,6 +297,7 @@ impl ExponentialFit {
     }
 }
 
+/// Checks the points, and computes their weights and the range of their positions.
 fn checked<'a>(points: &'a [(f64, f64)], weighting: Weighting<'_>) -> Result<Data<'a>, FitError> {
     let stds: Vec<f64> = match weighting {
         Weighting::Absolute => vec![1.0; points.len()],
@@ -346,7 +348,7 @@ fn best_shape(data: &Data<'_>) -> Result<Shape, FitError> {
         let Some(step) = normal.cholesky().map(|c| c.solve(&descent)) else { break };
         let next = shape.moved(&step);
         let sum = data.sum_of_squares(&next);
-        // False for NaN.
+        // The comparison is false for NaN, which rejects the step.
         if sum < least {
             let small = (next.beta - shape.beta).abs() < 1e-14 * shape.beta.abs();
             (shape, least) = (next, sum);

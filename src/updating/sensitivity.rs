@@ -10,10 +10,10 @@ use crate::simulator::Simulator;
 const MOST_ITERATIONS: usize = 60;
 
 /// Root mean square of the relative residuals below which the frequencies are matched.
-const MET: f64 = 1e-9;
+const MATCHED_RESIDUAL: f64 = 1e-9;
 
 /// Step in the unit box below which the search has converged.
-const AT_REST: f64 = 1e-9;
+const CONVERGED_STEP: f64 = 1e-9;
 
 /// Result of updating the parameters by one measurement.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,9 +31,9 @@ pub struct Update {
 }
 
 impl Update {
-    /// Whether the frequencies at θ match the measured ones.
+    /// Whether the frequencies at θ match the measured ones: the residual is at most 1e-9.
     pub fn is_met(&self) -> bool {
-        self.residual <= MET
+        self.residual <= MATCHED_RESIDUAL
     }
 }
 
@@ -99,14 +99,14 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
         } else {
             damping *= 10.0;
         }
-        let met = root_mean_square(&residual) <= MET;
-        converged = met || moved <= AT_REST || damping > 1e10;
+        let matched = root_mean_square(&residual) <= MATCHED_RESIDUAL;
+        converged = matched || moved <= CONVERGED_STEP || damping > 1e10;
     }
     Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, starts: 1, converged })
 }
 
-/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the middle of the prior; while its frequencies are not
-/// matched, it starts again from the next of `further_starts` (`[starts][d]`), and the best result is kept.
+/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the middle of the prior; while its frequencies are
+/// not matched, it starts again from the next of `further_starts` (`[starts][d]`), and the best result is kept.
 ///
 /// # Errors
 /// As [`update`].
@@ -134,8 +134,8 @@ pub fn update_all(
     measurements.par_iter().map(one).collect()
 }
 
-/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box over the first six parameters, with
-/// the others at the middle of their priors, `[starts][d]`.
+/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box over the first six parameters,
+/// with the others at the middle of their priors, `[starts][d]`.
 pub fn prior_lattice(simulator: &Simulator) -> Vec<Vec<f64>> {
     const MOST: usize = 64;
     let space = simulator.space().as_slice();

@@ -1,5 +1,5 @@
-//! Stochastic model updating: finds the mean and the standard deviation of the parameters for which simulated frequencies have the
-//! same distribution as the measured ones.
+//! Stochastic model updating: finds the mean and the standard deviation of the parameters for which simulated frequencies have
+//! the same distribution as the measured ones.
 
 use nalgebra::DMatrix;
 use rand::{Rng as _, RngCore as _};
@@ -14,16 +14,16 @@ use crate::stats::{self, Stream};
 const SIMULATED: usize = 128;
 
 /// Default number of simulated measurements at each θ for a batch of n = `measurements` measurements. They are points of a Sobol'
-/// sequence, and their number is chosen so that the error of their moments changes ln L by less than ½. This error of ln L is 4n
-/// times the square of the error of the moments, which decreases inversely with the number of points.
+/// sequence, and their number is a power of two, chosen so that the error of their moments changes ln L by less than ½. This
+/// error of ln L is 4n times the square of the error of the moments, which decreases inversely with the number of points.
 pub fn simulated_for(measurements: usize) -> usize {
     let needed = SIMULATED as f64 * (measurements as f64 / 500.0).sqrt();
     (needed.ceil() as usize).clamp(SIMULATED, MOST_POINTS).next_power_of_two()
 }
 
-/// Settings for `samples` samples when each evaluation of the likelihood takes about a hundred model runs. The samples move only
-/// until their correlation has halved, which halves the number of evaluations and increases the scatter of the evidence by a
-/// third.
+/// Settings for `samples` samples when each evaluation of the likelihood takes about a hundred model runs. In each stage the
+/// samples move only until their correlation with their starting points has fallen to 0.5. This halves the number of evaluations
+/// and increases the standard error of the log-evidence by a third.
 pub fn settings(samples: usize) -> Settings {
     Settings { samples, correlation: 0.5, ..Settings::default() }
 }
@@ -203,8 +203,8 @@ impl<'a> Population<'a> {
     }
 }
 
-/// Transforms the scores `[points, dimensions]` to have exactly mean 0 and covariance I. Their images under a linear map then have
-/// the exact moments, and only the curvature of the map causes an error. `None` for too few points for a covariance.
+/// Transforms the scores `[points, dimensions]` to have exactly mean 0 and covariance I. Their images under a linear map then
+/// have the exact moments, and only the curvature of the map causes an error. `None` for too few points for a covariance.
 ///
 /// Source: J. Barraquand (1995), Numerical valuation of high dimensional multivariate European securities, Management Science
 /// 41, 1882–1891 (quadratic resampling).

@@ -29,7 +29,7 @@ pub trait Target: Sync {
     /// Number of dimensions d of θ.
     fn dimensions(&self) -> usize;
 
-    /// Draws θ from the prior, `[d]`.
+    /// Draws one θ from the prior, `[d]`.
     fn draw_prior(&self, stream: &mut Stream) -> Vec<f64>;
 
     /// Logarithm of the prior density, −∞ outside its support. A constant factor may be omitted, because it changes neither the
@@ -52,8 +52,8 @@ pub struct Settings {
     /// In each stage the samples move until the correlation of every parameter with its start is at most this, from 0 to 1. With
     /// fewer steps, copies of the same sample would remain and the uncertainty of the results would be underestimated.
     pub correlation: f64,
-    /// Largest number of Metropolis steps of a sample in one stage; at least 1. It is reached for a posterior with separate modes,
-    /// for which the correlation remains high.
+    /// Largest number of Metropolis steps of a sample in one stage; at least 1. It is reached for a posterior with separate
+    /// modes, for which the correlation remains high.
     pub most_steps: usize,
 }
 
@@ -150,7 +150,7 @@ pub enum Error {
         theta: Vec<f64>,
     },
     /// The exponent did not reach 1, because the likelihood is concentrated in too small a part of the prior.
-    #[error("the exponent of the likelihood is only {exponent} after {stages} stages, and must reach 1")]
+    #[error("the exponent of the likelihood reached only {exponent} in {stages} stages, and must reach 1")]
     TooManyStages {
         /// Number of stages.
         stages: usize,
@@ -190,9 +190,9 @@ pub enum Error {
 /// The same seed gives the same bits on any number of threads, because every sample has its own random stream in every stage.
 /// `progress` is called after each stage.
 ///
-/// Source: Ching & Chen (2007) for stages, weights and evidence. Betz et al. (2016) for β, and for why the samples move by
-/// several steps instead of a chain growing from each as often as it is drawn: such chains are biased. Lee & Whiteley (2018)
-/// for the standard error, which requires multinomial resampling.
+/// Source: Ching & Chen (2007) for stages, weights and evidence. Betz et al. (2016) for β, and for moving each resampled copy by
+/// several steps: in the original method, copies of the same sample form one chain, which is biased. Lee & Whiteley (2018) for
+/// the standard error, which requires multinomial resampling.
 ///
 /// # Errors
 /// [`Error`] for settings outside their range, and for a target that cannot be sampled.

@@ -13,7 +13,8 @@ pub(super) struct Weights {
 }
 
 impl Weights {
-    /// Weights L^step. They are zero where L is zero, even for a step of 0. At least one L must be positive.
+    /// Weights L^step of samples with the logarithms `log_likelihood` of their likelihoods, nats, `[n]`. They are zero where L is
+    /// zero, even for a step of 0. At least one L must be positive.
     pub fn new(log_likelihood: &[f64], step: f64) -> Self {
         let n = log_likelihood.len() as f64;
         let largest = log_likelihood.iter().copied().fold(f64::NEG_INFINITY, f64::max);

@@ -226,7 +226,7 @@ fn mistakes_in_a_beam_are_named_with_their_place() {
     let cases = [
         ("support = \"pinned\"", "support = \"glued\"", "/node/0/support", "unknown variant `glued`"),
         ("x_m = 12.0", "x_m = 0.0", "/beam/0/to", "no length"),
-        ("to = \"pier\"\nbending", "to = \"peer\"\nbending", "/beam/0/to", "\"peer\", which is no node"),
+        ("to = \"pier\"\nbending", "to = \"peer\"\nbending", "/beam/0/to", "\"peer\", which is not a node"),
         ("bending_stiffness_n_m2 = 3.0e8\n", "", "/beam/1", "no bending_stiffness_n_m2"),
         ("bending_stiffness_n_m2 = 3.0e8", "bending_stiffness_n_m2 = -1.0", "/beam/1/bending_stiffness_n_m2", "above 0"),
         ("mass_kg_per_m = 800.0", "mass_kg_per_m = 0.0", "/beam/1/mass_kg_per_m", "above 0"),
@@ -234,7 +234,7 @@ fn mistakes_in_a_beam_are_named_with_their_place() {
         ("elements = 6", "elements = 600", "/beam/1/elements", "at most 200"),
         ("at = \"pier\"", "at = \"end\"", "/mass/0/at", "does not move"),
         ("at = \"pier\"\n", "", "/mass/0/at", "no node"),
-        ("to = \"end\"\nn_m_per_rad", "to = \"end\"\nn_per_m", "/spring/1/to", "support holds it already"),
+        ("to = \"end\"\nn_m_per_rad", "to = \"end\"\nn_per_m", "/spring/1/to", "support fixes this degree of freedom already"),
         ("n_m_per_rad = 2.0e7", "n_m_per_rad = 2.0e7\nn_per_m = 1.0", "/spring/1/n_m_per_rad", "not both"),
         ("sets = { beam = \"west\" }", "sets = { beam = \"wast\" }", "/parameter/0/sets", "no beam \"wast\""),
         ("sets = { beam = \"west\" }", "sets = { beam = \"west\", spring = \"clamp\" }", "/parameter/0/sets", "one spring or one beam"),

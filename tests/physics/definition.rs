@@ -69,7 +69,7 @@ fn each_mistake_is_named_with_its_line_and_place() {
         ("kg = 1.0\n[[spring]]", "kg = -1.0\n[[spring]]", 8, "/mass/1/kg", "-1 kg"),
         ("kg = 1.0\n[[spring]]", "kg = nan\n[[spring]]", 8, "/mass/1/kg", "NaN kg"),
         ("n_per_m = 10.0", "n_per_m = -10.0", 13, "/spring/0/n_per_m", "not negative"),
-        ("to = \"m2\"", "to = \"m9\"", 17, "/spring/1/to", "\"m9\", which is no mass"),
+        ("to = \"m2\"", "to = \"m9\"", 17, "/spring/1/to", "\"m9\", which is neither a mass nor"),
         ("to = \"m2\"", "to = \"m1\"", 17, "/spring/1/to", "to itself"),
         ("name = \"k2\"", "name = \"k1\"", 15, "/spring/1/name", "used already by /spring/0"),
         ("to = \"m1\"\nn_per_m = 10.0", "to = \"m1\"", 9, "/spring/0", "no n_per_m and no parameter"),

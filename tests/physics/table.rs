@@ -166,7 +166,7 @@ fn mistakes_in_a_table_are_named_with_their_place() {
     let cases = [
         ("run,p12", "run,p13".to_owned(), "/table/csv", "no column \"p12\""),
         ("f3_hz", "f4_hz".to_owned(), "/table/csv", "f3_hz is missing"),
-        ("run,p12", "label,p12".to_owned(), "/table/csv", "\"label\" is no parameter"),
+        ("run,p12", "label,p12".to_owned(), "/table/csv", "\"label\" is neither a parameter nor a frequency"),
         (line.as_str(), line.replace(cells[4], "x"), "/table/csv", "column f2_hz: \"x\" is not a finite number"),
         (line.as_str(), line.replace(cells[4], "999"), "/table/csv", "run 7"),
         ("uniform = [0.0, 0.12]", "uniform = [0.0, 0.2]".to_owned(), "/parameter/0/prior/uniform", "does not extrapolate"),

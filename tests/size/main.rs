@@ -141,7 +141,7 @@ fn a_shape_unlike_every_mode_is_named_with_the_mode_it_is_least_unlike() {
     }
     let alternating: Vec<f64> = (0..15).map(|i| if i % 2 == 0 { 1.0 } else { -1.0 }).collect();
     let mistake = points.mistake(&alternating).unwrap();
-    assert!(mistake.contains("its MAC is at most 0.0") && mistake.contains("those of m2, m4, m6, …"), "{mistake}");
+    assert!(mistake.contains("its highest MAC is 0.0") && mistake.contains("those of m2, m4, m6, …"), "{mistake}");
 }
 
 #[test]
@@ -153,10 +153,16 @@ fn what_is_wrong_with_instrumented_points_is_said() {
         StructureDefinition::parse_toml(&text).unwrap_err().to_string()
     };
     let table = [
-        (wrong("\"m4\", ", "\"m9\", "), "/mode_shapes/points/1: \"m9\" is no mass or node that moves"),
+        (
+            wrong("\"m4\", ", "\"m9\", "),
+            "/mode_shapes/points/1: \"m9\" is not the name of a mass or of a node that can deflect",
+        ),
         (wrong("\"m4\", ", "\"m2\", "), "/mode_shapes/points/1: \"m2\" is listed twice"),
-        (wrong("[\"m2\", \"m4\", \"m6\"]", "[\"m2\"]"), "/mode_shapes/points: 1 points: a shape has at least 2"),
-        (wrong("noise = 0.005", "noise = 0.0"), "/mode_shapes/noise: 0 is no share of a shape's root mean square"),
+        (wrong("[\"m2\", \"m4\", \"m6\"]", "[\"m2\"]"), "/mode_shapes/points: 1 points: a shape needs at least 2"),
+        (
+            wrong("noise = 0.005", "noise = 0.0"),
+            "/mode_shapes/noise: a noise of 0 is not valid: it is a share of the shape's root mean square",
+        ),
     ];
     for (message, expected) in table {
         assert!(message.contains(expected), "{message}");

@@ -20,7 +20,7 @@ use residuals::{figure, Axis, Drawn};
 /// Greatest number of misfits in the table.
 const MISFITS: usize = 12;
 
-/// One self-contained HTML page; `None` if the structure has no frequencies in some row under one of the fits.
+/// One self-contained HTML page; `None` if the frequencies cannot be computed in some row under one of the fits.
 pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<String> {
     let d = &outcome.diagnosis;
     let drawn = Drawn::new(simulator, data, outcome)?;

@@ -12,7 +12,7 @@ use crate::stats;
 /// Greatest number of rows that are drawn.
 const MOST_DRAWN: usize = 1500;
 
-/// Stride that spreads points evenly over an interval, whatever the period of the data: the golden ratio minus 1.
+/// Stride that spreads points evenly over an interval for data with any period: the golden ratio minus 1.
 const GOLDEN: f64 = 0.618_033_988_749_895;
 
 /// Colours of [`Points`]: orange without, blue with the causes.
@@ -43,11 +43,11 @@ pub(super) struct Axis {
 }
 
 impl<'a> Drawn<'a> {
-    /// `None` if the structure has no frequencies in some row under one of the fits.
+    /// `None` if the frequencies cannot be computed in some row under one of the fits.
     pub(super) fn new(simulator: &'a Simulator, data: &'a Data, outcome: &Outcome) -> Option<Self> {
         let stride = (data.rows() as f64 / MOST_DRAWN as f64).max(1.0);
         let count = (data.rows() as f64 / stride).floor() as usize;
-        // Evenly, but not at a fixed phase, which would select the same hour of every day.
+        // Rows are selected evenly but not periodically: a fixed period could select the same hour of every day.
         let place = |i: usize| if stride > 1.0 { (i as f64 * GOLDEN).fract() } else { 0.0 };
         let rows: Vec<usize> = (0..count).map(|i| ((i as f64 + place(i)) * stride) as usize).collect();
         // Both fits contain the effects of the structure.

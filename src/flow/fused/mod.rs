@@ -1,9 +1,9 @@
-//! Training on the CPU without candle: loss, gradient and optimiser written out, in single precision.
+//! Training on the CPU without candle: loss, gradient and optimiser implemented by hand in single precision.
 //!
 //! candle allocates a tensor for every operation of the forward and the backward pass, and adds the gradients of shared
 //! inputs one by one. Here a tile of the batch passes through the whole flow, forward and backward, in reused buffers, and
-//! all weights are in one vector. `Flow::forward` with candle's gradient remains the readable form, and the reference in
-//! the tests.
+//! all weights are in one vector. `Flow::forward` with candle's gradient remains the readable implementation, and the
+//! reference in the tests.
 //!
 //! ```text
 //!  loss = 1/M Σ ( ½|z|² − Σ s ),   ∂loss/∂z = z/M,   ∂loss/∂s = −1/M plus the part through exp(s)
@@ -124,8 +124,8 @@ impl Fused {
         self.pass(rows, &all, false)
     }
 
-    /// Makes one step of the optimiser on the `chosen` rows and returns their mean loss before it, nats. Where that is not
-    /// finite, no step is made.
+    /// Makes one step of the optimiser on the rows with the indices `chosen`, `[M]`, and returns their mean loss before the step,
+    /// nats. If that loss is not finite, no step is made.
     pub fn step(&mut self, rows: &Rows, chosen: &[u32], learning_rate: f64) -> f64 {
         let loss = self.pass(rows, chosen, true);
         if loss.is_finite() {
@@ -135,7 +135,7 @@ impl Fused {
         loss
     }
 
-    /// The current weights, in the order of the layout.
+    /// The current weights as one vector, `[weights]`, in alphabetical order of their names.
     pub fn weights(&self) -> &[f32] {
         &self.weights
     }
@@ -148,7 +148,7 @@ impl Fused {
         self.layout.write(values, weights)
     }
 
-    /// Mean loss of the `chosen` rows. With `back`, the lanes contain the partial sums of its gradient afterwards.
+    /// Mean loss of the `chosen` rows, nats. If `back` is true, the lanes then contain the partial sums of its gradient.
     fn pass(&mut self, rows: &Rows, chosen: &[u32], back: bool) -> f64 {
         let mut own = std::mem::take(&mut self.lanes);
         while own.len() < lanes(chosen.len()) {

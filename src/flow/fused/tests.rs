@@ -107,7 +107,7 @@ fn the_optimiser_takes_the_same_steps_as_candle() {
 }
 
 #[test]
-fn the_number_of_threads_changes_no_bit() {
+fn the_result_does_not_depend_on_the_number_of_threads() {
     let trained = |threads: usize| {
         let case = case(4, 3, 1, 300);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

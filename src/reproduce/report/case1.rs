@@ -46,6 +46,7 @@ pub fn html(case: &Case) -> String {
     .concat()
 }
 
+/// Figure 9.
 fn measured(undamaged: Option<&State>) -> String {
     let panels = undamaged.map_or_else(Vec::new, |state| frequencies(state, ""));
     let caption =
@@ -54,6 +55,7 @@ fn measured(undamaged: Option<&State>) -> String {
     figure("fig9", &panels, &frequency_keys(), caption)
 }
 
+/// Figure 10.
 fn found(undamaged: Option<&State>) -> String {
     let panels = undamaged.map_or_else(Vec::new, |state| posteriors(state, ""));
     let prior = undamaged.and_then(|state| state.quantities.first()).and_then(|q| Some((q.prior?, &q.unit)));
@@ -67,10 +69,12 @@ fn found(undamaged: Option<&State>) -> String {
     figure("fig10", &panels, &posterior_keys(), &caption)
 }
 
+/// Beginning of the titles of the panels of a state.
 fn title(state: &State) -> String {
     format!("{}, ", capital(&state.name))
 }
 
+/// Figure 11.
 fn measured_damaged(scenarios: &[State]) -> String {
     let panels: Vec<String> = scenarios.iter().flat_map(|state| frequencies(state, &title(state))).collect();
     let caption =
@@ -79,6 +83,7 @@ fn measured_damaged(scenarios: &[State]) -> String {
     figure("fig11", &panels, &frequency_keys(), caption)
 }
 
+/// Figure 12.
 fn found_damaged(scenarios: &[State]) -> String {
     let panels: Vec<String> = scenarios.iter().flat_map(|state| posteriors(state, &title(state))).collect();
     let caption = "Figure 12. Posterior of each stiffness in the damage scenarios: it should follow the target, and \
@@ -86,6 +91,7 @@ fn found_damaged(scenarios: &[State]) -> String {
     figure("fig12", &panels, &posterior_keys(), caption)
 }
 
+/// Figure 13.
 fn compared(undamaged: Option<&State>, scenarios: &[State]) -> String {
     let panels = |state: &State| -> Vec<String> {
         let before = undamaged.map_or(&[][..], |state| &state.quantities);
@@ -103,6 +109,7 @@ fn compared(undamaged: Option<&State>, scenarios: &[State]) -> String {
     figure("fig13", &scenarios.iter().flat_map(panels).collect::<Vec<_>>(), &keys, &caption)
 }
 
+/// Figure 14.
 fn by_method(case: &Case) -> String {
     let quantities = case.states.first().map_or(&[][..], |state| &state.quantities);
     let panel = |(k, q): (usize, &Quantity)| methods(&case.methods, k, [&q.name, &q.unit], q.target, &[]);

@@ -44,10 +44,12 @@ pub fn html(case: &Case) -> String {
     .concat()
 }
 
+/// A cloud of dots.
 fn cloud(colour: usize, radius: u32, points: Vec<(f64, f64)>) -> Cloud {
     Cloud { colour, radius, points, crosses: false }
 }
 
+/// A square plot of the positions of both links.
 fn links(title: String, clouds: Vec<Cloud>) -> Panel {
     let [x_label, y_label] = ["p12, m", "p23, m"].map(str::to_owned);
     Panel {
@@ -61,6 +63,7 @@ fn links(title: String, clouds: Vec<Cloud>) -> Panel {
     }
 }
 
+/// Figure 16.
 fn configurations(all: &[Configuration]) -> String {
     let of = |damaged: bool| -> Vec<(f64, f64)> {
         all.iter().filter(|c| c.damaged == damaged).map(|c| (c.p12_m, c.p23_m)).collect()
@@ -83,6 +86,7 @@ fn total(sensitivity: &Sensitivity, input: usize, output: usize) -> Option<Index
     sensitivity.outputs.get(output)?.indices.as_ref()?.total.get(input).copied()
 }
 
+/// Figure 17 and the table of its indices.
 fn sensitivity(s: &Sensitivity) -> String {
     let outputs = 0..s.outputs.len();
     let row = |output: usize| (0..s.inputs.len()).map(|input| Some(total(s, input, output)?.value)).collect();
@@ -115,6 +119,7 @@ fn sensitivity(s: &Sensitivity) -> String {
     figure("fig17", &[heat.svg()], "", caption) + &framed("fig17-table", &text, &head(&titles), &body)
 }
 
+/// Figure 18 and the table of its constants.
 fn laws(laws: &[LawFit]) -> String {
     let panel = |law: &LawFit| {
         let ends = |pick: fn(f64, f64) -> f64, from: f64| law.points.iter().map(|p| p.0).fold(from, pick);
@@ -157,7 +162,7 @@ fn laws(laws: &[LawFit]) -> String {
         + &framed("fig18-table", "The constants of k = A·exp(B·p) + C in Figure 18", &head(&titles), &body)
 }
 
-/// A, B and C of a coupling, beside those of the paper.
+/// A, B and C of a coupling, compared with those of the paper.
 fn constants(law: &LawFit) -> String {
     let fitted: [(&str, &Estimate); 3] = [("A, N/m", &law.fit.a), ("B, 1/m", &law.fit.b), ("C, N/m", &law.fit.c)];
     let line = |((name, estimate), paper): ((&str, &Estimate), f64)| {
@@ -188,6 +193,7 @@ fn pairs(state: &State, of: fn(&Quantity) -> &Vec<f64>) -> Vec<(f64, f64)> {
     first.iter().copied().zip(second.iter().copied()).collect()
 }
 
+/// Figure 20.
 fn settings(states: &[State]) -> String {
     let all: Vec<f64> =
         states.iter().flat_map(|s| s.quantities.iter().take(2)).flat_map(|q| &q.samples).copied().collect();
@@ -205,6 +211,7 @@ fn settings(states: &[State]) -> String {
     figure("fig20", &states.iter().map(panel).collect::<Vec<_>>(), &keys, caption)
 }
 
+/// Figure 21.
 fn compared(states: &[State]) -> String {
     let [undamaged, damaged] = [0, 1].map(|index| states.get(index).map_or(&[][..], |state| &state.quantities));
     let stiffness = |q: &Quantity| q.prior.is_none();
@@ -224,6 +231,7 @@ fn compared(states: &[State]) -> String {
     figure("fig21", &panels, &keys, &caption)
 }
 
+/// Figure 22.
 fn by_method(case: &Case) -> String {
     let configurations = case.rig.as_ref().map_or(&[][..], |rig| &rig.configurations);
     let set = [

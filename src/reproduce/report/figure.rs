@@ -20,6 +20,7 @@ pub fn name(quantity: &Quantity) -> &str {
     quantity.name.rsplit(':').next().unwrap_or_default()
 }
 
+/// Label of an axis: a name with its unit.
 pub fn with_unit(name: &str, unit: &str) -> String {
     if unit.is_empty() {
         name.to_owned()
@@ -28,6 +29,7 @@ pub fn with_unit(name: &str, unit: &str) -> String {
     }
 }
 
+/// Label of the axis of a density over a quantity with this unit.
 pub fn per(unit: &str) -> String {
     if unit.is_empty() {
         "density".to_owned()
@@ -81,6 +83,7 @@ pub fn frequencies(state: &State, prefix: &str) -> Vec<String> {
     state.frequencies_hz.iter().enumerate().map(panel).collect()
 }
 
+/// Legend of [`frequencies`], as HTML.
 pub fn frequency_keys() -> String {
     key(Swatch::Bar, MEASURED, "measurements") + &key(Swatch::Line, OURS, "normal curve fitted to them")
 }
@@ -115,6 +118,7 @@ pub fn posteriors(state: &State, prefix: &str) -> Vec<String> {
     state.quantities.iter().filter(|q| q.prior.is_some()).map(panel).collect()
 }
 
+/// Legend of [`posteriors`], as HTML.
 pub fn posterior_keys() -> String {
     key(Swatch::Bar, PRIOR, "prior")
         + &key(Swatch::Bar, OURS, "posterior samples")
@@ -148,8 +152,8 @@ pub fn damage_text(state: &State, wanted: impl Fn(&Quantity) -> bool) -> String 
     format!("{}: {}", capital(&state.name), texts.join(", "))
 }
 
-/// Figures 14 and 22: densities of a parameter by each method. `target` gives the normal curve that the values were drawn from, or
-/// `drawn` the values themselves.
+/// Figures 14 and 22: densities of a parameter by each method. `target` gives the normal curve that the values were drawn from,
+/// or `drawn` the values themselves.
 pub fn methods(
     methods: &[MethodSamples],
     k: usize,
@@ -179,6 +183,7 @@ pub fn methods(
     panel.svg()
 }
 
+/// Legend of the methods in [`methods`], as HTML.
 pub fn method_keys() -> String {
     METHODS.iter().map(|(_, colour, name)| key(Swatch::Line, *colour, name)).collect()
 }

@@ -14,14 +14,14 @@ pub fn framed(id: &str, caption: &str, head: &str, body: &str) -> String {
     )
 }
 
-/// Titles of columns; `true` aligns to the left.
+/// Header cells of a table, as HTML: the title of each column (HTML) and whether it is left-aligned.
 pub fn head(titles: &[(&str, bool)]) -> String {
     let class = |words: bool| if words { " class=\"words\"" } else { "" };
     let cell = |(title, words): &(&str, bool)| format!("<th scope=\"col\"{}>{title}</th>", class(*words));
     titles.iter().map(cell).collect()
 }
 
-/// One number of a row.
+/// One figure of a row, printed as one line of the table.
 struct Line<'a> {
     row: &'a Row,
     figure: Figure,
@@ -116,7 +116,7 @@ pub fn methods(id: &str, caption: &str, rows: &[Row]) -> String {
     framed(id, caption, &head(&titles), &body)
 }
 
-/// Heading of some lines, HTML, the name of each, HTML, and the lines.
+/// A group of lines: its heading, the name of each line (both HTML), and the lines.
 type Block<'a> = (String, Vec<String>, Vec<Line<'a>>);
 
 fn by_parameter<'a>(rows: &[&'a Row]) -> Vec<Block<'a>> {
@@ -195,7 +195,7 @@ fn error(line: &Line<'_>, decimals: usize) -> String {
     }
 }
 
-/// Tables 6 and 10.
+/// Tables 6 and 10: the time of each step of each method, here and in the paper.
 pub fn time(id: &str, caption: &str, rows: &[Time]) -> String {
     let reference = rows.iter().find(|t| t.method == Method::Tmcmc).map_or(f64::NAN, |t| t.paper_seconds);
     let one = |t: &Time| {

@@ -116,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_are_written_as_one_reads_them() {
+    fn numbers_are_formatted_for_readers() {
         assert_eq!([fixed(-0.0004, 2), fixed(-1.5, 1), fixed(f64::NAN, 1)], ["0.00", "−1.5", "–"]);
         assert_eq!([digits(0.011_64), digits(3202.4), digits(0.0)], ["0.0116", "3202", "0.000"]);
         assert_eq!(
