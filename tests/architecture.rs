@@ -201,7 +201,7 @@ fn each_module_uses_only_modules_below_it() {
 }
 
 #[test]
-fn only_the_store_speaks_sql_and_only_the_doors_speak_http() {
+fn only_the_store_uses_sqlx_and_only_http_uses_axum() {
     for path in sources() {
         let (module, text) = (module_of(&path), fs::read_to_string(root().join(&path)).unwrap());
         assert!(module == "store" || !text.contains("sqlx::"), "{} uses sqlx", path.display());

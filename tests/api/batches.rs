@@ -51,7 +51,7 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
 }
 
 #[tokio::test]
-async fn the_example_of_the_readme_is_taken() {
+async fn the_example_of_the_readme_is_accepted() {
     let readme = include_str!("../../README.md");
     let (_, rest) = readme.split_once(" -d '").unwrap();
     let (body, _) = rest.split_once("'\n").unwrap();
@@ -221,7 +221,7 @@ fn codes(answer: &Value) -> Vec<&str> {
 }
 
 #[tokio::test]
-async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
+async fn an_untrusted_batch_has_findings_and_no_probability_of_damage() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
@@ -268,7 +268,7 @@ async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
 }
 
 #[tokio::test]
-async fn one_bad_measurement_is_named_and_the_others_are_believed() {
+async fn one_outlier_is_reported_and_the_others_are_used() {
     let (service, _folder) = spawn();
     let mut rows = measurements([4.0, 5.0, 6.0], 12, 0);
     rows[7]["frequencies_hz"] = json!([0.47, 1.05, 1.24]);
@@ -280,7 +280,7 @@ async fn one_bad_measurement_is_named_and_the_others_are_believed() {
 }
 
 #[tokio::test]
-async fn damage_becomes_one_alarm_which_somebody_sees() {
+async fn damage_becomes_one_alarm_that_can_be_acknowledged() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
@@ -336,7 +336,7 @@ async fn one_measurement_has_a_mean_and_no_spread() {
 }
 
 #[tokio::test]
-async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_baseline() {
+async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_model() {
     let (service, _folder) = spawn();
     let definition = json!({
         "id": "tower-1", "modes": 1,

@@ -200,7 +200,7 @@ async fn a_spike_among_twenty_thousand_measurements_is_in_the_reduced_series() {
 }
 
 #[tokio::test]
-async fn a_question_that_makes_no_sense_is_named() {
+async fn an_invalid_query_is_refused_with_its_place() {
     let (service, _folder) = spawn();
     for (query, place) in [
         ("from=yesterday", "query/from"),
@@ -324,7 +324,7 @@ impl Watcher {
 }
 
 #[tokio::test]
-async fn events_tell_of_batches_alarms_structures_and_jobs() {
+async fn events_report_batches_alarms_structures_and_jobs() {
     let (service, _folder) = spawn();
     let mut watcher = Watcher::open(&service).await;
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
@@ -355,7 +355,7 @@ async fn events_tell_of_batches_alarms_structures_and_jobs() {
 }
 
 #[tokio::test]
-async fn a_job_is_told_of_from_its_beginning_to_its_end_and_listed() {
+async fn events_follow_a_job_from_beginning_to_end_and_it_is_listed() {
     let (service, _folder) = spawn();
     assert_eq!(service.read("/v1/jobs").await, json!({ "items": [] }));
     for i in 0..6 {

@@ -173,7 +173,7 @@ fn a_measurement_beyond_the_prior_is_counted_and_does_not_spill_into_other_param
 }
 
 #[test]
-fn a_damaged_foreign_or_outdated_baseline_is_refused_with_the_reason() {
+fn a_damaged_foreign_or_outdated_model_is_refused_with_the_reason() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/three-dof");
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
     let (manifest, weights) = (read("baseline.json"), read("baseline.safetensors"));

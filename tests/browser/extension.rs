@@ -87,7 +87,7 @@ fn press_and_confirm(page: &mut Page, button: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undoes_it() {
+async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_be_undone() {
     let Some(_turn) = turn().await else { return };
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");

@@ -67,7 +67,7 @@ async fn a_wrong_token_is_refused_with_a_message_and_the_right_one_shows_the_fle
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_that_only_reads_sees_everything_and_is_told_what_it_lacks_to_change_it() {
+async fn a_read_token_sees_everything_and_a_refused_change_names_the_missing_scope() {
     let Some(_turn) = turn().await else { return };
     let folder = tempfile::tempdir().unwrap();
     let admin = first_token(folder.path());

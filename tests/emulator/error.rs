@@ -27,7 +27,7 @@ fn error_met(emulator: &Emulator, truth: impl Fn(&[f64]) -> Vec<f64>) -> Vec<f64
 }
 
 #[test]
-fn the_error_told_of_the_rig_is_small_and_met_at_fresh_points() {
+fn the_estimated_error_of_the_rig_is_small_and_right_at_new_points() {
     for seed in 0..4 {
         let emulator = Emulator::fit(&runs(latin_hypercube(200, 2, seed), rig)).unwrap();
         for (mode, met) in error_met(&emulator, rig).iter().enumerate() {
@@ -42,7 +42,7 @@ fn the_error_told_of_the_rig_is_small_and_met_at_fresh_points() {
 }
 
 #[test]
-fn the_error_told_of_twenty_parameters_is_met_at_fresh_points() {
+fn the_estimated_error_with_twenty_parameters_is_right_at_new_points() {
     let emulator = Emulator::fit(&runs(latin_hypercube(300, 20, 0), long_chain)).unwrap();
     for (mode, met) in error_met(&emulator, long_chain).iter().enumerate() {
         let told = emulator.relative_error(mode);
@@ -52,7 +52,7 @@ fn the_error_told_of_twenty_parameters_is_met_at_fresh_points() {
 }
 
 #[test]
-fn noise_shows_in_the_error_told_and_runs_done_twice_break_nothing() {
+fn noise_shows_in_the_estimated_error_and_repeated_runs_are_accepted() {
     let once = latin_hypercube(100, 2, 4);
     let twice = DMatrix::from_fn(200, 2, |run, j| once[(run / 2, j)]);
     let exact = runs(twice.clone(), rig);
@@ -68,7 +68,7 @@ fn noise_shows_in_the_error_told_and_runs_done_twice_break_nothing() {
 }
 
 #[test]
-fn the_residual_of_each_run_left_out_explains_the_error_told() {
+fn the_residuals_of_runs_left_out_give_the_estimated_error() {
     let emulator = Emulator::fit(&runs(latin_hypercube(60, 2, 8), rig)).unwrap();
     assert_eq!(emulator.held_out_residuals().len(), 3);
     for (mode, missed) in emulator.held_out_residuals().iter().enumerate() {

@@ -25,7 +25,7 @@ fn request(number: usize) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn clients_that_go_away_in_the_middle_leave_whole_batches_and_a_service_that_writes() {
+async fn clients_that_disconnect_midway_leave_complete_batches_and_a_working_writer() {
     let (mut service, folder) = spawn();
     for number in 0..60 {
         let bytes = request(number);

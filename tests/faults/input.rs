@@ -60,7 +60,7 @@ async fn a_posterior_at_the_edge_of_its_prior_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_covariate_that_the_simulation_needs_is_asked_for_where_that_is_wanted() {
+async fn a_missing_covariate_that_the_simulation_needs_is_refused_if_so_configured() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command(folder.path());
     let service = Service::spawn(command.env("MODALWATCH__MONITOR__MISSING_COVARIATE", "refuse"));

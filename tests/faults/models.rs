@@ -44,7 +44,7 @@ fn models_with(change: &Change) -> TempDir {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_kind_of_wrong_baseline_is_refused_with_its_reason_and_batches_wait() {
+async fn each_kind_of_invalid_model_is_refused_with_its_reason_and_batches_wait() {
     let cases: Vec<(&str, Change, &str)> = vec![
         (
             "a header that claims to be longer than memory",
@@ -135,7 +135,7 @@ async fn each_kind_of_wrong_baseline_is_refused_with_its_reason_and_batches_wait
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_any_baseline_the_service_says_not_ready_and_still_takes_batches() {
+async fn without_any_trained_model_the_service_is_not_ready_and_still_accepts_batches() {
     let models = tempfile::tempdir().unwrap();
     for id in ["three-dof", "rig", "ruler-frame-4dof"] {
         let target = models.path().join(id);
@@ -155,7 +155,7 @@ async fn without_any_baseline_the_service_says_not_ready_and_still_takes_batches
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_baseline_that_failed_its_calibration_is_used_only_where_its_digest_is_accepted_and_says_so() {
+async fn a_model_that_failed_its_calibration_is_used_only_if_its_digest_is_accepted_and_says_so() {
     let failure = "all modes: ranks of k1 are not uniform (p = 1.0e-9)";
     let change: Change = Box::new(move |f| manifest(f, |m| m["calibration"]["failures"] = json!([failure])));
     let models = models_with(&change);

@@ -63,7 +63,7 @@ async fn a_message_is_a_batch_and_twice_the_same_is_one() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
+async fn a_message_without_a_valid_batch_is_quarantined_and_blocks_no_other() {
     let Some(broker) = Broker::start() else { return };
     let folder = tempfile::tempdir().unwrap();
     let service = Service::spawn(

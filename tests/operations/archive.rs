@@ -55,7 +55,7 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
 }
 
 #[tokio::test]
-async fn an_archive_that_is_not_whole_or_not_true_is_refused_with_its_line() {
+async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
     let (service, folder) = spawn();
     with_past(&service, 4).await;
     let file = folder.path().join("export.ndjson");

@@ -153,7 +153,7 @@ async fn backed_up() -> (tempfile::TempDir, std::path::PathBuf) {
 }
 
 #[tokio::test]
-async fn a_backup_that_is_not_whole_is_refused_and_nothing_is_touched() {
+async fn an_incomplete_backup_is_refused_and_nothing_is_changed() {
     let (_folder, backup) = backed_up().await;
     let target = tempfile::tempdir().unwrap();
     let restore = |target: &Path| ["restore", "--from", text(&backup), "--data-dir", text(target)].map(str::to_owned);
@@ -199,7 +199,7 @@ async fn a_backup_that_is_not_whole_is_refused_and_nothing_is_touched() {
 }
 
 #[tokio::test]
-async fn a_database_that_is_there_is_replaced_only_when_asked_and_kept_aside() {
+async fn an_existing_database_is_replaced_only_on_request_and_kept() {
     let (_folder, backup) = backed_up().await;
     let (mut service, folder) = spawn();
     service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 5, 86_400)).await;

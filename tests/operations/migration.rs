@@ -197,7 +197,7 @@ async fn every_earlier_schema_opens_and_its_rows_are_answered() {
 
 /// What an earlier program took and this one does not is left alone, told, and keeps no other structure from being watched.
 #[tokio::test]
-async fn a_stored_definition_that_does_not_pass_any_more_stops_nothing_else() {
+async fn a_stored_definition_that_is_now_refused_affects_no_other_structure() {
     let structure = three_dof().await;
     let folder = tempfile::tempdir().unwrap();
     of_schema(folder.path(), 3, &structure).await;
@@ -252,7 +252,7 @@ async fn a_backup_of_an_earlier_schema_restores_and_one_of_a_later_one_is_refuse
 
 /// A program killed while it migrates leaves the schema before or the one after, and the next start ends the work.
 #[tokio::test]
-async fn a_migration_that_is_killed_is_ended_by_the_next_start() {
+async fn a_migration_that_is_killed_is_completed_by_the_next_start() {
     let structure = three_dof().await;
     let folder = tempfile::tempdir().unwrap();
     of_schema(folder.path(), 1, &structure).await;

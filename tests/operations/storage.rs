@@ -115,7 +115,7 @@ async fn a_disk_that_fails_is_answered_503_and_the_service_heals_by_itself() {
 }
 
 #[tokio::test]
-async fn batches_are_deleted_only_where_it_was_asked_for_and_never_those_of_states_and_alarms() {
+async fn batches_are_deleted_only_on_request_and_never_those_of_references_and_alarms() {
     let (mut service, folder) = spawn();
     with_past(&service, 8).await;
     let data_dir = text(folder.path()).to_owned();

@@ -9,7 +9,7 @@ use crate::helpers::{command, spawn, Service};
 use crate::world::{fails, program, run};
 
 #[tokio::test]
-async fn systemd_hears_of_readiness_of_life_and_of_the_end() {
+async fn systemd_is_notified_of_readiness_watchdog_and_stop() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("notify");
     let socket = UnixDatagram::bind(&path).unwrap();
@@ -38,7 +38,7 @@ async fn systemd_hears_of_readiness_of_life_and_of_the_end() {
 }
 
 #[tokio::test]
-async fn a_hangup_takes_over_what_can_change_and_keeps_what_is_wrong_out() {
+async fn a_hangup_applies_a_valid_configuration_and_refuses_an_invalid_one() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("config.toml");
     std::fs::write(&config, "[log]\nlevel = \"info\"\n").unwrap();

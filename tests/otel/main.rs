@@ -158,7 +158,7 @@ async fn a_collector_that_is_away_or_never_answers_holds_up_nothing() {
 }
 
 #[test]
-fn an_address_that_is_none_is_refused_by_its_key() {
+fn an_invalid_address_is_refused_with_its_key() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command(folder.path());
     command.env("MODALWATCH__LOG__OTLP_ENDPOINT", "localhost:4318").stdout(Stdio::null());

@@ -58,7 +58,7 @@ fn table() -> Simulator {
 }
 
 #[test]
-fn a_table_stands_for_the_simulation_it_was_made_of() {
+fn a_table_reproduces_the_simulation_it_was_made_from() {
     let (direct, table) = (rig(), table());
     let mut stream = stats::stream(2, "points");
     let (mut squares, mut slope_squares) = ([0.0; 3], [0.0; 2]);

@@ -22,7 +22,7 @@ fn measured(simulator: &Simulator, theta: &[f64]) -> Vec<Option<f64>> {
 }
 
 #[test]
-fn updating_ends_at_the_truth_from_two_hundred_starts_or_says_that_it_does_not() {
+fn updating_from_two_hundred_starts_converges_to_the_truth_or_reports_a_misfit() {
     // The means of the undamaged state of each case.
     let truths = [vec![4.0, 5.0, 6.0], vec![0.0475, 0.0475]];
     for ((name, text), truth) in CASES.into_iter().zip(truths) {

@@ -187,7 +187,7 @@ fn the_evidence_is_unbiased_and_its_error_is_the_scatter_over_seeds() {
 }
 
 #[test]
-fn short_chains_are_told_in_the_error() {
+fn short_chains_increase_the_estimated_error() {
     // With one step per stage, samples remain similar over the stages, and the sum of the variances of the stages would give only
     // a third of the scatter.
     let target = Conjugate::new(2);
@@ -330,7 +330,7 @@ fn parameters_in_strict_dependence_are_sampled_along_their_ridge() {
 }
 
 #[test]
-fn the_stages_tell_what_was_done() {
+fn the_stages_record_what_was_done() {
     struct Counted(Conjugate, AtomicUsize);
     impl Target for Counted {
         fn dimensions(&self) -> usize {

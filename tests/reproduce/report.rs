@@ -43,7 +43,7 @@ fn every_table_and_figure_of_the_paper_is_there_once() {
 }
 
 #[test]
-fn the_page_needs_nothing_else_and_holds_no_number_that_is_none() {
+fn the_page_is_self_contained_and_all_its_numbers_are_finite() {
     let page = html(&fake::reproduction(2));
     assert!(!words(&page).any(|word| ["NaN", "inf", "None"].contains(&word)));
     assert!(!page.contains("<script") && !page.contains("javascript:") && !page.contains("@import"));

@@ -132,7 +132,7 @@ fn shapes_turned_around_and_in_another_order_are_paired_back() {
 }
 
 #[test]
-fn a_shape_unlike_every_mode_is_named_with_the_mode_it_is_least_unlike() {
+fn a_shape_unlike_every_mode_is_reported_with_the_closest_mode() {
     let simulator = chain_simulator(30, 3);
     let points = simulator.instrumented_points().unwrap();
     for (mode, shape) in points.nominal.iter().enumerate() {
@@ -145,7 +145,7 @@ fn a_shape_unlike_every_mode_is_named_with_the_mode_it_is_least_unlike() {
 }
 
 #[test]
-fn what_is_wrong_with_instrumented_points_is_said() {
+fn mistakes_in_instrumented_points_are_reported() {
     let right = chain_file(6, 3);
     let wrong = |from: &str, to: &str| {
         let text = right.replace(from, to);

@@ -60,7 +60,7 @@ async fn batches_with_shapes_and_without_are_assessed_and_kept() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_a_shape_is_said_with_its_place() {
+async fn mistakes_in_a_shape_are_reported_with_their_place() {
     let (service, _folder) = spawn();
     let right = measurements(1, true).remove(0);
     let points = right["mode_shapes"][0].as_array().unwrap().len();

@@ -108,7 +108,7 @@ fn draws_beyond_the_prior_come_back_as_the_normal_distribution_that_is_cut_off_t
 }
 
 #[test]
-fn to_the_flow_and_back_is_where_it_began_and_its_volume_is_the_determinant() {
+fn the_map_to_the_flow_is_invertible_and_its_volume_is_the_determinant() {
     let simulator = chain_simulator(6, 4);
     let set = simulator.training_set(1, 4).unwrap();
     let fit = locate(&simulator, &exact(&set, 0)).unwrap();
@@ -179,7 +179,7 @@ fn a_chain_of_ten_is_learnt_to_the_optimum_with_intervals_that_cover() {
 }
 
 #[test]
-fn without_shapes_the_same_baseline_answers_wider() {
+fn without_shapes_the_same_model_gives_wider_intervals() {
     let baseline = &CHAIN.baseline;
     let set = baseline.simulator().training_set(20, 9).unwrap();
     let with: Vec<Observation> = (0..20).map(|row| exact(&set, row)).collect();

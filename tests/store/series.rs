@@ -82,7 +82,7 @@ async fn fill(folder: &tempfile::TempDir) {
 }
 
 #[tokio::test]
-async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
+async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     let (store, folder) = open().await;
     store
         .reference()
@@ -203,7 +203,7 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
 }
 
 #[tokio::test]
-async fn the_column_for_plots_says_what_the_rows_say() {
+async fn the_packed_column_for_plots_agrees_with_the_rows() {
     let (store, folder) = open().await;
     for i in 0..60 {
         let id = format!("b{i:02}");

@@ -8,7 +8,7 @@ mod needs;
 use std::io::Write as _;
 
 #[test]
-fn in_ci_no_tool_is_missing_and_every_skipped_test_is_named_here() {
+fn skipped_tests_are_listed_and_in_ci_no_tool_is_missing() {
     let skipped = needs::skipped();
     // Written past the harness, which shows what a test prints only where it fails.
     let mut out = std::io::stderr().lock();
