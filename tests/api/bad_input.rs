@@ -356,7 +356,7 @@ async fn a_damaged_model_file_is_reported_and_the_other_models_are_used() {
         let folder = tempfile::tempdir().unwrap();
         let service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));
         let ready = service.get("/readyz").send().await.unwrap();
-        assert_eq!(ready.status(), 200, "{name}: the other baselines serve");
+        assert_eq!(ready.status(), 200, "{name}: the other models are used");
         let ready: Value = ready.json().await.unwrap();
         let refused = ready["baselines_refused"][0].clone();
         assert_eq!(refused["structure"], "three-dof", "{name}: {ready}");

@@ -54,7 +54,7 @@ fn numbers(value: &Value) -> Vec<Option<f64>> {
 }
 
 fn length(value: &Value) -> usize {
-    value.as_array().unwrap_or_else(|| panic!("{value} is no list")).len()
+    value.as_array().unwrap_or_else(|| panic!("{value} is not a list")).len()
 }
 
 /// The items of a list by a text in them.
@@ -196,7 +196,11 @@ async fn a_spike_among_twenty_thousand_measurements_is_in_the_reduced_series() {
     assert!(f["covariates"].get("operator").is_none(), "a category is no number");
     let missing = f["values_hz"].as_array().unwrap().iter().filter(|row| row[1].is_null()).count();
     assert!(missing >= 100, "{missing} missing modes are left of 400");
-    assert_eq!((length(&all["parameters"]), length(&all["trust"])), (0, 0), "nothing is assessed without a baseline");
+    assert_eq!(
+        (length(&all["parameters"]), length(&all["trust"])),
+        (0, 0),
+        "nothing is assessed without a trained model"
+    );
 }
 
 #[tokio::test]

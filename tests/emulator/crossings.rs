@@ -1,4 +1,4 @@
-//! Modes that cross are told, modes that do not are not.
+//! Modes that cross are reported, and only those.
 
 use modalwatch::emulator::Emulator;
 

@@ -1,4 +1,5 @@
-//! Baselines that are damaged, foreign, huge or of a newer program: refused with the reason, and everything else serves.
+//! Trained models that are damaged, of another structure, huge or of a newer program are refused with the reason; all other
+//! structures are served.
 
 use std::fs::File;
 use std::path::Path;
@@ -10,7 +11,7 @@ use tempfile::TempDir;
 use crate::helpers::{command, repository, Service};
 use crate::kit::{batch, post, resident_mib};
 
-/// What a test does to the files of a baseline's folder.
+/// Change of the files in the folder of a trained model.
 type Change = Box<dyn Fn(&Path)>;
 
 fn weights(folder: &Path) -> std::path::PathBuf {
@@ -25,7 +26,7 @@ fn manifest(folder: &Path, change: impl Fn(&mut Value)) {
     std::fs::write(path, serde_json::to_vec(&manifest).unwrap()).unwrap();
 }
 
-/// Writes weights, and a manifest that says they are right.
+/// Writes weights, and a manifest that matches them.
 fn signed(folder: &Path, bytes: &[u8]) {
     std::fs::write(weights(folder), bytes).unwrap();
     let digest = Digest::of_file(bytes);

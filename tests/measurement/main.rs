@@ -1,4 +1,4 @@
-//! Tables of measurements: whatever comes, no panic; what is written is read back.
+//! Tables of measurements: no input causes a panic, and a table that was written is read back unchanged.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 

@@ -16,7 +16,7 @@ const IDS: [&str; 21] = [
     "fig13", "fig14", "fig16", "fig17", "fig18", "fig19", "fig20", "fig21", "fig22",
 ];
 
-/// How often an id is given.
+/// Number of elements with an id.
 fn given(page: &str, id: &str) -> usize {
     page.matches(&format!(" id=\"{id}\"")).count()
 }

@@ -1,4 +1,4 @@
-//! Many parameters and mode shapes: laws of shapes and their derivatives, the fit a flow starts at, and a chain of ten
+//! Many parameters and mode shapes: laws of shapes and their derivatives, the fit that a trained model starts at, and a chain of ten
 //! stiffnesses from training to the service.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
@@ -59,7 +59,7 @@ pub fn chain_simulator(count: usize, modes: usize) -> Simulator {
     Simulator::new(StructureDefinition::parse_toml(&chain_file(count, modes)).unwrap()).unwrap()
 }
 
-/// Both eigen solvers, below and above the size at which they change over.
+/// Both eigensolvers, below and above the size at which the program changes from one to the other.
 #[test]
 fn a_uniform_chain_has_the_frequencies_and_shapes_of_the_closed_form() {
     for count in [10, 31, 32, 120] {

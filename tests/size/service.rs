@@ -1,4 +1,4 @@
-//! Batches with shapes and without, through the real program.
+//! Batches with and without shapes, in the real program.
 
 use serde_json::{json, Value};
 
@@ -33,7 +33,7 @@ fn spawn() -> (Service, tempfile::TempDir) {
     std::fs::write(models.join("baseline.safetensors"), &CHAIN.weights).unwrap();
     let mut command = command(&folder.path().join("data"));
     command.arg("--models").arg(folder.path().join("models"));
-    // Seconds of training do not always pass the calibration, and what is looked at here is the way of a shape.
+    // A training of a few seconds does not always pass the calibration; this test is only about the handling of shapes.
     command.env("MODALWATCH__MONITOR__ACCEPT_UNCALIBRATED", format!("[\"{}\"]", CHAIN.baseline.digest()));
     (Service::spawn(&mut command), folder)
 }

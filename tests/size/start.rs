@@ -1,4 +1,4 @@
-//! The fit that a flow starts at, and a chain of ten stiffnesses trained from it.
+//! The fit that a trained model starts at, and a chain of ten stiffnesses trained from it.
 
 use std::sync::LazyLock;
 
@@ -58,7 +58,7 @@ fn the_fit_is_the_same_for_shapes_turned_around_and_modes_in_another_order() {
     }
 }
 
-/// Standard errors of the fit are those it states, and what it leaves is χ²-distributed.
+/// The fit has the standard errors that it states, and its remaining misfit is χ²-distributed.
 #[test]
 fn fits_of_noisy_measurements_scatter_as_they_say() {
     let simulator = chain_simulator(10, 5);
@@ -73,7 +73,7 @@ fn fits_of_noisy_measurements_scatter_as_they_say() {
         misfit += fit.chi_squared / fit.degrees_of_freedom / 300.0;
     }
     println!("mean of whitened squares {whitened:.3}, of χ² over its degrees of freedom {misfit:.3}");
-    // 3,000 squares have a standard error of 0.026; a prior of finite width and a bent map add to it.
+    // 3,000 squares have a standard error of 0.026; a prior of finite width and a nonlinear map add to it.
     assert!((0.9..1.2).contains(&whitened), "{whitened}");
     // Fifteen degrees of freedom, 300 times: standard error 0.021.
     assert!((misfit - 1.0).abs() < 0.07, "{misfit}");
@@ -117,7 +117,7 @@ fn the_map_to_the_flow_is_invertible_and_its_volume_is_the_determinant() {
     assert!((fit.log_det() - 0.5 * fit.precision.determinant().ln()).abs() < 1e-9);
 }
 
-/// The information of frequencies and shapes against that of differences.
+/// The Fisher information of frequencies and shapes compared with that of finite differences.
 #[test]
 fn the_fisher_information_is_that_of_differences() {
     let simulator = chain_simulator(8, 4);

@@ -220,7 +220,7 @@ async fn the_packed_column_for_plots_agrees_with_the_rows() {
             }
         }
         if i % 2 == 1 {
-            // Another trained baseline has other quantities in another order.
+            // Another trained model has other quantities in another order.
             given.quantities.reverse();
             given.quantities[0].name = "k9".to_owned();
         }
