@@ -52,7 +52,7 @@ async fn each_change_is_recorded_with_token_address_and_outcome() {
     assert_eq!((&window["structure"], &window["status"]), (&json!("three-dof"), &json!(201)));
     assert_eq!((&window["peer"], &window["request_id"]), (&json!("127.0.0.1"), &json!("window-1")));
     assert_eq!(window["actor_name"], "admin three-dof");
-    assert_eq!(items[3]["subject"], format!("/v1/tokens/{keeper}"), "what was made, not only where");
+    assert_eq!(items[3]["subject"], format!("/v1/tokens/{keeper}"), "the new token itself, not only the list");
     assert_eq!(items[4]["subject"], format!("/v1/tokens/{admin}"));
 }
 

@@ -128,7 +128,11 @@ async fn an_unknown_token_is_refused() {
     let with = |value: String| world.service.get(LIST).header("authorization", value).send();
     problem(with("Basic dXNlcjpwYXNz".to_owned()).await.unwrap(), 401, "unauthorized").await;
     problem(with(world.admin.clone()).await.unwrap(), 401, "unauthorized").await;
-    assert_eq!(with(format!("bearer {}", world.admin)).await.unwrap().status(), 200, "the scheme has no case");
+    assert_eq!(
+        with(format!("bearer {}", world.admin)).await.unwrap().status(),
+        200,
+        "the scheme is not case-sensitive"
+    );
     let twice = world.ask(Method::GET, LIST, &world.admin).header("authorization", format!("Bearer {}", world.admin));
     problem(twice.send().await.unwrap(), 401, "unauthorized").await;
 }

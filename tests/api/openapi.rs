@@ -74,7 +74,10 @@ async fn the_document_is_complete() {
     assert!(operations.len() >= 52, "{}", operations.len());
     for (path, method, operation) in operations {
         let place = format!("{method} {path}: {operation}");
-        assert!(names.insert(operation["operationId"].as_str().unwrap().to_owned()), "another has its id: {place}");
+        assert!(
+            names.insert(operation["operationId"].as_str().unwrap().to_owned()),
+            "another operation has the same id: {place}"
+        );
         for text in ["summary", "description"] {
             assert!(operation[text].as_str().is_some_and(|t| !t.is_empty()), "{text}: {place}");
         }

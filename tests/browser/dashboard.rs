@@ -95,12 +95,12 @@ fn axe_findings(page: &mut Page) -> Option<Value> {
             .map((v) => [v.id, v.nodes.map((n) => n.html.slice(0, 200) + ' ' + n.failureSummary)]),
     }))";
     let outcome = page.evaluate(run);
-    assert!(outcome["rules"].as_u64().unwrap() > 10, "axe looked at too little: {outcome}");
+    assert!(outcome["rules"].as_u64().unwrap() > 10, "axe checked too few elements: {outcome}");
     Some(outcome["serious"].clone())
 }
 
 fn check_view(page: &mut Page, what: &str) {
-    assert_eq!(page.evaluate(BLANK_FIGURES), json!([]), "blank figures: {what}");
+    assert_eq!(page.evaluate(BLANK_FIGURES), json!([]), "empty figures: {what}");
     assert_eq!(page.evaluate(FIGURES_WITHOUT_TEXT), json!([]), "figures without a text alternative: {what}");
     let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
     assert_eq!(overflow, json!(0), "the page scrolls sideways: {what}");

@@ -91,7 +91,7 @@ async fn full_and_healed(service: &Service, acknowledged: &mut Acknowledged, hea
     assert!(reasons.to_string().contains("nothing can be stored"), "{reasons}");
     assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
     let stored = &history(service).await | &history_of(service, PLAIN).await;
-    assert!(acknowledged.0.keys().all(|id| stored.contains(id)), "reads must go on");
+    assert!(acknowledged.0.keys().all(|id| stored.contains(id)), "reads must still be served");
     let some = acknowledged.0.keys().next_back().unwrap();
     let read = service.read(&format!("/v1/structures/{PLAIN}/batches/{some}")).await;
     assert_eq!(read["content_digest"], acknowledged.0[some].as_str());

@@ -84,7 +84,7 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
             acknowledged.add(&given, &answer);
         }
     }
-    assert!(failed >= 3 * PER_CASE, "only {failed} posts met a fault: the test shows little");
+    assert!(failed >= 3 * PER_CASE, "only {failed} posts had a fault: the test shows little");
     all_assessed(&service, Duration::from_secs(30)).await;
     service.kill();
     let mut service = Service::start(&data);

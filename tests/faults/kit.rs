@@ -96,7 +96,7 @@ impl Acknowledged {
         assert_eq!(answer["content_digest"], digest.as_str(), "another batch was acknowledged: {answer}");
         let id = answer["batch"].as_str().unwrap().to_owned();
         if let Some(other) = self.0.insert(id, digest.clone()) {
-            assert_eq!(other, digest, "one id was given to two batches");
+            assert_eq!(other, digest, "an id was assigned to two batches");
         }
     }
 }
@@ -124,7 +124,7 @@ pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
     .fetch_one(&mut connection)
     .await
     .unwrap();
-    assert_eq!(halves, 0, "half batches");
+    assert_eq!(halves, 0, "incomplete batches");
     let (doubled,): (i64,) = sqlx::query_as(
         "select count(*) from (select 1 from measurement group by structure_id, source, measured_at_us having count(*) > 1)",
     )

@@ -259,7 +259,7 @@ impl Lives {
     fn check(&self) {
         for (middle, end) in &self.memory_mib {
             let flat = *end < MOST_MIB && *end < middle + GROWTH_MIB;
-            assert!(flat, "memory is not flat: {middle:.0} MiB in the middle of a life, {end:.0} MiB at its end");
+            assert!(flat, "the memory grows: {middle:.0} MiB in the middle of a process life, {end:.0} MiB at its end");
         }
         let most = self.memory_mib.iter().map(|(_, end)| *end).fold(0.0, f64::max);
         println!("{} lives, at most {most:.0} MiB", self.memory_mib.len());

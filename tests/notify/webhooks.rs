@@ -143,7 +143,7 @@ async fn a_receiver_that_fails_gets_the_same_message_again_and_a_redirect_is_not
     settled(&service, &hook, "delivered", 1).await;
     assert_eq!(receiver.taken().len(), 1);
     let ids: BTreeSet<String> = receiver.all().iter().map(|r| r.id().to_owned()).collect();
-    assert_eq!((ids.len(), bait.all().len()), (1, 0), "one message; and nobody was redirected");
+    assert_eq!((ids.len(), bait.all().len()), (1, 0), "one message, and no redirect was followed");
     assert!(receiver.all().len() >= 3);
 }
 

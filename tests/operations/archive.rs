@@ -99,5 +99,5 @@ async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
     let out = folder.path().join("never.ndjson");
     fails(&["export", "--structure", "bridge", "--data-dir", text(folder.path()), "--url", &url, "--out", text(&out)])
         .await;
-    assert!(!out.exists(), "a file that is not whole was left behind");
+    assert!(!out.exists(), "an incomplete file was left behind");
 }

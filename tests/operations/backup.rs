@@ -28,7 +28,7 @@ async fn a_backup_under_ingest_restores_to_the_same_answers() {
                     let start = 86_400 * 20 + (round * 3 + client) * 4_000;
                     let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 4, start) });
                     let response = http.post(&url).json(&body).send().await.unwrap();
-                    assert_eq!(response.status(), 201, "a backup must not get in the way");
+                    assert_eq!(response.status(), 201, "a backup must not block posts");
                     posted.fetch_add(1, Ordering::Relaxed);
                 }
             })

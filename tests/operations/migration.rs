@@ -287,12 +287,12 @@ async fn a_migration_that_is_killed_is_completed_by_the_next_start() {
         .fetch_one(&mut connection)
         .await
         .unwrap();
-        assert_eq!(count, rows + 1, "schema {version}: rows were lost or doubled");
+        assert_eq!(count, rows + 1, "schema {version}: rows were lost or duplicated");
         let failed: (i64,) = sqlx::query_as("select count(*) from _sqlx_migrations where success = 0")
             .fetch_one(&mut connection)
             .await
             .unwrap();
-        assert_eq!(failed.0, 0, "half a migration was left");
+        assert_eq!(failed.0, 0, "a migration was left incomplete");
         connection.close().await.unwrap();
         versions.push(version);
         if version == newest {

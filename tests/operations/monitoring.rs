@@ -48,7 +48,7 @@ async fn dashboard_and_alerts_name_only_metrics_that_are_there() {
         alerts.lines().filter(|line| line.trim_start().starts_with("expr:")).flat_map(names).collect();
     assert!(asked.len() > 15 && rules.len() > 8, "{asked:?} {rules:?}");
     let missing: Vec<&String> = asked.union(&rules).filter(|name| !there.contains(*name)).collect();
-    assert!(missing.is_empty(), "named but not in /metrics: {missing:?}");
+    assert!(missing.is_empty(), "metrics that are used but not in /metrics: {missing:?}");
     // Panels do not overlap.
     let mut places = BTreeSet::new();
     for panel in panels {

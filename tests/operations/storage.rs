@@ -107,7 +107,7 @@ async fn a_disk_that_fails_is_answered_503_and_the_service_heals_by_itself() {
     limit("unlimited");
     for round in 0..5 {
         let taken = post(&service, 86_400 * 50 + round * 4_000).await;
-        assert_eq!(taken.status(), 201, "it did not heal: {}", taken.text().await.unwrap());
+        assert_eq!(taken.status(), 201, "the service did not recover: {}", taken.text().await.unwrap());
     }
     ready_again(&service).await;
     assert!(metric(&service, "modalwatch_write_failures_total{cause=\"disk_failed\"} ").await >= 5.0);
