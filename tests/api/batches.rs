@@ -17,8 +17,8 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
     assert!((k1["mean"].as_f64().unwrap() - 4.0).abs() < 0.05, "{k1}");
     assert_eq!(k1["probability_of_damage"], Value::Null);
 
-    let baseline = json!({ "batches": [first["batch"]] });
-    let undamaged = created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
+    let reference = json!({ "batches": [first["batch"]] });
+    let undamaged = created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
     assert_eq!(undamaged["version"], 1);
     assert_eq!(undamaged["measurement_count"], 20);
     let delta = undamaged["parameters"][1]["threshold"].as_f64().unwrap();
@@ -95,9 +95,9 @@ async fn an_undamaged_reference_declared_among_posts_misses_none_of_them() {
         .map(|body| service.request(reqwest::Method::POST, BATCHES).json(&body).send())
         .map(tokio::spawn)
         .collect();
-    let baseline = json!({ "batches": [healthy["batch"]] });
+    let reference = json!({ "batches": [healthy["batch"]] });
     let path = "/v1/structures/three-dof/reference";
-    tasks.insert(20, tokio::spawn(service.request(reqwest::Method::POST, path).json(&baseline).send()));
+    tasks.insert(20, tokio::spawn(service.request(reqwest::Method::POST, path).json(&reference).send()));
     for task in tasks {
         created(task.await.unwrap().unwrap()).await;
     }
@@ -359,8 +359,8 @@ async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_model() {
     let path = format!("/v1/structures/tower-1/batches/{}", answer["batch"].as_str().unwrap());
     assert_eq!(service.read(&path).await["measurements"][0], measurement);
 
-    let baseline = service.post("/v1/structures/tower-1/reference", &json!({ "batches": [answer["batch"]] })).await;
-    problem(baseline, 409, "no_model").await;
+    let reference = service.post("/v1/structures/tower-1/reference", &json!({ "batches": [answer["batch"]] })).await;
+    problem(reference, 409, "no_model").await;
     let mut heavier = definition.clone();
     heavier["mass"][0]["kg"] = json!(101.0);
     problem(put(heavier).await.unwrap(), 409, "structure_in_use").await;

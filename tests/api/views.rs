@@ -35,8 +35,8 @@ async fn put_bare(service: &Service) {
 async fn with_a_damage() -> (Service, tempfile::TempDir, Vec<Value>) {
     let (service, folder) = spawn();
     let mut batches = vec![service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await];
-    let baseline = json!({ "batches": [batches[0]["batch"]] });
-    created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
+    let reference = json!({ "batches": [batches[0]["batch"]] });
+    created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
     for (i, k2) in [(1, 5.0), (2, 5.0), (3, 4.5)] {
         batches.push(service.post_batch("three-dof", &measurements([4.0, k2, 6.0], 20, 100_000 * i)).await);
     }

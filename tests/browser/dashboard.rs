@@ -30,8 +30,8 @@ async fn post(service: &Service, k: [f64; 3], day: usize) -> String {
 /// An undamaged reference, healthy days, a pause, a batch in another unit, and a loss of k1 that raises an alarm.
 async fn watched_bridge(service: &Service) {
     let mut batches = vec![post(service, UNDAMAGED, 0).await, post(service, UNDAMAGED, 1).await];
-    let baseline = json!({ "batches": batches });
-    created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
+    let reference = json!({ "batches": batches });
+    created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
     for day in [2, 3, 12, 13] {
         batches.push(post(service, UNDAMAGED, day).await);
     }

@@ -63,7 +63,7 @@ async fn each_kind_of_invalid_model_is_refused_with_its_reason_and_batches_wait(
             "safetensors",
         ),
         (
-            "a file larger than any baseline",
+            "a file larger than any trained model",
             Box::new(|f| File::create(weights(f)).unwrap().set_len(20 << 30).unwrap()),
             "larger than",
         ),
