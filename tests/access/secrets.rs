@@ -77,7 +77,7 @@ async fn no_secret_is_in_log_database_or_metrics() {
     let database: Vec<_> = while_running.into_iter().chain(files(&data)).collect();
     assert!(database.iter().any(|(_, bytes)| contains(bytes, id_of(&secrets[2]))), "the ids are in the database");
     for secret in &secrets {
-        // The second half alone would be enough for somebody who has the first.
+        // The second half of a token would be sufficient for an attacker who has the first.
         let secret = &secret.rsplit('_').next().unwrap()[26..];
         assert!(!contains(&log, secret), "a secret is in the log");
         assert!(!contains(metrics.as_bytes(), secret), "a secret is in the metrics");

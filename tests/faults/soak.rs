@@ -30,7 +30,7 @@ const PER_BATCH: usize = 20;
 const READERS: usize = 20;
 
 /// Maximum number of posts in progress; a gateway with more batches waits.
-const ON_THE_WAY: usize = 48;
+const MOST_POSTS: usize = 48;
 
 /// Maximum time after the last kill until all batches are assessed and the model is replaced.
 const SETTLING: Duration = Duration::from_secs(150);
@@ -120,7 +120,7 @@ async fn deliver(target: &Target, number: usize, acknowledged: &Mutex<Acknowledg
 }
 
 /// A reader that requests all routes in turn until the load ends.
-async fn go_round(target: Target, reader: usize) {
+async fn request_in_turn(target: Target, reader: usize) {
     let structure = "/v1/structures/three-dof";
     for round in reader.. {
         if target.is_over() {
@@ -320,7 +320,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
     };
     let (acknowledged, replays) = (Arc::new(Mutex::new(Acknowledged::default())), Arc::new(AtomicUsize::new(0)));
 
-    let readers: Vec<_> = (0..READERS).map(|reader| tokio::spawn(go_round(target.clone(), reader))).collect();
+    let readers: Vec<_> = (0..READERS).map(|reader| tokio::spawn(request_in_turn(target.clone(), reader))).collect();
     let swap = tokio::spawn({
         let target = target.clone();
         async move { swap_model(&target).await }
@@ -328,7 +328,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
     let due = tokio::spawn({
         let (target, acknowledged, replays) = (target.clone(), Arc::clone(&acknowledged), Arc::clone(&replays));
         async move {
-            let places = Arc::new(tokio::sync::Semaphore::new(ON_THE_WAY));
+            let places = Arc::new(tokio::sync::Semaphore::new(MOST_POSTS));
             let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / batches_per_s));
             let mut posts = tokio::task::JoinSet::new();
             for number in 0.. {
