@@ -1,14 +1,14 @@
-//! What a training reaches in its time, on the paper's case 1 without noise.
+//! Accuracy of a training against its time, for case 1 of the paper without noise.
 //!
 //! ```text
 //! cargo bench --bench accuracy [-- THREADS EPOCHS SAMPLES UNITS WIDTH CLAMP BATCH]…    seven numbers for each training
 //! ```
 //!
-//! Without noise the exact posterior of a measurement is the point that it was simulated at, so that every distance of a draw from
-//! it is an error, but for the few measurements that another point of the prior gives too. Prints the time of the training alone
-//! (simulations and checks are beside it), the held-out negative log-likelihood in the unit box of the prior, the gross outliers
-//! among the draws, and how far hyperparameters of fifty measurements with ten draws each lie from those of their population,
-//! against those of the exact posterior.
+//! Without noise the exact posterior of a measurement is the point that it was simulated at, so that the distance of a draw from
+//! it is an error, except for the few measurements that a second point of the prior gives too. Prints the time of the training
+//! alone (without simulations and checks), the held-out negative log-likelihood in the unit box of the prior, the gross outliers
+//! among the draws, and the errors of the hyperparameters of fifty measurements with ten draws each, relative to those of the
+//! exact posterior.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -25,13 +25,14 @@ use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use nalgebra::DMatrix;
 
-/// Held-out measurements, and draws of each when outliers are counted.
+/// Number of held-out measurements, and of draws for each when outliers are counted.
 const HELD_OUT: usize = 10_000;
 const DRAWS: usize = 20;
 /// A draw further than this from the truth is a gross outlier. Where k1 is stiff and k2 soft, the map from stiffnesses to frequencies
-/// folds: two points of the prior give the same frequencies there, which is why the bench tells how many outliers give them.
+/// folds: two points of the prior give the same frequencies there. The bench therefore prints how many outliers reproduce the
+/// measured frequencies.
 const GROSS_N_PER_M: f64 = 0.1;
-/// Batches of fifty measurements that hyperparameters are estimated from, and draws of each measurement.
+/// Number of batches of fifty measurements from which hyperparameters are estimated, and of draws for each measurement.
 const BATCHES: u64 = 400;
 const POOLED: usize = 10;
 
@@ -39,7 +40,7 @@ const POOLED: usize = 10;
 const TRAININGS: [[usize; 7]; 2] = [[1, 50, 10_000, 4, 64, 30, 256], [2, 120, 40_000, 4, 64, 50, 256]];
 
 fn main() {
-    // As the program does at its start, see `main.rs`.
+    // As in `main.rs`.
     std::env::set_var("RAYON_NUM_THREADS", "1");
     let numbers: Vec<usize> = std::env::args().skip(1).filter_map(|given| given.parse().ok()).collect();
     let given: Vec<[usize; 7]> = numbers.as_chunks::<7>().0.to_vec();
@@ -62,7 +63,7 @@ fn measure(simulator: &Simulator, [threads, epochs, samples, units, width, clamp
         first.get_or_insert(last);
     });
     let baseline = trained.expect("it trains").baseline;
-    // The first epoch ends one epoch after the start.
+    // The time is measured from the end of the first epoch and extrapolated to all epochs.
     let took_s =
         first.map_or(0.0, |first| last.duration_since(first).as_secs_f64()) * epochs as f64 / (epochs - 1) as f64;
 
@@ -97,14 +98,14 @@ fn measure(simulator: &Simulator, [threads, epochs, samples, units, width, clamp
     );
     if !gross.is_empty() {
         println!(
-            "  {} of them give the measured frequencies to ten digits: the other point that does",
+            "  {} of them reproduce the measured frequencies to ten digits: they lie at the second solution",
             misfits.iter().filter(|misfit| **misfit < 1e-10).count()
         );
     }
     hyperparameters(&baseline);
 }
 
-/// Mean distance of hyperparameters from those of the population, of the flow's pool over that of the true values.
+/// Mean error of the hyperparameters of the pooled draws, divided by that of the true values of the same measurements.
 fn hyperparameters(baseline: &Baseline) {
     let moments = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)].map(|(name, m, s)| (name.to_owned(), m, s));
     let population = Population::new(baseline.space(), &moments).expect("it lies in the prior");
@@ -122,7 +123,9 @@ fn hyperparameters(baseline: &Baseline) {
     }
     for (k, (name, ..)) in moments.iter().enumerate() {
         let [mean, std] = [0, 1].map(|i| of_flow[k][i] / of_exact[k][i]);
-        println!("  {name}: errors over those of the exact posterior: mean {mean:.3}, standard deviation {std:.3}");
+        println!(
+            "  {name}: errors relative to those of the exact posterior: mean {mean:.3}, standard deviation {std:.3}"
+        );
     }
 }
 

@@ -1,4 +1,4 @@
-//! What a diagnosis costs, against rows and against what there is to look at.
+//! Time of a diagnosis against the number of rows and of candidates.
 //!
 //! `cargo bench --bench discrepancy`
 
@@ -35,7 +35,7 @@ fn simulator(masses: usize) -> Simulator {
     Simulator::new(StructureDefinition::parse_toml(&text).expect("a structure")).expect("a structure")
 }
 
-/// A year of rows in which the last tie softens with temperature.
+/// Rows of one year in which the last tie softens with temperature.
 fn data(simulator: &Simulator, rows: usize) -> Data {
     let mut stream = stats::stream(1, "benchmark of diagnosis");
     let last = simulator.modes() - 1;

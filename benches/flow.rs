@@ -1,4 +1,4 @@
-//! Inference of the shipped `three-dof` in process. `cargo bench --bench flow`; training has `benches/training.rs`.
+//! Inference of the shipped model `three-dof` in process. `cargo bench --bench flow`; `benches/training.rs` is about training.
 
 use std::hint::black_box;
 
@@ -9,7 +9,7 @@ use modalwatch::hierarchy::populations;
 use modalwatch::quantity::StructureId;
 
 fn flow(criterion: &mut Criterion) {
-    // As the program does at its start: candle on one thread, our own loops on those of the pool they run in, see `main.rs`.
+    // As in `main.rs`: candle uses one thread, our own loops use the threads of the pool in which they run.
     std::env::set_var("RAYON_NUM_THREADS", "1");
     let library = Library::open(None).expect("no folder is read");
     let id = StructureId::parse("three-dof").expect("it is an id");

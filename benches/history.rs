@@ -1,11 +1,13 @@
-//! Questions to a database of a million batches, and history assessed again. `cargo bench --bench history`
+//! Queries of a database with a million batches, and the assessment of a history under a new reference.
 //!
-//! - `queries`: pages of history, the overview of a thousand structures, a plot of a hundred thousand batches; over loopback, by
-//!   the program itself, on a database of `MODALWATCH_BENCH_BATCHES` batches (1 000 000), which is made first and removed
-//!   afterwards. Half of them are of one structure.
+//! `cargo bench --bench history`
+//!
+//! - `queries`: pages of history, the overview of a thousand structures, a series of a hundred thousand batches; the program itself
+//!   over loopback, on a database of `MODALWATCH_BENCH_BATCHES` batches (default 1 000 000), which is generated first and removed
+//!   afterwards. Half of the batches belong to one structure.
 //! - `replay`: stored batches assessed again after a new undamaged reference, on one thread and on all.
 //!
-//! Arguments after `--`: which of these (both without).
+//! Arguments after `--` select one of these; without arguments both run.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -26,24 +28,24 @@ use serde_json::json;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{AssertSqlSafe, Connection as _};
 
-/// Structures beside the large one; they share the other half of the batches.
+/// Number of structures beside the large one; they share the other half of the batches.
 const STRUCTURES: usize = 999;
-/// Measurements of a generated batch.
+/// Number of measurements of a generated batch.
 const MEASUREMENTS: usize = 5;
-/// Batches that are inserted by one statement a table.
+/// Number of batches that one statement for each table inserts.
 const AT_A_TIME: usize = 2_000;
-/// Pages that are asked for.
+/// Number of pages that are requested.
 const PAGES: usize = 500;
-/// Times that the overview is asked for.
+/// Number of requests of the overview.
 const OVERVIEWS: usize = 50;
-/// Batches of the plot.
+/// Number of batches of the series.
 const PLOTTED: i64 = 100_000;
 /// Microseconds between batches of a structure: ten minutes.
 const BETWEEN_US: i64 = 600_000_000;
 /// 2020-01-01T00:00:00Z, µs.
 const EPOCH_US: i64 = 1_577_836_800_000_000;
 
-/// Batches that are replayed, and measurements of each.
+/// Number of batches that are assessed again, and of measurements in each.
 const REPLAYED: usize = 600;
 const OF_A_REPLAYED: usize = 20;
 
@@ -74,8 +76,8 @@ fn id_of(structure: usize) -> String {
     }
 }
 
-/// A database of `batches` batches, as the service would have written them over years; the number of those of the large
-/// structure.
+/// Generates a database of `batches` batches as the service would have written them over years; returns the number of those of
+/// the large structure.
 async fn generate(folder: &Path, batches: usize) -> usize {
     let started = Instant::now();
     let store = Store::open(folder).await.expect("a store");
@@ -104,7 +106,7 @@ async fn generate(folder: &Path, batches: usize) -> usize {
     }
     while written < batches {
         let count = AT_A_TIME.min(batches - written);
-        // Every second one is of the large structure: time goes on in all of them together.
+        // Every second batch belongs to the large structure; the times of all structures advance together.
         let of = |i: usize| if i.is_multiple_of(2) { 0 } else { 1 + (i / 2) % STRUCTURES };
         let rows: Vec<_> = (written..written + count)
             .map(|i| {
@@ -128,7 +130,7 @@ async fn generate(folder: &Path, batches: usize) -> usize {
     large
 }
 
-/// What the statements of [`insert`] need of a batch.
+/// The values of a batch that the statements of [`insert`] use.
 fn generated(structure: usize, number: i64, index: usize, frequencies: &[f64]) -> serde_json::Value {
     let start = Timestamp::from_micros(EPOCH_US + BETWEEN_US * number).expect("a time");
     let id = StructureId::parse(&id_of(structure)).expect("an id");
@@ -140,7 +142,7 @@ fn generated(structure: usize, number: i64, index: usize, frequencies: &[f64]) -
         data_encoding::HEXLOWER.encode(&bytes)
     };
     let wave = (index as f64 * 0.37).sin();
-    // The column that the store packs for plots: trust, then each quantity as the statement of `insert` gives it.
+    // The packed column for plots: trust, then each quantity in the order of the statement of `insert`.
     let mut plotted = vec![0.25, 0.0, 1.0];
     for mean in [4.0, 5.0, 6.0] {
         let mean = mean + 0.1 * wave;
@@ -204,7 +206,7 @@ async fn insert(connection: &mut SqliteConnection, rows: &str) {
     transaction.commit().await.expect("a commit");
 }
 
-/// Asks the program itself.
+/// Sends the queries to the program itself.
 async fn queries(folder: &Path, large: usize) {
     let started = Instant::now();
     let program = std::env::var("MODALWATCH_BENCH_PROGRAM");
@@ -216,15 +218,15 @@ async fn queries(folder: &Path, large: usize) {
         .spawn()
         .expect("the service starts");
     let mut line = String::new();
-    BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
+    BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it prints its address");
     let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
-    println!("  the service is there after {:.0} s, its check of the file included", started.elapsed().as_secs_f64());
+    println!("  the service is ready after {:.0} s, including its check of the file", started.elapsed().as_secs_f64());
     let client = modalwatch::notify::client_builder().build().unwrap();
     let get = async |path: &str| {
         let started = Instant::now();
         let response = client.get(format!("{url}{path}")).send().await.expect("the service answers");
         assert_eq!(response.status(), 200, "{path}");
-        let bytes = response.bytes().await.expect("the answer is whole");
+        let bytes = response.bytes().await.expect("the answer is complete");
         (started.elapsed().as_secs_f64() * 1e3, bytes.len())
     };
     let mut stream = stats::stream(20_260_301, "pages that somebody looks at");
@@ -233,7 +235,7 @@ async fn queries(folder: &Path, large: usize) {
         let (structure, length) =
             if page.is_multiple_of(2) { (0, large) } else { (stream.random_range(1..=STRUCTURES), large / STRUCTURES) };
         let number = stream.random_range(0..length.max(1)) as i64;
-        // The cursor of the page before.
+        // The cursor of the previous page.
         let cursor = format!("{}~01890000-0000-7000-8000-000000000000", EPOCH_US + BETWEEN_US * number);
         pages.push(get(&format!("/v1/structures/{}/history?cursor={cursor}", id_of(structure))).await.0);
     }
@@ -259,7 +261,7 @@ fn quantiles(mut latencies_ms: Vec<f64>) -> String {
     format!("p50 {p50:.1} ms, p99 {p99:.1} ms, largest {most:.1} ms")
 }
 
-/// Batches a second that are assessed again, with so many threads.
+/// Number of batches per second that are assessed again with this number of threads.
 async fn replay(threads: usize) -> f64 {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let store = Store::open(folder.path()).await.expect("a store");
@@ -278,11 +280,11 @@ async fn replay(threads: usize) -> f64 {
         let measurements = at_intervals(&rows, start, 1, None).expect("measurements");
         let (structure, source) = (structure.clone(), "logger".to_owned());
         let batch = MeasurementBatch { structure, source, idempotency_key: None, measurements };
-        let taken = monitor.ingest().take(batch).await.expect("it is taken");
+        let taken = monitor.ingest().take(batch).await.expect("the batch is accepted");
         first.get_or_insert(taken.view.record.batch_id);
     }
     let started = Instant::now();
-    // All others go back to be compared with it.
+    // All other batches are assessed again under this reference.
     monitor
         .replay()
         .declare_reference(&structure, first.into_iter().collect(), 0.05)

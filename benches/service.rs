@@ -1,13 +1,13 @@
 //! The service over loopback, each batch on disk before its 201. `cargo bench --bench service`
 //!
-//! - `latency`: posts of 50 measurements, assessed, open loop: post number i starts at i/rate, whether or not the one before was
-//!   answered, so a slow answer does not hide the ones behind it. Beside it what the disk alone takes: two bare SQLite commits
-//!   for each post, as often.
-//! - `sustained`: posts of 20 measurements, assessed, as many as the service takes from 32 clients.
+//! - `latency`: posts of 50 measurements with assessment in an open loop: post number i starts at i/rate, whether or not the
+//!   previous one was answered, so that a slow answer does not delay later posts. For comparison with the disk alone: two bare SQLite
+//!   commits for each post, at the same rate.
+//! - `sustained`: posts of 20 measurements with assessment, as many as the service accepts from 32 clients.
 //! - `storing`: the same without an assessment, beside bare SQLite commits of the same rows on the same disk.
 //!
-//! Arguments after `--`: which of these (all without), and `rate=50 seconds=30`. `MODALWATCH_BENCH_PROGRAM` is another build of
-//! the program to measure instead.
+//! Arguments after `--` select some of these (default: all) and set `rate=50 seconds=30`. `MODALWATCH_BENCH_PROGRAM` is the path
+//! of another build to measure instead.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -25,20 +25,20 @@ use serde_json::{json, Value};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 use sqlx::Connection as _;
 
-/// Measurements of a post whose latency is measured, and of one of many.
+/// Number of measurements of a post in `latency`, and in the other two.
 const LARGE: usize = 50;
 const SMALL: usize = 20;
 
-/// Clients that post as fast as they are answered.
+/// Number of clients that post as fast as they are answered.
 const CLIENTS: usize = 32;
 
-/// Populations that are drawn; further batches repeat them at other times.
+/// Number of batches that are drawn; further batches repeat their values at other times.
 const DRAWN: usize = 200;
 
 /// 2026-01-01T00:00:00Z, µs.
 const EPOCH_MICROS: i64 = 1_767_225_600_000_000;
 
-/// A structure with a trained baseline, and the same under another id, which has none.
+/// A structure with a trained model, and the same structure under another id without a model.
 const ASSESSED: &str = "three-dof";
 const STORED: &str = "plain";
 
@@ -63,7 +63,7 @@ fn main() {
     }
 }
 
-/// The program on a folder of its own.
+/// The program with its own data folder.
 struct Service {
     process: Child,
     url: String,
@@ -102,7 +102,7 @@ impl Service {
         self.post(&format!("/v1/structures/{ASSESSED}/reference"), declared).await;
     }
 
-    /// Posts until the time is over; what each took, ms.
+    /// Posts until the time is over; returns the latency of each post, ms.
     async fn load(&self, structure: &str, seconds: u32) -> (Vec<f64>, f64) {
         let next = Arc::new(AtomicUsize::new(0));
         let started = Instant::now();
@@ -134,7 +134,7 @@ impl Service {
         (all, per_second)
     }
 
-    /// Peak resident memory, as the system writes it.
+    /// Peak resident memory, as the operating system prints it.
     fn peak(&self) -> String {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id())).unwrap_or_default();
         let line = status.lines().find(|l| l.starts_with("VmHWM")).unwrap_or("VmHWM: unknown").to_owned();
@@ -182,12 +182,12 @@ async fn latency(rate: u32, seconds: u32) {
             None => refused += 1,
         }
     }
-    println!("latency: POST of {LARGE} measurements, assessed, {rate}/s open loop for {seconds} s");
-    // A service that cannot keep up fills its queue and refuses: the quantiles then are those of the others only.
+    println!("latency: POST of {LARGE} measurements, assessed, {rate}/s in an open loop for {seconds} s");
+    // A service that cannot keep up fills its queue and refuses posts; the quantiles are then those of the accepted posts.
     println!("  {}; {refused} refused", quantiles(latencies_ms));
-    println!("  {:.1} ms of processor time a batch", 1e3 * service.processor_s() / f64::from(rate * seconds));
+    println!("  {:.1} ms of processor time per batch", 1e3 * service.processor_s() / f64::from(rate * seconds));
     let bare_ms = bare_pairs(service.folder.path(), rate, seconds).await;
-    println!("  two bare SQLite commits of the same rows, as often: {}", quantiles(bare_ms));
+    println!("  two bare SQLite commits of the same rows, at the same rate: {}", quantiles(bare_ms));
     println!("  peak resident memory of the service: {}", service.peak());
 }
 
@@ -199,7 +199,7 @@ async fn sustained(seconds: u32) {
     let each_ms = 1e3 * (service.processor_s() - before) / latencies_ms.len() as f64;
     println!("sustained: POST of {SMALL} measurements, assessed, {CLIENTS} clients for {seconds} s");
     println!("  {per_second:.0} batches/s; {}", quantiles(latencies_ms));
-    println!("  {each_ms:.1} ms of processor time a batch; peak resident memory: {}", service.peak());
+    println!("  {each_ms:.1} ms of processor time per batch; peak resident memory: {}", service.peak());
 }
 
 async fn storing(seconds: u32) {
@@ -209,7 +209,7 @@ async fn storing(seconds: u32) {
     let put = service.client.put(format!("{}/v1/structures/{STORED}", service.url));
     let put = put.header("content-type", "application/json").body(definition).send().await.expect("an answer");
     assert!(put.status().is_success());
-    // Before and after, since the disk is not ours alone.
+    // Measured before and after, because other programs use the disk as well.
     let bare_before = bare_commits(service.folder.path(), seconds.div_ceil(2)).await;
     let before = service.processor_s();
     let (latencies_ms, per_second) = service.load(STORED, seconds).await;
@@ -217,12 +217,12 @@ async fn storing(seconds: u32) {
     let bare_after = bare_commits(service.folder.path(), seconds.div_ceil(2)).await;
     let bare = f64::midpoint(bare_before, bare_after);
     println!("storing: POST of {SMALL} measurements, not assessed, {CLIENTS} clients for {seconds} s");
-    println!("  {per_second:.0} batches/s; {}; {each_ms:.2} ms of processor time a batch", quantiles(latencies_ms));
+    println!("  {per_second:.0} batches/s; {}; {each_ms:.2} ms of processor time per batch", quantiles(latencies_ms));
     println!("  bare SQLite: {bare_before:.0} and {bare_after:.0} commits/s of the same rows");
     println!("  ratio {:.2} (bare to service)", bare / per_second);
 }
 
-/// A bare connection to the tables of a store: WAL, synced in full, one statement a table, no service.
+/// A bare connection to the tables of a store: write-ahead log, full sync, one statement for each table, no service.
 struct Bare {
     connection: SqliteConnection,
     insert_measurements: String,
@@ -232,7 +232,7 @@ struct Bare {
 }
 
 impl Bare {
-    /// On the disk of a folder, for batches of so many measurements.
+    /// Opens one in a folder, for batches of this number of measurements.
     async fn open(beside: &Path, measurements: usize) -> Self {
         let folder = tempfile::tempdir_in(beside).expect("a temporary folder");
         Store::open(folder.path()).await.expect("a store").close().await;
@@ -276,7 +276,7 @@ impl Bare {
     }
 }
 
-/// Bare commits a second, one transaction after another.
+/// Number of bare commits per second, one transaction after another.
 async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
     let mut bare = Bare::open(beside, SMALL).await;
     let started = Instant::now();
@@ -286,7 +286,7 @@ async fn bare_commits(beside: &Path, seconds: u32) -> f64 {
     f64::from(bare.commits) / started.elapsed().as_secs_f64()
 }
 
-/// What two bare commits take, ms, begun `rate` times a second: what a post cannot do without.
+/// Times of two bare commits, ms, started `rate` times a second: a lower bound for a post.
 async fn bare_pairs(beside: &Path, rate: u32, seconds: u32) -> Vec<f64> {
     let mut bare = Bare::open(beside, LARGE).await;
     let started = Instant::now();
@@ -311,7 +311,7 @@ fn batches(structure: &str) -> String {
     format!("/v1/structures/{structure}/batches")
 }
 
-/// Body number `index` of a source, a second between measurements.
+/// Body number `index` of a source, with one second between measurements.
 fn body(source: &str, index: usize, measurements: usize) -> Vec<u8> {
     let rows = &drawn()[index % DRAWN];
     let row = |(i, row): (usize, &Vec<f64>)| {
@@ -322,7 +322,7 @@ fn body(source: &str, index: usize, measurements: usize) -> Vec<u8> {
     json!({ "source": source, "measurements": rows }).to_string().into_bytes()
 }
 
-/// Measurements of the structure of the paper, undamaged: one population drawn again and again.
+/// Measurements of the undamaged structure of the paper, drawn from one population.
 fn drawn() -> &'static Vec<Vec<Vec<f64>>> {
     static DRAWN_ROWS: std::sync::OnceLock<Vec<Vec<Vec<f64>>>> = std::sync::OnceLock::new();
     DRAWN_ROWS.get_or_init(|| {

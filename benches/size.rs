@@ -1,12 +1,12 @@
-//! Cost and accuracy against the number of unknown stiffnesses, chains and frames with mode shapes.
+//! Cost and accuracy against the number of unknown stiffnesses, for chains and frames with mode shapes.
 //!
 //! ```text
 //! cargo bench --bench size -- [--frames] [--threads N] [--out FOLDER] [PARAMETERS…]
-//! cargo bench --bench size -- --eigen     both eigen solvers at several sizes
-//! cargo bench --bench size -- --fits [PARAMETERS…]    how far the truth lies from the fits, without a training
+//! cargo bench --bench size -- --eigen     both eigensolvers at several sizes
+//! cargo bench --bench size -- --fits [PARAMETERS…]    distance of the truth from the fits, without a training
 //! ```
 //!
-//! Each size is trained in a process of its own, whose peak memory is read at its end. Prints a line for each and writes
+//! Each size is trained in a separate process, whose peak memory is read at its end. Prints a line for each size and writes
 //! `size.svg`, the structure files and the figures as JSON. Accuracy is measured on measurements that were not trained on, at
 //! the structure's own noise, against the linear-Gaussian optimum at the truth, tr (12·1 + JᵀΣ⁻¹J)⁻¹.
 
@@ -29,17 +29,17 @@ use nalgebra::DMatrix;
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
-/// Sizes unless others are asked for.
+/// Default sizes.
 const SIZES: [usize; 4] = [10, 30, 100, 300];
-/// Measurements that accuracy is measured on, and posterior draws for each.
+/// Number of measurements on which accuracy is measured, and of posterior draws for each.
 const MEASUREMENTS: usize = 200;
 const DRAWS: usize = 100;
-/// Measurements whose fits are looked at.
+/// Number of measurements whose fits are analysed.
 const FITS: usize = 40;
 /// Columns of masses of a frame.
 const BAYS: usize = 5;
 
-/// What was measured at one size.
+/// Figures of one size.
 #[derive(Serialize, Deserialize)]
 struct Figures {
     kind: String,
@@ -71,20 +71,20 @@ fn main() {
     let numbers = arguments.iter().enumerate().filter(|(i, _)| *i == 0 || !arguments[i - 1].starts_with("--t"));
     let mut sizes: Vec<usize> = numbers.filter_map(|(_, a)| a.parse().ok()).collect();
     if arguments.iter().any(|a| a == "--one") {
-        // As the program does at its start: our own pool, candle on one thread, see `main.rs`.
+        // As in `main.rs`: our own pool, and one thread for candle.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
         std::env::set_var("RAYON_NUM_THREADS", "1");
         println!("{}", serde_json::to_string(&measured(sizes[0], frames, &out)).expect("figures are plain data"));
         return;
     }
     if arguments.iter().any(|a| a == "--eigen") {
-        return compare_eigen_solvers();
+        return compare_eigensolvers();
     }
     if sizes.is_empty() {
         sizes = SIZES.to_vec();
     }
     if arguments.iter().any(|a| a == "--fits") {
-        return sizes.into_iter().for_each(|size| look_at_fits(size, frames));
+        return sizes.into_iter().for_each(|size| analyse_fits(size, frames));
     }
     std::fs::create_dir_all(&out).expect("a folder for the figures");
     let mut all: Vec<Figures> = Vec::new();
@@ -112,9 +112,9 @@ fn main() {
     eprintln!("{} and size.json", out.join("size.svg").display());
 }
 
-/// Squared distance of the truth from the fit, in variances of the normal distribution at the fit, mean over the parameters and
-/// over its independent directions: 1 where it is the posterior. Quantiles over measurements.
-fn look_at_fits(parameters: usize, frames: bool) {
+/// Squared distance of the truth from the fit in variances of the normal distribution at the fit, averaged over the parameters and
+/// over the principal directions; its expectation is 1 if this distribution is the posterior. Prints quantiles over measurements.
+fn analyse_fits(parameters: usize, frames: bool) {
     let text = if frames { frame(parameters) } else { chain(parameters) };
     let simulator = Simulator::new(StructureDefinition::parse_toml(&text).expect("a structure")).expect("a structure");
     let (set, observations) = held_out(&simulator, FITS);
@@ -136,8 +136,8 @@ fn look_at_fits(parameters: usize, frames: bool) {
     );
 }
 
-/// All eigenvalues and eigenvectors of a chain's matrix: nalgebra beside what the program takes.
-fn compare_eigen_solvers() {
+/// All eigenvalues and eigenvectors of a chain's matrix: nalgebra compared with the solver of the program.
+fn compare_eigensolvers() {
     println!("{:>4} {:>12} {:>12}", "n", "nalgebra, ms", "program, ms");
     for n in [8, 16, 24, 32, 64, 100, 300] {
         let mut stream = stats::stream(n as u64, "stiffnesses");
@@ -236,7 +236,7 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
         coverage_90: stats::mean(&covered),
         coverage_least: covered.iter().copied().fold(1.0, f64::min),
         coverage_greatest: covered.iter().copied().fold(0.0, f64::max),
-        // Of a uniform prior, whose variance is 1/12.
+        // The variance of a uniform prior on the unit interval is 1/12.
         r_squared: 1.0 - 12.0 * error,
         r_squared_optimum: 1.0 - 12.0 * bound,
         r_squared_fit_alone: 1.0 - 12.0 * fit_error,
@@ -245,7 +245,7 @@ fn measured(parameters: usize, frames: bool, out: &std::path::Path) -> Figures {
     }
 }
 
-/// Measurements that were not trained on, at the structure's own noise, and what they were made of.
+/// Measurements that were not used for training, with the noise of the structure, and the parameters behind them.
 fn held_out(simulator: &Simulator, count: usize) -> (TrainingSet, Vec<Observation>) {
     let set = simulator.training_set(count, 99).expect("a set");
     let mut stream = stats::stream(99, "observations");
@@ -259,14 +259,14 @@ fn held_out(simulator: &Simulator, count: usize) -> (TrainingSet, Vec<Observatio
     (set, observations)
 }
 
-/// Most memory this process has held, MiB; 0 where the system does not tell.
+/// Peak resident memory of this process, MiB; 0 if the system does not provide it.
 fn peak_memory_mib() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
     line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
 }
 
-/// Modes of a structure of this size: those of the issue from a hundred on, fewer where masses are few.
+/// Number of modes of a structure of this size: 20 from a hundred parameters on, fewer for fewer masses.
 fn modes(parameters: usize) -> usize {
     (parameters / 5).clamp(4, 20)
 }
@@ -300,7 +300,7 @@ fn spring(text: &mut String, name: &str, from: &str, to: &str, known: Option<f64
     }
 }
 
-/// A chain of masses from the ground; every spring is unknown to 30 %, shapes are measured at every second mass.
+/// A chain of masses from the ground; the stiffness of every spring is uncertain by 30 %, shapes are measured at every second mass.
 fn chain(parameters: usize) -> String {
     let points: Vec<String> = (2..=parameters).step_by(2).map(|i| format!("m{i}")).collect();
     let mut text = head(&format!("chain-{parameters}"), parameters, &points);

@@ -1,6 +1,6 @@
-//! Speed of the flow against the arithmetic limit of the machine and against PyTorch, in one run. `cargo bench --bench training`
+//! Speed of the flow compared with the arithmetic limit of the machine and with PyTorch, in one run. `cargo bench --bench training`
 //!
-//! PyTorch is timed by `benches/peers/flow.py` where the Python named by `MODALWATCH_PYTHON` (`python3` without it) has it.
+//! PyTorch is timed by `benches/peers/flow.py` if the Python of `MODALWATCH_PYTHON` (default `python3`) has it installed.
 
 use std::collections::BTreeMap;
 use std::process::Command;
@@ -19,25 +19,25 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 
 const BATCH: usize = 256;
-/// Steps in one reading of the clock, and readings; the middle one counts.
+/// Number of steps in one reading of the clock, and of readings, whose median is used.
 const STEPS: usize = 50;
 const READINGS: usize = 21;
-/// Measurements and draws of each in the bulk.
+/// Number of measurements in bulk sampling, and of draws for each.
 const BULK: [usize; 2] = [50, 1_000];
 
 fn main() {
-    // As the program does at its start: candle on one thread, see `main.rs`.
+    // As in `main.rs`: candle uses one thread.
     let _ = rayon::ThreadPoolBuilder::new().build_global();
     std::env::set_var("RAYON_NUM_THREADS", "1");
     speed();
 }
 
-/// Runs `work` on a pool of so many threads.
+/// Runs `work` on a pool of this number of threads.
 fn on<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
     rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads start").install(work)
 }
 
-/// Middle reading of the seconds that one of `count` goes of `work` takes.
+/// Median over the readings of the time of one of `count` repetitions of `work`, seconds.
 fn seconds(count: usize, mut work: impl FnMut()) -> f64 {
     work();
     let mut reading = || {
@@ -49,12 +49,12 @@ fn seconds(count: usize, mut work: impl FnMut()) -> f64 {
     stats::quantile(&readings, 0.5)
 }
 
-/// Floating-point operations a second of one product of two square matrices.
+/// Floating-point operations per second of a product of two square matrices.
 fn product_rate(threads: usize) -> f64 {
     const SIDE: usize = 768;
     let [a, b] = [1, 2].map(|seed| Mat::<f32>::from_fn(SIDE, SIDE, |i, j| ((i * seed + j) % 7) as f32));
     let mut c = Mat::<f32>::zeros(SIDE, SIDE);
-    // Each thread its own product: what so many cores reach when nothing is shared.
+    // Each thread computes its own product, so that the rate is that of independent cores.
     let mut results = vec![c.clone(); threads];
     let took = on(threads, || {
         seconds(1, || {
@@ -69,7 +69,7 @@ fn product_rate(threads: usize) -> f64 {
     2.0 * (threads * SIDE.pow(3)) as f64 / took
 }
 
-/// Multiplications and additions of the products of one training step.
+/// Number of multiplications and additions in the matrix products of one training step.
 fn operations(a: &Architecture) -> f64 {
     let context = a.context_features + a.modes * a.channels;
     let (first, second) = (a.parameters / 2, a.parameters - a.parameters / 2);
@@ -77,7 +77,7 @@ fn operations(a: &Architecture) -> f64 {
     let nets = a.units * (net(first, second) + net(second, first));
     let unfolded = a.modes * 3 * a.context_channels * (a.channels + a.context_channels);
     let features = a.modes * a.context_channels * a.context_features;
-    // There, the gradient of the weights, and that of the inputs (which the first convolution does not need).
+    // Forward pass, gradient of the weights, and gradient of the inputs (which the first convolution does not need).
     2.0 * (BATCH * (3 * (nets + unfolded + features) - a.modes * 3 * a.channels * a.context_channels)) as f64
 }
 
@@ -85,7 +85,7 @@ fn random_pairs(architecture: &Architecture, rows: usize) -> Pairs {
     let mut stream = stats::stream(1, "pairs");
     let mut normal = |shape: Vec<usize>| {
         let draws: Vec<f32> = (0..shape.iter().product()).map(|_| stream.sample(StandardNormal)).collect();
-        Tensor::from_vec(draws, shape, &Device::Cpu).expect("as many draws as places")
+        Tensor::from_vec(draws, shape, &Device::Cpu).expect("as many draws as entries")
     };
     let x = normal(vec![rows, architecture.parameters]);
     Pairs { x, y: normal(vec![rows, architecture.channels, architecture.modes]) }
@@ -132,7 +132,7 @@ fn speed() {
     }
     for threads in [1, 2] {
         let Some(peer) = peer(threads) else {
-            println!("PyTorch: not here (see benches/README.md)");
+            println!("PyTorch is not installed (see benches/README.md)");
             return;
         };
         let own = step_ms[threads - 1];
@@ -147,7 +147,7 @@ fn speed() {
     }
 }
 
-/// What the script of the peer prints; `None` where there is no PyTorch.
+/// Output of the PyTorch script; `None` without PyTorch.
 fn peer(threads: usize) -> Option<BTreeMap<String, f64>> {
     let python = std::env::var("MODALWATCH_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/peers/flow.py");

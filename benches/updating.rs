@@ -1,4 +1,4 @@
-//! Reference methods beside the trained flow, on the same measurements: three masses on springs, without noise told.
+//! Reference methods compared with the trained flow on the same measurements of three masses on springs, without stated noise.
 //!
 //! `cargo bench --bench updating`; compare within one run.
 
@@ -14,12 +14,12 @@ use modalwatch::updating::tmcmc::Target as _;
 const MEASUREMENTS: usize = 500;
 
 fn updating(criterion: &mut Criterion) {
-    // As the program does at its start: our own pool on all cores, candle on one thread, see `main.rs`.
+    // As in `main.rs`: our own pool on all cores, and one thread for candle.
     let _ = rayon::ThreadPoolBuilder::new().build_global();
     std::env::set_var("RAYON_NUM_THREADS", "1");
-    let library = Library::open(None).expect("the shipped baselines");
+    let library = Library::open(None).expect("the shipped models");
     let id = StructureId::parse("three-dof").expect("an id");
-    let baseline = library.get(&id).and_then(|entry| entry.baseline.clone()).expect("a shipped baseline");
+    let baseline = library.get(&id).and_then(|entry| entry.baseline.clone()).expect("a shipped model");
     let simulator = baseline.simulator().clone();
     let moments = [("k1", 4.0, 0.3), ("k2", 5.0, 0.1), ("k3", 6.0, 0.2)].map(|(k, m, s)| (k.to_owned(), m, s));
     let population = Drawn::new(simulator.space(), &moments).expect("a population");

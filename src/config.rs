@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_key_is_named() {
+    fn an_unknown_key_is_reported_by_its_name() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("config.toml");
         std::fs::write(&path, "[http]\nlisten = \"127.0.0.1:1\"\nlistn = 3\n").unwrap();
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn what_changed_is_named_by_its_keys() {
+    fn changed_settings_are_reported_by_their_keys() {
         let before = Config::default();
         let mut after = before.clone();
         assert_eq!(before.differing_keys(&after), Vec::<String>::new());
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn flags_go_over_the_file() {
+    fn flags_take_precedence_over_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("config.toml");
         std::fs::write(&path, "data_dir = \"a\"\n[http]\nlisten = \"127.0.0.1:1\"\n").unwrap();

@@ -1,6 +1,6 @@
 //! The rules of the source tree: which module may use which, no circles of files, and limits for files, functions and types.
 //!
-//! `cargo test --test architecture figures -- --ignored --nocapture` prints what is measured.
+//! `cargo test --test architecture figures -- --ignored --nocapture` prints the measured figures.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -28,18 +28,19 @@ const MOST_LINES_OF_A_TEST: usize = 700;
 const MOST_LINES_OF_A_FUNCTION: usize = 80;
 const MOST_PARAMETERS: usize = 7;
 const MOST_METHODS: usize = 25;
-/// Modules whose types are held to `MOST_METHODS`.
+/// Modules whose types have at most `MOST_METHODS` methods.
 const FEW_METHODS: [&str; 2] = ["src/store", "src/monitor"];
 
-/// What may exceed a limit, and why: `file`, `file: function`, `file: Type`, or `file -> file` for a use that closes a circle.
+/// Exceptions from the limits, each with its reason: `file`, `file: function`, `file: Type`, or `file -> file` for a use that
+/// closes a circle.
 const EXCEPTIONS: [(&str, &str); 0] = [];
 
-// `fault` is for the tests inside the modules.
+// `fault` is used by the unit tests in the modules.
 const FOUNDATION: [&str; 5] = ["quantity", "stats", "parameter", "measurement", "fault"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
 const TABLE: [(&str, &[&str], bool); 34] = [
-    // Where tests make things fail: a macro that needs nothing.
+    // A macro for fault injection in tests; it uses no other module.
     ("fault", &[], false),
     ("quantity", &[], false),
     ("access", &[], true),
@@ -57,7 +58,7 @@ const TABLE: [(&str, &[&str], bool); 34] = [
     ("simulator", &["emulator", "physics"], true),
     ("updating", &["physics", "simulator"], true),
     ("posterior", &[], true),
-    // `physics` for the error of a simulation only.
+    // Uses `physics` only for the error of a simulation.
     ("baseline", &["flow", "simulator", "posterior", "physics"], true),
     ("hierarchy", &["posterior", "simd"], true),
     ("trust", &["baseline", "simulator", "physics"], true),
@@ -73,7 +74,7 @@ const TABLE: [(&str, &[&str], bool); 34] = [
     ("notify", &["store"], true),
     ("mqtt", &["monitor"], true),
     ("telemetry", &[], false),
-    // A study of the methods, the assessment of a batch included.
+    // Compares the methods, including the assessment of a batch.
     ("reproduce", &["assessment", "baseline", "damage", "gsa", "physics", "plot", "simulator", "updating"], true),
     (
         "monitor",
@@ -131,7 +132,7 @@ fn may_use(module: &str) -> Vec<&'static str> {
     let (_, own, foundation) = TABLE
         .iter()
         .find(|(name, ..)| *name == module || (*name == "lib" && module == "main"))
-        .unwrap_or_else(|| panic!("module {module} has no row in this table: give it one"));
+        .unwrap_or_else(|| panic!("module {module} has no row in this table: add one"));
     own.iter().copied().chain(FOUNDATION.into_iter().filter(|_| *foundation)).collect()
 }
 
@@ -155,7 +156,7 @@ fn module_of(file: &Path) -> String {
     first.as_os_str().to_str().unwrap().trim_end_matches(".rs").to_owned()
 }
 
-/// A place that breaks a rule, as `EXCEPTIONS` names it, and the message about it.
+/// A violation of a rule: its place as written in `EXCEPTIONS`, and the message.
 type Violation = (String, String);
 
 fn is_excepted(place: &str) -> bool {
@@ -173,7 +174,7 @@ fn assert_none(violations: Vec<Violation>) {
 fn each_module_uses_only_modules_below_it() {
     let mut used: BTreeSet<(String, usize, String)> = BTreeSet::new();
     for file in sources() {
-        // Links in comments are held to the table, too.
+        // Links in comments must obey the table, too.
         for (number, line) in fs::read_to_string(root().join(&file)).unwrap().lines().enumerate() {
             for name in line.split("crate::").skip(1) {
                 let name = name.split(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap();
@@ -183,7 +184,7 @@ fn each_module_uses_only_modules_below_it() {
     }
     let tree = tree();
     for (module, mention) in tree.mentions() {
-        if let Some(name) = tree.room(module, &mention.path) {
+        if let Some(name) = tree.top_module(module, &mention.path) {
             used.insert((tree.files[tree.modules[module].file].clone(), mention.line, name));
         }
     }
@@ -201,7 +202,7 @@ fn each_module_uses_only_modules_below_it() {
 }
 
 #[test]
-fn only_the_store_speaks_sql_and_only_the_doors_speak_http() {
+fn only_the_store_uses_sqlx_and_only_http_uses_axum() {
     for path in sources() {
         let (module, text) = (module_of(&path), fs::read_to_string(root().join(&path)).unwrap());
         assert!(module == "store" || !text.contains("sqlx::"), "{} uses sqlx", path.display());
@@ -334,7 +335,7 @@ fn every_exception_is_still_needed() {
 }
 
 #[test]
-#[ignore = "prints figures, checks nothing"]
+#[ignore = "prints figures and checks nothing"]
 fn figures() {
     let (tree, root) = (tree(), root());
     let sources = lengths(&SOURCES);

@@ -1,4 +1,4 @@
-//! `modalwatch calibrate`: simulation-based calibration of a trained baseline, with plots.
+//! `modalwatch calibrate`: simulation-based calibration of a trained model, with plots.
 
 use std::path::PathBuf;
 
@@ -13,20 +13,20 @@ use crate::baseline::train::renew;
 use crate::baseline::Baseline;
 use crate::plot::{escaped, page, table, Line, Plot};
 
-/// Measure the calibration of a trained baseline.
+/// Measure the calibration of a trained model.
 #[derive(Debug, Args)]
 pub struct CalibrateArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
     #[arg(long)]
     structure: String,
-    /// The .safetensors file of the trained baseline, with its .json beside it [default: the shipped baseline]
+    /// Trained model: its .safetensors file, with its .json beside it [default: the shipped model]
     #[arg(long)]
     model: Option<PathBuf>,
     /// Seed of the simulations; the training uses other seeds
     #[arg(long, default_value_t = 1_000_003)]
     seed: u64,
-    /// Write the measured calibration to the manifest beside --model, as a new training would: for a baseline that was trained
-    /// by an earlier version of this program
+    /// Write the measured calibration to the manifest beside --model, as a new training would: for a model that was trained by
+    /// an earlier version of this program
     #[arg(long, requires = "model")]
     renew: bool,
     /// Write the plots as one HTML page
@@ -40,7 +40,7 @@ pub struct CalibrateArgs {
 /// Measures and prints the calibration.
 ///
 /// # Errors
-/// An invalid baseline, a file that cannot be written, a calibration that fails.
+/// An invalid trained model, a file that cannot be written, a calibration that fails.
 pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     let mut baseline = load(&args.structure, args.model.as_deref())?;
     if let Some(path) = args.model.as_deref().filter(|_| args.renew) {
@@ -104,7 +104,7 @@ fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) ->
         "<p>Passed: 90 % intervals cover about 90 % in every cell, ranks and TARP are uniform.</p>".to_owned()
     } else {
         let items: Vec<String> = record.failures.iter().map(|f| format!("<li>{}</li>", escaped(f))).collect();
-        format!("<p class=\"bad\">Failed: the service does not use this baseline.</p><ul>{}</ul>", items.concat())
+        format!("<p class=\"bad\">Failed: the service does not use this model unless its digest is accepted in the configuration.</p><ul>{}</ul>", items.concat())
     };
     let names: Vec<String> = baseline.space().iter().map(|p| p.name.clone()).collect();
     let plots: String = ranks.iter().map(|cell| plot(cell, &names).svg()).collect();

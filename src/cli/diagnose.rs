@@ -61,19 +61,19 @@ pub struct DiagnoseArgs {
     json: bool,
 }
 
-/// Measurements from tables, with the assumptions made in reading them.
+/// Measurements read from tables.
 pub struct Tables {
     /// All rows.
     pub measurements: Vec<ModalMeasurement>,
     /// Covariates, those of the structure first, then those found in the tables.
     pub covariates: Vec<Covariate>,
-    /// The assumptions, for a person.
+    /// The assumptions made in reading the tables, as text.
     pub notes: Vec<String>,
     /// Whether the tables have times; if not, the order of the rows is used.
     pub timed: bool,
 }
 
-/// How to read tables.
+/// Options for reading tables.
 #[derive(Debug, Clone, Default)]
 pub struct TableArgs<'a> {
     /// Column that holds the time.
@@ -129,7 +129,7 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     Ok(Study { simulator, data, outcome })
 }
 
-/// Diagnose, add the causes to a new version of the structure, and train its baseline.
+/// Diagnose, add the causes to a new version of the structure, and train its model.
 #[derive(Debug, Args)]
 pub struct ExtendArgs {
     #[command(flatten)]
@@ -137,7 +137,7 @@ pub struct ExtendArgs {
     /// Folder for structure.json, baseline.safetensors and baseline.json
     #[arg(long)]
     out: PathBuf,
-    /// Only write the structure; it can be trained later with `modalwatch train`
+    /// Only write the structure; its model can be trained later with `modalwatch train`
     #[arg(long)]
     no_training: bool,
     /// Number of simulated training samples [default: as for `modalwatch train`]
@@ -151,10 +151,10 @@ pub struct ExtendArgs {
     report: Option<PathBuf>,
 }
 
-/// Diagnoses, extends the structure and trains its baseline.
+/// Diagnoses, extends the structure and trains its model.
 ///
 /// # Errors
-/// As [`diagnose`]; no cause to add; a training that fails.
+/// As [`diagnose`]; there is no cause to add; the training fails.
 pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
     let Study { simulator, data, outcome } = studied(&args.study)?;
     println!("{}", outcome.diagnosis.summary);
@@ -257,7 +257,7 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
 
 fn refused(path: &Path, problems: &[Problem]) -> anyhow::Error {
     let lines: Vec<String> = problems.iter().map(|p| format!("  {}: {}", p.pointer, p.message)).collect();
-    anyhow::anyhow!("{} is refused:\n{}", path.display(), lines.join("\n"))
+    anyhow::anyhow!("{} is invalid:\n{}", path.display(), lines.join("\n"))
 }
 
 /// Adds the undeclared columns of a table to the covariates, or to the ignored columns; returns a note for each.
@@ -337,7 +337,7 @@ fn read_rows(
     Ok(())
 }
 
-/// Whether the time of a row only stands for its number, because the table has no times.
+/// Whether the time of a row is only a placeholder for its number, because the table has no times.
 fn untimed(row: &RawMeasurement) -> bool {
     row.measured_at.as_deref().is_some_and(|time| time.starts_with("1970-"))
 }

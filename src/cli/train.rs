@@ -1,4 +1,4 @@
-//! `modalwatch train`: trains the baseline of a structure by simulation.
+//! `modalwatch train`: trains the model of a structure by simulation.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -15,7 +15,7 @@ use crate::baseline::train::diverged;
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
 
-/// Train the baseline of a structure.
+/// Train the model of a structure.
 #[derive(Debug, Args)]
 pub struct TrainArgs {
     /// Structure file (TOML or JSON), or the id of a shipped structure
@@ -24,18 +24,18 @@ pub struct TrainArgs {
     /// Folder for structure.toml, baseline.safetensors and baseline.json [default: models/<structure>]
     #[arg(long)]
     out: Option<PathBuf>,
-    /// Simulated training samples [default: 200000; 10000 for a structure without measurement noise; 3000 to 40000 for one of many
+    /// Number of simulated training samples [default: 200000; 10000 for a structure without measurement noise; 3000 to 40000 with many
     /// parameters or with mode shapes]
     #[arg(long)]
     samples: Option<usize>,
-    /// Passes over the training samples [default: 80; 200 for a structure without measurement noise; 8 for one of many
+    /// Number of passes over the training samples [default: 80; 200 for a structure without measurement noise; 8 with many
     /// parameters or with mode shapes]
     #[arg(long)]
     epochs: Option<usize>,
-    /// Coupling units of the flow; more units represent more complex posteriors and take longer [default: 4]
+    /// Number of coupling units of the network; more units represent more complex posteriors and take longer [default: 4]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=64))]
     units: Option<u16>,
-    /// Noise that the baseline must cover, as multiples of the noise of the structure
+    /// Range of noise that the trained model must cover, as multiples of the noise of the structure
     #[arg(long, value_name = "LOW,HIGH", value_parser = noise_range, default_value = "0.1,5")]
     noise_range: NoiseRange,
     /// Seed of all random numbers; the same seed gives the same files
@@ -46,7 +46,7 @@ pub struct TrainArgs {
     json: bool,
 }
 
-/// Trains the baseline, writes its files and prints its validation.
+/// Trains the model, writes its files and prints its validation.
 ///
 /// # Errors
 /// An invalid structure file, a training that fails, a folder that cannot be written.
@@ -59,7 +59,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let own_file =
         ["structure.toml", "structure.json"].map(|name| out.join(name)).into_iter().find(|path| path.exists());
     if let Some(path) = &own_file {
-        // A baseline in the folder of another structure would be refused when it is loaded.
+        // A trained model in the folder of another structure would be refused when it is loaded.
         let beside = read_structure_file(path)?;
         anyhow::ensure!(
             beside.digest() == simulator.digest(),
@@ -73,7 +73,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         let error = |mode: usize| format!("{:.2e}", table.emulator().relative_error(mode));
         let errors: Vec<String> = (0..simulator.modes()).map(error).collect();
         eprintln!(
-            "emulator of {} runs: relative error of each mode on runs left out {}",
+            "emulator of {} runs: relative error of each mode on runs that were left out: {}",
             table.runs(),
             errors.join(", ")
         );

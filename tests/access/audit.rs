@@ -15,7 +15,7 @@ async fn entries(world: &World, query: &str) -> Vec<Value> {
 }
 
 #[tokio::test]
-async fn each_change_is_written_down_with_who_where_and_what_came_of_it() {
+async fn each_change_is_recorded_with_token_address_and_outcome() {
     let world = World::start();
     let keeper = world.token(&["admin"], &["three-dof"]).await;
     let window = json!({ "from": "2026-01-01T00:00:00Z", "to": "2026-01-02T00:00:00Z", "reason": "bolts" });
@@ -52,7 +52,7 @@ async fn each_change_is_written_down_with_who_where_and_what_came_of_it() {
     assert_eq!((&window["structure"], &window["status"]), (&json!("three-dof"), &json!(201)));
     assert_eq!((&window["peer"], &window["request_id"]), (&json!("127.0.0.1"), &json!("window-1")));
     assert_eq!(window["actor_name"], "admin three-dof");
-    assert_eq!(items[3]["subject"], format!("/v1/tokens/{keeper}"), "what was made, not only where");
+    assert_eq!(items[3]["subject"], format!("/v1/tokens/{keeper}"), "the new token itself, not only the list");
     assert_eq!(items[4]["subject"], format!("/v1/tokens/{admin}"));
 }
 
@@ -83,7 +83,7 @@ async fn the_audit_is_paged_and_cut_by_time() {
 }
 
 #[tokio::test]
-async fn a_client_that_goes_away_leaves_a_whole_entry() {
+async fn a_client_that_disconnects_leaves_a_complete_entry() {
     let world = World::start();
     for day in 10..30 {
         let (from, to) = ("2026-01-01T00:00:00Z", format!("2026-01-{day}T00:00:00Z"));

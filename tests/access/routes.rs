@@ -180,7 +180,7 @@ async fn every_route_asks_for_what_the_table_says() {
     for (method, pattern) in &routes {
         let row = TABLE.iter().find(|(m, p, ..)| m == method && p == pattern);
         let Some((_, _, needs, about)) = row else {
-            panic!("{method} {pattern} has no row in the table: say what it needs, and see http::access::route");
+            panic!("{method} {pattern} has no row in the table: add one, and see http::access::route");
         };
         let path = path_of(pattern, OWN, &diagnosis);
         let method = Method::from_bytes(method.as_bytes()).unwrap();

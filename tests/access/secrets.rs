@@ -73,11 +73,11 @@ async fn no_secret_is_in_log_database_or_metrics() {
     let ended = child.wait().unwrap();
     assert!(status.success() && ended.success(), "{ended}");
     let log = std::fs::read(&log).unwrap();
-    assert!(log.len() > 2_000, "the log was to be talkative: {} bytes", log.len());
+    assert!(log.len() > 2_000, "the log should be verbose: {} bytes", log.len());
     let database: Vec<_> = while_running.into_iter().chain(files(&data)).collect();
     assert!(database.iter().any(|(_, bytes)| contains(bytes, id_of(&secrets[2]))), "the ids are in the database");
     for secret in &secrets {
-        // The second half alone would be enough for somebody who has the first.
+        // The second half of a token would be sufficient for an attacker who has the first.
         let secret = &secret.rsplit('_').next().unwrap()[26..];
         assert!(!contains(&log, secret), "a secret is in the log");
         assert!(!contains(metrics.as_bytes(), secret), "a secret is in the metrics");

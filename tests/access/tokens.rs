@@ -32,7 +32,7 @@ async fn a_token_is_shown_once_and_listed_without_its_secret() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_a_new_token_is_named() {
+async fn mistakes_in_a_new_token_are_reported() {
     let world = World::start();
     let pointer = async |body: Value| {
         let refused = problem(world.post("/v1/tokens", &world.admin, &body).await, 422, "invalid").await;
@@ -114,7 +114,7 @@ async fn a_revoked_token_is_refused_at_once_and_after_a_restart() {
 }
 
 #[tokio::test]
-async fn what_is_no_token_of_ours_is_refused() {
+async fn an_unknown_token_is_refused() {
     let world = World::start();
     let other_secret = {
         let mut token = world.admin.clone();
@@ -128,7 +128,11 @@ async fn what_is_no_token_of_ours_is_refused() {
     let with = |value: String| world.service.get(LIST).header("authorization", value).send();
     problem(with("Basic dXNlcjpwYXNz".to_owned()).await.unwrap(), 401, "unauthorized").await;
     problem(with(world.admin.clone()).await.unwrap(), 401, "unauthorized").await;
-    assert_eq!(with(format!("bearer {}", world.admin)).await.unwrap().status(), 200, "the scheme has no case");
+    assert_eq!(
+        with(format!("bearer {}", world.admin)).await.unwrap().status(),
+        200,
+        "the scheme is not case-sensitive"
+    );
     let twice = world.ask(Method::GET, LIST, &world.admin).header("authorization", format!("Bearer {}", world.admin));
     problem(twice.send().await.unwrap(), 401, "unauthorized").await;
 }

@@ -14,7 +14,7 @@ async fn nothing_is_stored(service: &Service) {
 }
 
 #[tokio::test]
-async fn what_is_no_json_is_a_400() {
+async fn invalid_json_is_a_400() {
     let (service, _folder) = spawn();
     for body in ["", "{", "{\"measurements\": [}", "[1, 2", "{\"measurements\": []} trailing", "hello", "{'a': 1}"] {
         let answer = problem(service.post_text(BATCHES, "application/json", body).await, 400, "malformed_json").await;
@@ -80,7 +80,7 @@ async fn json_of_another_shape_is_a_422_with_a_pointer() {
 }
 
 #[tokio::test]
-async fn values_that_cannot_be_are_a_422_with_a_pointer() {
+async fn impossible_values_are_a_422_with_a_pointer() {
     let (service, _folder) = spawn();
     let good = || measurements([4.0, 5.0, 6.0], 3, 0);
     let cases: &[(&str, Value, &str, &str)] = &[
@@ -191,7 +191,7 @@ async fn other_content_types_are_a_415() {
 }
 
 #[tokio::test]
-async fn ids_and_keys_that_are_none_are_refused() {
+async fn invalid_ids_and_keys_are_refused() {
     let (service, _folder) = spawn();
     let long = "x".repeat(10_000);
     for id in
@@ -220,7 +220,7 @@ async fn ids_and_keys_that_are_none_are_refused() {
 }
 
 #[tokio::test]
-async fn a_baseline_that_is_none_is_refused() {
+async fn an_invalid_reference_is_refused() {
     let (service, _folder) = spawn();
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 5, 0)).await["batch"].clone();
     let path = "/v1/structures/three-dof/reference";
@@ -303,7 +303,7 @@ fn models_with(change: impl Fn(&std::path::Path)) -> tempfile::TempDir {
 }
 
 #[tokio::test]
-async fn a_baseline_file_that_is_damaged_is_named_and_the_others_serve() {
+async fn a_damaged_model_file_is_reported_and_the_other_models_are_used() {
     let weights = |f: &std::path::Path| f.join("baseline.safetensors");
     let rewrite = |path: std::path::PathBuf, change: &dyn Fn(&mut Vec<u8>)| {
         let mut bytes = std::fs::read(&path).unwrap();
@@ -359,7 +359,7 @@ async fn a_baseline_file_that_is_damaged_is_named_and_the_others_serve() {
         let folder = tempfile::tempdir().unwrap();
         let service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));
         let ready = service.get("/readyz").send().await.unwrap();
-        assert_eq!(ready.status(), 200, "{name}: the other baselines serve");
+        assert_eq!(ready.status(), 200, "{name}: the other models are used");
         let ready: Value = ready.json().await.unwrap();
         let refused = ready["baselines_refused"][0].clone();
         assert_eq!(refused["structure"], "three-dof", "{name}: {ready}");
@@ -373,7 +373,7 @@ async fn a_baseline_file_that_is_damaged_is_named_and_the_others_serve() {
 }
 
 #[tokio::test]
-async fn a_batch_that_waited_is_assessed_when_its_baseline_is_there() {
+async fn a_batch_that_waited_is_assessed_when_its_model_is_available() {
     let models = models_with(|f| std::fs::write(f.join("baseline.json"), "").unwrap());
     let folder = tempfile::tempdir().unwrap();
     let mut service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));

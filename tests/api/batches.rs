@@ -17,8 +17,8 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
     assert!((k1["mean"].as_f64().unwrap() - 4.0).abs() < 0.05, "{k1}");
     assert_eq!(k1["probability_of_damage"], Value::Null);
 
-    let baseline = json!({ "batches": [first["batch"]] });
-    let undamaged = created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
+    let reference = json!({ "batches": [first["batch"]] });
+    let undamaged = created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
     assert_eq!(undamaged["version"], 1);
     assert_eq!(undamaged["measurement_count"], 20);
     let delta = undamaged["parameters"][1]["threshold"].as_f64().unwrap();
@@ -51,7 +51,7 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
 }
 
 #[tokio::test]
-async fn the_example_of_the_readme_is_taken() {
+async fn the_example_of_the_readme_is_accepted() {
     let readme = include_str!("../../README.md");
     let (_, rest) = readme.split_once(" -d '").unwrap();
     let (body, _) = rest.split_once("'\n").unwrap();
@@ -95,9 +95,9 @@ async fn an_undamaged_reference_declared_among_posts_misses_none_of_them() {
         .map(|body| service.request(reqwest::Method::POST, BATCHES).json(&body).send())
         .map(tokio::spawn)
         .collect();
-    let baseline = json!({ "batches": [healthy["batch"]] });
+    let reference = json!({ "batches": [healthy["batch"]] });
     let path = "/v1/structures/three-dof/reference";
-    tasks.insert(20, tokio::spawn(service.request(reqwest::Method::POST, path).json(&baseline).send()));
+    tasks.insert(20, tokio::spawn(service.request(reqwest::Method::POST, path).json(&reference).send()));
     for task in tasks {
         created(task.await.unwrap().unwrap()).await;
     }
@@ -221,7 +221,7 @@ fn codes(answer: &Value) -> Vec<&str> {
 }
 
 #[tokio::test]
-async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
+async fn an_untrusted_batch_has_findings_and_no_probability_of_damage() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
@@ -268,7 +268,7 @@ async fn what_cannot_be_trusted_is_named_and_gets_no_probability_of_damage() {
 }
 
 #[tokio::test]
-async fn one_bad_measurement_is_named_and_the_others_are_believed() {
+async fn one_outlier_is_reported_and_the_others_are_used() {
     let (service, _folder) = spawn();
     let mut rows = measurements([4.0, 5.0, 6.0], 12, 0);
     rows[7]["frequencies_hz"] = json!([0.47, 1.05, 1.24]);
@@ -280,7 +280,7 @@ async fn one_bad_measurement_is_named_and_the_others_are_believed() {
 }
 
 #[tokio::test]
-async fn damage_becomes_one_alarm_which_somebody_sees() {
+async fn damage_becomes_one_alarm_that_can_be_acknowledged() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;
@@ -336,7 +336,7 @@ async fn one_measurement_has_a_mean_and_no_spread() {
 }
 
 #[tokio::test]
-async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_baseline() {
+async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_model() {
     let (service, _folder) = spawn();
     let definition = json!({
         "id": "tower-1", "modes": 1,
@@ -359,8 +359,8 @@ async fn a_structure_is_defined_over_http_and_its_batches_wait_for_a_baseline() 
     let path = format!("/v1/structures/tower-1/batches/{}", answer["batch"].as_str().unwrap());
     assert_eq!(service.read(&path).await["measurements"][0], measurement);
 
-    let baseline = service.post("/v1/structures/tower-1/reference", &json!({ "batches": [answer["batch"]] })).await;
-    problem(baseline, 409, "no_model").await;
+    let reference = service.post("/v1/structures/tower-1/reference", &json!({ "batches": [answer["batch"]] })).await;
+    problem(reference, 409, "no_model").await;
     let mut heavier = definition.clone();
     heavier["mass"][0]["kg"] = json!(101.0);
     problem(put(heavier).await.unwrap(), 409, "structure_in_use").await;

@@ -92,7 +92,7 @@ async fn posting_the_same_again_stores_nothing_and_keys_are_kept() {
 }
 
 #[tokio::test]
-async fn the_source_of_the_query_stands_for_lines_without_one() {
+async fn the_source_of_the_query_applies_to_lines_without_one() {
     let (service, _folder) = spawn();
     let own = line(2, 1);
     let none = json!({ "measurements": line(1, 1)["measurements"] });
@@ -133,7 +133,7 @@ async fn limits_of_lines_and_bodies() {
 }
 
 #[tokio::test]
-async fn too_many_lines_are_told_with_what_was_done() {
+async fn too_many_lines_are_refused_with_the_results_so_far() {
     let (service, _folder) = spawn();
     let body = format!("{}\n{}", line(1, 1), "1\n".repeat(10_000));
     let refused = problem(post(&service, body).await, 413, "too_many_lines").await;
@@ -142,7 +142,7 @@ async fn too_many_lines_are_told_with_what_was_done() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_the_request_as_a_whole_is_a_problem() {
+async fn an_invalid_request_as_a_whole_is_a_problem() {
     let (service, _folder) = spawn();
     let text = line(1, 1).to_string();
     let request = |path: &str| {
@@ -163,7 +163,7 @@ async fn what_is_wrong_with_the_request_as_a_whole_is_a_problem() {
 }
 
 #[tokio::test]
-async fn lines_wait_for_a_place_instead_of_being_sent_back() {
+async fn lines_wait_for_a_place_in_the_queue_instead_of_being_refused() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command(folder.path());
     let service = Service::spawn(command.env("MODALWATCH__MONITOR__COMPUTE__QUEUE", "1"));
@@ -175,7 +175,7 @@ async fn lines_wait_for_a_place_instead_of_being_sent_back() {
 }
 
 #[tokio::test]
-async fn a_client_that_goes_away_stops_it_between_two_lines() {
+async fn a_client_that_disconnects_ends_the_request_between_two_lines() {
     let (service, _folder) = spawn();
     let (sender, receiver) = tokio::sync::mpsc::channel::<Result<String, std::io::Error>>(1);
     let lines = futures_util::stream::unfold(receiver, |mut receiver| async {

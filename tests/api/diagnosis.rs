@@ -172,7 +172,7 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     let found = alarms(service.read("/v1/structures/soft/alarms?limit=200").await);
     println!("alarms after the loss: {found:?}");
     assert!(found.contains(&"k1".to_owned()), "the loss of k1 was not alarmed");
-    assert!(!found.contains(&"k2".to_owned()), "k2 was alarmed, which lost nothing");
+    assert!(!found.contains(&"k2".to_owned()), "an alarm for k2, which has lost no stiffness");
 
     // A batch without a temperature is assessed over all temperatures, with a finding that says so.
     let mut blind = batch(430.0, 0.9, &mut rng);

@@ -109,7 +109,7 @@ async fn the_files_hold_the_same_and_csv_goes_back_in() {
 }
 
 #[tokio::test]
-async fn a_file_of_many_pages_is_whole() {
+async fn a_file_of_many_pages_is_complete() {
     let (service, _folder) = spawn();
     let mut sent = BTreeSet::new();
     for batch in 0..3 {
@@ -125,7 +125,7 @@ async fn a_file_of_many_pages_is_whole() {
 }
 
 #[tokio::test]
-async fn queries_that_make_no_sense_are_named() {
+async fn invalid_queries_are_refused_with_their_place() {
     let (service, _folder) = spawn();
     for (query, place) in [
         ("format=xml", "query/format"),

@@ -9,7 +9,7 @@ use reqwest::{Client, Method, RequestBuilder, Response};
 use serde_json::{json, Value};
 use tempfile::TempDir;
 
-/// A service of its own, ended when dropped.
+/// A service with its own process, which is ended when this value is dropped.
 pub struct Service {
     child: Child,
     url: String,
@@ -42,7 +42,7 @@ impl Service {
             child.stderr.take().unwrap().read_to_string(&mut text).unwrap();
             panic!("the service did not start: {line}{text}");
         };
-        // Its log must be read, or the pipe fills and the service waits for it.
+        // Its log must be read; otherwise the pipe fills and the service blocks.
         let mut stderr = child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut stderr, &mut std::io::sink()));
         Self {
@@ -136,7 +136,7 @@ pub fn exit_within(child: &mut Child, limit: Duration) -> Option<ExitStatus> {
     }
 }
 
-/// What a command that must not start prints; it is ended when it starts all the same.
+/// Output of a command that must not start; if it starts nevertheless, it is ended.
 pub fn refusal(command: &mut Command) -> String {
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let Some(status) = exit_within(&mut child, Duration::from_secs(20)) else {
@@ -149,12 +149,12 @@ pub fn refusal(command: &mut Command) -> String {
     text
 }
 
-/// Asks until `found` gives something, and returns it; panics with `what` after 20 s.
+/// Repeats `found` until it returns a value, and returns this; panics with `what` after 20 s.
 pub async fn eventually<T>(what: &str, found: impl AsyncFnMut() -> Option<T>) -> T {
     within(Duration::from_secs(20), what, found).await
 }
 
-/// As [`eventually`], for as long as `limit`.
+/// As [`eventually`], with another time limit.
 pub async fn within<T>(limit: Duration, what: &str, mut found: impl AsyncFnMut() -> Option<T>) -> T {
     let started = Instant::now();
     loop {
@@ -166,7 +166,7 @@ pub async fn within<T>(limit: Duration, what: &str, mut found: impl AsyncFnMut()
     }
 }
 
-/// A service in a folder of its own.
+/// A service with its own data folder.
 pub fn spawn() -> (Service, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     (Service::start(folder.path()), folder)
@@ -186,7 +186,7 @@ pub async fn problem(response: Response, status: u16, code: &str) -> Value {
     let content_type = response.headers().get("content-type").map(|v| v.to_str().unwrap().to_owned());
     let id = response.headers().get("x-request-id").map(|v| v.to_str().unwrap().to_owned());
     let text = response.text().await.unwrap();
-    let body: Value = serde_json::from_str(&text).unwrap_or_else(|_| panic!("{found} is no problem+json: {text}"));
+    let body: Value = serde_json::from_str(&text).unwrap_or_else(|_| panic!("{found} is not problem+json: {text}"));
     assert_eq!(found, status, "{body}");
     assert_eq!(body["code"], code, "{body}");
     assert_eq!(body["status"], status, "{body}");

@@ -92,7 +92,7 @@ async fn exceedances_are_paged_newest_first() {
 }
 
 #[tokio::test]
-async fn a_query_that_makes_no_sense_is_named() {
+async fn an_invalid_query_is_refused_with_its_place() {
     let (service, _folder) = spawn();
     for (query, place) in [
         ("limit=0", "query/limit"),

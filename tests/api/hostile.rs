@@ -53,7 +53,7 @@ fn check(answer: &Value) -> Result<(), TestCaseError> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn no_number_that_is_none_leaves_the_service() {
+async fn no_answer_contains_a_number_that_is_not_finite() {
     let (service, _folder) = spawn();
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 0)).await;
     created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": [healthy["batch"]] })).await).await;

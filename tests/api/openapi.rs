@@ -47,7 +47,7 @@ fn response_schema(document: &Value, path: &str, method: &str, status: u16, cont
 }
 
 #[tokio::test]
-async fn the_document_is_whole() {
+async fn the_document_is_complete() {
     let (service, _folder) = spawn();
     let document = service.read("/openapi.json").await;
     assert!(document["openapi"].as_str().unwrap().starts_with("3.1"), "{}", document["openapi"]);
@@ -74,7 +74,10 @@ async fn the_document_is_whole() {
     assert!(operations.len() >= 52, "{}", operations.len());
     for (path, method, operation) in operations {
         let place = format!("{method} {path}: {operation}");
-        assert!(names.insert(operation["operationId"].as_str().unwrap().to_owned()), "another has its id: {place}");
+        assert!(
+            names.insert(operation["operationId"].as_str().unwrap().to_owned()),
+            "another operation has the same id: {place}"
+        );
         for text in ["summary", "description"] {
             assert!(operation[text].as_str().is_some_and(|t| !t.is_empty()), "{text}: {place}");
         }
@@ -127,7 +130,7 @@ fn sources() -> BTreeMap<String, String> {
 
 /// Router and document agree, provided that every route is added through the document.
 #[test]
-fn routes_are_made_with_their_description_only() {
+fn every_route_is_added_with_its_description() {
     let mut plain = BTreeMap::new();
     for (name, code) in sources() {
         let count =
@@ -269,7 +272,7 @@ async fn check(service: &Service, document: &Value, template: &str, path: &str) 
 }
 
 #[tokio::test]
-async fn a_real_answer_of_each_get_is_as_the_document_says() {
+async fn the_answer_of_each_get_agrees_with_the_document() {
     let (service, _folder) = spawn();
     let document = service.read("/openapi.json").await;
     let mut first = measurements([4.0, 5.0, 6.0], 20, 0);
@@ -339,7 +342,7 @@ async fn a_real_answer_of_each_get_is_as_the_document_says() {
 }
 
 #[tokio::test]
-async fn a_structure_as_the_schema_has_it_is_what_the_service_gives() {
+async fn a_structure_of_the_service_agrees_with_its_schema() {
     let (service, _folder) = spawn();
     let document = service.read("/openapi.json").await;
     let definition = json!({ "$ref": "#/components/schemas/StructureDefinition" });
@@ -354,7 +357,7 @@ async fn a_structure_as_the_schema_has_it_is_what_the_service_gives() {
 
 /// The service accepts what the document allows, and refuses what it forbids.
 #[tokio::test]
-async fn bodies_are_valid_by_the_document_exactly_when_the_service_takes_them() {
+async fn the_document_allows_exactly_the_bodies_that_the_service_accepts() {
     let (service, _folder) = spawn();
     let document = service.read("/openapi.json").await;
     let long = |length: usize| "a".repeat(length);
@@ -461,7 +464,7 @@ async fn the_api_explorer_needs_nothing_from_elsewhere() {
 }
 
 #[tokio::test]
-async fn a_method_that_is_not_taken_is_told_which_are() {
+async fn an_unsupported_method_is_answered_with_the_supported_ones() {
     let (service, _folder) = spawn();
     for (method, path, allowed) in [
         (reqwest::Method::DELETE, "/v1/structures/three-dof", "GET,HEAD,PUT"),

@@ -32,7 +32,7 @@ async fn health_readiness_version_and_metrics_are_answered() {
 
 /// Every transaction adds at least one page to the write-ahead log, so the log counts them.
 #[tokio::test]
-async fn whoever_asks_for_readiness_makes_the_writer_work_once_a_second_at_most() {
+async fn requests_for_readiness_use_the_writer_at_most_once_a_second() {
     const PAGE_BYTES: u64 = 4_096;
     let (service, folder) = spawn();
     let log = folder.path().join("modalwatch.sqlite-wal");
@@ -150,7 +150,7 @@ async fn sigterm_under_load_answers_what_was_taken_and_exits_with_0() {
 }
 
 #[tokio::test]
-async fn what_keeps_the_service_from_starting_is_named() {
+async fn the_reason_why_the_service_cannot_start_is_reported() {
     let (service, used) = spawn();
     let folder = tempfile::tempdir().unwrap();
     let mut taken = command(folder.path());

@@ -41,7 +41,7 @@ async fn every_201_is_in_the_history_exactly_once_whenever_the_service_is_killed
                         // body.
                         let Ok(answer) = response.json::<serde_json::Value>().await else { return };
                         let id = answer["batch"].as_str().unwrap().to_owned();
-                        assert!(acknowledged.lock().unwrap().insert(id), "one id was given out twice");
+                        assert!(acknowledged.lock().unwrap().insert(id), "an id was assigned twice");
                     }
                 })
             })

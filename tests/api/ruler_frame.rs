@@ -7,7 +7,7 @@ use crate::needs;
 
 const BATCHES: &str = "/v1/structures/ruler-frame-4dof/batches";
 
-/// Rows of one laboratory, or `None` where the data are not on this machine.
+/// Rows of one laboratory, or `None` if the data are not on this machine.
 fn rows(lab: &str) -> Option<Vec<Value>> {
     let path = repository("../shared/data/ruler-frame-4dof/ruler_frame_frequencies.csv");
     let text = std::fs::read_to_string(path).ok()?;
@@ -41,7 +41,7 @@ async fn two_laboratories_are_taken_with_their_missing_values() {
         assert_eq!(answer["state"], "assessed", "{answer}");
         left_out += answer["assessment"]["measurements_left_out"].as_u64().unwrap();
     }
-    // Rows that lack a mode (four of laboratory de) are used; outliers are excluded by name.
+    // Rows that lack a mode (four of laboratory de) are used; outliers are reported and excluded.
     println!("{left_out} measurements left out");
     let history = service.read("/v1/structures/ruler-frame-4dof/history").await;
     assert_eq!(history["items"].as_array().unwrap().len(), 16);

@@ -35,8 +35,8 @@ async fn put_bare(service: &Service) {
 async fn with_a_damage() -> (Service, tempfile::TempDir, Vec<Value>) {
     let (service, folder) = spawn();
     let mut batches = vec![service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await];
-    let baseline = json!({ "batches": [batches[0]["batch"]] });
-    created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
+    let reference = json!({ "batches": [batches[0]["batch"]] });
+    created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
     for (i, k2) in [(1, 5.0), (2, 5.0), (3, 4.5)] {
         batches.push(service.post_batch("three-dof", &measurements([4.0, k2, 6.0], 20, 100_000 * i)).await);
     }
@@ -54,7 +54,7 @@ fn numbers(value: &Value) -> Vec<Option<f64>> {
 }
 
 fn length(value: &Value) -> usize {
-    value.as_array().unwrap_or_else(|| panic!("{value} is no list")).len()
+    value.as_array().unwrap_or_else(|| panic!("{value} is not a list")).len()
 }
 
 /// The items of a list by a text in them.
@@ -107,7 +107,7 @@ async fn a_series_holds_all_that_can_be_drawn_over_time() {
     let all = service.read(SERIES).await;
     assert_eq!((&all["structure"], &all["batches"], &all["reduced"]), (&json!("three-dof"), &json!(5), &json!(false)));
     assert_eq!((&all["from"], &all["to"]), (&json!(time(0)), &json!(time(402_400))));
-    assert_eq!((length(&all["alarms"]), length(&all["maintenance"])), (1, 0), "maintenance lies behind the window");
+    assert_eq!((length(&all["alarms"]), length(&all["maintenance"])), (1, 0), "the maintenance is after the window");
 
     let f = &all["frequencies"];
     assert_eq!((&f["modes"], length(&f["nominal_hz"])), (&json!(3), 3));
@@ -163,7 +163,7 @@ async fn a_series_holds_all_that_can_be_drawn_over_time() {
     // A part of it, selected by the start of the batches.
     let part = service.read(&format!("{SERIES}?from={}&to={}", time(100_000), time(300_000))).await;
     assert_eq!((&part["batches"], &part["from"]), (&json!(2), &json!(time(100_000))));
-    assert_eq!(length(&part["alarms"]), 0, "it was opened later");
+    assert_eq!(length(&part["alarms"]), 0, "the alarm was opened later");
     let part = service.read(&format!("{SERIES}?from={}", time(950_000))).await;
     assert_eq!((&part["batches"], length(&part["maintenance"])), (&json!(0), 1));
     assert_eq!((length(&part["parameters"]), length(&part["frequencies"]["times"])), (0, 0));
@@ -193,14 +193,18 @@ async fn a_spike_among_twenty_thousand_measurements_is_in_the_reduced_series() {
     let row_at = |i: usize| f["times"].as_array().unwrap().iter().position(|t| *t == time(600 * i).as_str());
     assert_eq!(f["values_hz"][row_at(spike).unwrap()][0], 9.0);
     assert_eq!(f["covariates"]["temperature_c"][row_at(warm).unwrap()], 35.5);
-    assert!(f["covariates"].get("operator").is_none(), "a category is no number");
+    assert!(f["covariates"].get("operator").is_none(), "a category is not a number");
     let missing = f["values_hz"].as_array().unwrap().iter().filter(|row| row[1].is_null()).count();
     assert!(missing >= 100, "{missing} missing modes are left of 400");
-    assert_eq!((length(&all["parameters"]), length(&all["trust"])), (0, 0), "nothing is assessed without a baseline");
+    assert_eq!(
+        (length(&all["parameters"]), length(&all["trust"])),
+        (0, 0),
+        "nothing is assessed without a trained model"
+    );
 }
 
 #[tokio::test]
-async fn a_question_that_makes_no_sense_is_named() {
+async fn an_invalid_query_is_refused_with_its_place() {
     let (service, _folder) = spawn();
     for (query, place) in [
         ("from=yesterday", "query/from"),
@@ -266,7 +270,7 @@ async fn a_detail_has_the_densities_of_the_assessment_and_what_they_predict() {
         assert!(inside >= 14, "{inside} of 20 measured values lie within what is predicted: {mode}");
     }
     assert_eq!(length(&detail["modes"]), 3);
-    assert_eq!(service.read(&path).await, detail, "asked again, it answers the same");
+    assert_eq!(service.read(&path).await, detail, "a repeated request has the same answer");
     // Nothing for the reference before there is one, and at most 200 values of a mode.
     let (service, _folder) = spawn();
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 300, 0)).await;
@@ -324,7 +328,7 @@ impl Watcher {
 }
 
 #[tokio::test]
-async fn events_tell_of_batches_alarms_structures_and_jobs() {
+async fn events_report_batches_alarms_structures_and_jobs() {
     let (service, _folder) = spawn();
     let mut watcher = Watcher::open(&service).await;
     let healthy = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 50, 0)).await;
@@ -355,7 +359,7 @@ async fn events_tell_of_batches_alarms_structures_and_jobs() {
 }
 
 #[tokio::test]
-async fn a_job_is_told_of_from_its_beginning_to_its_end_and_listed() {
+async fn events_follow_a_job_from_beginning_to_end_and_it_is_listed() {
     let (service, _folder) = spawn();
     assert_eq!(service.read("/v1/jobs").await, json!({ "items": [] }));
     for i in 0..6 {
@@ -389,7 +393,7 @@ async fn sigterm_ends_an_open_stream_of_events_and_does_not_wait_for_it() {
     let mut watcher = Watcher::open(&service).await;
     let started = Instant::now();
     service.signal("TERM");
-    assert_eq!(watcher.next().await, None, "it ends as a stream ends, not as a connection that breaks");
+    assert_eq!(watcher.next().await, None, "the stream ends regularly and the connection does not break");
     assert!(service.wait(Duration::from_secs(20)).success());
     // If the stream did not end by itself, it would be aborted after the 30 s that open requests have.
     assert!(started.elapsed() < Duration::from_secs(15), "stopping took {:?}", started.elapsed());

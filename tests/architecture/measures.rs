@@ -1,4 +1,4 @@
-//! What is measured: lengths of functions and files, methods of types, circles of files.
+//! Measures of the source tree: lengths of functions and files, methods of types, circles of files.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -73,7 +73,7 @@ impl<'ast> Visit<'ast> for Functions<'_> {
     }
 }
 
-/// A type and its functions in `impl` blocks that implement no trait, in whichever file they stand.
+/// A type and its functions in `impl` blocks that implement no trait, in any file.
 pub struct Type {
     /// The file that defines the type, and the line of its name there.
     pub file: String,
@@ -125,7 +125,7 @@ pub fn lengths(root: &Path, folder: &str) -> Vec<(String, usize)> {
     lengths
 }
 
-/// Groups of files in which each file needs every other one, directly or by way of others of the group.
+/// Groups of files in which each file uses every other one, directly or through others of the group.
 pub fn circles(edges: &[Edge]) -> Vec<Vec<usize>> {
     let mut next: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
     for edge in edges {

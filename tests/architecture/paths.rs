@@ -1,4 +1,4 @@
-//! The paths that a source file writes: in `use` declarations, in code, in attributes and inside macros.
+//! The paths that a source file contains: in `use` declarations, in code, in attributes and inside macros.
 
 use proc_macro2::{TokenStream, TokenTree};
 use syn::visit::{self, Visit};
@@ -55,7 +55,7 @@ fn collect_leaves(tree: &syn::UseTree, before: &mut Vec<String>, found: &mut Vec
     }
 }
 
-/// Each path in a file, with the names of the inline modules around it. Code of tests is left out.
+/// Each path in a file, with the names of the inline modules around it. Test code is excluded.
 pub fn mentions(file: &syn::File) -> Vec<(Vec<String>, Mention)> {
     let mut reader = Reader { inner: Vec::new(), found: Vec::new() };
     reader.visit_file(file);
@@ -72,7 +72,7 @@ impl Reader {
         self.found.push((self.inner.clone(), Mention { path, line, reexport: false, glob: false }));
     }
 
-    /// Inside a macro nothing is parsed: names joined by `::` are taken for paths, and so are single capitalised names.
+    /// The arguments of a macro are not parsed: names joined by `::` and single capitalised names are regarded as paths.
     fn tokens(&mut self, tokens: TokenStream) {
         let mut tokens = tokens.into_iter().peekable();
         let mut after_dot = false;

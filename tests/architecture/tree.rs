@@ -8,7 +8,7 @@ use syn::visit::{self, Visit};
 
 use crate::paths::{self, Mention};
 
-/// A module: where it is, what it defines and what it imports. Modules and items of the tests are left out.
+/// A module: where it is, what it defines and what it imports. Modules and items of tests are excluded.
 pub struct Module {
     pub file: usize,
     /// Names of the inline modules that lead to this one within its file.
@@ -17,7 +17,7 @@ pub struct Module {
     krate: usize,
     children: BTreeMap<String, usize>,
     items: BTreeSet<String>,
-    /// Name in this module, and the path that it stands for.
+    /// Name in this module, and the path that it refers to.
     imports: BTreeMap<String, Vec<String>>,
     globs: Vec<Vec<String>>,
 }
@@ -30,7 +30,7 @@ pub struct Tree {
     crates: BTreeMap<String, usize>,
 }
 
-/// What a path leads to.
+/// The target of a path.
 #[derive(Clone, Copy)]
 pub enum Target {
     Module(usize),
@@ -70,7 +70,7 @@ impl Tree {
         tree
     }
 
-    /// `folder` is where the children of this module are looked for.
+    /// `folder` is the folder of the children of this module.
     fn read_file(&mut self, root: &Path, file: &Path, folder: &Path, parent: Option<usize>, krate: usize) -> usize {
         let text = fs::read_to_string(root.join(file)).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
         let source = syn::parse_file(&text).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
@@ -117,7 +117,7 @@ impl Tree {
         }
     }
 
-    /// What `path`, written in `module`, leads to; none for names that no crate of the tree defines.
+    /// Target of `path`, written in `module`; `None` for names that no crate of the tree defines.
     pub fn resolve(&self, module: usize, path: &[String], depth: usize) -> Option<Target> {
         let Some((first, rest)) = path.split_first() else { return Some(Target::Module(module)) };
         if depth > 16 {
@@ -143,7 +143,7 @@ impl Tree {
         }
     }
 
-    /// `path` inside a module; what a macro may have made there is taken for an item of that module.
+    /// Target of `path` inside a module; a name that a macro may have defined there is regarded as an item of that module.
     fn below(&self, module: usize, path: &[String], depth: usize) -> Option<Target> {
         match path.split_first() {
             None => Some(Target::Module(module)),
@@ -172,8 +172,8 @@ impl Tree {
         })
     }
 
-    /// All uses of an item of one file by another. An import of a module alone is no use, and neither is a public
-    /// re-export of what stands below the module that re-exports it.
+    /// All uses of an item of one file by another. The import of a module alone is not a use, and neither is a public
+    /// re-export of an item below the module that re-exports it.
     pub fn edges(&self) -> Vec<Edge> {
         let mentions = self.mentions();
         let edges = mentions.iter().filter_map(|(module, mention)| {
@@ -220,14 +220,14 @@ impl Tree {
         })
     }
 
-    /// The line of an item's name; 0 where a macro makes the item.
+    /// The line of an item's name; 0 if a macro defines the item.
     pub fn line_of(&self, module: usize, item: &str) -> usize {
         let names = self.items(module).iter().filter_map(name_of);
         names.into_iter().find(|name| *name == item).map_or(0, |name| name.span().start().line)
     }
 
-    /// First module below the crate that a path from outside any other module names: the room.
-    pub fn room(&self, module: usize, path: &[String]) -> Option<String> {
+    /// First module below the crate that a path from outside any other module names.
+    pub fn top_module(&self, module: usize, path: &[String]) -> Option<String> {
         let climbs = path.iter().take_while(|segment| *segment == "super").count();
         let mut from = Some(module);
         for _ in 0..climbs {
@@ -254,7 +254,7 @@ fn name_of(item: &syn::Item) -> Option<&syn::Ident> {
     })
 }
 
-/// Collects the imports of a module, those inside its functions included.
+/// Collects the imports of a module, including those inside its functions.
 struct Imports<'a> {
     module: &'a mut Module,
 }

@@ -67,7 +67,7 @@ fn pools(samples: &BatchSamples) -> Vec<Vec<f64>> {
 
 #[test]
 fn case_1_is_learnt_to_the_stated_likelihood_and_r_squared() {
-    // The paper's case has no noise, and needs a flow of its own, whose posteriors are almost points.
+    // The paper's case has no noise, and needs a separate model, whose posteriors are almost points.
     let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("models/three-dof/structure.toml"));
     let exact = text.unwrap().replace("relative = 0.001", "relative = 0.0");
     let simulator = Simulator::new(StructureDefinition::parse_toml(&exact).unwrap()).unwrap();
@@ -173,7 +173,7 @@ fn a_measurement_beyond_the_prior_is_counted_and_does_not_spill_into_other_param
 }
 
 #[test]
-fn a_damaged_foreign_or_outdated_baseline_is_refused_with_the_reason() {
+fn a_damaged_foreign_or_outdated_model_is_refused_with_the_reason() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("models/three-dof");
     let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
     let (manifest, weights) = (read("baseline.json"), read("baseline.safetensors"));

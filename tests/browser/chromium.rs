@@ -1,4 +1,4 @@
-//! Headless Chromium over the DevTools protocol: as much of a client as these tests need.
+//! Headless Chromium over the DevTools protocol: the part of a client that these tests need.
 
 use std::io::{BufRead as _, BufReader};
 use std::net::TcpStream;
@@ -9,10 +9,10 @@ use serde_json::{json, Value};
 use tempfile::TempDir;
 use tungstenite::{Message, WebSocket};
 
-/// Longest wait for anything on a page.
+/// Maximum time to wait for a condition on a page.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A browser with one page, ended when dropped.
+/// A browser with one page; it is ended when this value is dropped.
 pub struct Page {
     child: Child,
     socket: WebSocket<TcpStream>,
@@ -33,7 +33,7 @@ impl Page {
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
         let url = lines.find_map(|line| Some(line.ok()?.strip_prefix("DevTools listening on ")?.to_owned())).unwrap();
-        // What it goes on to print must be read, or the pipe fills and it waits.
+        // Its further output must be read; otherwise the pipe fills and the browser blocks.
         std::thread::spawn(move || lines.for_each(drop));
 
         let address = url.trim_start_matches("ws://").split('/').next().unwrap();
@@ -51,7 +51,7 @@ impl Page {
         page
     }
 
-    /// Calls a method of the protocol; what the page complains of meanwhile is kept.
+    /// Calls a method of the protocol; errors of the page that arrive meanwhile are kept.
     pub fn call(&mut self, method: &str, params: &Value) -> Value {
         self.last_id += 1;
         let mut command = json!({ "id": self.last_id, "method": method, "params": params });
@@ -84,13 +84,13 @@ impl Page {
         self.complaints.extend(complaint.map(Value::to_string));
     }
 
-    /// What the page has complained of since the last time.
+    /// Errors of the page since the last call.
     pub fn complaints(&mut self) -> Vec<String> {
         self.evaluate("1");
         std::mem::take(&mut self.complaints)
     }
 
-    /// Value of a JavaScript expression; a promise is waited for.
+    /// Value of a JavaScript expression; a promise is awaited.
     pub fn evaluate(&mut self, expression: &str) -> Value {
         let params = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
         let outcome = self.call("Runtime.evaluate", &params);
@@ -99,7 +99,7 @@ impl Page {
         outcome["result"]["value"].clone()
     }
 
-    /// Waits until an expression is true; gives its value.
+    /// Waits until an expression is true; returns its value.
     pub fn wait_for(&mut self, expression: &str) -> Value {
         let started = Instant::now();
         loop {
@@ -108,12 +108,15 @@ impl Page {
                 return value;
             }
             let complaints = &self.complaints;
-            assert!(started.elapsed() < PATIENCE, "{expression} did not become true; the page says {complaints:?}");
+            assert!(
+                started.elapsed() < PATIENCE,
+                "{expression} did not become true; errors of the page: {complaints:?}"
+            );
             std::thread::sleep(Duration::from_millis(50));
         }
     }
 
-    /// Colours and width of the window.
+    /// Sets the colour scheme and the width of the window.
     pub fn look(&mut self, theme: &str, width: u32) {
         let features = json!([{ "name": "prefers-color-scheme", "value": theme }]);
         self.call("Emulation.setEmulatedMedia", &json!({ "features": features }));
@@ -121,9 +124,9 @@ impl Page {
         self.call("Emulation.setDeviceMetricsOverride", &metrics);
     }
 
-    /// Loads an address anew and waits for the view.
+    /// Loads an address again and waits for the view.
     pub fn visit(&mut self, url: &str) {
-        // Another hash alone would not load the page again.
+        // A change of the hash alone would not reload the page.
         self.call("Page.navigate", &json!({ "url": "about:blank" }));
         self.call("Page.navigate", &json!({ "url": url }));
         self.wait_for("Boolean(document.querySelector('main .view'))");
@@ -147,7 +150,7 @@ impl Page {
         self.call("Input.dispatchKeyEvent", &up);
     }
 
-    /// Types into what has the focus.
+    /// Types into the focused element.
     pub fn type_text(&mut self, text: &str) {
         self.call("Input.insertText", &json!({ "text": text }));
     }

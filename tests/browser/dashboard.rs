@@ -1,4 +1,4 @@
-//! Every view complete, quiet and accessible; live; usable by keyboard.
+//! Every view is complete, without errors, accessible, updated live and usable by keyboard.
 
 use std::sync::OnceLock;
 
@@ -15,7 +15,7 @@ const DAMAGED: [f64; 3] = [3.2, 5.0, 6.0];
 const DAY_S: usize = 86_400;
 const PER_BATCH: usize = 20;
 
-/// One browser at a time, as each takes a core; `None`, and the test is recorded as skipped, where there is no chromium.
+/// One browser at a time, because each uses a core. Without Chromium returns `None` and records the test as skipped.
 pub async fn turn() -> Option<MutexGuard<'static, ()>> {
     static TURN: OnceLock<Mutex<()>> = OnceLock::new();
     needs::program("chromium")?;
@@ -30,8 +30,8 @@ async fn post(service: &Service, k: [f64; 3], day: usize) -> String {
 /// An undamaged reference, healthy days, a pause, a batch in another unit, and a loss of k1 that raises an alarm.
 async fn watched_bridge(service: &Service) {
     let mut batches = vec![post(service, UNDAMAGED, 0).await, post(service, UNDAMAGED, 1).await];
-    let baseline = json!({ "batches": batches });
-    created(service.post("/v1/structures/three-dof/reference", &baseline).await).await;
+    let reference = json!({ "batches": batches });
+    created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
     for day in [2, 3, 12, 13] {
         batches.push(post(service, UNDAMAGED, day).await);
     }
@@ -59,7 +59,7 @@ fn visit_structure(page: &mut Page, service: &Service) {
     page.wait_for("document.querySelectorAll('[data-figure^=density] canvas').length === 3");
 }
 
-/// Figures whose canvas is missing or blank.
+/// Figures whose canvas is missing or empty.
 const BLANK_FIGURES: &str = "
     [...document.querySelectorAll('figure')].filter((figure) => figure.offsetParent !== null).filter((figure) => {
         const canvases = [...figure.querySelectorAll('canvas')];
@@ -73,7 +73,7 @@ const BLANK_FIGURES: &str = "
     }).map((figure) => figure.dataset.figure)";
 
 /// Text alternatives that are missing: an image needs a name and a description, and its table.
-const UNTOLD_FIGURES: &str = "
+const FIGURES_WITHOUT_TEXT: &str = "
     [...document.querySelectorAll('figure')].filter((figure) => figure.offsetParent !== null).filter((figure) => {
         const plot = figure.querySelector('[role=img]');
         const summary = document.getElementById(plot.getAttribute('aria-describedby'))?.textContent ?? '';
@@ -95,13 +95,13 @@ fn axe_findings(page: &mut Page) -> Option<Value> {
             .map((v) => [v.id, v.nodes.map((n) => n.html.slice(0, 200) + ' ' + n.failureSummary)]),
     }))";
     let outcome = page.evaluate(run);
-    assert!(outcome["rules"].as_u64().unwrap() > 10, "axe looked at too little: {outcome}");
+    assert!(outcome["rules"].as_u64().unwrap() > 10, "axe checked too few elements: {outcome}");
     Some(outcome["serious"].clone())
 }
 
 fn check_view(page: &mut Page, what: &str) {
-    assert_eq!(page.evaluate(BLANK_FIGURES), json!([]), "blank figures: {what}");
-    assert_eq!(page.evaluate(UNTOLD_FIGURES), json!([]), "figures without words: {what}");
+    assert_eq!(page.evaluate(BLANK_FIGURES), json!([]), "empty figures: {what}");
+    assert_eq!(page.evaluate(FIGURES_WITHOUT_TEXT), json!([]), "figures without a text alternative: {what}");
     let overflow = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth");
     assert_eq!(overflow, json!(0), "the page scrolls sideways: {what}");
     if let Some(serious) = axe_findings(page) {
@@ -138,7 +138,7 @@ async fn every_view_is_complete_quiet_and_accessible_in_both_themes_and_on_a_pho
         }
         check_view(&mut page, &seen("structure"));
 
-        // One that nothing was measured on says what to do.
+        // A structure without measurements shows the next step.
         page.visit(&at(&service, "#/structures/rig"));
         page.wait_for("document.querySelector('main .blank')?.textContent.includes('curl')");
         check_view(&mut page, &seen("structure without batches"));
@@ -176,7 +176,7 @@ async fn a_batch_posted_elsewhere_appears_without_a_reload() {
     page.wait_for("document.querySelector('tr[data-structure=three-dof]').textContent.includes('12 batches')");
 }
 
-/// What has the focus: its tag, text and whether the focus can be seen.
+/// The focused element: its tag, its text and whether the focus is visible.
 const FOCUSED: &str = "(() => {
     const element = document.activeElement;
     const { outlineStyle, outlineWidth } = getComputedStyle(element);
@@ -185,7 +185,7 @@ const FOCUSED: &str = "(() => {
              visible: outlineStyle !== 'none' && parseFloat(outlineWidth) >= 2 };
 })()";
 
-/// Presses Tab until `wanted` has the focus; every stop on the way must show it.
+/// Presses Tab until `wanted` has the focus; each element on the way must show its focus.
 fn tab_to(page: &mut Page, wanted: impl Fn(&Value) -> bool) -> Value {
     for _ in 0..120 {
         page.press("Tab");
@@ -230,7 +230,7 @@ async fn everything_is_reached_and_done_by_keyboard() {
     tab_to(&mut page, |f| f["text"] == "1 week");
     page.press("Enter");
     page.wait_for("[...document.querySelectorAll('.spans button')].some((b) => b.ariaPressed === 'true' && b.textContent === '1 week')");
-    // A chart is read by arrow keys.
+    // The arrow keys move through a chart.
     page.evaluate("document.querySelector('[data-figure=control] .plot').focus()");
     page.press("ArrowRight");
     page.wait_for("document.querySelector('[data-figure=control] .readout').textContent.includes('shift')");
@@ -265,11 +265,11 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     page.wait_for("document.querySelector('dialog[open] input[name=reason]') !== null");
     page.evaluate("document.querySelector('input[name=reason]').focus()");
     page.type_text("new bearings");
-    // An end before the beginning is refused by the service, and the dialog says so.
+    // An end before the beginning is refused by the service, and the dialog shows the reason.
     page.evaluate("document.querySelector('input[name=to]').value = '2020-01-01T00:00'");
     page.press("Enter");
     page.wait_for("document.querySelector('dialog .problem')?.textContent.includes('/to')");
-    assert!(page.complaints().iter().all(|c| c.contains("422")), "only the refused request is told of");
+    assert!(page.complaints().iter().all(|c| c.contains("422")), "only the refused request is reported");
     page.evaluate("document.querySelector('input[name=to]').value = '2100-01-01T00:00'");
     page.evaluate("document.querySelector('dialog .primary').click()");
     page.wait_for("document.getElementById('maintenance').textContent.includes('new bearings')");

@@ -1,4 +1,4 @@
-//! A model that lacks something, from the diagnosis over its extension to the step back: all from the page.
+//! A simulation that lacks an effect: diagnosis, extension and undoing the extension, all from the page.
 
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -13,7 +13,8 @@ use crate::chromium::Page;
 use crate::dashboard::{at, turn};
 use crate::helpers::{command, created, time, within, Service};
 
-/// Two masses on two springs; the simulation knows nothing of temperature. Small, so that its flow is trained in seconds.
+/// Two masses on two springs; the simulation does not contain the temperature. The structure is small, so that its model is
+/// trained in seconds.
 const STRUCTURE: &str = r#"
 id = "tiny"
 modes = 2
@@ -87,7 +88,7 @@ fn press_and_confirm(page: &mut Page, button: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undoes_it() {
+async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_be_undone() {
     let Some(_turn) = turn().await else { return };
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
@@ -108,7 +109,7 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_step_back_undo
     page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('k2 falls by')");
     press_and_confirm(&mut page, "Extend the model");
 
-    // The bar of the job grows while one looks at it.
+    // The progress bar of the job grows while the page is shown.
     page.evaluate("location.hash = '#/jobs'");
     let job = "[...document.querySelectorAll('[data-job]')].find((row) => row.textContent.includes('Model extension'))";
     let bar = format!("{job}?.querySelector('progress')?.value");

@@ -124,7 +124,7 @@ fn a_table_names_the_parameter_that_follows_the_temperature_and_nothing_in_healt
     // Twice the half-width of the 90 % interval is allowed.
     println!("slope {value} [{low}, {high}]");
     assert!((value + 0.004).abs() < high - low, "{value} [{low}, {high}]");
-    assert!(high < 0.0 && high - low < 0.002, "an interval that says nothing: [{low}, {high}]");
+    assert!(high < 0.0 && high - low < 0.002, "an interval without information: [{low}, {high}]");
     extended_finds_nothing(&structure, &hidden);
 
     let healthy = season(3, 3, |_, stream| chain_hz(draw(stream, 4.2e6), draw(stream, 3.6e6)));

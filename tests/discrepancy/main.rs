@@ -580,7 +580,7 @@ fn two_laboratories_differ_by_something_common_and_not_by_three_storeys() {
 }
 
 #[test]
-fn an_extended_structure_explains_its_data_and_half_an_effect_is_found_wanting() {
+fn an_extended_structure_explains_its_data_and_half_an_effect_is_not_enough() {
     let world = world::draw_single(5_008, "spring_group", "linear");
     let folder = tempfile::tempdir().unwrap();
     let (structure, data) = (folder.path().join("world.toml"), folder.path().join("world.csv"));

@@ -1,4 +1,4 @@
-//! Modes that cross are told, modes that do not are not.
+//! Modes that cross are reported, and only those.
 
 use modalwatch::emulator::Emulator;
 
@@ -39,7 +39,7 @@ fn modes_that_cross_are_followed_through_the_crossing() {
 }
 
 #[test]
-fn a_crossing_in_a_corner_and_a_sharp_veering_are_told() {
+fn a_crossing_in_a_corner_and_a_sharp_veering_are_reported() {
     let corner = |u: &[f64]| sorted(vec![5.0 + u[0], 6.7 - u[1]]);
     assert_eq!(Emulator::fit(&runs(latin_hypercube(200, 2, 12), corner)).unwrap().crossings().len(), 1);
     let veering = |u: &[f64]| {

@@ -1,4 +1,4 @@
-//! The error told is the error met at fresh points.
+//! The estimated error of an emulator agrees with its actual error at new points.
 
 use modalwatch::emulator::{Emulator, Runs};
 use modalwatch::stats;
@@ -9,7 +9,7 @@ use super::structures::{long_chain, rig};
 use super::{latin_hypercube, runs};
 
 /// Root mean square of ln f̂ − ln f of each mode at 1,000 new points of the unit cube that are not outside.
-fn error_met(emulator: &Emulator, truth: impl Fn(&[f64]) -> Vec<f64>) -> Vec<f64> {
+fn actual_error(emulator: &Emulator, truth: impl Fn(&[f64]) -> Vec<f64>) -> Vec<f64> {
     let mut stream = stats::stream(17, "fresh points");
     let mut squares = vec![0.0; emulator.modes()];
     let mut points = 0;
@@ -27,32 +27,35 @@ fn error_met(emulator: &Emulator, truth: impl Fn(&[f64]) -> Vec<f64>) -> Vec<f64
 }
 
 #[test]
-fn the_error_told_of_the_rig_is_small_and_met_at_fresh_points() {
+fn the_estimated_error_of_the_rig_is_small_and_right_at_new_points() {
     for seed in 0..4 {
         let emulator = Emulator::fit(&runs(latin_hypercube(200, 2, seed), rig)).unwrap();
-        for (mode, met) in error_met(&emulator, rig).iter().enumerate() {
-            let told = emulator.relative_error(mode);
-            assert!(told < 1e-5, "seed {seed}, mode {mode}: {told}");
-            assert!(*met < 2.0 * told, "seed {seed}, mode {mode}: told {told}, met {met}");
+        for (mode, actual) in actual_error(&emulator, rig).iter().enumerate() {
+            let estimated = emulator.relative_error(mode);
+            assert!(estimated < 1e-5, "seed {seed}, mode {mode}: {estimated}");
+            assert!(*actual < 2.0 * estimated, "seed {seed}, mode {mode}: estimated {estimated}, actual {actual}");
             // The error falls tenfold per degree, so that a fit to nine tenths of the runs is far less accurate than one to all: the
             // estimate is above the actual error.
-            assert!(told < 2.0 * met || told < 1e-6, "seed {seed}, mode {mode}: told {told}, met {met}");
+            assert!(
+                estimated < 2.0 * actual || estimated < 1e-6,
+                "seed {seed}, mode {mode}: estimated {estimated}, actual {actual}"
+            );
         }
     }
 }
 
 #[test]
-fn the_error_told_of_twenty_parameters_is_met_at_fresh_points() {
+fn the_estimated_error_with_twenty_parameters_is_right_at_new_points() {
     let emulator = Emulator::fit(&runs(latin_hypercube(300, 20, 0), long_chain)).unwrap();
-    for (mode, met) in error_met(&emulator, long_chain).iter().enumerate() {
-        let told = emulator.relative_error(mode);
-        assert!(told < 0.01, "mode {mode}: {told}");
-        assert!((0.5..2.0).contains(&(told / met)), "mode {mode}: told {told}, met {met}");
+    for (mode, actual) in actual_error(&emulator, long_chain).iter().enumerate() {
+        let estimated = emulator.relative_error(mode);
+        assert!(estimated < 0.01, "mode {mode}: {estimated}");
+        assert!((0.5..2.0).contains(&(estimated / actual)), "mode {mode}: estimated {estimated}, actual {actual}");
     }
 }
 
 #[test]
-fn noise_shows_in_the_error_told_and_runs_done_twice_break_nothing() {
+fn noise_shows_in_the_estimated_error_and_repeated_runs_are_accepted() {
     let once = latin_hypercube(100, 2, 4);
     let twice = DMatrix::from_fn(200, 2, |run, j| once[(run / 2, j)]);
     let exact = runs(twice.clone(), rig);
@@ -62,13 +65,13 @@ fn noise_shows_in_the_error_told_and_runs_done_twice_break_nothing() {
     let emulator = Emulator::fit(&Runs { parameters: twice, frequencies_hz: noisy }).unwrap();
     for mode in 0..3 {
         // A uniform error of ±0.5 % has the standard deviation 0.01/√12 = 0.0029; 200 runs determine it to about 5 %.
-        let told = emulator.relative_error(mode);
-        assert!((0.0024..0.0036).contains(&told), "mode {mode}: {told}");
+        let estimated = emulator.relative_error(mode);
+        assert!((0.0024..0.0036).contains(&estimated), "mode {mode}: {estimated}");
     }
 }
 
 #[test]
-fn the_residual_of_each_run_left_out_explains_the_error_told() {
+fn the_residuals_of_runs_left_out_give_the_estimated_error() {
     let emulator = Emulator::fit(&runs(latin_hypercube(60, 2, 8), rig)).unwrap();
     assert_eq!(emulator.held_out_residuals().len(), 3);
     for (mode, missed) in emulator.held_out_residuals().iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Emulators against functions known in closed form, against fresh points, and against the mistakes of a table.
+//! Emulators against functions known in closed form, against new points, and tables with mistakes.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 

@@ -1,4 +1,4 @@
-//! Tables of which no emulator can be made, and odd ones of which it can.
+//! Tables that allow no emulator, and unusual ones that do.
 
 use modalwatch::emulator::{Emulator, FitError, Runs};
 use nalgebra::DMatrix;

@@ -1,4 +1,4 @@
-//! Clients that are slow, idle, gone, many or hostile: the others are served all the same.
+//! Slow, idle, disconnected, numerous or hostile clients: the others are still served.
 
 use std::collections::BTreeMap;
 use std::io::{Read as _, Write as _};
@@ -25,12 +25,12 @@ fn request(number: usize) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn clients_that_go_away_in_the_middle_leave_whole_batches_and_a_service_that_writes() {
+async fn clients_that_disconnect_midway_leave_complete_batches_and_a_working_writer() {
     let (mut service, folder) = spawn();
     for number in 0..60 {
         let bytes = request(number);
         let mut stream = TcpStream::connect(service.address()).unwrap();
-        // Cut in the header, in the body, or right behind it, while the batch is being stored.
+        // The request is cut in the header, in the body, or after it, while the batch is being stored.
         let cut = if number % 2 == 0 { bytes.len() } else { bytes.len() * (number % 7 + 1) / 9 };
         stream.write_all(&bytes[..cut]).unwrap();
         std::thread::sleep(Duration::from_micros(300 * (number as u64 % 10)));
@@ -43,7 +43,7 @@ async fn clients_that_go_away_in_the_middle_leave_whole_batches_and_a_service_th
         assert_eq!(status, 201, "{answer}");
         acknowledged.add(&given, &answer);
     }
-    // Whole posts are stored although nobody waited for the answer; broken ones are not.
+    // Complete posts are stored although the client did not wait for the answer; incomplete ones are not.
     let stored = history(&service).await.len();
     assert!((20..=40).contains(&stored), "{stored} stored of 10 and 30 whole ones");
     all_assessed(&service, Duration::from_secs(20)).await;
@@ -69,13 +69,13 @@ async fn idle_and_slow_connections_are_cut_off_and_others_are_served() {
         }
         held.push(stream);
     }
-    // All places are taken, and more than twice as many wait; still everybody has a turn.
+    // All connections are in use and more than twice as many wait; nevertheless each client is served.
     let given = batch("patient", 0, 5);
     let started = Instant::now();
     let (status, answer) = post(&service, &given).await.unwrap();
     assert_eq!(status, 201, "{answer}");
     assert!(started.elapsed() < Duration::from_secs(20), "it waited for {:?}", started.elapsed());
-    // Each of them was ended by the service: reading gives an end or an answer, not silence.
+    // The service ended each connection: a read returns the end or an answer and does not block.
     for mut stream in held {
         stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
         let mut answer = Vec::new();
@@ -130,8 +130,8 @@ async fn a_burst_is_answered_with_201_429_or_503_and_nothing_accepted_is_lost() 
 async fn nested_swollen_and_compressed_bodies_are_refused_in_flat_memory() {
     let (service, _folder) = spawn();
     let service = Arc::new(service);
-    // What a round leaves behind goes up and down by some fifty MiB, as the allocator gives memory back: the most after the first
-    // three rounds, in which each thread comes to read a body, against the least after the last three.
+    // The memory after a round varies by about 50 MiB, because the allocator returns memory late. So the maximum after the first
+    // three rounds, in which each thread reads a body, is compared with the minimum after the last three.
     let (mut early, mut late) = (0.0_f64, f64::INFINITY);
     for round in 0..9 {
         let deep = format!("{{\"measurements\": {}", "[".repeat(1_000_000));
@@ -152,8 +152,8 @@ async fn nested_swollen_and_compressed_bodies_are_refused_in_flat_memory() {
             let status = task.await.unwrap();
             assert!([400, 413, 422].contains(&status), "{status}");
         }
-        // A gzip bomb is not unpacked: a megabyte that would be a gigabyte.
-        // Its body is not read either, so that its connection ends with the answer: it has one of its own.
+        // A gzip bomb is not unpacked: one megabyte would become one gigabyte.
+        // Its body is not read either, so the connection is closed after the answer. It therefore has a separate connection.
         let bomb = modalwatch::notify::client_builder()
             .build()
             .unwrap()
@@ -169,12 +169,12 @@ async fn nested_swollen_and_compressed_bodies_are_refused_in_flat_memory() {
         }
     }
     println!("memory at most {early:.0} MiB in the first three rounds, at least {late:.0} MiB in the last three");
-    // The four rounds between send some 180 MiB; whatever kept their bodies would show.
+    // The four rounds in between send about 180 MiB; if their bodies were kept, the memory would show it.
     assert!(late < early + 90.0 && late < 500.0, "{early:.0} MiB, then {late:.0} MiB");
     assert_eq!(history(&service).await.len(), 0);
 }
 
-/// `length` bytes of a gzip stream that unpacks to a thousand times as much: deflate blocks of nothing but repetitions.
+/// `length` bytes of a gzip stream that unpacks to a thousand times as much: deflate blocks that contain only repetitions.
 fn gzip_of_zeros(length: usize) -> Vec<u8> {
     let head = [0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3, 0xec, 0xc1, 1, 0];
     head.into_iter().chain(std::iter::repeat(0)).take(length).collect()
@@ -198,12 +198,12 @@ async fn with_few_file_handles_connections_wait_and_the_database_still_opens() {
         let (status, answer) = post(&service, &given).await.unwrap();
         assert_eq!(status, 201, "{answer}");
         acknowledged.add(&given, &answer);
-        // Readers open their connections to the database when they are first needed.
+        // Database connections of readers are opened when they are first needed.
         let reads = (0..4).map(|_| service.get("/v1/structures/three-dof/history").send());
         for read in reads.map(|read| tokio::spawn(async move { read.await.unwrap().status().as_u16() })) {
             assert_eq!(read.await.unwrap(), 200);
         }
-        // Idle clients come back as often as they are cut off.
+        // Idle clients connect again whenever they are disconnected.
         idle.push(TcpStream::connect(service.address()).unwrap());
     }
     assert!(open_files(service.pid()) < 96);

@@ -1,4 +1,4 @@
-//! Clocks that jump: `faketime` moves the system clock of the running program, while time goes on for its timers.
+//! Clock jumps: `faketime` changes the system clock of the running program; the monotonic clock of its timers is not affected.
 
 use std::path::Path;
 
@@ -17,20 +17,20 @@ const LIBRARY: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
 
 /// Sets the program's clock: `+0`, `-365d`, or a time at which it stands still.
 fn set(file: &Path, time: &str) {
-    // Written beside and renamed: the program may read at any moment.
+    // Written to another file and renamed, because the program may read it at any moment.
     let beside = file.with_extension("new");
     std::fs::write(&beside, format!("{time}\n")).unwrap();
     std::fs::rename(&beside, file).unwrap();
 }
 
-/// Open alarms of silence of a structure.
+/// Open silence alarms of a structure.
 async fn silence_alarms(service: &Service, structure: &str) -> usize {
     let alarms = service.read(&format!("/v1/structures/{structure}/alarms")).await;
     let open = |a: &&Value| a["kind"] == "silence" && a["ended_at"].is_null();
     alarms["items"].as_array().unwrap().iter().filter(open).count()
 }
 
-/// Waits until a structure has so many open alarms of silence.
+/// Waits until a structure has this number of open silence alarms.
 async fn wait_for_silence(service: &Service, structure: &str, wanted: usize) {
     let what = format!("{wanted} alarms of silence of {structure}");
     eventually(&what, async || (silence_alarms(service, structure).await == wanted).then_some(())).await;
@@ -46,7 +46,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     set(&file, "+0");
     let mut command = command(&data);
     command.env("LD_PRELOAD", LIBRARY).env("FAKETIME_TIMESTAMP_FILE", &file).env("FAKETIME_NO_CACHE", "1");
-    // Clocks jump because somebody sets them; the monotonic clock never does.
+    // Only the system clock can be set; the monotonic clock never jumps.
     command.env("FAKETIME_DONT_FAKE_MONOTONIC", "1").env("DONT_FAKE_MONOTONIC", "1");
     let mut service = Service::spawn(command.env("MODALWATCH__MONITOR__ALARM__SILENCE_AFTER_S", "3600"));
     let mut acknowledged = Acknowledged::default();
@@ -62,7 +62,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     let undamaged = take(&service).await["batch"].clone();
     let other = take(&service).await["batch"].as_str().unwrap().to_owned();
 
-    // A year back: what was measured now is refused with the reason, what was measured then is taken.
+    // The clock is set back by a year: measurements of the present are refused with the reason, those of a year ago are accepted.
     set(&file, "-365d");
     let (status, answer) = post(&service, &batch("logger", 2, 10)).await.unwrap();
     let year =
@@ -72,7 +72,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
         json!({ "measurements": [{ "measured_at": "2020-06-01T00:00:00Z", "frequencies_hz": [0.49, 0.92, 1.24] }] });
     let early = created(service.post(BATCHES, &early).await).await;
     assert!(early["received_at"].as_str() < Some("2026"), "the clock is not set back: {early}");
-    // What is decided now counts, although it is "earlier" than what was decided before.
+    // The newest assessment is the current one, although its time is earlier than that of the previous one.
     let declared = service.post("/v1/structures/three-dof/reference", &json!({ "batches": [undamaged] })).await;
     created(declared).await;
     let path = format!("{BATCHES}/{other}");
@@ -81,7 +81,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     })
     .await;
 
-    // A day ahead: no structure has sent anything for so long, until one of them does.
+    // The clock is set ahead by a day: all structures are silent until one of them sends a batch.
     set(&file, "+0");
     define_as(&service, OTHER).await;
     let other = MeasurementBatch { structure: StructureId::parse(OTHER).unwrap(), ..batch("other", 0, 10) };
@@ -91,14 +91,14 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     wait_for_silence(&service, OTHER, 1).await;
     take(&service).await;
     wait_for_silence(&service, "three-dof", 0).await;
-    // And back again: that day is no silence. The service looks at all structures in the order of their ids, so that
-    // three-dof has been looked at when the alarm of the other one ends.
+    // The clock is set to the present again: that day was no silence. The service checks the structures in the order of their
+    // ids, so that three-dof has been checked when the alarm of the other structure ends.
     set(&file, "+0");
     take(&service).await;
     wait_for_silence(&service, OTHER, 0).await;
     assert_eq!(silence_alarms(&service, "three-dof").await, 0);
 
-    // Standing still: ids are distinct all the same, and requests still time out by the other clock.
+    // The clock stands still: ids are still distinct, and requests still time out by the monotonic clock.
     set(&file, "2027-01-01 00:00:00");
     let mut ids: Vec<String> = Vec::new();
     for _ in 0..8 {
@@ -114,7 +114,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     assert!(times.is_sorted() && times.len() == 13, "{times:?}");
     assert!(service.stop("TERM").success());
 
-    // The next start has the right clock.
+    // The next start uses the correct clock.
     let mut service = Service::start(&data);
     assert_eq!(history(&service).await.len(), 13);
     assert!(service.stop("TERM").success());

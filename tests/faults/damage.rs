@@ -1,4 +1,5 @@
-//! Damaged databases: refused with the way out, or read rightly; never mended, never a panic, never a wrong measurement.
+//! Damaged databases are refused with instructions or read correctly. They are never repaired, cause no panic and give no wrong
+//! measurement.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -38,16 +39,16 @@ async fn filled(folder: &Path) -> Acknowledged {
     acknowledged
 }
 
-/// What came of opening a damaged copy and reading everything in it.
+/// Result of opening a damaged copy and reading all its content.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Outcome {
     /// The store was not opened.
     Refused,
     /// It was opened, and some row was refused.
     RowRefused,
-    /// It was opened, and every batch is there as it was acknowledged.
+    /// It was opened, and every batch is as it was acknowledged.
     Intact,
-    /// It was opened, and a batch is missing or another without a word.
+    /// It was opened, and a batch is missing or different without an error.
     Wrong(String),
 }
 
@@ -77,7 +78,7 @@ async fn read_all(folder: &Path, acknowledged: &Acknowledged) -> Outcome {
             Ok(Some(record)) if record.content_digest.as_str() == digest => {}
             Ok(_) => outcome = Outcome::Wrong(format!("batch {id} is missing or another")),
         }
-        // Results may be refused; what they are is recomputed from the measurements.
+        // Results may be refused, because they can be computed again from the measurements.
         let _ = store.assessments().assessment(&structure, id).await;
         let _ = store.alarms().chart_points(&structure, id).await;
     }
@@ -92,7 +93,7 @@ async fn read_all(folder: &Path, acknowledged: &Acknowledged) -> Outcome {
 }
 
 impl Outcome {
-    /// A wrong answer stays one, whatever else is refused.
+    /// A wrong answer is an error of the test even if other rows are refused.
     fn max_of(self, other: Self) -> Self {
         self.max(other)
     }
@@ -109,7 +110,7 @@ async fn a_flipped_bit_is_refused_or_harms_no_measurement() {
     let mut wrong = Vec::new();
     for flip in 0..FLIPS {
         let mut bad = good.clone();
-        // One in eight in the file's own head and schema, the others anywhere.
+        // One bit in eight is in the header and the schema of the file, the others are anywhere.
         let place = stream.random_range(0..if flip % 8 == 0 { 4_096 } else { good.len() });
         let bit = stream.random_range(0..8);
         bad[place] ^= 1 << bit;
@@ -118,7 +119,7 @@ async fn a_flipped_bit_is_refused_or_harms_no_measurement() {
         let outcome = read_all(copy.path(), &acknowledged).await;
         if outcome == Outcome::Refused {
             let left = std::fs::read(database(copy.path())).unwrap();
-            // The first hundred bytes hold SQLite's own counters.
+            // The first hundred bytes contain counters of SQLite.
             assert!(
                 left.len() == bad.len() && left[100..] == bad[100..],
                 "bit {bit} of byte {place}: it was written to"
@@ -154,7 +155,7 @@ async fn a_database_cut_anywhere_is_refused_and_names_the_backup() {
         assert_eq!(outcome, Outcome::Refused, "cut to {length} of {} bytes", good.len());
         assert!(std::fs::read(database(copy.path())).unwrap() == good[..length], "cut to {length}: it was written to");
     }
-    // The program's own words.
+    // The message of the program.
     let copy = tempfile::tempdir().unwrap();
     std::fs::write(database(copy.path()), &good[..good.len() / 2]).unwrap();
     let output = command(copy.path()).output().unwrap();
@@ -187,14 +188,15 @@ async fn a_log_that_is_cut_or_garbled_gives_whole_batches_or_none() {
             bad[place] ^= 0x10;
         }
         std::fs::write(copy.path().join("modalwatch.sqlite-wal"), &bad).unwrap();
-        // What is behind the damage is gone, as after a power loss on a disk that lies; what is before it is whole.
+        // Batches after the damage are lost, as after a power loss on a disk that acknowledges writes too early; those before it are
+        // complete.
         if let Ok(store) = Store::open(copy.path()).await {
             store.close().await;
             drop(store);
             audit(copy.path(), &Acknowledged::default()).await;
         }
     }
-    // The untouched one has them all.
+    // The undamaged copy has all of them.
     Service::start(folder.path()).stop("TERM");
     audit(folder.path(), &acknowledged).await;
 }

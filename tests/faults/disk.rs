@@ -1,4 +1,5 @@
-//! Disks that are full, files that may not grow, are deleted or locked: writes are refused, reads go on, and it heals by itself.
+//! Full disks, and database files that cannot grow, are deleted or locked: writes are refused, reads are served, and the service
+//! recovers by itself.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,7 +21,7 @@ struct SmallDisk {
 }
 
 impl SmallDisk {
-    /// Mounts one; `None`, and the test is recorded as skipped, where that is not allowed.
+    /// Mounts one. If that is not permitted, returns `None` and records the test as skipped.
     fn mount(mebibytes: usize) -> Option<Self> {
         let folder = tempfile::tempdir().unwrap();
         let size = format!("size={mebibytes}m");
@@ -39,7 +40,7 @@ impl Drop for SmallDisk {
     }
 }
 
-/// Posts batches until three in a row are refused; each refusal must be a 503 or a 507 that says why.
+/// Posts batches until three in a row are refused; each refusal must be a 503 or a 507 with the reason.
 async fn fill(service: &Service, acknowledged: &mut Acknowledged) -> usize {
     let (mut number, mut refused) = (0, 0);
     while refused < 3 {
@@ -58,20 +59,20 @@ async fn fill(service: &Service, acknowledged: &mut Acknowledged) -> usize {
     number
 }
 
-/// A write that could not be done is answered 503 or 507 with a code of its own.
+/// A write that failed is answered 503 or 507 with its own code.
 fn refusal(status: u16, answer: &Value) {
     assert!([503, 507].contains(&status), "{status}: {answer}");
     assert!(answer["code"].is_string() && answer["code"] != "internal", "{answer}");
 }
 
-/// Everything that was acknowledged is read, and nothing is written, while the disk is full; then it is not full any more.
+/// While the disk is full, everything that was acknowledged can be read and nothing is written; then the disk has space again.
 async fn full_and_healed(service: &Service, acknowledged: &mut Acknowledged, heal: impl FnOnce()) {
     define_plain(service).await;
     let early = batch("early", 0, 10);
     acknowledged.add(&early, &post(service, &early).await.unwrap().1);
     let refused = fill(service, acknowledged).await - 1;
-    // A look at the disk is good for a second, unless a write was refused since: then the next look writes again, and takes
-    // the last free bytes of the log.
+    // The result of a check of the disk is used for a second, unless a write was refused since then: the next check writes
+    // again and uses the last free bytes of the log.
     let mut reasons = Value::Null;
     for number in 0..2_000 {
         let crumb = plain_batch("crumb", number, 1);
@@ -90,17 +91,18 @@ async fn full_and_healed(service: &Service, acknowledged: &mut Acknowledged, hea
     assert!(reasons.to_string().contains("nothing can be stored"), "{reasons}");
     assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
     let stored = &history(service).await | &history_of(service, PLAIN).await;
-    assert!(acknowledged.0.keys().all(|id| stored.contains(id)), "reads must go on");
+    assert!(acknowledged.0.keys().all(|id| stored.contains(id)), "reads must still be served");
     let some = acknowledged.0.keys().next_back().unwrap();
     let read = service.read(&format!("/v1/structures/{PLAIN}/batches/{some}")).await;
     assert_eq!(read["content_digest"], acknowledged.0[some].as_str());
-    // One that needs an assessment as well.
+    // A batch that is assessed as well.
     let (status, answer) = post(service, &batch("during", 0, 10)).await.unwrap();
     refusal(status, &answer);
 
     heal();
     ready_again(service, Duration::from_secs(20)).await;
-    // The batch that was refused is taken now, once, and those whose assessment could not be stored have one, asked or not.
+    // The batch that was refused is now stored, once, and batches whose assessment could not be stored are assessed without a
+    // further request.
     for given in [plain_batch("filler", refused, 150), batch("during", 0, 10), batch("after", 0, 10)] {
         let (status, answer) = post(service, &given).await.unwrap();
         assert_eq!(status, 201, "{answer}");
@@ -119,7 +121,7 @@ async fn a_full_disk_refuses_writes_serves_reads_and_heals_without_a_restart() {
     let Some(disk) = SmallDisk::mount(7) else { return };
     let data = disk.folder.path().join("data");
     let mut service = Service::spawn(without_floor(&mut command(&data)));
-    // Small enough a database that the log may not grow for long before it is written back.
+    // The database is small, so that the log is soon written back.
     let ballast = disk.folder.path().join("ballast");
     std::fs::write(&ballast, vec![0; 4 << 20]).unwrap();
     let mut acknowledged = Acknowledged::default();
@@ -137,7 +139,7 @@ async fn files_that_may_not_grow_refuse_writes_and_heal_without_a_restart() {
     }
     let folder = tempfile::tempdir().unwrap();
     let plain = command(folder.path());
-    // The signal that comes with the limit would end the program; the failed write is what is wanted.
+    // The signal that the limit raises would end the program; this test is about the write that fails.
     let mut limited = Command::new("bash");
     limited.args(["-c", "trap '' XFSZ; ulimit -S -f 1500; exec \"$0\" \"$@\""]);
     limited.arg(plain.get_program()).args(plain.get_args()).env("MODALWATCH__LOG__LEVEL", "error");
@@ -177,11 +179,11 @@ async fn a_database_that_is_deleted_while_open_acknowledges_nothing_more() {
         let (is_ready, reasons) = ready(&service).await;
         assert!(!is_ready && reasons.to_string().contains("deleted or replaced"), "{reasons}");
         assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
-        // Put back before anything else wrote it goes on.
+        // If the file is put back before anything is written, the service continues.
         std::fs::rename(&away, folder.path().join(file)).unwrap();
         ready_again(&service, Duration::from_secs(10)).await;
     }
-    // Replaced by another file of the same name.
+    // The file is replaced by another one of the same name.
     std::fs::copy(database(folder.path()), &away).unwrap();
     std::fs::rename(database(folder.path()), folder.path().join("original")).unwrap();
     std::fs::rename(&away, database(folder.path())).unwrap();
@@ -210,7 +212,7 @@ async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_
     let given = batch("before", 0, 5);
     acknowledged.add(&given, &post(&service, &given).await.unwrap().1);
 
-    // A reader that stays keeps the log from being written back: it grows, and nothing else happens.
+    // A long read transaction prevents that the log is written back: the log grows, with no other effect.
     sqlx::query("begin").execute(&mut other).await.unwrap();
     sqlx::query("select count(*) from measurement").fetch_all(&mut other).await.unwrap();
     let log = folder.path().join("modalwatch.sqlite-wal");
@@ -232,7 +234,7 @@ async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_
     let after = std::fs::metadata(&log).unwrap().len();
     assert!(after <= grown + (2 << 20), "the log goes on growing: {grown}, then {after} bytes");
 
-    // A writer for a second is waited for: that second is what is tested, nothing could end the wait earlier.
+    // The service waits for a writer that holds the lock for a second. The fixed time is what is tested.
     sqlx::query("begin immediate").execute(&mut other).await.unwrap();
     let waiting = batch("waiting", 0, 5);
     let (answered, ()) = tokio::join!(post(&service, &waiting), async {
@@ -245,7 +247,7 @@ async fn a_writer_from_outside_is_waited_for_and_then_refused_and_a_long_reader_
     assert_eq!(status, 201, "{answer}");
     acknowledged.add(&waiting, &answer);
 
-    // One for longer is not, and once it is gone everything goes on.
+    // It does not wait for a longer lock, and continues once the lock is released.
     sqlx::query("begin immediate").execute(&mut other).await.unwrap();
     let refused = batch("refused", 0, 5);
     let (status, answer) = post(&service, &refused).await.unwrap();

@@ -1,4 +1,4 @@
-//! Measurements that are legal and say little: what is found in them is named, and they move no alarm.
+//! Valid measurements with little information: they have findings and move no alarm chart.
 
 use serde_json::{json, Value};
 
@@ -23,7 +23,7 @@ async fn posted(service: &Service, body: &Value) -> Value {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn repeated_and_rounded_values_are_named_and_hold_the_alarm() {
     let (service, _folder) = spawn();
-    // A gateway that sends the second half again as if it were new.
+    // A gateway sends the second half again with new times.
     let mut repeated = body(&batch("gateway", 0, 20));
     for row in 10..20 {
         repeated["measurements"][row]["frequencies_hz"] = repeated["measurements"][row - 10]["frequencies_hz"].clone();
@@ -32,7 +32,7 @@ async fn repeated_and_rounded_values_are_named_and_hold_the_alarm() {
     assert!(has(&answer, "stale_repeat", "hold_alarm"), "{answer}");
     assert_eq!((&answer["assessment"]["measurements_used"], &answer["state"]), (&json!(10), &json!("assessed")));
 
-    // A display with two digits.
+    // The frequencies are rounded to two digits.
     let mut rounded = body(&batch("display", 1, 20));
     for row in rounded["measurements"].as_array_mut().unwrap() {
         for f in row["frequencies_hz"].as_array_mut().unwrap() {
@@ -60,7 +60,7 @@ async fn a_posterior_at_the_edge_of_its_prior_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_covariate_that_the_simulation_needs_is_asked_for_where_that_is_wanted() {
+async fn a_missing_covariate_that_the_simulation_needs_is_refused_if_so_configured() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command(folder.path());
     let service = Service::spawn(command.env("MODALWATCH__MONITOR__MISSING_COVARIATE", "refuse"));

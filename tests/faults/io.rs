@@ -1,4 +1,4 @@
-//! Writes and syncs that fail: `fiu` makes the system calls of the unmodified program fail, once, now and then, or always.
+//! Writes and syncs that fail: `fiu` makes the system calls of the unmodified program fail, once, at random, or always.
 
 use std::path::Path;
 use std::process::Command;
@@ -13,7 +13,7 @@ const PER_CASE: usize = 16;
 
 const PRELOAD: &str = "/usr/lib/fiu/fiu_run_preload.so /usr/lib/fiu/fiu_posix_preload.so";
 
-/// A program that can be told to fail, as `fiu-run -x` starts it.
+/// Starts a program under fault injection, as `fiu-run -x` does.
 fn controlled(data_dir: &Path, control: &Path) -> Command {
     let mut command = command(data_dir);
     command.env("LD_PRELOAD", PRELOAD).env("FIU_ENABLE", "").env("FIU_CTRL_FIFO", control);
@@ -21,7 +21,7 @@ fn controlled(data_dir: &Path, control: &Path) -> Command {
     command
 }
 
-/// Tells the running program which system calls fail.
+/// Sets the system calls of the running program that fail.
 fn control(service: &Service, control: &Path, order: &str) {
     let output =
         Command::new("fiu-ctrl").arg("-f").arg(control).args(["-c", order, &service.pid().to_string()]).output();
@@ -74,7 +74,7 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
             assert!(!is_ready, "{point}: {reasons}");
         }
         control(&service, &fifo, &format!("disable name={point}"));
-        // It heals without a restart, and a retry gives one batch.
+        // The service recovers without a restart, and a retry stores one batch.
         ready_again(&service, Duration::from_secs(10)).await;
         failed += refused.len();
         println!("{point} {how}: {} of {PER_CASE} refused", refused.len());
@@ -84,7 +84,7 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
             acknowledged.add(&given, &answer);
         }
     }
-    assert!(failed >= 3 * PER_CASE, "only {failed} posts met a fault: the test shows little");
+    assert!(failed >= 3 * PER_CASE, "only {failed} posts had a fault: the test shows little");
     all_assessed(&service, Duration::from_secs(30)).await;
     service.kill();
     let mut service = Service::start(&data);
@@ -116,7 +116,7 @@ async fn a_start_on_a_failing_disk_says_so_or_works_and_loses_nothing() {
         command.env("FIU_ENABLE", format!("enable_random name={point},probability={probability},failinfo=5"));
         command.stdout(std::process::Stdio::null()).stderr(std::process::Stdio::piped());
         let mut child = command.spawn().unwrap();
-        // It either stops by itself with a reason, or starts; then it is killed.
+        // The program either stops by itself with a reason or starts; in the second case it is killed.
         if let Some(status) = exit_within(&mut child, Duration::from_secs(2)) {
             let mut said = String::new();
             std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut said).unwrap();

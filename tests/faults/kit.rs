@@ -1,4 +1,4 @@
-//! Batches that cost nothing to make, a client that writes down what was acknowledged, and a look into the database afterwards.
+//! Batches that are cheap to generate, a client that records acknowledgements, and a check of the database afterwards.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -14,7 +14,7 @@ use crate::helpers::{repository, within, Service};
 
 pub const BATCHES: &str = "/v1/structures/three-dof/batches";
 pub const STRUCTURE: &str = "three-dof";
-/// The same structure under another id, without a trained baseline: its batches are stored and wait.
+/// The same structure under another id, without a trained model: its batches are stored and wait.
 pub const PLAIN: &str = "plain";
 
 /// 2026-01-01T00:00:00Z, µs.
@@ -53,12 +53,12 @@ pub fn batch(source: &str, number: usize, count: usize) -> MeasurementBatch {
     }
 }
 
-/// A batch of the structure without a baseline, for what is only about storing.
+/// A batch of the structure without a trained model, for tests that only store.
 pub fn plain_batch(source: &str, number: usize, count: usize) -> MeasurementBatch {
     MeasurementBatch { structure: StructureId::parse(PLAIN).unwrap(), ..batch(source, number, count) }
 }
 
-/// Defines the structure without a baseline.
+/// Defines the structure without a trained model.
 pub async fn define_plain(service: &Service) {
     define_as(service, PLAIN).await;
 }
@@ -85,30 +85,30 @@ pub async fn post(service: &Service, batch: &MeasurementBatch) -> Option<(u16, V
     Some((status, response.json().await.unwrap_or(Value::Null)))
 }
 
-/// What was acknowledged: digest of the content by the id that the service gave.
+/// Acknowledged batches: digest of the content by the id that the service assigned.
 #[derive(Default)]
 pub struct Acknowledged(pub BTreeMap<String, String>);
 
 impl Acknowledged {
-    /// Writes down a 201.
+    /// Records a 201.
     pub fn add(&mut self, batch: &MeasurementBatch, answer: &Value) {
         let digest = batch.content_digest().to_string();
         assert_eq!(answer["content_digest"], digest.as_str(), "another batch was acknowledged: {answer}");
         let id = answer["batch"].as_str().unwrap().to_owned();
         if let Some(other) = self.0.insert(id, digest.clone()) {
-            assert_eq!(other, digest, "one id was given to two batches");
+            assert_eq!(other, digest, "an id was assigned to two batches");
         }
     }
 }
 
-/// What a database holds of the monitored structure.
+/// Content of a database about the monitored structure.
 pub struct Audit {
     pub stored: usize,
     pub unassessed: usize,
 }
 
-/// Looks through the database of a service that has stopped: SQLite finds nothing wrong with it, every batch is whole and as its
-/// digest says, no measurement is there twice, and everything acknowledged is there.
+/// Checks the database of a service that has stopped: SQLite finds no error, every batch is complete and agrees with its digest,
+/// no measurement is stored twice, and everything acknowledged is stored.
 pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
     use sqlx::Connection as _;
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(data_dir.join("modalwatch.sqlite"));
@@ -124,7 +124,7 @@ pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
     .fetch_one(&mut connection)
     .await
     .unwrap();
-    assert_eq!(halves, 0, "half batches");
+    assert_eq!(halves, 0, "incomplete batches");
     let (doubled,): (i64,) = sqlx::query_as(
         "select count(*) from (select 1 from measurement group by structure_id, source, measured_at_us having count(*) > 1)",
     )
@@ -160,7 +160,7 @@ pub async fn audit(data_dir: &Path, acknowledged: &Acknowledged) -> Audit {
     }
 }
 
-/// Ids in the history of the monitored structure, from first to last; none may be there twice.
+/// Ids in the history of the monitored structure, from first to last; none may occur twice.
 pub async fn history(service: &Service) -> BTreeSet<String> {
     history_of(service, STRUCTURE).await
 }
@@ -193,7 +193,7 @@ pub async fn all_assessed(service: &Service, limit: Duration) {
     .await;
 }
 
-/// Whether `/readyz` says yes, and its reasons if not.
+/// Whether `/readyz` reports that the service is ready, and its reasons if not.
 pub async fn ready(service: &Service) -> (bool, Value) {
     let response = service.get("/readyz").send().await.unwrap();
     let ready = response.status() == 200;
@@ -202,24 +202,24 @@ pub async fn ready(service: &Service) -> (bool, Value) {
     (ready, answer["reasons"].clone())
 }
 
-/// Waits until `/readyz` says yes.
+/// Waits until the service is ready.
 pub async fn ready_again(service: &Service, limit: Duration) {
     within(limit, "ready", async || ready(service).await.0.then_some(())).await;
 }
 
-/// Memory that a process has in RAM, MiB.
+/// Resident memory of a process, MiB.
 pub fn resident_mib(pid: u32) -> f64 {
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
     line.split_whitespace().next().unwrap().parse::<f64>().unwrap() / 1024.0
 }
 
-/// File handles that a process has open.
+/// Number of open file handles of a process.
 pub fn open_files(pid: u32) -> usize {
     std::fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count()
 }
 
-/// Lets a service write until its disk is full, where it would stop before.
+/// Sets no minimum of free space, so that the service writes until its disk is full.
 pub fn without_floor(command: &mut std::process::Command) -> &mut std::process::Command {
     let defaults = std::process::Command::new(env!("CARGO_BIN_EXE_modalwatch")).args(["config", "print"]).output();
     if String::from_utf8(defaults.unwrap().stdout).unwrap().contains("min_free_bytes") {

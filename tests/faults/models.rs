@@ -1,4 +1,5 @@
-//! Baselines that are damaged, foreign, huge or of a newer program: refused with the reason, and everything else serves.
+//! Trained models that are damaged, of another structure, huge or of a newer program are refused with the reason; all other
+//! structures are served.
 
 use std::fs::File;
 use std::path::Path;
@@ -10,7 +11,7 @@ use tempfile::TempDir;
 use crate::helpers::{command, repository, Service};
 use crate::kit::{batch, post, resident_mib};
 
-/// What a test does to the files of a baseline's folder.
+/// Change of the files in the folder of a trained model.
 type Change = Box<dyn Fn(&Path)>;
 
 fn weights(folder: &Path) -> std::path::PathBuf {
@@ -25,7 +26,7 @@ fn manifest(folder: &Path, change: impl Fn(&mut Value)) {
     std::fs::write(path, serde_json::to_vec(&manifest).unwrap()).unwrap();
 }
 
-/// Writes weights, and a manifest that says they are right.
+/// Writes weights, and a manifest that matches them.
 fn signed(folder: &Path, bytes: &[u8]) {
     std::fs::write(weights(folder), bytes).unwrap();
     let digest = Digest::of_file(bytes);
@@ -44,7 +45,7 @@ fn models_with(change: &Change) -> TempDir {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn each_kind_of_wrong_baseline_is_refused_with_its_reason_and_batches_wait() {
+async fn each_kind_of_invalid_model_is_refused_with_its_reason_and_batches_wait() {
     let cases: Vec<(&str, Change, &str)> = vec![
         (
             "a header that claims to be longer than memory",
@@ -62,7 +63,7 @@ async fn each_kind_of_wrong_baseline_is_refused_with_its_reason_and_batches_wait
             "safetensors",
         ),
         (
-            "a file larger than any baseline",
+            "a file larger than any trained model",
             Box::new(|f| File::create(weights(f)).unwrap().set_len(20 << 30).unwrap()),
             "larger than",
         ),
@@ -135,7 +136,7 @@ async fn each_kind_of_wrong_baseline_is_refused_with_its_reason_and_batches_wait
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_any_baseline_the_service_says_not_ready_and_still_takes_batches() {
+async fn without_any_trained_model_the_service_is_not_ready_and_still_accepts_batches() {
     let models = tempfile::tempdir().unwrap();
     for id in ["three-dof", "rig", "ruler-frame-4dof"] {
         let target = models.path().join(id);
@@ -155,7 +156,7 @@ async fn without_any_baseline_the_service_says_not_ready_and_still_takes_batches
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_baseline_that_failed_its_calibration_is_used_only_where_its_digest_is_accepted_and_says_so() {
+async fn a_model_that_failed_its_calibration_is_used_only_if_its_digest_is_accepted_and_says_so() {
     let failure = "all modes: ranks of k1 are not uniform (p = 1.0e-9)";
     let change: Change = Box::new(move |f| manifest(f, |m| m["calibration"]["failures"] = json!([failure])));
     let models = models_with(&change);

@@ -1,8 +1,8 @@
-//! Mixed load with `kill -9` again and again, and a client that writes down every 201.
+//! Mixed load with repeated `kill -9`, and a client that records every 201.
 //!
-//! Every second so many batches of 20 measurements are due, 20 readers go round, one diagnosis runs, and its extension swaps the
-//! model of a structure under load. Nothing acknowledged may be lost, nothing may be there twice, no answer may be a 5xx but 503
-//! with `Retry-After`, and memory must stay flat.
+//! A fixed number of batches of 20 measurements is due each second, 20 readers send requests, one diagnosis runs, and its extension
+//! replaces the trained model of a structure under load. No acknowledged batch may be lost or stored twice, no answer may be a 5xx
+//! except 503 with `Retry-After`, and the memory must not grow.
 //!
 //! | variable | default | meaning |
 //! |---|---|---|
@@ -29,34 +29,34 @@ use crate::kit::{audit, batch, body, resident_mib, Acknowledged, BATCHES};
 const PER_BATCH: usize = 20;
 const READERS: usize = 20;
 
-/// Batches that may be on their way at a time: a gateway with more behind it waits.
-const ON_THE_WAY: usize = 48;
+/// Maximum number of posts in progress; a gateway with more batches waits.
+const MOST_POSTS: usize = 48;
 
-/// Longest time until everything is assessed and the model is swapped, once nothing is killed any more.
+/// Maximum time after the last kill until all batches are assessed and the model is replaced.
 const SETTLING: Duration = Duration::from_secs(150);
 
-/// Memory that the process may have, and by how much it may grow from the middle of a life to its end, MiB.
+/// Maximum memory of the process, and its maximum growth from the middle of a process life to its end, MiB.
 const MOST_MIB: f64 = 700.0;
 const GROWTH_MIB: f64 = 150.0;
 
 fn setting(name: &str, default: f64) -> f64 {
-    std::env::var(name).map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{name}={text} is no number")))
+    std::env::var(name).map_or(default, |text| text.parse().unwrap_or_else(|_| panic!("{name}={text} is not a number")))
 }
 
-/// A service that is killed and started again behind the backs of its clients.
+/// A service that is killed and started again while its clients use it.
 #[derive(Clone)]
 struct Target {
     url: Arc<RwLock<String>>,
     client: Client,
     /// Set when the load ends.
     over: Arc<AtomicBool>,
-    /// Answers that may not be: status and text.
+    /// Answers that are not allowed: status and text.
     forbidden: Arc<Mutex<Vec<String>>>,
     counts: Arc<Mutex<BTreeMap<u16, usize>>>,
 }
 
 impl Target {
-    /// One request; `None` where the connection broke, which a kill explains.
+    /// One request; `None` if the connection broke, as it does at a kill.
     async fn send(&self, method: Method, path: &str, body: Option<&Value>) -> Option<Response> {
         let url = format!("{}{path}", self.url.read().unwrap());
         let request = self.client.request(method.clone(), url);
@@ -64,7 +64,7 @@ impl Target {
         let response = request.send().await.ok()?;
         let status = response.status().as_u16();
         *self.counts.lock().unwrap().entry(status).or_default() += 1;
-        // `/readyz` says by 503 that it is not ready, which is its answer and no refusal.
+        // A 503 of `/readyz` is its regular answer while the service is not ready.
         let allowed =
             status < 500 || (status == 503 && (response.headers().contains_key("retry-after") || path == "/readyz"));
         if !allowed {
@@ -85,7 +85,7 @@ impl Target {
     }
 }
 
-/// Posts one batch until it is acknowledged, however often the service dies meanwhile.
+/// Posts one batch until it is acknowledged, however often the service is killed.
 async fn deliver(target: &Target, number: usize, acknowledged: &Mutex<Acknowledged>, replays: &AtomicUsize) {
     let given = batch("soak", number, PER_BATCH);
     let json = body(&given);
@@ -93,13 +93,13 @@ async fn deliver(target: &Target, number: usize, acknowledged: &Mutex<Acknowledg
         if let Some(response) = target.send(Method::POST, BATCHES, Some(&json)).await {
             match response.status().as_u16() {
                 201 => {
-                    // The status line is the promise, even where the body breaks off: then the retry must find it.
+                    // The status line is the acknowledgement, even if the body is incomplete: then the retry must find the batch.
                     if let Ok(answer) = response.json::<Value>().await {
                         acknowledged.lock().unwrap().add(&given, &answer);
                         if !number.is_multiple_of(20) {
                             return;
                         }
-                        // A gateway that repeats itself gets the same batch again.
+                        // A gateway that repeats its post gets the same batch again.
                         let Some(again) = target.send(Method::POST, BATCHES, Some(&json)).await else { continue };
                         if again.status() == 201 {
                             assert_eq!(again.headers()["idempotency-replayed"], "true");
@@ -119,8 +119,8 @@ async fn deliver(target: &Target, number: usize, acknowledged: &Mutex<Acknowledg
     }
 }
 
-/// A reader that goes round until the load ends.
-async fn go_round(target: Target, reader: usize) {
+/// A reader that requests all routes in turn until the load ends.
+async fn request_in_turn(target: Target, reader: usize) {
     let structure = "/v1/structures/three-dof";
     for round in reader.. {
         if target.is_over() {
@@ -141,7 +141,7 @@ async fn go_round(target: Target, reader: usize) {
     }
 }
 
-/// A chain whose second spring softens with the temperature, which its definition does not know.
+/// A chain whose second spring softens with the temperature, which its definition does not contain.
 const SOFT: &str = r#"
 id = "soft"
 modes = 3
@@ -160,12 +160,12 @@ parameter = [
 covariate = [{ name = "temperature_c" }]
 "#;
 
-/// What a job says that a kill ended.
+/// Error message of a job that a kill interrupted.
 const STOPPED: &str = "stopped while it was running";
 
 const SOFT_BATCHES: usize = 30;
 
-/// A batch of the chain: a day with its temperature.
+/// A batch of the chain: one day with its temperature.
 fn soft_batch(simulator: &Simulator, number: usize, rng: &mut impl rand::Rng) -> Value {
     let day = 12.0 * number as f64;
     let mut one = |i: usize| {
@@ -182,8 +182,8 @@ fn soft_batch(simulator: &Simulator, number: usize, rng: &mut impl rand::Rng) ->
     json!({ "measurements": (0..15).map(&mut one).collect::<Vec<Value>>() })
 }
 
-/// Diagnoses the chain and extends it by what was found; whatever a kill interrupts is asked for again. The digest of the
-/// structure before and after.
+/// Diagnoses the chain and extends it by the cause that was found; jobs that a kill interrupts are requested again. Returns the
+/// digest of the structure before and after.
 async fn swap_model(target: &Target) -> (String, String) {
     let pause = || tokio::time::sleep(Duration::from_millis(300));
     let definition = StructureDefinition::parse_toml(SOFT).unwrap();
@@ -212,7 +212,7 @@ async fn swap_model(target: &Target) -> (String, String) {
     let before = structure["digest"].as_str().unwrap().to_owned();
     loop {
         pause().await;
-        // The switch itself may have been the last thing before a kill.
+        // The kill may have come directly after the switch.
         let Some(structure) = target.read("/v1/structures/soft").await else { continue };
         let present = structure["digest"].as_str().unwrap();
         if present != before {
@@ -249,7 +249,7 @@ async fn ended(target: &Target, path: &str, pointer: &str) -> Value {
     }
 }
 
-/// What the service left when it went: memory in the middle of each life and at its end, MiB.
+/// Memory of the service in the middle of each process life and at its end, MiB.
 #[derive(Default)]
 struct Lives {
     memory_mib: Vec<(f64, f64)>,
@@ -259,7 +259,7 @@ impl Lives {
     fn check(&self) {
         for (middle, end) in &self.memory_mib {
             let flat = *end < MOST_MIB && *end < middle + GROWTH_MIB;
-            assert!(flat, "memory is not flat: {middle:.0} MiB in the middle of a life, {end:.0} MiB at its end");
+            assert!(flat, "the memory grows: {middle:.0} MiB in the middle of a process life, {end:.0} MiB at its end");
         }
         let most = self.memory_mib.iter().map(|(_, end)| *end).fold(0.0, f64::max);
         println!("{} lives, at most {most:.0} MiB", self.memory_mib.len());
@@ -271,7 +271,7 @@ fn start(data: &Path) -> Service {
     Service::spawn(command.env("MODALWATCH__LOG__LEVEL", "error"))
 }
 
-/// Lets the service live and die until the time is over; the last life goes on.
+/// Kills and restarts the service until the time is over; the last process keeps running.
 async fn live_and_die(target: &Target, data: PathBuf, length: Duration, kill_every: f64) -> (Service, Lives) {
     let mut stream = modalwatch::stats::stream(20_261_121, "times of death under load");
     let mut lives = Lives::default();
@@ -294,7 +294,7 @@ async fn live_and_die(target: &Target, data: PathBuf, length: Duration, kill_eve
     }
 }
 
-/// Batches of both structures that still wait.
+/// Number of batches of both structures that wait for their assessment.
 async fn unassessed(data: &Path) -> i64 {
     use sqlx::Connection as _;
     let options = sqlx::sqlite::SqliteConnectOptions::new().filename(data.join("modalwatch.sqlite")).read_only(true);
@@ -320,7 +320,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
     };
     let (acknowledged, replays) = (Arc::new(Mutex::new(Acknowledged::default())), Arc::new(AtomicUsize::new(0)));
 
-    let readers: Vec<_> = (0..READERS).map(|reader| tokio::spawn(go_round(target.clone(), reader))).collect();
+    let readers: Vec<_> = (0..READERS).map(|reader| tokio::spawn(request_in_turn(target.clone(), reader))).collect();
     let swap = tokio::spawn({
         let target = target.clone();
         async move { swap_model(&target).await }
@@ -328,7 +328,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
     let due = tokio::spawn({
         let (target, acknowledged, replays) = (target.clone(), Arc::clone(&acknowledged), Arc::clone(&replays));
         async move {
-            let places = Arc::new(tokio::sync::Semaphore::new(ON_THE_WAY));
+            let places = Arc::new(tokio::sync::Semaphore::new(MOST_POSTS));
             let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / batches_per_s));
             let mut posts = tokio::task::JoinSet::new();
             for number in 0.. {
@@ -346,7 +346,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
                     done.unwrap();
                 }
             }
-            // Those on their way arrive.
+            // Posts in progress are completed.
             while let Some(done) = posts.join_next().await {
                 done.unwrap();
             }
@@ -368,7 +368,7 @@ async fn under_load_and_kills_nothing_acknowledged_is_lost_or_doubled() {
             tokio::time::sleep(Duration::from_millis(200)).await;
         }
     });
-    settled.await.expect("everything is assessed and the model swapped soon after the load");
+    settled.await.expect("everything is assessed and the model is replaced soon after the load");
 
     assert!(service.stop("TERM").success());
     let acknowledged = std::mem::take(&mut *acknowledged.lock().unwrap());

@@ -1,4 +1,4 @@
-//! The way down: SIGTERM with a request that never ends, and a second SIGTERM.
+//! Shutdown: SIGTERM with a request that never ends, and a second SIGTERM.
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use crate::helpers::{command, eventually, Service};
 use crate::kit::{audit, batch, body, post, Acknowledged, BATCHES};
 
-/// A request whose body never comes; the service waits for it, since it has asked for the body.
+/// A request whose body never arrives; the service waits for it, because it has requested the body.
 fn hanging(service: &Service) -> TcpStream {
     let mut stream = TcpStream::connect(service.address()).unwrap();
     let head = format!(
@@ -44,7 +44,7 @@ async fn a_second_sigterm_ends_the_process_at_once_and_what_was_acknowledged_sta
     let first = batch("a", 0, 5);
     acknowledged.add(&first, &post(&service, &first).await.unwrap().1);
     let _hanging = hanging(&service);
-    // Load until the end.
+    // Clients post until the service stops.
     let (url, client) = (format!("http://{}{BATCHES}", service.address()), service.client.clone());
     let answered = Arc::new(AtomicUsize::new(0));
     let counter = Arc::clone(&answered);
@@ -64,7 +64,7 @@ async fn a_second_sigterm_ends_the_process_at_once_and_what_was_acknowledged_sta
     });
     eventually("some answers", async || (answered.load(Ordering::Relaxed) >= 5).then_some(())).await;
     service.signal("TERM");
-    // The first signal has arrived when no more connections are taken.
+    // Once the service accepts no more connections, it has received the first signal.
     eventually("the end of listening", async || TcpStream::connect(service.address()).err()).await;
     let started = Instant::now();
     // The drain time is 30 s: only the second signal can end it now.

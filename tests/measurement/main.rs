@@ -1,4 +1,4 @@
-//! Tables of measurements: whatever comes, no panic; what is written is read back.
+//! Tables of measurements: no input causes a panic, and a table that was written is read back unchanged.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -144,7 +144,7 @@ fn the_ways_a_table_is_written_are_read_alike() {
 }
 
 #[test]
-fn what_cannot_be_meant_is_refused_with_its_line() {
+fn invalid_or_ambiguous_values_are_refused_with_their_line() {
     let refused = |text: &str| read(text.as_bytes(), 3, &covariates(), &options()).unwrap_err().remove(0);
     for (text, place, message) in [
         (

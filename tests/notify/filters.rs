@@ -7,7 +7,7 @@ use crate::receiver::{Answer, Receiver};
 use crate::webhooks::{damage, declare_undamaged, settled, start};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_webhook_gets_what_it_asked_for_and_nothing_else() {
+async fn a_webhook_gets_only_the_messages_that_it_selects() {
     let folder = tempfile::tempdir().unwrap();
     let service = start(folder.path(), &[]);
     let receiver = Receiver::start(Answer::Status(200)).await;
@@ -47,7 +47,7 @@ async fn a_webhook_gets_what_it_asked_for_and_nothing_else() {
 }
 
 #[tokio::test]
-async fn what_no_webhook_may_be_is_a_422_that_says_why() {
+async fn an_invalid_webhook_is_a_422_with_the_reason() {
     let (service, _folder) = spawn();
     for (body, pointer, reason) in [
         (json!({ "url": "http://127.0.0.1:9/" }), "/url", "loopback"),

@@ -63,7 +63,7 @@ async fn a_message_is_a_batch_and_twice_the_same_is_one() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
+async fn a_message_without_a_valid_batch_is_quarantined_and_blocks_no_other() {
     let Some(broker) = Broker::start() else { return };
     let folder = tempfile::tempdir().unwrap();
     let service = Service::spawn(
@@ -110,7 +110,7 @@ async fn what_is_no_batch_is_put_aside_with_its_reason_and_stops_nothing() {
     assert!(items.iter().all(|item| item["tries"] == 1 && item["topic"].as_str().unwrap().ends_with("/batches")));
     let large = items.iter().find(|item| item["payload_bytes"] == 300_000).unwrap();
     let whole = service.read(&format!("/v1/quarantine/{}", large["message"])).await;
-    assert_eq!(whole["payload"].as_str().unwrap().len(), 64 * 1024, "its beginning is kept");
+    assert_eq!(whole["payload"].as_str().unwrap().len(), 64 * 1024, "the beginning of the payload is kept");
 
     // The same message again is counted but not stored twice.
     broker.publish(&[(TOPIC, b"\xff\x00 hello".to_vec())]).await;
@@ -177,7 +177,7 @@ async fn every_message_is_stored_exactly_once_whenever_the_service_is_killed() {
     let times: BTreeSet<&str> = items.iter().map(|item| item["measured_from"].as_str().unwrap()).collect();
     assert_eq!((items.len(), times.len()), (MESSAGES + 2, MESSAGES + 2));
     println!("stored before each kill: {seen:?}");
-    assert!(seen[0] < MESSAGES, "the service was killed when all was done: the test shows nothing");
+    assert!(seen[0] < MESSAGES, "the service was killed after the last message: the test shows nothing");
     assert_eq!(service.read("/v1/quarantine").await["items"], json!([]));
     assert_eq!(service.stop("TERM").code(), Some(0));
 }

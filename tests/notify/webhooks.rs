@@ -63,7 +63,7 @@ pub async fn settled(service: &Service, webhook: &Value, state: &str, count: usi
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_alarm_is_told_once_signed_and_in_the_order_of_its_life() {
+async fn messages_of_an_alarm_are_sent_once_signed_and_in_order() {
     let folder = tempfile::tempdir().unwrap();
     let service = start(folder.path(), &[("PUBLIC_URL", "https://shm.example.org")]);
     let receiver = Receiver::start(Answer::Status(200)).await;
@@ -143,7 +143,7 @@ async fn a_receiver_that_fails_gets_the_same_message_again_and_a_redirect_is_not
     settled(&service, &hook, "delivered", 1).await;
     assert_eq!(receiver.taken().len(), 1);
     let ids: BTreeSet<String> = receiver.all().iter().map(|r| r.id().to_owned()).collect();
-    assert_eq!((ids.len(), bait.all().len()), (1, 0), "one message; and nobody was redirected");
+    assert_eq!((ids.len(), bait.all().len()), (1, 0), "one message, and no redirect was followed");
     assert!(receiver.all().len() >= 3);
 }
 
@@ -166,7 +166,7 @@ async fn a_receiver_that_never_answers_delays_no_other() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_nobody_takes_becomes_a_dead_letter_that_can_be_sent_again() {
+async fn an_undeliverable_message_becomes_a_dead_letter_that_can_be_sent_again() {
     let folder = tempfile::tempdir().unwrap();
     let service = start(folder.path(), &[("GIVE_UP_AFTER_S", "2")]);
     let receiver = Receiver::start(Answer::Status(503)).await;
@@ -193,7 +193,7 @@ async fn what_nobody_takes_becomes_a_dead_letter_that_can_be_sent_again() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_alarm_raised_just_before_a_kill_is_told_after_the_restart() {
+async fn an_alarm_raised_just_before_a_kill_is_sent_after_the_restart() {
     let folder = tempfile::tempdir().unwrap();
     let mut service = start(folder.path(), &[]);
     let receiver = Receiver::start(Answer::Status(503)).await;
@@ -212,7 +212,7 @@ async fn an_alarm_raised_just_before_a_kill_is_told_after_the_restart() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn while_secrets_change_over_both_sign_and_only_the_answers_that_make_one_show_it() {
+async fn during_a_rotation_both_secrets_sign_and_only_the_answer_that_makes_one_shows_it() {
     let folder = tempfile::tempdir().unwrap();
     let service = start(folder.path(), &[("SECRET_OVERLAP_S", "2")]);
     let receiver = Receiver::start(Answer::Status(204)).await;

@@ -1,11 +1,11 @@
-//! A structure out of one installation and into another.
+//! Export of a structure and import into another installation.
 
 use serde_json::Value;
 
 use crate::helpers::{problem, spawn, Service};
 use crate::world::{answers, fails, run, text, with_past, without};
 
-/// What belongs to an installation and not to the structure: when something was computed or noticed here.
+/// Fields that differ between installations: times at which something was computed or noticed.
 const OF_THE_INSTALLATION: [&str; 4] = ["assessed_at", "noticed_at", "created_at", "updated_at"];
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -22,7 +22,7 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
     run(&["export", "--structure", "three-dof", "--data-dir", data_dir, "--out", text(&offline)]).await;
     let lines = |path| std::fs::read_to_string(path).unwrap().lines().map(str::to_owned).collect::<Vec<_>>();
     let (online_lines, offline_lines) = (lines(&online), lines(&offline));
-    // First and last line name the time of the export.
+    // The first and the last line contain the time of the export.
     assert_eq!(online_lines[1..online_lines.len() - 1], offline_lines[1..offline_lines.len() - 1]);
 
     let target = elsewhere.path().join("data");
@@ -46,7 +46,7 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
     compare(&expected, &answers(&second).await);
     second.stop("TERM");
 
-    // Once more: nothing is new, and nothing changes.
+    // A second import changes nothing.
     let again: Value = serde_json::from_str(&run(&import).await).unwrap();
     for what in ["versions", "models", "batches_new", "undamaged_states", "maintenance_windows", "acknowledgements"] {
         assert_eq!(again[what], 0, "{what}: {again}");
@@ -55,7 +55,7 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
 }
 
 #[tokio::test]
-async fn an_archive_that_is_not_whole_or_not_true_is_refused_with_its_line() {
+async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
     let (service, folder) = spawn();
     with_past(&service, 4).await;
     let file = folder.path().join("export.ndjson");
@@ -99,5 +99,5 @@ async fn an_archive_that_is_not_whole_or_not_true_is_refused_with_its_line() {
     let out = folder.path().join("never.ndjson");
     fails(&["export", "--structure", "bridge", "--data-dir", text(folder.path()), "--url", &url, "--out", text(&out)])
         .await;
-    assert!(!out.exists(), "a file that is not whole was left behind");
+    assert!(!out.exists(), "an incomplete file was left behind");
 }

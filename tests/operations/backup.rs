@@ -1,4 +1,4 @@
-//! A backup counts only once it was restored.
+//! Backups, each verified by restoring it.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -28,13 +28,13 @@ async fn a_backup_under_ingest_restores_to_the_same_answers() {
                     let start = 86_400 * 20 + (round * 3 + client) * 4_000;
                     let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 4, start) });
                     let response = http.post(&url).json(&body).send().await.unwrap();
-                    assert_eq!(response.status(), 201, "a backup must not get in the way");
+                    assert_eq!(response.status(), 201, "a backup must not block posts");
                     posted.fetch_add(1, Ordering::Relaxed);
                 }
             })
         })
         .collect();
-    // However slow the machine is: some batches before, some after.
+    // On any machine some batches are stored before the backup and some after it.
     let more = async |count: usize| {
         let enough = posted.load(Ordering::Relaxed) + count;
         eventually("more posts", async || (posted.load(Ordering::Relaxed) >= enough).then_some(())).await;
@@ -62,14 +62,14 @@ async fn a_backup_under_ingest_restores_to_the_same_answers() {
     for id in &there {
         let path = format!("/v1/structures/three-dof/batches/{id}");
         let (mut here, mut restored) = (service.read(&path).await, second.read(&path).await);
-        // A batch that was stored but not assessed yet is assessed after the restore, with the same seed; batches that came
-        // later than the backup moved the charts.
+        // A batch that was stored but not assessed yet is assessed after the restore, with the same seed; batches that were posted
+        // after the backup changed the charts.
         without(&mut here, &["assessed_at", "charts"]);
         without(&mut restored, &["assessed_at", "charts"]);
         assert_eq!(here, restored);
     }
 
-    // Nothing comes in any more: every answer is the same to the last character.
+    // No more batches are posted: every answer is identical.
     created(service.post("/v1/backups", &json!({ "name": "tuesday" })).await).await;
     let again = restored.path().join("again");
     let backup = folder.path().join("backups/tuesday");
@@ -100,7 +100,7 @@ async fn a_backup_goes_into_the_services_own_folder_under_a_name_that_is_free() 
     problem(service.post("/v1/backups", &json!({ "path": "/tmp/x" })).await, 422, "invalid").await;
     created(service.post("/v1/backups", &json!({ "name": "one" })).await).await;
     problem(service.post("/v1/backups", &json!({ "name": "one" })).await, 409, "backup_exists").await;
-    // Without a body, the time makes the name.
+    // Without a body, the name is the time.
     let unnamed = created(service.request(reqwest::Method::POST, "/v1/backups").send().await.unwrap()).await;
     assert!(unnamed["name"].as_str().unwrap().starts_with("20"), "{unnamed}");
     let entries = std::fs::read_dir(folder.path().join("backups")).unwrap();
@@ -120,7 +120,7 @@ async fn the_command_backs_up_through_the_service_and_without_it() {
     let data_dir = text(folder.path()).to_owned();
     let url = format!("http://{}", service.address());
     let running = elsewhere.path().join("running");
-    // No --url: the lock says that a service is there. Its port is not the configured one here, so it is named.
+    // Without --url, the lock file shows that a service runs. Its port differs from the configured one here, so the URL is given.
     let config = elsewhere.path().join("config.toml");
     std::fs::write(&config, "[http]\nlisten = \"127.0.0.1:1\"\n").unwrap();
     let config = ["--config", text(&config)];
@@ -143,7 +143,7 @@ async fn the_command_backs_up_through_the_service_and_without_it() {
     assert!(said.contains("has no database"), "{said}");
 }
 
-/// A backup of a service with a past.
+/// A backup of a service with a history.
 async fn backed_up() -> (tempfile::TempDir, std::path::PathBuf) {
     let (service, folder) = spawn();
     service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 5, 0)).await;
@@ -153,7 +153,7 @@ async fn backed_up() -> (tempfile::TempDir, std::path::PathBuf) {
 }
 
 #[tokio::test]
-async fn a_backup_that_is_not_whole_is_refused_and_nothing_is_touched() {
+async fn an_incomplete_backup_is_refused_and_nothing_is_changed() {
     let (_folder, backup) = backed_up().await;
     let target = tempfile::tempdir().unwrap();
     let restore = |target: &Path| ["restore", "--from", text(&backup), "--data-dir", text(target)].map(str::to_owned);
@@ -199,14 +199,14 @@ async fn a_backup_that_is_not_whole_is_refused_and_nothing_is_touched() {
 }
 
 #[tokio::test]
-async fn a_database_that_is_there_is_replaced_only_when_asked_and_kept_aside() {
+async fn an_existing_database_is_replaced_only_on_request_and_kept() {
     let (_folder, backup) = backed_up().await;
     let (mut service, folder) = spawn();
     service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 5, 86_400)).await;
     let old = answers(&service).await;
     let arguments = ["restore", "--from", text(&backup), "--data-dir", text(folder.path()), "--replace"];
     assert!(fails(&arguments).await.contains("in use by another modalwatch"));
-    // Killed, so that its newest rows are only in the log: they must be kept too.
+    // The service is killed, so that its newest rows are only in the write-ahead log: they must be kept too.
     service.kill();
     assert!(fails(&arguments[..5]).await.contains("--replace"));
     let said = run(&arguments).await;

@@ -1,11 +1,11 @@
-//! The doctor finds what is wrong and says what to do.
+//! `modalwatch doctor` finds defects and reports the next step for each.
 
 use serde_json::Value;
 
 use crate::helpers::{measurements, repository, spawn};
 use crate::world::{program, run, text};
 
-/// Findings of the doctor: verdict and text of each check by name, and whether it ended well.
+/// Findings of the doctor: verdict and text of each check by name, and whether the exit status was 0.
 async fn doctor(arguments: &[&str], environment: &[(&str, &str)]) -> (Vec<(String, String, String)>, bool) {
     let mut command = program(&[&["doctor", "--json"], arguments].concat());
     // The default port may be taken on this machine.
@@ -85,7 +85,7 @@ async fn each_defect_is_found_and_ends_with_status_1() {
     finds(&["--data-dir", text(other.path())], &[], "database", "is not a SQLite database").await;
     let file = folder.path().join("modalwatch.sqlite");
     let mut bytes = std::fs::read(&file).unwrap();
-    // A page in the middle.
+    // A page in the middle of the file.
     let half = bytes.len() / 2 / 4_096 * 4_096;
     bytes[half..half + 2_000].fill(0xa5);
     std::fs::write(&file, &bytes).unwrap();

@@ -1,4 +1,4 @@
-//! Keeping the real program: backups, archives, models swapped under load, disks that fail, databases of earlier versions.
+//! Operating the real program: backups, archives, models replaced under load, disks that fail, databases of earlier versions.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 

@@ -1,4 +1,4 @@
-//! Databases of every earlier schema open, and what is in them is answered.
+//! Databases of every earlier schema can be opened, and their content is answered.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -51,7 +51,7 @@ fn content_digest(at_us: i64) -> String {
     batch.content_digest().to_string()
 }
 
-/// A database as a program with the first `schema` migrations left it, with rows of that time: a batch compared with an
+/// A database as a program with the first `schema` migrations wrote it: a batch compared with an
 /// undamaged reference.
 #[expect(clippy::too_many_lines, reason = "one statement after another")]
 async fn of_schema(folder: &Path, schema: i64, (definition, digest): &(String, String)) {
@@ -186,18 +186,18 @@ async fn every_earlier_schema_opens_and_its_rows_are_answered() {
             assert_eq!(alarms["items"][0]["acknowledgement"]["by"], "Ida");
         }
         let diagnoses = service.read("/v1/structures/three-dof/diagnoses").await;
-        // A job that ran when the program ended is marked as failed, whatever wrote it.
+        // A job that was running when the program ended is marked as failed, whichever version wrote it.
         let states: Vec<_> = diagnoses["items"].as_array().unwrap().iter().map(|d| d["state"].clone()).collect();
         assert_eq!(states, if schema >= 3 { vec![json!("failed")] } else { Vec::new() }, "{diagnoses}");
-        // A gateway that repeats what it sent before the upgrade is recognised by its key.
+        // A batch that a gateway repeats after the upgrade is recognised by its key.
         let known = service.read("/v1/structures/three-dof/history").await;
         assert_eq!(known["items"].as_array().unwrap().len(), 2);
     }
 }
 
-/// What an earlier program took and this one does not is left alone, told, and keeps no other structure from being watched.
+/// A definition that an earlier version accepted and this one refuses is kept and reported, and does not affect other structures.
 #[tokio::test]
-async fn a_stored_definition_that_does_not_pass_any_more_stops_nothing_else() {
+async fn a_stored_definition_that_is_now_refused_affects_no_other_structure() {
     let structure = three_dof().await;
     let folder = tempfile::tempdir().unwrap();
     of_schema(folder.path(), 3, &structure).await;
@@ -234,7 +234,7 @@ async fn a_backup_of_an_earlier_schema_restores_and_one_of_a_later_one_is_refuse
     run(&["backup", "--data-dir", text(folder.path()), "--out", text(&backup)]).await;
     let record: serde_json::Value =
         serde_json::from_slice(&std::fs::read(backup.join("manifest.json")).unwrap()).unwrap();
-    // It is copied as it is: a backup before an upgrade must serve the program before the upgrade.
+    // The database is copied unchanged: a backup made before an upgrade must be usable by the earlier version.
     assert_eq!(record["schema_version"], 1, "{record}");
     let data_dir = target.path().join("data");
     run(&["restore", "--from", text(&backup), "--data-dir", text(&data_dir)]).await;
@@ -250,14 +250,14 @@ async fn a_backup_of_an_earlier_schema_restores_and_one_of_a_later_one_is_refuse
     assert!(said.contains("version 9999, newer than this program's"), "{said}");
 }
 
-/// A program killed while it migrates leaves the schema before or the one after, and the next start ends the work.
+/// A program killed while it migrates leaves the schema before or the one after, and the next start completes the migration.
 #[tokio::test]
-async fn a_migration_that_is_killed_is_ended_by_the_next_start() {
+async fn a_migration_that_is_killed_is_completed_by_the_next_start() {
     let structure = three_dof().await;
     let folder = tempfile::tempdir().unwrap();
     of_schema(folder.path(), 1, &structure).await;
     let mut connection = SqliteConnection::connect_with(&database(folder.path())).await.unwrap();
-    // Enough rows that the table which the second migration writes anew takes some hundred milliseconds.
+    // Enough rows for the second migration, which rewrites a table, to take several hundred milliseconds.
     let rows = 60_000;
     let newest =
         Migrator::new(repository("migrations").as_path()).await.unwrap().iter().map(|m| m.version).max().unwrap();
@@ -273,7 +273,7 @@ async fn a_migration_that_is_killed_is_ended_by_the_next_start() {
     )
     .await;
     connection.close().await.unwrap();
-    // Killed a little later each time, until one got through: some of them in the middle of a migration.
+    // Each start is killed a little later, until one completes: some kills come in the middle of a migration.
     let mut versions = Vec::new();
     for step in 1..=200 {
         let mut child = command(folder.path()).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
@@ -287,12 +287,12 @@ async fn a_migration_that_is_killed_is_ended_by_the_next_start() {
         .fetch_one(&mut connection)
         .await
         .unwrap();
-        assert_eq!(count, rows + 1, "schema {version}: rows were lost or doubled");
+        assert_eq!(count, rows + 1, "schema {version}: rows were lost or duplicated");
         let failed: (i64,) = sqlx::query_as("select count(*) from _sqlx_migrations where success = 0")
             .fetch_one(&mut connection)
             .await
             .unwrap();
-        assert_eq!(failed.0, 0, "half a migration was left");
+        assert_eq!(failed.0, 0, "a migration was left incomplete");
         connection.close().await.unwrap();
         versions.push(version);
         if version == newest {

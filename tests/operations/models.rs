@@ -1,4 +1,4 @@
-//! Trained baselines swapped while batches come in.
+//! Trained models are replaced while batches are posted.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -33,7 +33,7 @@ fn put_manifest(models: &Path, manifest: &Value) {
     std::fs::write(models.join("three-dof/baseline.json"), serde_json::to_vec(manifest).unwrap()).unwrap();
 }
 
-/// Puts weights there, and into the manifest what they are.
+/// Writes weights, and their digest into the manifest.
 fn put_weights(models: &Path, weights: &[u8]) {
     let mut manifest = manifest(models);
     manifest["weights_sha256"] = json!(HEXLOWER.encode(&Sha256::digest(weights)));
@@ -86,7 +86,7 @@ impl Load {
         Self { stop, posted, clients }
     }
 
-    /// What was answered.
+    /// The answers.
     async fn end(self) -> Vec<Value> {
         self.stop.store(true, Ordering::Relaxed);
         for client in self.clients {
@@ -107,14 +107,14 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
     let first = in_use(&service).await;
 
     let load = Load::begin(&service);
-    // Each of four clients may have begun its post before the last switch; the fifth answer belongs to the present model.
+    // Each of four clients may have begun its post before the last switch; the fifth answer comes from the current model.
     let more_posts = async || {
         let enough = load.posted.lock().unwrap().len() + 5;
         eventually("more posts", async || (load.posted.lock().unwrap().len() >= enough).then_some(())).await;
     };
     more_posts().await;
 
-    // Another manifest around the same weights: a good model with a digest of its own.
+    // The same weights with another manifest: a valid model with another digest.
     let mut other = manifest(models.path());
     other["program_version"] = json!("0.0.1-other");
     put_manifest(models.path(), &other);
@@ -126,7 +126,7 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
     assert_eq!(in_use(&service).await, second);
     more_posts().await;
 
-    // Each of these is refused with its reason, and the good one goes on.
+    // Each of these is refused with its reason, and the valid model remains in use.
     let refused = async |reason: &str| {
         let body = problem(service.post(RELOAD, &json!({})).await, 409, "model_refused").await;
         let detail = body["detail"].as_str().unwrap();
@@ -173,7 +173,7 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
     std::fs::remove_file(models.path().join("three-dof/baseline.json")).unwrap();
     refused("manifest").await;
 
-    // Back to the first.
+    // The first model again.
     std::fs::copy(repository("models/three-dof/baseline.json"), models.path().join("three-dof/baseline.json")).unwrap();
     let back: Value = service.post(RELOAD, &json!({})).await.json().await.unwrap();
     assert_eq!((&back["model_digest"], &back["changed"]), (&json!(first), &json!(true)), "{back}");
@@ -190,7 +190,8 @@ async fn good_and_bad_models_are_swapped_in_under_load_without_a_failed_post() {
         let digest = answer["assessment"]["model_digest"].as_str().unwrap_or_else(|| panic!("{answer}")).to_owned();
         assert!(known.contains(&digest), "{answer}");
         used.insert(digest);
-        // Whatever it was answered with, the batch ends under the baseline in use, compared with the state taken with that.
+        // Whichever model answered the post, the current assessment is that of the model in use, compared with the reference that was
+        // renewed with it.
         let path = format!("/v1/structures/three-dof/batches/{}", answer["batch"].as_str().unwrap());
         let now = service.read(&path).await;
         assert_eq!(now["assessment"]["model_digest"], json!(first), "{now}");

@@ -1,4 +1,4 @@
-//! Every metric that the shipped dashboard and the alert rules name is there from the first scrape on.
+//! Every metric that the shipped dashboard and the alert rules name exists from the first scrape on.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::helpers::{measurements, repository, spawn};
 
-/// The names of our metrics in a text, without the endings that Prometheus gives to parts of a histogram.
+/// Names of the program's metrics in a text, without the suffixes of histogram series.
 fn names(text: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for (start, _) in text.match_indices("modalwatch_") {
@@ -48,8 +48,8 @@ async fn dashboard_and_alerts_name_only_metrics_that_are_there() {
         alerts.lines().filter(|line| line.trim_start().starts_with("expr:")).flat_map(names).collect();
     assert!(asked.len() > 15 && rules.len() > 8, "{asked:?} {rules:?}");
     let missing: Vec<&String> = asked.union(&rules).filter(|name| !there.contains(*name)).collect();
-    assert!(missing.is_empty(), "named but not in /metrics: {missing:?}");
-    // Panels do not lie on each other.
+    assert!(missing.is_empty(), "metrics that are used but not in /metrics: {missing:?}");
+    // Panels do not overlap.
     let mut places = BTreeSet::new();
     for panel in panels {
         let at = |key: &str| panel["gridPos"][key].as_u64().unwrap();
@@ -79,7 +79,7 @@ async fn metrics_say_what_the_service_is_and_what_it_holds() {
     assert!(build.contains(env!("CARGO_PKG_VERSION")) && build.contains("sqlite_version=\"3."), "{build}");
     let nameless: Vec<String> =
         names(&text).into_iter().filter(|name| !text.contains(&format!("# HELP {name} "))).collect();
-    assert!(nameless.is_empty(), "nothing says what they mean: {nameless:?}");
+    assert!(nameless.is_empty(), "metrics without a description: {nameless:?}");
     // No label grows with the number of structures.
     assert!(!text.contains("three-dof"), "{text}");
 }

@@ -1,4 +1,4 @@
-//! Disks that are full, fail and heal; old batches.
+//! Full and failing disks, recovery, and the deletion of old batches.
 
 use std::process::Command;
 
@@ -36,7 +36,7 @@ async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
     std::fs::write(&config, "").unwrap();
     let service = Service::spawn(command(&data).arg("--config").arg(&config));
     with_past(&service, 2).await;
-    // As if the disk had filled up: the floor is above what any disk has.
+    // The minimum of free space is larger than any disk, as if the disk were full.
     std::fs::write(&config, "[store]\nmin_free_bytes = 9000000000000000000\n").unwrap();
     service.signal("HUP");
     let refused = wait_for_status(&service, 507).await;
@@ -63,12 +63,12 @@ async fn below_the_floor_posts_are_refused_reads_go_on_and_a_new_floor_heals() {
     assert!(metric(&service, "modalwatch_ready ").await > 0.5);
 }
 
-/// Waits until `/readyz` says yes: what it says of the writer may be a second old.
+/// Waits until the service is ready; what `/readyz` reports about the writer may be a second old.
 async fn ready_again(service: &Service) {
     eventually("ready", async || (service.get("/readyz").send().await.unwrap().status() == 200).then_some(())).await;
 }
 
-/// Posts batches until one is answered like this: a signal takes its time.
+/// Posts batches until one has this answer, because a signal does not act at once.
 async fn wait_for_status(service: &Service, status: u16) -> Response {
     let mut attempt = 0;
     eventually(&format!("a post that is answered {status}"), async || {
@@ -78,14 +78,14 @@ async fn wait_for_status(service: &Service, status: u16) -> Response {
     .await
 }
 
-/// A limit on the size of files makes every write of the log fail, until it is lifted: the process is the same throughout.
+/// A limit on the size of files makes every write of the log fail, until it is lifted; the process is not restarted.
 #[tokio::test]
 async fn a_disk_that_fails_is_answered_503_and_the_service_heals_by_itself() {
     let folder = tempfile::tempdir().unwrap();
     let service = command(folder.path());
     let arguments: Vec<_> = service.get_args().map(|a| a.to_str().unwrap().to_owned()).collect();
     let mut shell = Command::new("sh");
-    // Ignored, or the limit would end the process.
+    // The signal is ignored; otherwise the limit would end the process.
     shell.args(["-c", "trap '' XFSZ; exec \"$0\" \"$@\""]).arg(service.get_program()).args(&arguments);
     shell.env("MODALWATCH__LOG__LEVEL", "off");
     let service = Service::spawn(&mut shell);
@@ -107,7 +107,7 @@ async fn a_disk_that_fails_is_answered_503_and_the_service_heals_by_itself() {
     limit("unlimited");
     for round in 0..5 {
         let taken = post(&service, 86_400 * 50 + round * 4_000).await;
-        assert_eq!(taken.status(), 201, "it did not heal: {}", taken.text().await.unwrap());
+        assert_eq!(taken.status(), 201, "the service did not recover: {}", taken.text().await.unwrap());
     }
     ready_again(&service).await;
     assert!(metric(&service, "modalwatch_write_failures_total{cause=\"disk_failed\"} ").await >= 5.0);
@@ -115,7 +115,7 @@ async fn a_disk_that_fails_is_answered_503_and_the_service_heals_by_itself() {
 }
 
 #[tokio::test]
-async fn batches_are_deleted_only_where_it_was_asked_for_and_never_those_of_states_and_alarms() {
+async fn batches_are_deleted_only_on_request_and_never_those_of_references_and_alarms() {
     let (mut service, folder) = spawn();
     with_past(&service, 8).await;
     let data_dir = text(folder.path()).to_owned();
@@ -127,7 +127,7 @@ async fn batches_are_deleted_only_where_it_was_asked_for_and_never_those_of_stat
     assert_eq!(all.len(), 10);
     let plan = service.read("/v1/retention").await;
     assert_eq!((&plan["measurements_days"], &plan["would_delete"]), (&json!(0), &json!([])), "{plan}");
-    // Of ten batches, two are the undamaged reference and the damaged ones belong to the alarm that lasts.
+    // Of ten batches, two belong to the undamaged reference, and the damaged ones belong to the open alarm.
     let alarms = service.read("/v1/structures/three-dof/alarms").await;
     let opened = alarms["items"][0]["opened_batch"].as_str().unwrap().to_owned();
     let first_of_alarm = all.iter().position(|id| *id == opened).unwrap();

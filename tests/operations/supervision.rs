@@ -9,14 +9,14 @@ use crate::helpers::{command, spawn, Service};
 use crate::world::{fails, program, run};
 
 #[tokio::test]
-async fn systemd_hears_of_readiness_of_life_and_of_the_end() {
+async fn systemd_is_notified_of_readiness_watchdog_and_stop() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("notify");
     let socket = UnixDatagram::bind(&path).unwrap();
     socket.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
     let service = command(&folder.path().join("data"));
     let mut shell = Command::new("sh");
-    // systemd names the process that it waits for; exec keeps its id.
+    // systemd sets the id of the process that it waits for; exec keeps this id.
     shell.args(["-c", "WATCHDOG_PID=$$ exec \"$0\" \"$@\""]).arg(service.get_program()).args(service.get_args());
     shell.env("NOTIFY_SOCKET", &path).env("WATCHDOG_USEC", "300000").env("MODALWATCH__LOG__LEVEL", "warn");
     let mut service = Service::spawn(&mut shell);
@@ -38,7 +38,7 @@ async fn systemd_hears_of_readiness_of_life_and_of_the_end() {
 }
 
 #[tokio::test]
-async fn a_hangup_takes_over_what_can_change_and_keeps_what_is_wrong_out() {
+async fn a_hangup_applies_a_valid_configuration_and_refuses_an_invalid_one() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("config.toml");
     std::fs::write(&config, "[log]\nlevel = \"info\"\n").unwrap();
@@ -103,7 +103,7 @@ async fn the_health_check_ends_with_the_status_a_watcher_needs() {
     assert!(output.await.unwrap().status.success(), "the address comes from the environment, as in a container");
     drop(service);
     assert!(fails(&["healthcheck", "--url", &url]).await.contains("does not answer"));
-    // Somebody who takes the connection and says nothing.
+    // A server that accepts the connection and does not answer.
     let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}", silent.local_addr().unwrap());
     assert!(fails(&["healthcheck", "--timeout-s", "1", "--url", &url]).await.contains("does not answer"));

@@ -1,4 +1,4 @@
-//! A service with a past, everything it answers, and commands run beside it.
+//! A service with a history, all its answers, and commands that run beside it.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,14 +8,14 @@ use serde_json::{json, Value};
 
 use crate::helpers::{created, eventually, measurements, Service};
 
-/// The program with arguments.
+/// The program with its arguments.
 pub fn program(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
     command.args(arguments);
     command
 }
 
-/// Runs a command that must succeed; what it printed.
+/// Runs a command that must succeed; returns its output.
 pub async fn run(arguments: &[&str]) -> String {
     let output = output(arguments).await;
     let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
@@ -23,7 +23,7 @@ pub async fn run(arguments: &[&str]) -> String {
     out.into_owned()
 }
 
-/// Runs a command that must fail; what it said.
+/// Runs a command that must fail; returns its error message.
 pub async fn fails(arguments: &[&str]) -> String {
     let output = output(arguments).await;
     let text = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
@@ -92,7 +92,7 @@ pub async fn answers(service: &Service) -> BTreeMap<String, Value> {
     all
 }
 
-/// Takes away fields of that name at every depth.
+/// Removes fields of this name at every depth.
 pub fn without(value: &mut Value, fields: &[&str]) {
     match value {
         Value::Object(members) => {

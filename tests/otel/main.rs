@@ -1,4 +1,4 @@
-//! Traces: the real program, built with the feature `otel`, and a collector that reads what it sends.
+//! Traces: the real program, built with the feature `otel`, and a collector that reads its spans.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -60,7 +60,7 @@ fn all(bytes: &[u8], number: u64) -> Vec<&[u8]> {
     fields(bytes).into_iter().filter(|(found, _)| *found == number).map(|(_, value)| value).collect()
 }
 
-/// A span as opentelemetry/proto/trace/v1/trace.proto has it.
+/// A span as defined in opentelemetry/proto/trace/v1/trace.proto.
 #[derive(Debug, Clone)]
 struct Span {
     trace: String,
@@ -81,7 +81,7 @@ fn spans(export: &[u8]) -> Vec<Span> {
     found.collect()
 }
 
-/// A collector: its address and the spans it got, with the names of the resources they came from.
+/// A collector: its address and the spans that it received, with the names of their resources.
 async fn collector() -> (String, Arc<Mutex<Vec<Bytes>>>) {
     let exports: Arc<Mutex<Vec<Bytes>>> = Arc::default();
     let take = |State(exports): State<Arc<Mutex<Vec<Bytes>>>>, body: Bytes| async move {
@@ -101,11 +101,11 @@ fn start(folder: &Path, variables: &[(&str, &str)]) -> Service {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_spans_of_a_batch_are_in_the_trace_of_its_sender_and_are_sent_before_the_end() {
-    // The standard variable, and our own key over it.
+    // The standard variable, and the program's own setting, which takes precedence.
     for ours in [false, true] {
         let (url, exports) = collector().await;
         let folder = tempfile::tempdir().unwrap();
-        // Only the end of the service sends anything.
+        // Spans are sent only when the service stops.
         let mut variables = vec![("OTEL_BSP_SCHEDULE_DELAY", "3600000")];
         let elsewhere = "http://127.0.0.1:9";
         if ours {
@@ -119,7 +119,7 @@ async fn the_spans_of_a_batch_are_in_the_trace_of_its_sender_and_are_sent_before
         let body = json!({ "measurements": measurements([4.0, 5.0, 6.0], 3, 0) });
         let request = service.request(reqwest::Method::POST, BATCHES).header("traceparent", traceparent).json(&body);
         assert_eq!(request.send().await.unwrap().status(), 201);
-        // One whose header is none has a trace of its own.
+        // A request with an invalid header gets a new trace.
         let other = service.get("/healthz").header("traceparent", "00-xyz").send().await.unwrap();
         assert_eq!(other.status(), 200);
         assert!(exports.lock().unwrap().is_empty());
@@ -148,7 +148,7 @@ async fn a_collector_that_is_away_or_never_answers_holds_up_nothing() {
         let url = format!("http://{address}");
         let few = [("OTEL_BSP_MAX_QUEUE_SIZE", "8"), ("OTEL_BSP_MAX_EXPORT_BATCH_SIZE", "4")];
         let mut service = start(folder.path(), &[few[0], few[1], ("OTEL_EXPORTER_OTLP_ENDPOINT", &url)]);
-        // More spans than may wait.
+        // More spans than the queue holds.
         for i in 0..20 {
             service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 3, 4_000 * i)).await;
         }
@@ -158,7 +158,7 @@ async fn a_collector_that_is_away_or_never_answers_holds_up_nothing() {
 }
 
 #[test]
-fn an_address_that_is_none_is_refused_by_its_key() {
+fn an_invalid_address_is_refused_with_its_key() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = command(folder.path());
     command.env("MODALWATCH__LOG__OTLP_ENDPOINT", "localhost:4318").stdout(Stdio::null());

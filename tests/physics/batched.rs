@@ -39,7 +39,7 @@ fn as_one_by_one(structure: &Structure, springs: &[usize], runs: usize, seed: u6
 }
 
 #[test]
-fn random_structures_have_the_frequencies_that_they_have_one_by_one() {
+fn batched_frequencies_of_random_structures_are_those_of_single_runs() {
     for seed in 0..40 {
         let structure = random_structure(seed);
         let changing: Vec<usize> =

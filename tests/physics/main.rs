@@ -190,7 +190,7 @@ fn a_cluster_cut_by_the_number_of_modes_asked_for_has_the_same_derivatives() {
 }
 
 #[test]
-fn what_is_no_structure_is_named() {
+fn an_invalid_structure_is_refused_with_the_reason() {
     let two = || vec![mass(0, 1.0), mass(1, 1.0)];
     let tied = || vec![spring(0, Node::Ground, Node::Dof(0), 1.0), spring(1, Node::Dof(0), Node::Dof(1), 1.0)];
     let with = |change: &dyn Fn(&mut Vec<Mass>, &mut Vec<Spring>)| {

@@ -58,7 +58,7 @@ fn table() -> Simulator {
 }
 
 #[test]
-fn a_table_stands_for_the_simulation_it_was_made_of() {
+fn a_table_reproduces_the_simulation_it_was_made_from() {
     let (direct, table) = (rig(), table());
     let mut stream = stats::stream(2, "points");
     let (mut squares, mut slope_squares) = ([0.0; 3], [0.0; 2]);
@@ -77,11 +77,14 @@ fn a_table_stands_for_the_simulation_it_was_made_of() {
     println!("slopes: relative error {slope_error:.1e}");
     assert!(slope_error < 0.02, "{slope_error}");
     for (mode, square) in squares.iter().enumerate() {
-        let told = table.table().unwrap().emulator().relative_error(mode);
-        println!("mode {}: error {:.1e}, told {told:.1e}", mode + 1, square.sqrt());
+        let estimated = table.table().unwrap().emulator().relative_error(mode);
+        println!("mode {}: error {:.1e}, estimated {estimated:.1e}", mode + 1, square.sqrt());
         // The estimated error includes the edges of the box, where the error is largest.
-        assert!(square.sqrt() < 2.0 * told && told < 1e-3, "mode {mode}: {} {told}", square.sqrt());
-        assert!((table.std_hz(mode, 10.0) - 10.0 * told).abs() < 1e-12, "without noise, the error is all");
+        assert!(square.sqrt() < 2.0 * estimated && estimated < 1e-3, "mode {mode}: {} {estimated}", square.sqrt());
+        assert!(
+            (table.std_hz(mode, 10.0) - 10.0 * estimated).abs() < 1e-12,
+            "without noise only the error of the emulator remains"
+        );
     }
     assert!(table.warnings().is_empty(), "{:?}", table.warnings());
     assert!(table.structure().is_none() && table.is_noisy());

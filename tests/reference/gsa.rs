@@ -131,7 +131,7 @@ fn the_same_seed_gives_the_same_bits_on_any_number_of_threads() {
 }
 
 #[test]
-fn outputs_are_told_apart_and_one_that_does_not_vary_has_null() {
+fn each_output_has_its_own_indices_and_a_constant_one_has_null() {
     let model = |x: &[f64]| vec![x[0], 1e6 + 1e-12 * x[1], 1e8 + 1e-3 * x[1]];
     let found = indices(&inputs(2, 0.0, 1.0), &settings(256, 1), model);
     let total = |output: usize, input: usize| found.outputs[output].indices.as_ref().unwrap().total[input].value;

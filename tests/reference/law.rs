@@ -95,7 +95,7 @@ fn frequencies_of_the_papers_configurations_give_back_stiffnesses_and_laws() {
 }
 
 #[test]
-fn the_first_frequency_tells_two_solutions_apart() {
+fn the_first_frequency_distinguishes_two_solutions() {
     // Above 0.035 m, the second solution of the rig is positive, too.
     let (k12, k23) = (law(LAWS[0], 0.05), law(LAWS[1], 0.05));
     let [first, second, third] = frequencies_hz(MASSES_KG, GROUND_N_PER_M, k12, k23);
@@ -181,7 +181,7 @@ fn intervals_of_the_constants_and_the_band_cover_ninety_five_percent() {
 }
 
 #[test]
-fn without_standard_deviations_the_intervals_are_no_narrower_than_they_say() {
+fn without_standard_deviations_the_intervals_cover_at_least_the_stated_share() {
     const SEEDS: u64 = 1000;
     let mut covered = [[[0_u32; 3]; 2]; 2];
     for seed in 0..SEEDS {
@@ -252,7 +252,7 @@ fn four_points_are_enough_and_have_one_degree_of_freedom() {
 }
 
 #[test]
-fn what_is_no_chain_is_refused() {
+fn a_structure_that_is_not_a_chain_is_refused() {
     let solve = |masses, ground, first, second, third| coupling_stiffness(masses, ground, first, second, third);
     for (masses, ground) in [([0.0, 1.0, 1.0], GROUND_N_PER_M), (MASSES_KG, [0.0; 3]), (MASSES_KG, [-1.0, 9.0, 9.0])] {
         let error = solve(masses, ground, None, 10.0, 12.0).unwrap_err();

@@ -1,4 +1,4 @@
-//! Sensitivity-based updating recovers what made the frequencies, from anywhere in the prior.
+//! Sensitivity-based updating recovers the parameters behind the frequencies from any start in the prior.
 
 use std::fmt::Write as _;
 
@@ -22,8 +22,8 @@ fn measured(simulator: &Simulator, theta: &[f64]) -> Vec<Option<f64>> {
 }
 
 #[test]
-fn updating_ends_at_the_truth_from_two_hundred_starts_or_says_that_it_does_not() {
-    // The means of the undamaged state of each case.
+fn updating_from_two_hundred_starts_converges_to_the_truth_or_reports_a_misfit() {
+    // The means of the undamaged reference of each case.
     let truths = [vec![4.0, 5.0, 6.0], vec![0.0475, 0.0475]];
     for ((name, text), truth) in CASES.into_iter().zip(truths) {
         let simulator = simulator(text);

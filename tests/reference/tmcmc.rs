@@ -168,13 +168,16 @@ fn the_evidence_is_unbiased_and_its_error_is_the_scatter_over_seeds() {
         // The estimate of the evidence is unbiased; its logarithm is too low by half its variance on average.
         let (ratio, ratio_error) = mean_and_error(&off.iter().map(|o| o.exp()).collect::<Vec<_>>());
         assert!((ratio - 1.0).abs() < 3.0 * ratio_error, "d {d}: evidence {ratio} ± {ratio_error} of the exact one");
-        let told = stats::mean(&runs.iter().map(|r| r.log_evidence_std_error.powi(2)).collect::<Vec<_>>()).sqrt();
+        let reported = stats::mean(&runs.iter().map(|r| r.log_evidence_std_error.powi(2)).collect::<Vec<_>>()).sqrt();
         let (bias, error) = mean_and_error(&off);
-        assert!((bias + 0.5 * told.powi(2)).abs() < 3.0 * error, "d {d}: log-evidence off by {bias} ± {error}");
+        assert!(
+            (bias + 0.5 * reported.powi(2)).abs() < 3.0 * error,
+            "d {d}: error of the log-evidence {bias} ± {error}"
+        );
         // The relative standard error of the scatter over 60 runs is 1/√(2·60) = 9 %: a third is more than three times that.
         let scatter = stats::sample_std(&off).unwrap();
-        println!("d {d}: evidence × {ratio:.3} ± {ratio_error:.3}, log {bias:.3} ± {error:.3}; scatter {scatter:.3}, told {told:.3}");
-        assert!((1.0 / 1.35..1.35).contains(&(told / scatter)), "d {d}: told {told}, scatter {scatter}");
+        println!("d {d}: evidence × {ratio:.3} ± {ratio_error:.3}, log {bias:.3} ± {error:.3}; scatter {scatter:.3}, reported {reported:.3}");
+        assert!((1.0 / 1.35..1.35).contains(&(reported / scatter)), "d {d}: reported {reported}, scatter {scatter}");
         // Copies among the samples would make the standard error of the mean of each run larger than that of 1,000 independent
         // samples, 0.0316 standard deviations. A remaining correlation of 0.3 gives 0.035, measured with an error of 9 %; the
         // tolerance is three times that.
@@ -187,19 +190,19 @@ fn the_evidence_is_unbiased_and_its_error_is_the_scatter_over_seeds() {
 }
 
 #[test]
-fn short_chains_are_told_in_the_error() {
+fn short_chains_increase_the_estimated_error() {
     // With one step per stage, samples remain similar over the stages, and the sum of the variances of the stages would give only
     // a third of the scatter.
     let target = Conjugate::new(2);
     let settings = Settings { most_steps: 1, ..Settings::default() };
     let runs: Vec<Samples> = (0..60).map(|seed| tmcmc(&target, &settings, seed, &|_| {}).unwrap()).collect();
     let scatter = stats::sample_std(&runs.iter().map(|r| r.log_evidence).collect::<Vec<_>>()).unwrap();
-    let told = stats::mean(&runs.iter().map(|r| r.log_evidence_std_error.powi(2)).collect::<Vec<_>>()).sqrt();
+    let reported = stats::mean(&runs.iter().map(|r| r.log_evidence_std_error.powi(2)).collect::<Vec<_>>()).sqrt();
     let by_stage = |s: &Stage| 1.0 / s.effective_sample_size - 1e-3;
     let independent = runs[0].stages.iter().map(by_stage).sum::<f64>().sqrt();
-    println!("scatter {scatter:.3}, told {told:.3}, stages alone {independent:.3}");
+    println!("scatter {scatter:.3}, reported {reported:.3}, stages alone {independent:.3}");
     // As above, 9 % of the scatter, and about 15 % for an error that is itself estimated from few families.
-    assert!((1.0 / 1.5..1.5).contains(&(told / scatter)), "told {told}, scatter {scatter}");
+    assert!((1.0 / 1.5..1.5).contains(&(reported / scatter)), "reported {reported}, scatter {scatter}");
     assert!(independent < 0.5 * scatter);
 }
 
@@ -314,7 +317,7 @@ fn a_parameter_that_the_prior_fixes_or_one_survivor_does_not_stop_the_rest() {
     let std = stats::sample_std(&column(&samples, 0)).unwrap();
     assert!((2e-4..3.5e-4).contains(&std), "{std}");
     assert!((samples.log_evidence - 1e-3f64.ln()).abs() < 1e-9);
-    assert!(samples.log_evidence_std_error > 0.9, "one survivor tells the evidence to no better than its whole");
+    assert!(samples.log_evidence_std_error > 0.9, "with one survivor the relative error of the evidence is at least 1");
 }
 
 #[test]
@@ -330,7 +333,7 @@ fn parameters_in_strict_dependence_are_sampled_along_their_ridge() {
 }
 
 #[test]
-fn the_stages_tell_what_was_done() {
+fn the_stages_record_what_was_done() {
     struct Counted(Conjugate, AtomicUsize);
     impl Target for Counted {
         fn dimensions(&self) -> usize {
@@ -483,7 +486,7 @@ fn four_n_times_the_distance_is_the_log_likelihood_ratio_near_the_truth() {
         let own = log_likelihood(truth.bhattacharyya(&population(mu, sigma)).unwrap(), epsilon_squared(n));
         // −n KL(N(0, 1) ‖ N(μ, σ²)).
         let exact = -n * (f64::ln(sigma) + (1.0 + mu * mu) / (2.0 * sigma * sigma) - 0.5);
-        // The next order: 2 % off the truth, a few times 2 % of the ratio.
+        // The next order: at a distance of 2 % from the truth, a few times 2 % of the ratio.
         assert!((own / exact - 1.0).abs() < 0.06, "({mu}, {sigma}): {own}, exact {exact}");
     }
 }
@@ -517,7 +520,7 @@ fn the_likelihood_of_the_distance_gives_the_spread_of_the_exact_posterior() {
     // The standard deviation of 1,000 samples is known to 1/√2,000 = 0.022 times 1.1; three times that, 0.012 for n_eff, and
     // 1/n for what is beyond the second order.
     assert!((mu_ratio - 1.0).abs() < 0.1 && (sigma_ratio - 1.0).abs() < 0.1, "{mu_ratio}, {sigma_ratio}");
-    // The draws are off by 1/√4,000: 0.16 of a posterior standard deviation; three times that and the Monte Carlo error.
+    // The draws have an error of 1/√4,000: 0.16 of a posterior standard deviation; three times that and the Monte Carlo error.
     assert!(((stats::mean(&mu) - mean) / (std / root_n)).abs() < 0.6);
     assert!(((stats::mean(&sigma) - std) / (std / (2f64.sqrt() * root_n))).abs() < 0.6);
 }

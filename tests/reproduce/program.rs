@@ -1,4 +1,4 @@
-//! The commands `reproduce` and `update`, run as people run them.
+//! The commands `reproduce` and `update`, run as a user runs them.
 
 use std::path::Path;
 use std::process::Command;
@@ -78,7 +78,7 @@ fn a_quick_reproduction_has_every_table_and_finds_what_was_drawn() {
 }
 
 /// Figure 20b: in every damaged configuration one link is at its lowest position, and so are the samples of a flow that was trained
-/// as long as for the figures of README.
+/// as long as for the figures of docs/paper.md.
 #[test]
 fn samples_of_the_damaged_rig_lie_on_an_l() {
     let folder = tempfile::tempdir().unwrap();

@@ -16,7 +16,7 @@ const IDS: [&str; 21] = [
     "fig13", "fig14", "fig16", "fig17", "fig18", "fig19", "fig20", "fig21", "fig22",
 ];
 
-/// How often an id is given.
+/// Number of elements with an id.
 fn given(page: &str, id: &str) -> usize {
     page.matches(&format!(" id=\"{id}\"")).count()
 }
@@ -43,7 +43,7 @@ fn every_table_and_figure_of_the_paper_is_there_once() {
 }
 
 #[test]
-fn the_page_needs_nothing_else_and_holds_no_number_that_is_none() {
+fn the_page_is_self_contained_and_all_its_numbers_are_finite() {
     let page = html(&fake::reproduction(2));
     assert!(!words(&page).any(|word| ["NaN", "inf", "None"].contains(&word)));
     assert!(!page.contains("<script") && !page.contains("javascript:") && !page.contains("@import"));

@@ -1,4 +1,4 @@
-//! Many parameters and mode shapes: laws of shapes and their derivatives, the fit a flow starts at, and a chain of ten
+//! Many parameters and mode shapes: laws of shapes and their derivatives, the fit that a trained model starts at, and a chain of ten
 //! stiffnesses from training to the service.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
@@ -59,7 +59,7 @@ pub fn chain_simulator(count: usize, modes: usize) -> Simulator {
     Simulator::new(StructureDefinition::parse_toml(&chain_file(count, modes)).unwrap()).unwrap()
 }
 
-/// Both eigen solvers, below and above the size at which they change over.
+/// Both eigensolvers, below and above the size at which the program changes from one to the other.
 #[test]
 fn a_uniform_chain_has_the_frequencies_and_shapes_of_the_closed_form() {
     for count in [10, 31, 32, 120] {
@@ -132,7 +132,7 @@ fn shapes_turned_around_and_in_another_order_are_paired_back() {
 }
 
 #[test]
-fn a_shape_unlike_every_mode_is_named_with_the_mode_it_is_least_unlike() {
+fn a_shape_unlike_every_mode_is_reported_with_the_closest_mode() {
     let simulator = chain_simulator(30, 3);
     let points = simulator.instrumented_points().unwrap();
     for (mode, shape) in points.nominal.iter().enumerate() {
@@ -145,7 +145,7 @@ fn a_shape_unlike_every_mode_is_named_with_the_mode_it_is_least_unlike() {
 }
 
 #[test]
-fn what_is_wrong_with_instrumented_points_is_said() {
+fn mistakes_in_instrumented_points_are_reported() {
     let right = chain_file(6, 3);
     let wrong = |from: &str, to: &str| {
         let text = right.replace(from, to);

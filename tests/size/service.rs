@@ -1,4 +1,4 @@
-//! Batches with shapes and without, through the real program.
+//! Batches with and without shapes, in the real program.
 
 use serde_json::{json, Value};
 
@@ -33,7 +33,7 @@ fn spawn() -> (Service, tempfile::TempDir) {
     std::fs::write(models.join("baseline.safetensors"), &CHAIN.weights).unwrap();
     let mut command = command(&folder.path().join("data"));
     command.arg("--models").arg(folder.path().join("models"));
-    // Seconds of training do not always pass the calibration, and what is looked at here is the way of a shape.
+    // A training of a few seconds does not always pass the calibration; this test is only about the handling of shapes.
     command.env("MODALWATCH__MONITOR__ACCEPT_UNCALIBRATED", format!("[\"{}\"]", CHAIN.baseline.digest()));
     (Service::spawn(&mut command), folder)
 }
@@ -60,7 +60,7 @@ async fn batches_with_shapes_and_without_are_assessed_and_kept() {
 }
 
 #[tokio::test]
-async fn what_is_wrong_with_a_shape_is_said_with_its_place() {
+async fn mistakes_in_a_shape_are_reported_with_their_place() {
     let (service, _folder) = spawn();
     let right = measurements(1, true).remove(0);
     let points = right["mode_shapes"][0].as_array().unwrap().len();

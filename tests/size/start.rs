@@ -1,4 +1,4 @@
-//! The fit that a flow starts at, and a chain of ten stiffnesses trained from it.
+//! The fit that a trained model starts at, and a chain of ten stiffnesses trained from it.
 
 use std::sync::LazyLock;
 
@@ -58,7 +58,7 @@ fn the_fit_is_the_same_for_shapes_turned_around_and_modes_in_another_order() {
     }
 }
 
-/// Standard errors of the fit are those it states, and what it leaves is χ²-distributed.
+/// The fit has the standard errors that it states, and its remaining misfit is χ²-distributed.
 #[test]
 fn fits_of_noisy_measurements_scatter_as_they_say() {
     let simulator = chain_simulator(10, 5);
@@ -73,7 +73,7 @@ fn fits_of_noisy_measurements_scatter_as_they_say() {
         misfit += fit.chi_squared / fit.degrees_of_freedom / 300.0;
     }
     println!("mean of whitened squares {whitened:.3}, of χ² over its degrees of freedom {misfit:.3}");
-    // 3,000 squares have a standard error of 0.026; a prior of finite width and a bent map add to it.
+    // 3,000 squares have a standard error of 0.026; a prior of finite width and a nonlinear map add to it.
     assert!((0.9..1.2).contains(&whitened), "{whitened}");
     // Fifteen degrees of freedom, 300 times: standard error 0.021.
     assert!((misfit - 1.0).abs() < 0.07, "{misfit}");
@@ -108,7 +108,7 @@ fn draws_beyond_the_prior_come_back_as_the_normal_distribution_that_is_cut_off_t
 }
 
 #[test]
-fn to_the_flow_and_back_is_where_it_began_and_its_volume_is_the_determinant() {
+fn the_map_to_the_flow_is_invertible_and_its_volume_is_the_determinant() {
     let simulator = chain_simulator(6, 4);
     let set = simulator.training_set(1, 4).unwrap();
     let fit = locate(&simulator, &exact(&set, 0)).unwrap();
@@ -117,7 +117,7 @@ fn to_the_flow_and_back_is_where_it_began_and_its_volume_is_the_determinant() {
     assert!((fit.log_det() - 0.5 * fit.precision.determinant().ln()).abs() < 1e-9);
 }
 
-/// The information of frequencies and shapes against that of differences.
+/// The Fisher information of frequencies and shapes compared with that of finite differences.
 #[test]
 fn the_fisher_information_is_that_of_differences() {
     let simulator = chain_simulator(8, 4);
@@ -179,7 +179,7 @@ fn a_chain_of_ten_is_learnt_to_the_optimum_with_intervals_that_cover() {
 }
 
 #[test]
-fn without_shapes_the_same_baseline_answers_wider() {
+fn without_shapes_the_same_model_gives_wider_intervals() {
     let baseline = &CHAIN.baseline;
     let set = baseline.simulator().training_set(20, 9).unwrap();
     let with: Vec<Observation> = (0..20).map(|row| exact(&set, row)).collect();

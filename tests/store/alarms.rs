@@ -228,7 +228,7 @@ async fn each_change_of_an_alarm_is_one_message_and_storing_it_again_is_no_chang
 }
 
 #[tokio::test]
-async fn a_wrong_alarm_is_withdrawn_and_one_found_in_the_past_is_sent_with_its_end() {
+async fn a_wrong_alarm_is_withdrawn_and_an_alarm_found_in_the_past_is_sent_with_its_end() {
     let (store, _folder) = opened_with_a_webhook().await;
     chart(&store, "b1", 1_000, 4.0).await;
     chart(&store, "b2", 2_000, 0.0).await;

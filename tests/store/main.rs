@@ -132,7 +132,7 @@ async fn pages_walk_batches_of_equal_time_once() {
 }
 
 #[tokio::test]
-async fn a_writer_who_goes_away_leaves_whole_batches_and_a_usable_store() {
+async fn a_caller_that_disconnects_leaves_complete_batches_and_a_usable_store() {
     let (store, _folder) = open().await;
     for i in 0..60 {
         let given = batch(&format!("s{i}"), 0, 40);

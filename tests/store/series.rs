@@ -82,7 +82,7 @@ async fn fill(folder: &tempfile::TempDir) {
 }
 
 #[tokio::test]
-async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
+async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     let (store, folder) = open().await;
     store
         .reference()
@@ -105,11 +105,14 @@ async fn a_hundred_thousand_batches_become_a_plot_that_shows_what_is_unusual() {
     let spike = measured.rows.iter().find(|row| row.time_us == time_of(SPIKE)).unwrap();
     let expected = [1.0, 2.0, 3.9, 4.0, 5.0, 10.0 + (SPIKE % 7) as f64];
     assert!(spike.values.iter().zip(expected).all(|(value, expected)| (value - expected).abs() < 1e-12), "{spike:?}");
-    assert!(spike.values[6].is_nan(), "text is no value");
-    assert!(measured.rows.iter().filter(|row| row.values[2].is_nan()).count() > 300, "missing modes are there");
+    assert!(spike.values[6].is_nan(), "text is not a value");
+    assert!(
+        measured.rows.iter().filter(|row| row.values[2].is_nan()).count() > 300,
+        "the series contains missing modes"
+    );
     let [(middle, behind)] = measured.gaps[..] else { panic!("{} gaps", measured.gaps.len()) };
     assert!(time_of(AFTER_THE_GAP - 1) < middle && middle < time_of(AFTER_THE_GAP));
-    assert_eq!(measured.rows[behind].time_us, time_of(AFTER_THE_GAP), "the rows beside the gap stay");
+    assert_eq!(measured.rows[behind].time_us, time_of(AFTER_THE_GAP), "the rows beside the gap are kept");
     assert_eq!(measured.rows[behind - 1].time_us, time_of(AFTER_THE_GAP - 1));
 
     let started = Instant::now();
@@ -196,14 +199,14 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
     for quantity in quantities {
         let [row] = &quantity.batches.rows[..] else { panic!("one batch: {quantity:?}") };
         assert_eq!((row.tag.batch.as_str(), row.values[0]), ("b1", 3.6));
-        assert!(row.values[1].is_nan(), "compared with nothing under the new model: {row:?}");
+        assert!(row.values[1].is_nan(), "not compared with a reference under the new model: {row:?}");
     }
     assert_eq!(trust.rows.len(), 1);
     assert_eq!(trust.rows[0].tag.findings, [FindingCode::Outlier]);
 }
 
 #[tokio::test]
-async fn the_column_for_plots_says_what_the_rows_say() {
+async fn the_packed_column_for_plots_agrees_with_the_rows() {
     let (store, folder) = open().await;
     for i in 0..60 {
         let id = format!("b{i:02}");
@@ -220,7 +223,7 @@ async fn the_column_for_plots_says_what_the_rows_say() {
             }
         }
         if i % 2 == 1 {
-            // Another trained baseline has other quantities in another order.
+            // Another trained model has other quantities in another order.
             given.quantities.reverse();
             given.quantities[0].name = "k9".to_owned();
         }

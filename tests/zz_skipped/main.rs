@@ -1,4 +1,4 @@
-//! The last test binary by name, so that its output stands at the end of `cargo test`: which tests were skipped, and why.
+//! Lists the skipped tests and the reasons. It is the last test binary by name, so that its output is at the end of `cargo test`.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
@@ -8,9 +8,9 @@ mod needs;
 use std::io::Write as _;
 
 #[test]
-fn in_ci_no_tool_is_missing_and_every_skipped_test_is_named_here() {
+fn skipped_tests_are_listed_and_in_ci_no_tool_is_missing() {
     let skipped = needs::skipped();
-    // Written past the harness, which shows what a test prints only where it fails.
+    // Written to stderr directly, because the test harness shows the output of a test only if it fails.
     let mut out = std::io::stderr().lock();
     writeln!(out, "\n{} tests were skipped, wholly or in part:", skipped.len()).unwrap();
     for line in &skipped {

@@ -1,11 +1,11 @@
-//! What some tests need besides Rust. Where it is missing the test is recorded as skipped; with `CI=true` a missing program
-//! fails the test.
+//! Programs, files and rights that some tests need. If one is missing, the test is recorded as skipped; with `CI=true` a missing
+//! program or file of `.ci/tools` fails the test.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
-/// The place of a program on the search path or in Debian's folders for administrators.
+/// Path of a program on the search path or in Debian's folders for administrators; `None` if it is missing.
 pub fn program(name: &str) -> Option<PathBuf> {
     let search_path = std::env::var_os("PATH").unwrap_or_default();
     let more = ["/usr/sbin", "/usr/local/sbin"].map(PathBuf::from);
@@ -16,7 +16,7 @@ pub fn program(name: &str) -> Option<PathBuf> {
     found
 }
 
-/// Whether a file is there that `.ci/tools` installs.
+/// Whether a file that `.ci/tools` installs exists.
 pub fn installed(file: &Path) -> bool {
     let there = file.is_file();
     if !there {
@@ -25,7 +25,7 @@ pub fn installed(file: &Path) -> bool {
     there
 }
 
-/// Records that data which are not part of the repository are missing, or a right that the machine does not give.
+/// Records the test as skipped, because it lacks data that are not part of the repository or a right on this machine.
 pub fn missing(what: &str) {
     record(what);
 }
@@ -39,7 +39,7 @@ pub fn in_ci() -> bool {
     std::env::var("CI").as_deref() == Ok("true")
 }
 
-/// The file of skipped tests. Its first line names the `cargo test` that they belong to.
+/// The file of skipped tests. Its first line identifies the run of `cargo test` to which they belong.
 fn file() -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("skipped")
 }
@@ -48,7 +48,7 @@ fn run() -> String {
     format!("cargo test, process {}", std::os::unix::process::parent_id())
 }
 
-/// What the tests of this `cargo test` have recorded so far: the name of the test and what is missing.
+/// The records of this run of `cargo test` so far: the name of the test and what is missing.
 pub fn skipped() -> Vec<String> {
     let text = std::fs::read_to_string(file()).unwrap_or_default();
     match text.split_once('\n') {
@@ -64,7 +64,7 @@ fn record(what: &str) {
     let line = format!("{}::{test}: {what}", env!("CARGO_CRATE_NAME"));
     let mut lines = skipped();
     if !lines.contains(&line) {
-        // Written past the harness, which shows what a test prints only where it fails.
+        // Written to stderr directly, because the test harness shows the output of a test only if it fails.
         let _ = writeln!(std::io::stderr(), "skipped: {line}");
         lines.push(line);
         std::fs::write(file(), format!("{}\n{}\n", run(), lines.join("\n"))).unwrap();

@@ -1,5 +1,5 @@
-//! A table of measurements: any bytes are measurements or problems with their line, never a panic. What was taken is written and
-//! read back as it was.
+//! A table of measurements: any bytes give measurements or problems with their line, never a panic. Accepted measurements are
+//! written and read back unchanged.
 #![no_main]
 
 use std::sync::OnceLock;

@@ -1,5 +1,5 @@
-//! A batch as JSON, as a post and as a message of a broker: any bytes are measurements or problems, never a panic. What was
-//! taken is taken again from what the service writes of it, with the same digest.
+//! A batch as JSON, as a post and as a message of a broker: any bytes give measurements or problems, never a panic. The JSON that
+//! the service writes of an accepted batch is accepted again, with the same digest.
 #![no_main]
 
 use std::sync::OnceLock;
@@ -45,6 +45,6 @@ fuzz_target!(|bytes: &[u8]| {
     let source = serde_json::to_string(&batch.source).unwrap();
     let written = format!("{{\"source\":{source},\"measurements\":{measurements}}}");
     let again = RawBatch::of_post(written.as_bytes(), None).ok().and_then(checked);
-    let again = again.unwrap_or_else(|| panic!("what was taken is not taken again: {written}"));
+    let again = again.unwrap_or_else(|| panic!("an accepted batch is not accepted again: {written}"));
     assert_eq!(again.content_digest(), batch.content_digest(), "{written}");
 });

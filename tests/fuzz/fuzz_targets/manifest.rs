@@ -1,5 +1,5 @@
-//! The manifest beside a weight file: any bytes are a baseline that passes its self-test or a refusal, never a panic, and never
-//! more memory than the weight file explains.
+//! The manifest beside a weight file: any bytes give a trained model that passes its self-test or a refusal, never a panic, and
+//! never more memory than the weight file requires.
 #![no_main]
 
 use std::sync::OnceLock;
@@ -12,7 +12,7 @@ use modalwatch::simulator::Simulator;
 fn simulator() -> &'static Simulator {
     static SIMULATOR: OnceLock<Simulator> = OnceLock::new();
     SIMULATOR.get_or_init(|| {
-        // As the program does: one thread for tiny products.
+        // As in `main.rs`: one thread for small matrix products.
         std::env::set_var("RAYON_NUM_THREADS", "1");
         find_structure("three-dof").unwrap()
     })

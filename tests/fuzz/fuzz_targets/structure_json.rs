@@ -1,5 +1,5 @@
-//! A structure as JSON: any text is a structure or problems with their place, never a panic and never an endless computation. A
-//! structure that is one has finite frequencies, and its canonical form is the same structure.
+//! A structure as JSON: any text gives a structure or problems with their place, never a panic and never an endless computation. An
+//! accepted structure has finite frequencies, and its canonical form is the same structure.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -15,6 +15,6 @@ fuzz_target!(|text: &str| {
     assert!(simulator.nominal_frequencies_hz().iter().all(|f| f.is_finite() && *f > 0.0));
     let (low, high) = simulator.frequency_limits_hz();
     assert!(low < high, "{low} to {high}");
-    let again = Simulator::new(again).expect("the canonical form is taken as well");
+    let again = Simulator::new(again).expect("the canonical form is accepted as well");
     assert_eq!(again.digest(), simulator.digest());
 });
