@@ -221,7 +221,7 @@ async fn queries(folder: &Path, large: usize) {
     BufReader::new(service.stdout.take().expect("it was piped")).read_line(&mut line).expect("it prints its address");
     let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
     println!("  the service is ready after {:.0} s, including its check of the file", started.elapsed().as_secs_f64());
-    let client = modalwatch::notify::client_builder().build().unwrap();
+    let client = modalwatch::notify::client_builder().build().expect("a client can be made");
     let get = async |path: &str| {
         let started = Instant::now();
         let response = client.get(format!("{url}{path}")).send().await.expect("the service answers");

@@ -85,7 +85,12 @@ impl Service {
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("it was piped")).read_line(&mut line).expect("it says its address");
         let url = line.trim().rsplit(' ').next().expect("the address is its last word").to_owned();
-        Self { process, url, client: modalwatch::notify::client_builder().build().unwrap(), folder }
+        Self {
+            process,
+            url,
+            client: modalwatch::notify::client_builder().build().expect("a client can be made"),
+            folder,
+        }
     }
 
     async fn post(&self, path: &str, body: Vec<u8>) -> Value {

@@ -18,7 +18,7 @@ fn a_table_with_a_mistake_is_refused_and_the_mistake_is_named() {
         (refused(|t| t.parameters[(4, 1)] = f64::NAN), "run 5, parameter 2: NaN is not a finite number"),
         (refused(|t| t.parameters.column_mut(1).fill(0.3)), "parameter 2 is 0.3 in every run"),
         (refused(|t| t.frequencies_hz[(6, 2)] = f64::INFINITY), "run 7, mode 3: the frequency inf Hz"),
-        (refused(|t| t.frequencies_hz[(6, 0)] = 0.0), "run 7, mode 1: the frequency 0 Hz is not positive"),
+        (refused(|t| t.frequencies_hz[(6, 0)] = 0.0), "run 7, mode 1: the frequency 0 Hz must be positive and finite"),
         (refused(|t| t.frequencies_hz.swap((9, 0), (9, 2))), "run 10: mode 2 has"),
         (refused(|t| t.frequencies_hz = DMatrix::from_element(59, 3, 1.0)), "of 60 runs, but frequencies of 59"),
         (refused(|t| t.parameters = DMatrix::zeros(60, 0)), "the table has 0 parameters and 3 frequencies"),

@@ -65,7 +65,7 @@ async fn each_kind_of_invalid_model_is_refused_with_its_reason_and_batches_wait(
         (
             "a file larger than any trained model",
             Box::new(|f| File::create(weights(f)).unwrap().set_len(20 << 30).unwrap()),
-            "larger than",
+            "more than the 268435456 that are accepted",
         ),
         (
             "weights of another architecture",
