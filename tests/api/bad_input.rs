@@ -108,7 +108,7 @@ async fn impossible_values_are_a_422_with_a_pointer() {
         ("measured_at", Value::Null, "/measurements/2/measured_at", "missing"),
         ("covariates", json!({ "temperature_c": 3 }), "/measurements/2/covariates/temperature_c", "declared: none"),
         ("settings", json!({ "k1": 99.0 }), "/measurements/2/settings/k1", "outside the prior"),
-        ("settings", json!({ "k9": 4.0 }), "/measurements/2/settings/k9", "no parameter"),
+        ("settings", json!({ "k9": 4.0 }), "/measurements/2/settings/k9", "not a parameter of this structure"),
     ];
     for (field, value, pointer, message) in cases {
         let mut rows = good();
