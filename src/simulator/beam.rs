@@ -95,6 +95,9 @@ fn bodies(definition: &StructureDefinition, nodes: &BTreeMap<&str, NodeDofs>, pr
             found => {
                 let name = shown(&mass.name);
                 let message = match found {
+                    None if at.is_empty() => {
+                        format!("mass {name} has no `at`: give the name of the node it is attached to")
+                    }
                     None => format!("mass {name} is attached to {}, which is not a node", shown(at)),
                     Some(_) => {
                         format!("mass {name} is attached to a support that does not move: attach it to a free node")
