@@ -32,7 +32,7 @@ impl Baseline {
     /// Posterior samples of each measurement, `[n·draws, d]` for n observations, in parameter units.
     ///
     /// The flow proposes two draws for each sample, and sampling–importance resampling corrects them by the exact
-    /// likelihood; see [`resample`](super::resample) for where this is done. Where a covariate is missing, the samples go
+    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where a covariate is missing, the samples go
     /// through its possible values in turn:
     ///
     /// ```text
