@@ -9,6 +9,7 @@ mod further;
 mod needs;
 mod settings;
 mod spectrum;
+mod tables;
 mod world;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -523,8 +524,6 @@ fn bad_data_get_clear_answers() {
     let collinear = chain_csv(120, "temperature_c,humidity_percent", together);
     noted(&collinear, &["temperature_c", "humidity_percent", "cannot tell which"]);
 
-    let set = |row: usize, _: &mut ChaCha8Rng| if row == 41 { "9000" } else { "4000" }.to_owned();
-    refused(&chain_csv(120, "set_k1", set), &[], &["line 43", "set_k1", "prior of k1", "2000 to 6400"]);
     refused(&weather(120).replace("f1_hz", "first_hz"), &[], &["f1_hz", "3 modes"]);
     refused(&operators, &["--holdout", "where:lab=B"], &["lab", "there are operator, time"]);
     refused(&operators, &["--holdout", "where:operator=D"], &["operator = D", "A, B, C"]);
