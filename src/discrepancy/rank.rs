@@ -21,6 +21,11 @@ const REFINED: usize = 5;
 /// Evidence that a covariate must add to a constant effect on the same target, nats.
 const COVARIATE_NATS: f64 = 3.0;
 
+/// Constant effects that are fitted if an arbitrary constant is significant: all in structures of up to about ten bodies. They are not
+/// chosen by the score test alone, because it is a linear estimate at size 0, and constant effects are often large: parameters
+/// have adapted to them, and the estimate of the true one can lie far below that of others.
+const CONSTANTS: usize = 80;
+
 /// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
@@ -104,6 +109,10 @@ pub fn rank(
     let ones = DVector::from_element(rows.len(), 1.0);
     let constant = whitened.free_score(&whitened.output_sums(study.outputs()), &ones);
     if constant.nats > CONSTANT_NATS {
+        let left = promised.iter().filter(|p| candidates[p.candidate].covariate.is_none());
+        let left = left.filter(|p| !tried.iter().any(|t| t.candidate == p.candidate)).take(CONSTANTS);
+        let constants: Vec<Trial> = left.collect::<Vec<_>>().par_iter().filter_map(fitted).collect();
+        tried.extend(constants);
         tried.extend(unscreened(study, rows, fit, candidates));
     }
     let evidence = |t: &Trial| t.fit.log_evidence - t.cost_nats + candidates[t.candidate].weight.ln();

@@ -28,6 +28,9 @@ use world::{Kind, Truth, World};
 /// Difference in log evidence, nats, below which two causes cannot be distinguished.
 const EQUIVALENT_NATS: f64 = 5.0;
 
+/// Greatest number of causes that an ambiguous answer names.
+const MOST_NAMED: usize = 8;
+
 /// Share of the gain of the true model on the rows held out that a diagnosis should reach.
 const GAIN: f64 = 0.8;
 
@@ -243,16 +246,16 @@ fn as_good(other: &Value, truth: &Truth) -> bool {
     names(other, truth) && other["log_evidence_difference"].as_f64().unwrap() > -EQUIVALENT_NATS
 }
 
-/// The cause that names the one hidden effect: the first, or one of the few of an ambiguous answer.
+/// The cause that names the one hidden effect: the first, or one of the first three of an ambiguous answer.
 fn named<'a>(answer: &'a Value, truth: &Truth) -> Option<&'a Value> {
     let causes = list(answer, "causes");
     match answer["verdict"].as_str()? {
         "cause" => causes.first().filter(|cause| names(cause, truth)),
         "ambiguous" => {
-            assert!(causes.len() <= 3, "{} causes are too many for an answer", causes.len());
+            assert!(causes.len() <= MOST_NAMED, "{} causes are too many for an answer", causes.len());
             let first = names(&causes[0], truth);
             let equivalent = first || list(answer, "alternatives").iter().any(|other| as_good(other, truth));
-            causes.iter().find(|cause| names(cause, truth)).filter(|_| equivalent)
+            causes.iter().take(3).find(|cause| names(cause, truth)).filter(|_| equivalent)
         }
         _ => None,
     }
