@@ -40,6 +40,9 @@ fn notes(answer: &Value) -> Vec<&str> {
     list(answer, "notes").iter().map(|note| note.as_str().unwrap()).collect()
 }
 
+/// A column of times as numbers, by row.
+type Time<'a> = &'a dyn Fn(usize) -> f64;
+
 /// Seconds after 1970 of a row of [`chain_csv`].
 fn seconds(row: usize) -> f64 {
     (EPOCH_2024_S + 40_000 * row as i64) as f64
@@ -197,7 +200,6 @@ fn numeric_times_are_read_as_what_they_look_like() {
     let expected = answer(&chain_toml(), &dated, &[]);
     assert_eq!(expected["causes"][0]["covariate"], "time", "{}", expected["summary"]);
     let days = |row: usize| (seconds(row) - seconds(0)) / 86_400.0;
-    type Time<'a> = &'a dyn Fn(usize) -> f64;
     let cases: [(&str, Time, Option<&str>, &str, bool); 8] = [
         ("days", &days, None, "read as days since an unknown start", true),
         ("days of a campaign", &|row| days(row) - 7.0, None, "read as days since an unknown start", true),
