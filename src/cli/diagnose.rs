@@ -13,6 +13,7 @@ use crate::baseline::library::find_structure;
 use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend as extend_structure;
+use crate::discrepancy::gain::GainMethod;
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -196,7 +197,11 @@ fn print(d: &Diagnosis) {
         println!("unexplained: residuals depend on {} (p = {:.1e})", r.function, r.p_value);
     }
     if let Some(g) = &d.gain {
-        println!("on {} rows held out:            before      after", g.holdout_rows);
+        let rows = match g.method {
+            GainMethod::HeldOut => format!("on {} rows held out:", g.holdout_rows),
+            GainMethod::CrossValidation => format!("by cross-validation, {} rows:", g.holdout_rows),
+        };
+        println!("{rows:<32} before      after");
         for (mode, (a, b)) in g.rms_error_percent.before.iter().zip(&g.rms_error_percent.after).enumerate() {
             println!("  error of mode {:<2} (%)        {a:>10.4} {b:>10.4}", mode + 1);
         }
@@ -206,10 +211,12 @@ fn print(d: &Diagnosis) {
             l.before, l.after, l.difference, l.standard_error
         );
         println!("  inside 90 % intervals      {:>10.3} {:>10.3}", g.coverage90.before, g.coverage90.after);
-        let f = &g.false_alarms_per_1000;
-        println!("  false alarms per 1000      {:>10.0} {:>10.0}", f.before, f.after);
-        let s = &g.smallest_detectable_loss_percent;
-        println!("  smallest detectable loss % {:>10.1} {:>10.1}", s.before, s.after);
+        if let Some(f) = &g.false_alarms_per_1000 {
+            println!("  false alarms per 1000      {:>10.0} {:>10.0}", f.before, f.after);
+        }
+        if let Some(s) = &g.smallest_detectable_loss_percent {
+            println!("  smallest detectable loss % {:>10.1} {:>10.1}", s.before, s.after);
+        }
     }
     for note in &d.notes {
         println!("note: {note}");
