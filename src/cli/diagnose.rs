@@ -7,11 +7,13 @@ use anyhow::Context as _;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::next::{join, Read};
 use super::output::write_whole;
 use super::training::{print_record, sizes, train_into};
 use crate::baseline::library::find_structure;
 use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::{Data, MOST_LEVELS};
+use crate::discrepancy::declared::{mistake, WEIGHED_KG};
 use crate::discrepancy::extend::extend as extend_structure;
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
@@ -43,6 +45,12 @@ pub struct StudyArgs {
     /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
+    /// Result of an earlier diagnosis of the same data, as JSON, to be decided with the rows of --further
+    #[arg(long, requires = "further")]
+    next: Option<PathBuf>,
+    /// CSV file of what was measured after the earlier diagnosis; several files are joined in the order given
+    #[arg(long, requires = "next")]
+    further: Vec<PathBuf>,
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -115,9 +123,18 @@ struct Study {
 fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     let simulator = find_structure(&args.structure)?;
     let how = TableArgs { time: args.time.as_deref(), settings: &args.settings, ignore: &args.ignore };
-    let tables = read_tables(&simulator, &args.data, &how)?;
-    let data = Data::new(&simulator, &tables.measurements);
-    let data = if tables.timed { data } else { data.by_order() };
+    let (data, mut notes, earlier) = if let Some(path) = &args.next {
+        let read = |simulator: &Simulator, paths: &[PathBuf]| {
+            let Tables { measurements, covariates, notes, timed } = read_tables(simulator, paths, &how)?;
+            Ok(Read { measurements, covariates, notes, timed })
+        };
+        let joined = join(&simulator, path, (&args.data, &args.further), &read)?;
+        (joined.data, joined.notes, Some(joined.earlier))
+    } else {
+        let tables = read_tables(&simulator, &args.data, &how)?;
+        let data = Data::new(&simulator, &tables.measurements);
+        (if tables.timed { data } else { data.by_order() }, tables.notes, None)
+    };
     let bar = ProgressBar::new_spinner();
     let style = ProgressStyle::with_template("{spinner} {elapsed} {msg}");
     bar.set_style(style.context("the template of the progress bar")?);
@@ -125,7 +142,10 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     let progress = |step: Step| bar.set_message(step.to_string());
     let mut outcome = run(&simulator, &data, &args.holdout, args.seed, &progress)?;
     bar.finish_and_clear();
-    outcome.diagnosis.notes.splice(0..0, tables.notes);
+    if let Some(earlier) = earlier {
+        notes.extend(outcome.diagnosis.changes_since(&earlier));
+    }
+    outcome.diagnosis.notes.splice(0..0, notes);
     Ok(Study { simulator, data, outcome })
 }
 
@@ -200,6 +220,9 @@ fn print(d: &Diagnosis) {
             a.instead_of, a.cause.sentence, a.log_evidence_difference, a.discriminating_measurement
         );
     }
+    for m in d.next_measurements.iter().take(5) {
+        println!("next: {}", m.sentence);
+    }
     for m in d.misfit.iter().take(8) {
         let what = m.mode.map_or_else(|| m.parameter.clone().unwrap_or_default(), |mode| format!("mode {mode}"));
         let covariate = m.covariate.as_ref().map_or_else(|| "constant".to_owned(), |c| format!("depends on {c}"));
@@ -250,6 +273,9 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         notes.extend(add_covariates(file, &mut covariates, &mut options)?);
     }
     let mut tables = Tables { measurements: Vec::new(), covariates, notes, timed: false };
+    if let Some(wrong) = tables.covariates.iter().find_map(|c| mistake(simulator, &c.name)) {
+        anyhow::bail!(wrong);
+    }
     read_rows(simulator, &files, &options, how.time, &mut tables)?;
     anyhow::ensure!(!tables.measurements.is_empty(), "the {} tables hold no measurements", files.len());
     Ok(tables)
@@ -314,6 +340,14 @@ fn read_rows(
         }
         earlier_rows += rows as i64;
         tables.timed |= raw.iter().any(|r| !untimed(r));
+        let weighed = |r: &RawMeasurement| r.covariates.keys().any(|name| name.starts_with(WEIGHED_KG));
+        if raw.iter().any(|r| weighed(r) && r.frequencies_hz.iter().all(Option::is_none)) {
+            anyhow::bail!(
+                "{} has a row with a weighed mass and without a frequency: state the mass in a row of frequencies that were measured \
+                 in the same conditions",
+                path.display()
+            );
+        }
         raw.retain(|r| r.frequencies_hz.iter().any(Option::is_some));
         empty += rows - raw.len();
         for row in &mut raw {

@@ -96,6 +96,7 @@ pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
             between = Some([node(*from), node(*to)]);
             ("added_spring", String::new())
         }
+        Target::AddedMass(dof) => ("added_mass", node(Node::Dof(*dof))),
         Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
     };
@@ -145,7 +146,7 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
         Target::FrequencyOffset(_) => plain("Hz"),
         Target::SettingOffset(k) => plain(&simulator.space().as_slice()[*k].unit),
         Target::AddedSpring(..) => plain("N/m"),
-        Target::Oscillator(_) => plain("kg"),
+        Target::Oscillator(_) | Target::AddedMass(_) => plain("kg"),
         Target::ModeOrder(_) => plain(""),
         _ => relative(),
     }

@@ -7,6 +7,7 @@ use super::fit::Fit;
 use super::gain::Gain;
 use super::grammar::Class;
 use super::misfit::{Misfit, Remainder};
+use super::next::experiment::NextMeasurement;
 use super::rank::Ranked;
 use crate::quantity::Digest;
 
@@ -39,7 +40,7 @@ pub struct Alternative {
     pub instead_of: usize,
     /// Its log evidence minus that of the chosen cause, prior included, nats.
     pub log_evidence_difference: f64,
-    /// A measurement that would distinguish the two.
+    /// The measurement, of those that are possible, that best distinguishes the two if both are equally probable.
     #[serde(rename = "told_apart_by")]
     pub discriminating_measurement: String,
 }
@@ -59,6 +60,9 @@ pub struct Diagnosis {
     pub causes: Vec<Cause>,
     /// Causes that were not chosen.
     pub alternatives: Vec<Alternative>,
+    /// Measurements that would decide between the candidates of a cause that is not sure, the best first.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub next_measurements: Vec<NextMeasurement>,
     /// Deviation that no cause explains.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub remainder: Option<Remainder>,
@@ -102,6 +106,21 @@ pub struct Outcome {
 }
 
 impl Diagnosis {
+    /// How the probabilities of the causes that an earlier diagnosis named have changed, one sentence for each.
+    pub fn changes_since(&self, earlier: &Self) -> Vec<String> {
+        let same = |a: &Cause, b: &Cause| (&a.target, &a.covariate) == (&b.target, &b.covariate);
+        let change = |before: &Cause| {
+            let others = self.alternatives.iter().map(|a| &a.cause);
+            let now = self.causes.iter().chain(others).find(|now| same(now, before));
+            let now = now.map_or_else(|| "below that of those listed".to_owned(), |c| format!("{:.3}", c.probability));
+            format!(
+                "with the further rows, the probability of \u{201c}{}\u{201d} is {now}; it was {:.3}",
+                before.sentence, before.probability
+            )
+        };
+        earlier.causes.iter().map(change).collect()
+    }
+
     /// The answer in words.
     pub(super) fn in_words(&self) -> String {
         let mut text = self.finding_in_words();
@@ -150,8 +169,10 @@ impl Diagnosis {
             DiagnosisVerdict::Ambiguous => {
                 let each = |c: &Cause| format!("{} (probability {:.2})", c.sentence, c.probability);
                 let each: Vec<String> = self.causes.iter().map(each).collect();
+                let next = self.next_measurements.first().map_or_else(String::new, |m| format!(" {}", m.sentence));
                 format!(
-                    "The simulation does not account for one cause, and these data cannot tell which of the following it is: {}.",
+                    "The simulation does not account for one cause, and these data cannot tell which of the following it is: \
+                     {}.{next}",
                     each.join("; or ")
                 )
             }

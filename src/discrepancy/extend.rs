@@ -63,13 +63,14 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
         return Err(Error::Unexplained);
     }
     let bare = simulator.without_effects();
-    let known = simulator.effects().len();
+    // The effects of the structure, and masses that were hung in some rows.
+    let given = outcome.after.effects.len() - outcome.causes.len();
     let (mut added, mut left_out) = (Vec::new(), Vec::new());
-    let mut effects: Vec<FittedEffect> = outcome.after.effects[..known].to_vec();
-    let mut psi: Vec<Option<Vec<f64>>> = outcome.after.psi[..known].iter().cloned().map(Some).collect();
+    let mut effects: Vec<FittedEffect> = outcome.after.effects[..given].to_vec();
+    let mut psi: Vec<Option<Vec<f64>>> = outcome.after.psi[..given].iter().cloned().map(Some).collect();
     for (place, ranked) in outcome.causes.iter().enumerate() {
         let sentence = &outcome.diagnosis.causes[place].sentence;
-        let effect = &outcome.after.effects[known + place];
+        let effect = &outcome.after.effects[given + place];
         if let Some(why) = why_left_out(ranked, effect, outcome.maybe_damage[place]) {
             left_out.push(format!("{sentence}: {why}"));
         } else if effect.law.kind == LawKind::Lagged {
@@ -82,7 +83,7 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
             effects.push(effect);
         } else {
             added.push(sentence.clone());
-            psi.push(Some(outcome.after.psi[known + place].clone()));
+            psi.push(Some(outcome.after.psi[given + place].clone()));
             effects.push(effect.clone());
         }
     }
@@ -93,7 +94,7 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
     let all: Vec<usize> = (0..data.rows()).collect();
     // The causes were chosen without the rows held out; their numbers may be fitted to all rows.
     let fit = study.fit(&all, &effects, Some(&Start { fit: &outcome.after, psi })).ok_or(Error::NoFit)?;
-    let definition = extended_definition(simulator, &bare, data, &fit, &added);
+    let definition = extended_definition(simulator, &bare, data, &fit, (&added, given));
     // Checks the whole structure: under an effect, the frequencies may not exist for some parameters.
     Simulator::new(definition.clone())?;
     Ok(Extended { definition, added, left_out })
@@ -129,20 +130,24 @@ fn without_lag(
     ranked.candidate.effect(simulator, data, rows, law, effect.law.with_level, 0.0)
 }
 
-/// The definition with the effects of a fit: first those of the structure, then those that were `added`.
+/// The definition with the effects of a fit: first those of the structure, then, from effect `given` on, those that were `added`.
+/// Masses that were hung, between the two, are not part of the structure.
 fn extended_definition(
     simulator: &Simulator,
     bare: &Simulator,
     data: &Data,
     fit: &Fit,
-    added: &[String],
+    (added, given): (&[String], usize),
 ) -> StructureDefinition {
     let known = simulator.effects().len();
     let mut definition = simulator.definition().clone();
     definition.parent = Some(simulator.digest().to_string());
     let old = std::mem::take(&mut definition.effects);
     for (place, effect) in fit.effects.iter().enumerate() {
-        let (name, description) = match place.checked_sub(known) {
+        if (known..given).contains(&place) {
+            continue;
+        }
+        let (name, description) = match place.checked_sub(given) {
             None => (old[place].name.clone(), old[place].description.clone()),
             Some(new) => (free_name(&definition, &old, place), Some(added[new].clone())),
         };

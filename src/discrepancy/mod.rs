@@ -9,7 +9,8 @@
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
 //! - [`misfit`]: deviations before and after; [`gain`]: errors before and after on rows held out;
-//! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its text; [`report`]: the HTML page;
+//! - [`diagnosis`]: the result; [`describe`], `naming` and `notes`: its text; [`report`]: the HTML page;
+//! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
 //! - [`extend`]: a new version of the structure with the causes as effects.
 //!
 //! # Words
@@ -29,9 +30,9 @@
 //! mass or frequency. A fit that needs them there returns `None`.
 
 pub mod data;
+pub mod declared;
 pub mod describe;
 pub mod diagnosis;
-mod discriminate;
 pub mod effect;
 pub mod extend;
 pub mod fit;
@@ -41,6 +42,7 @@ pub mod holdout;
 pub mod misfit;
 pub mod model;
 mod naming;
+pub mod next;
 mod notes;
 mod problem;
 pub mod progress;
@@ -51,9 +53,11 @@ mod row;
 pub mod screen;
 pub mod select;
 pub mod study;
+mod weighing;
 
 pub use diagnosis::{Alternative, Diagnosis, DiagnosisVerdict, Outcome};
 pub use holdout::Holdout;
+pub use next::experiment::NextMeasurement;
 pub use progress::{Progress, Step};
 
 use crate::simulator::Simulator;
@@ -189,7 +193,8 @@ fn run(
     progress: &Progress<'_>,
 ) -> Result<Outcome, Error> {
     let bare = simulator.without_effects();
-    let known: Vec<FittedEffect> = simulator.effects().iter().map(FittedEffect::known).collect();
+    let mut known: Vec<FittedEffect> = simulator.effects().iter().map(FittedEffect::known).collect();
+    known.extend(data.hung.iter().map(|(dof, column)| FittedEffect::hung(*dof, &column.name)));
     let study = Study::new(&bare, data);
     progress(Step::Showing);
     let candidates = candidates(simulator, data, &training);
@@ -202,7 +207,8 @@ fn run(
     let limit = if found { REMAINDER_WITH_CAUSES } else { REMAINDER };
     let left = left.filter(|r| r.p_value < limit);
 
-    let Named { causes, alternatives, ambiguous, maybe_damage } = name(simulator, data, &selection, known.len());
+    let Named { causes, alternatives, ambiguous, maybe_damage, next_measurements } =
+        name(simulator, &study, &training, &selection, known.len());
     progress(Step::Measuring);
     let gain = if found && holdout.len() >= 2 {
         gain::gain(&study, &training, &holdout, &selection.base, &selection.fit, seed)
@@ -220,6 +226,7 @@ fn run(
         misfit,
         causes,
         alternatives,
+        next_measurements,
         remainder: left,
         gain,
         notes,

@@ -8,6 +8,7 @@ use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
 use super::study::Study;
+use super::weighing::log_density;
 use crate::physics::effect::Target;
 use crate::simulator::law::LawKind;
 
@@ -71,10 +72,11 @@ impl Trial {
 /// best candidate. `rows`: indices of the rows that are used.
 ///
 /// ```text
-///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) − cost ) − ln(number of laws) + ln prior,    r = (1 − ρ)/(1 + ρ)
+///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) + w_law − w_fit − cost ) − ln(number of laws) + ln prior
+///  r = (1 − ρ)/(1 + ρ)
 /// ```
 ///
-/// E: evidence by Laplace's method; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
+/// E: evidence by Laplace's method; w: log density of the bodies that were weighed, 0 without any; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
 /// with the largest estimated gain in a score test are fitted. The first `known` effects of the fit belong to the structure:
 /// their numbers may be wrong, so that a further effect of the same kind is allowed for them. `None` if the frequencies cannot
 /// be computed.
@@ -106,7 +108,9 @@ pub fn rank(
     if constant.nats > CONSTANT_NATS {
         tried.extend(unscreened(study, rows, fit, candidates));
     }
-    let evidence = |t: &Trial| t.fit.log_evidence - t.cost_nats + candidates[t.candidate].weight.ln();
+    let evidence = |t: &Trial| {
+        t.fit.log_evidence - t.cost_nats + candidates[t.candidate].weight.ln() + log_density(study.data, &t.fit, 1.0)
+    };
     let mut order: Vec<(usize, f64)> = tried.iter().map(|t| (t.candidate, evidence(t))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     let refined: Vec<usize> = order.iter().take(REFINED).map(|o| o.0).collect();
@@ -157,7 +161,11 @@ fn by_probability(
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
         own.sort_by(|a, b| (b.fit.log_evidence - b.cost_nats).total_cmp(&(a.fit.log_evidence - a.cost_nats)));
         let Some(first) = own.first() else { continue };
-        let gain = |t: &&Trial| independent_share * (t.fit.log_evidence - fit.log_evidence) - t.cost_nats;
+        let weighed = log_density(study.data, fit, independent_share);
+        let gain = |t: &&Trial| {
+            let weighed = log_density(study.data, &t.fit, independent_share) - weighed;
+            independent_share * (t.fit.log_evidence - fit.log_evidence) - t.cost_nats + weighed
+        };
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();
         let laws = own.iter().map(|t| (t.law, gain(t))).collect();

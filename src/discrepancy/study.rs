@@ -35,10 +35,12 @@ impl<'a> Study<'a> {
         &self.free
     }
 
-    /// False if the target is a setting that was not set in this row; true for every other target.
+    /// Whether an effect on this target acts in a row: one on a setting does not where it was not set, and one of the instrument
+    /// does not where a second instrument was used.
     pub fn is_set(&self, row: usize, target: &Target) -> bool {
         match target {
             Target::SettingOffset(k) | Target::SettingScale(k) => self.data.settings[row][*k].is_some(),
+            Target::FrequencyScale(_) | Target::FrequencyOffset(_) => !self.data.second_instrument[row],
             _ => true,
         }
     }

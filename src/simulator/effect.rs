@@ -452,6 +452,6 @@ pub fn target_definition(
         Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Dof(*host)))),
         Target::ModeOrder(order) => Some(TargetDefinition::ModeOrder(order.iter().map(|m| m + 1).collect())),
         Target::ParameterScale(column) => Some(TargetDefinition::Parameter(parameter(*column))),
-        Target::SettingOffset(_) | Target::SettingScale(_) => None,
+        Target::SettingOffset(_) | Target::SettingScale(_) | Target::AddedMass(_) => None,
     }
 }
