@@ -265,8 +265,12 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         files.push((path, renamed(bytes, how.settings)?));
     }
-    let mut options =
-        CsvOptions { times: Times::RowNumber, ignore: how.ignore.to_vec(), time_column: how.time.map(str::to_owned) };
+    let mut options = CsvOptions {
+        times: Times::RowNumber,
+        ignore: how.ignore.to_vec(),
+        time_column: how.time.map(str::to_owned),
+        points: simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone()),
+    };
     let mut covariates = simulator.covariates().to_vec();
     let mut notes = Vec::new();
     for file in &files {

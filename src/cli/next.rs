@@ -30,7 +30,7 @@ pub(super) struct Joined {
 }
 
 /// Reads an earlier result, checks that `data` and the structure are those that it was made from, and joins the rows of
-/// `further` to them. The structure may have more modes than before; the earlier rows then lack the further ones.
+/// `further` to them. The structure may have more modes than before, or mode shapes; the earlier rows then lack them.
 ///
 /// # Errors
 /// A file that is not the JSON of a diagnosis; a structure that differs in more than its modes; data with another digest; tables
@@ -60,21 +60,23 @@ pub(super) fn join(
     joined(simulator, result, old, new)
 }
 
-/// The simulator of the earlier diagnosis: the present one, or the same with fewer modes.
+/// The simulator of the earlier diagnosis: the present one, or the same with fewer modes or without mode shapes.
 fn simulator_then(simulator: &Simulator, earlier: &Diagnosis) -> anyhow::Result<Simulator> {
     if *simulator.digest() == earlier.structure_digest {
         return Ok(simulator.clone());
     }
-    for modes in (1..simulator.modes()).rev() {
-        let mut definition = simulator.definition().clone();
-        definition.modes = modes;
-        if definition.digest() == earlier.structure_digest {
-            return Simulator::new(definition).context("the structure of the earlier diagnosis");
+    for modes in (1..=simulator.modes()).rev() {
+        for shapes in [simulator.definition().mode_shapes.clone(), None] {
+            let mut definition = simulator.definition().clone();
+            (definition.modes, definition.mode_shapes) = (modes, shapes);
+            if definition.digest() == earlier.structure_digest {
+                return Simulator::new(definition).context("the structure of the earlier diagnosis");
+            }
         }
     }
     bail!(
-        "the structure {} is not that of the earlier diagnosis ({}): its digest is {}, and the result states {}; only `modes` may have \
-         become larger since",
+        "the structure {} is not that of the earlier diagnosis ({}): its digest is {}, and the result states {}; since then only `modes` \
+         may have become larger, and `mode_shapes` may have been added",
         simulator.id(),
         earlier.structure,
         simulator.digest(),

@@ -41,6 +41,7 @@ mod instrumented;
 pub mod law;
 mod layout;
 mod model;
+mod moved;
 mod parse;
 pub mod population;
 mod shapes;
@@ -49,6 +50,6 @@ pub mod table;
 mod training;
 
 pub use model::{Binding, SimulationModel};
-pub use shapes::Linearised;
+pub use shapes::{Linearised, ShapeResponse};
 pub use simulate::{DerivedStiffness, Error, Response, Simulator};
 pub use training::TrainingSet;

@@ -12,6 +12,7 @@ use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinit
 use super::effect::{self, SimulationEffect};
 use super::instrumented::Instrumented;
 use super::model::{chained, changes, structure_at, Binding, SimulationModel};
+use super::moved::MovedParameters;
 use super::table::Table;
 use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
@@ -357,54 +358,30 @@ impl Simulator {
         targets: &[Target],
         sizes: &[f64],
     ) -> Result<Response, physics::Error> {
-        let own: usize = self.sizes.len();
-        let targets: Vec<Target> = self.effects().iter().map(|e| &e.target).chain(targets).cloned().collect();
-        let sizes: Vec<f64> = self.sizes.iter().chain(sizes).copied().collect();
-        let (targets, sizes) = (targets.as_slice(), sizes.as_slice());
-        let mut theta = theta.to_vec();
-        let mut set_scale = vec![1.0; theta.len()];
-        let mut first = 0;
-        for target in targets {
-            match target {
-                Target::SettingOffset(column) => theta[*column] += sizes[first],
-                Target::SettingScale(column) | Target::ParameterScale(column) => {
-                    theta[*column] *= 1.0 + sizes[first];
-                    set_scale[*column] *= 1.0 + sizes[first];
-                }
-                _ => {}
-            }
-            first += target.sizes();
-        }
-        let (frequencies_hz, mut by_parameter, mut by_size) = match self.model() {
+        let moved = self.moved(theta, targets, sizes);
+        let theta = &moved.theta;
+        let (frequencies_hz, by_parameter, by_size) = match self.model() {
             SimulationModel::Matrices { structure, bindings } => {
-                let response = respond(&structure_at(structure, bindings, &theta)?, modes, targets, sizes)?;
-                let by_parameter = chained(&response.by_spring, bindings, &theta);
+                let changed = structure_at(structure, bindings, theta)?;
+                let response = respond(&changed, modes, &moved.targets, &moved.sizes)?;
+                let by_parameter = chained(&response.by_spring, bindings, theta);
                 (response.frequencies_hz, by_parameter, response.by_size)
             }
             SimulationModel::Table(table) => {
-                let (frequencies, jacobian) = table.frequencies_and_jacobian(&theta);
-                let measured = measured(&frequencies, &jacobian, modes, targets, sizes)?;
+                let (frequencies, jacobian) = table.frequencies_and_jacobian(theta);
+                let measured = measured(&frequencies, &jacobian, modes, &moved.targets, &moved.sizes)?;
                 (measured.frequencies_hz, measured.by_parameter, measured.by_size)
             }
         };
-        first = 0;
-        for target in targets {
-            for mode in 0..modes {
-                match target {
-                    Target::SettingOffset(column) => by_size[(mode, first)] = by_parameter[(mode, *column)],
-                    Target::SettingScale(column) | Target::ParameterScale(column) => {
-                        by_size[(mode, first)] = by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
-                    }
-                    _ => {}
-                }
-            }
-            first += target.sizes();
-        }
-        for (column, scale) in set_scale.iter().enumerate() {
-            by_parameter.column_mut(column).scale_mut(*scale);
-        }
-        let by_size = by_size.columns(own, sizes.len() - own).into_owned();
+        let (by_parameter, by_size) = moved.chain(by_parameter, by_size);
         Ok(Response { frequencies_hz, by_parameter, by_size })
+    }
+
+    /// The parameters `theta` (`[d]`) under the effects of the structure file and the further effects `targets` of the sizes
+    /// `sizes`.
+    pub(super) fn moved(&self, theta: &[f64], targets: &[Target], sizes: &[f64]) -> MovedParameters {
+        let own: Vec<Target> = self.effects().iter().map(|e| e.target.clone()).collect();
+        MovedParameters::new(theta, (own.as_slice(), &*self.sizes), (targets, sizes))
     }
 
     /// Natural frequencies at the nominal stiffnesses, or in the middle of the prior of a table, Hz, `[m]`.

@@ -8,6 +8,7 @@ mod further;
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
 mod next;
+mod places;
 mod spectrum;
 mod world;
 
@@ -79,20 +80,28 @@ impl Order {
     }
 }
 
-/// Draws worlds, runs the program on each and judges the answers, in parallel on all cores; the results are in the order given.
-fn judged(orders: &[Order]) -> Vec<Judged> {
+/// Results of a computation for each item, computed in parallel on all cores, in the order of the items.
+fn in_parallel<T: Sync, R: Send>(items: &[T], compute: impl Fn(&T) -> R + Sync) -> Vec<R> {
     let next = AtomicUsize::new(0);
     let done = Mutex::new(BTreeMap::new());
     let work = || loop {
         let index = next.fetch_add(1, Ordering::Relaxed);
-        let Some(order) = orders.get(index) else { break };
-        let (kind, world) = order.draw();
-        let answer = answer(&world.structure_toml, &world.csv, &[]);
-        done.lock().unwrap().insert(index, Judged::new(kind, world, answer));
+        let Some(item) = items.get(index) else { break };
+        let result = compute(item);
+        done.lock().unwrap().insert(index, result);
     };
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     std::thread::scope(|scope| (0..threads).for_each(|_| drop(scope.spawn(work))));
     done.into_inner().unwrap().into_values().collect()
+}
+
+/// Draws worlds, runs the program on each and judges the answers; the results are in the order given.
+fn judged(orders: &[Order]) -> Vec<Judged> {
+    in_parallel(orders, |order| {
+        let (kind, world) = order.draw();
+        let answer = answer(&world.structure_toml, &world.csv, &[]);
+        Judged::new(kind, world, answer)
+    })
 }
 
 // ---- Judging ----

@@ -43,16 +43,19 @@ fn resolved(answer: &Value, truth: &Truth) -> bool {
     answer["verdict"] == "cause" && is_truth(&answer["causes"][0], truth) && probability(answer, truth) > 0.9
 }
 
-/// What a recommendation asks for; `None` for mode shapes, which a table of frequencies does not hold.
-fn done(recommended: &Value) -> Option<Done> {
+/// What a recommendation asks for.
+fn done(recommended: &Value) -> Done {
     let place = || recommended["place"].as_str().unwrap().to_owned();
     match recommended["kind"].as_str().unwrap() {
-        "hung_mass" => Some(Done::Hung(place(), recommended["kg"].as_f64().unwrap())),
-        "second_instrument" => Some(Done::SecondInstrument),
-        "weighing" => Some(Done::Weighed(place())),
-        "further_mode" => Some(Done::FurtherMode),
-        "mode_shapes" => None,
-        _ => Some(Done::MoreRows),
+        "hung_mass" => Done::Hung(place(), recommended["kg"].as_f64().unwrap()),
+        "second_instrument" => Done::SecondInstrument,
+        "weighing" => Done::Weighed(place()),
+        "further_mode" => Done::FurtherMode,
+        "mode_shapes" => {
+            let points = list(recommended, "points").iter().map(|point| point.as_str().unwrap().to_owned());
+            Done::Shapes(points.collect())
+        }
+        _ => Done::MoreRows,
     }
 }
 
@@ -103,7 +106,7 @@ impl Folder {
 
 /// The answer after a recommendation was followed; `None` if it cannot be followed.
 fn followed(world: &World, earlier: &Value, recommended: &Value) -> Option<Value> {
-    let done = done(recommended)?;
+    let done = done(recommended);
     let enough = recommended["repeats_to_95"].as_u64().map_or(MOST_REPEATS, |n| n as usize);
     let repeats =
         if matches!(done, Done::Weighed(_)) { 1 } else { enough.max(recommended["repeats"].as_u64()? as usize) };
@@ -135,23 +138,22 @@ fn follow(seed: u64) -> Option<Followed> {
         return None;
     }
     let recommended = list(&earlier, "next_measurements");
-    let can_follow = recommended.iter().filter(|r| done(r).is_some()).collect::<Vec<_>>();
-    let drawn = ChaCha8Rng::seed_from_u64(seed).random_range(0..can_follow.len().max(1));
-    let first = can_follow.first().and_then(|r| followed(&world, &earlier, r));
-    let random = can_follow.get(drawn).and_then(|r| followed(&world, &earlier, r));
+    let drawn = ChaCha8Rng::seed_from_u64(seed).random_range(0..recommended.len().max(1));
+    let first = recommended.first().and_then(|r| followed(&world, &earlier, r));
+    let random = recommended.get(drawn).and_then(|r| followed(&world, &earlier, r));
     let is_resolved = |answer: &Option<Value>| answer.as_ref().is_some_and(|a| resolved(a, truth));
-    let sentence = |r: Option<&&Value>| r.map_or("nothing", |r| r["sentence"].as_str().unwrap()).to_owned();
+    let sentence = |r: Option<&Value>| r.map_or("nothing", |r| r["sentence"].as_str().unwrap()).to_owned();
     let before = probability(&earlier, truth);
     let after = first.as_ref().map_or(0.0, |a| probability(a, truth));
     let summary = |a: &Option<Value>| a.as_ref().map_or(String::new(), |a| a["summary"].as_str().unwrap().to_owned());
     let text = format!(
         "seed {seed}: {}\n    {before:.3} -> {after:.3}; first: {}\n    -> {}\n    drawn: {}",
         world.description,
-        sentence(can_follow.first()),
+        sentence(recommended.first()),
         summary(&first),
-        sentence(can_follow.get(drawn)),
+        sentence(recommended.get(drawn)),
     );
-    let expected = can_follow.first().map_or(0.0, |r| r["probability_after"].as_f64().unwrap());
+    let expected = recommended.first().map_or(0.0, |r| r["probability_after"].as_f64().unwrap());
     Some(Followed { text, before, expected, after, first: is_resolved(&first), random: is_resolved(&random) })
 }
 

@@ -30,7 +30,7 @@ fn space() -> ParameterSpace {
 }
 
 fn options() -> CsvOptions {
-    CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: None }
+    CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: None, points: Vec::new() }
 }
 
 prop_compose! {

@@ -53,7 +53,9 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
     if let Some(structure) = simulator.structure() {
         all.extend(hung_masses(structure, &plain));
         all.extend(weighings(structure, ranked, &plain));
-        all.extend(mode_shapes(structure, &plain));
+        if data.shapes.is_none() {
+            all.extend(mode_shapes(simulator, structure, &plain));
+        }
     }
     let with = |kind: Kind, place: Option<String>, conditions: Vec<Condition>| Experiment {
         kind,
@@ -114,11 +116,14 @@ fn weighings(structure: &Structure, ranked: &[&Ranked], plain: &Experiment) -> V
     bodies.iter().step_by(bodies.len().div_ceil(MOST_PLACES).max(1)).map(weighing).collect()
 }
 
-/// The shapes of the measured modes at all attachment points, in the first conditions only.
-fn mode_shapes(structure: &Structure, plain: &Experiment) -> Option<Experiment> {
+/// The shapes of the measured modes at the instrumented points, or at all attachment points if there are none; in the first
+/// conditions only.
+fn mode_shapes(simulator: &Simulator, structure: &Structure, plain: &Experiment) -> Option<Experiment> {
     let points = structure.attachment_points();
-    let every = points.len().div_ceil(MOST_POINTS).max(1);
-    let points: Vec<usize> = points.iter().step_by(every).map(|p| p.dof).collect();
+    let points: Vec<usize> = match simulator.instrumented_points() {
+        Some(instrumented) => points.iter().filter(|p| instrumented.names.contains(&p.name)).map(|p| p.dof).collect(),
+        None => points.iter().step_by(points.len().div_ceil(MOST_POINTS).max(1)).map(|p| p.dof).collect(),
+    };
     let conditions = plain.conditions[..1].to_vec();
     (points.len() > 1).then(|| Experiment { kind: Kind::ModeShapes, points, conditions, ..plain.clone() })
 }

@@ -214,7 +214,7 @@ impl<'a> Predictor<'a> {
 
     /// Relative noise of a mode that was not measured: as stated, with the mean noise factor of the others.
     fn noise_of_further_mode(&self, mode: usize, f: f64) -> f64 {
-        let logs: Vec<f64> = self.fit.noise_factor.iter().map(|factor| factor.ln()).collect();
+        let logs: Vec<f64> = self.fit.noise_factor[..self.noise.len()].iter().map(|factor| factor.ln()).collect();
         stats::mean(&logs).exp() * (self.study.simulator.std_hz(mode, f) / f).max(1e-5)
     }
 

@@ -36,7 +36,12 @@ pub enum Done {
     Weighed(String),
     /// One more mode is measured.
     FurtherMode,
+    /// Mode shapes are measured at these masses.
+    Shapes(Vec<String>),
 }
+
+/// Noise of a component of a measured shape as a share of the root mean square of the shape.
+const SHAPE_NOISE: f64 = 0.03;
 
 /// Values of columns and of the setting in which to measure.
 pub type Condition = BTreeMap<String, String>;
@@ -64,11 +69,22 @@ impl Hidden {
             Done::Hung(mass, _) => format!("hung_kg_{mass}"),
             Done::Weighed(mass) => format!("weighed_kg_{mass}"),
             Done::SecondInstrument => "second_instrument".to_owned(),
-            Done::MoreRows | Done::FurtherMode => return Some((structure.toml(), csv(&structure, &rows))),
+            Done::Shapes(points) => {
+                let mode = |mode: usize| points.iter().map(move |point| format!("phi{mode}_{point}"));
+                (1..=structure.modes).flat_map(mode).collect::<Vec<_>>().join(",")
+            }
+            Done::MoreRows | Done::FurtherMode => return Some((structure.toml(), csv(&structure, &rows, None))),
         };
-        let table = csv(&structure, &rows);
+        let table = csv(&structure, &rows, None);
         let lines = table.lines().zip(std::iter::once(name).chain(cells));
-        Some((structure.toml(), lines.map(|(line, cell)| format!("{line},{cell}\n")).collect()))
+        let toml = match done {
+            Done::Shapes(points) => {
+                let declared = format!("mode_shapes = {{ points = {points:?}, noise = {SHAPE_NOISE:?} }}\n");
+                structure.toml().replacen("measurement_noise", &format!("{declared}measurement_noise"), 1)
+            }
+            _ => structure.toml(),
+        };
+        Some((toml, lines.map(|(line, cell)| format!("{line},{cell}\n")).collect()))
     }
 
     /// A row in a condition, `place` hours after the last one, and the value of each effect in it.
@@ -145,6 +161,13 @@ fn measured(
             };
             let share = 1.0 + hidden.effects.iter().zip(&gains).map(gain).sum::<f64>();
             number(structure.masses_kg[body] * share * (1.0 + balance + BALANCE.1 * normal(rng)))
+        }
+        Done::Shapes(names) => {
+            let points = names.iter().map(|name| mass(name)).collect::<Option<Vec<_>>>()?;
+            let std = SHAPE_NOISE / (points.len() as f64).sqrt();
+            let shapes = structure.shapes(row.set, &free, &all, &points)?;
+            let noisy = shapes.into_iter().flatten().map(|x| number(x + std * normal(rng)));
+            noisy.collect::<Vec<_>>().join(",")
         }
         _ => "1".to_owned(),
     };

@@ -28,7 +28,7 @@ fn covariates() -> [Covariate; 2] {
 
 fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
     let covariates = covariates();
-    let options = CsvOptions { times, ignore: vec!["lab".to_owned()], time_column: None };
+    let options = CsvOptions { times, ignore: vec!["lab".to_owned()], time_column: None, points: Vec::new() };
     let raw = match read(bytes, 3, &covariates, &options) {
         Ok(raw) => raw,
         Err(problems) => {
@@ -49,7 +49,8 @@ fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
 }
 
 fuzz_target!(|bytes: &[u8]| {
-    let options = CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: Some("Zeit".to_owned()) };
+    let points = vec!["m1".to_owned(), "m2".to_owned()];
+    let options = CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: Some("Zeit".to_owned()), points };
     let _ = offered(bytes, &covariates(), &options, 5);
     let _ = read(bytes, 3, &covariates(), &options);
     let _ = checked(bytes, Times::RowNumber);
