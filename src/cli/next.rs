@@ -3,11 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{bail, Context as _};
+use serde::Deserialize;
 
 use crate::discrepancy::data::Data;
-use crate::discrepancy::Diagnosis;
+use crate::discrepancy::describe::Cause;
 use crate::measurement::{Covariate, ModalMeasurement};
-use crate::quantity::Timestamp;
+use crate::quantity::{Digest, Timestamp};
 use crate::simulator::Simulator;
 
 /// Tables that have been read.
@@ -22,9 +23,18 @@ pub(super) struct Read {
 /// Reads tables for a structure.
 type ReadTables<'a> = dyn Fn(&Simulator, &[PathBuf]) -> anyhow::Result<Read> + 'a;
 
-/// The earlier result, the joined data, and notes on both tables.
+/// What is needed of an earlier result.
+#[derive(Deserialize)]
+struct EarlierResult {
+    structure: String,
+    causes: Vec<Cause>,
+    structure_digest: Digest,
+    data_digest: Digest,
+}
+
+/// The causes that the earlier result names, the joined data, and notes on both tables.
 pub(super) struct Joined {
-    pub(super) earlier: Diagnosis,
+    pub(super) earlier: Vec<Cause>,
     pub(super) data: Data,
     pub(super) notes: Vec<String>,
 }
@@ -42,7 +52,7 @@ pub(super) fn join(
     read: &ReadTables<'_>,
 ) -> anyhow::Result<Joined> {
     let text = std::fs::read_to_string(earlier).with_context(|| format!("cannot read {}", earlier.display()))?;
-    let result: Diagnosis = serde_json::from_str(&text).with_context(|| {
+    let result: EarlierResult = serde_json::from_str(&text).with_context(|| {
         format!("{} is not the result of a diagnosis: write it with `modalwatch diagnose --json`", earlier.display())
     })?;
     let then = simulator_then(simulator, &result)?;
@@ -61,7 +71,7 @@ pub(super) fn join(
 }
 
 /// The simulator of the earlier diagnosis: the present one, or the same with fewer modes or without mode shapes.
-fn simulator_then(simulator: &Simulator, earlier: &Diagnosis) -> anyhow::Result<Simulator> {
+fn simulator_then(simulator: &Simulator, earlier: &EarlierResult) -> anyhow::Result<Simulator> {
     if *simulator.digest() == earlier.structure_digest {
         return Ok(simulator.clone());
     }
@@ -85,7 +95,7 @@ fn simulator_then(simulator: &Simulator, earlier: &Diagnosis) -> anyhow::Result<
 }
 
 /// Joins the rows of both tables.
-fn joined(simulator: &Simulator, earlier: Diagnosis, old: Read, new: Read) -> anyhow::Result<Joined> {
+fn joined(simulator: &Simulator, earlier: EarlierResult, old: Read, new: Read) -> anyhow::Result<Joined> {
     for covariate in &new.covariates {
         let before = old.covariates.iter().find(|c| c.name == covariate.name);
         if let Some(before) = before.filter(|before| before.kind != covariate.kind) {
@@ -132,5 +142,5 @@ fn joined(simulator: &Simulator, earlier: Diagnosis, old: Read, new: Read) -> an
         before.len(),
         after.len()
     ));
-    Ok(Joined { earlier, data, notes })
+    Ok(Joined { earlier: earlier.causes, data, notes })
 }

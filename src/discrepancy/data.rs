@@ -113,22 +113,20 @@ impl Data {
             }
         }
         let (mut columns, mut hung, mut weighings) = (Vec::new(), Vec::new(), Vec::new());
+        let kg_in = |m: &&ModalMeasurement, name: &str| match m.covariates.get(name) {
+            Some(CovariateValue::Number(kg)) => *kg,
+            _ => 0.0,
+        };
         for (name, category) in names {
-            let values = |c: Column| if let Values::Numbers(values) = c.values { values } else { Vec::new() };
+            let kg = || sorted.iter().map(|m| kg_in(m, name));
             match declared(simulator, name) {
                 None => columns.push(column(name, category, &sorted)),
                 Some(Declared::SecondInstrument) => {}
                 Some(Declared::Hung(dof)) => {
-                    let kg =
-                        values(column(name, false, &sorted))
-                            .into_iter()
-                            .map(|kg| if kg.is_finite() { kg } else { 0.0 });
-                    hung.push((dof, Column { name: name.to_owned(), values: Values::Numbers(kg.collect()) }));
+                    hung.push((dof, Column { name: name.to_owned(), values: Values::Numbers(kg().collect()) }));
                 }
                 Some(Declared::Weighed(mass)) => {
-                    let kg = values(column(name, false, &sorted));
-                    let weighing = |(row, kg): (usize, f64)| Weighing::new(simulator, row, mass, kg);
-                    weighings.extend(kg.into_iter().enumerate().filter_map(weighing));
+                    weighings.extend(kg().enumerate().filter_map(|(row, kg)| Weighing::new(simulator, row, mass, kg)));
                 }
             }
         }

@@ -107,7 +107,7 @@ pub struct Outcome {
 
 impl Diagnosis {
     /// How the probabilities of the causes that an earlier diagnosis named have changed, one sentence for each.
-    pub fn changes_since(&self, earlier: &Self) -> Vec<String> {
+    pub fn changes_since(&self, earlier: &[Cause]) -> Vec<String> {
         let same = |a: &Cause, b: &Cause| (&a.target, &a.covariate) == (&b.target, &b.covariate);
         let change = |before: &Cause| {
             let others = self.alternatives.iter().map(|a| &a.cause);
@@ -118,7 +118,7 @@ impl Diagnosis {
                 before.sentence, before.probability
             )
         };
-        earlier.causes.iter().map(change).collect()
+        earlier.iter().map(change).collect()
     }
 
     /// The answer in words.

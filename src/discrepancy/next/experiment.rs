@@ -18,9 +18,9 @@ pub enum Kind {
     FurtherMode,
     /// The frequencies with a known mass fixed to a point.
     HungMass,
-    /// The frequencies with a second instrument.
+    /// The frequencies with a second instrument, and nothing else.
     SecondInstrument,
-    /// The mass of a body.
+    /// The mass of a body, and the frequencies if a second instrument is used.
     Weighing,
     /// The frequencies at a value of a covariate beyond those met so far.
     FurtherRange,
@@ -44,6 +44,8 @@ pub(super) struct Experiment {
     pub(super) hung: Option<(usize, f64)>,
     /// Body that is weighed.
     pub(super) weighed: Option<usize>,
+    /// Whether the frequencies are measured with a second instrument.
+    pub(super) second_instrument: bool,
     /// Degrees of freedom at which mode shapes are measured.
     pub(super) points: Vec<usize>,
     /// Name of the point, body, covariate or setting.
@@ -61,6 +63,8 @@ pub struct NextMeasurement {
     /// The mass that is hung, kg.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub kg: Option<f64>,
+    /// Whether the frequencies are measured with a second instrument.
+    pub second_instrument: bool,
     /// Number, from 1, of the further mode.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub mode: Option<usize>,

@@ -31,7 +31,7 @@ const LEAST_PROBABILITY: f64 = 2e-3;
 const MOST_CANDIDATES: usize = 12;
 
 /// Greatest number of measurements that are reported.
-const MOST_REPORTED: usize = 10;
+const MOST_REPORTED: usize = 20;
 
 /// Smallest expected probability with which a measurement is recommended for distinguishing two candidates of equal probability.
 const DISTINGUISHES: f64 = 0.6;
@@ -79,7 +79,7 @@ impl<'a> Outlook<'a> {
     }
 
     /// The measurements, the one with the largest expected probability of the right candidate first; of those that agree within
-    /// 0.01 the one that needs fewest rows. Empty if fewer than two candidates are probable.
+    /// 0.01 one without a second instrument, then the one that needs fewest rows. Empty if fewer than two candidates are probable.
     pub(super) fn next_measurements(&self) -> Vec<NextMeasurement> {
         let probable = self.ranked.iter().enumerate().take(MOST_CANDIDATES);
         let mut candidates: Vec<(usize, f64)> =
@@ -97,7 +97,7 @@ impl<'a> Outlook<'a> {
         let reported = |(option, value): &(usize, Value)| self.reported(*option, *value, now, &candidates);
         let mut all: Vec<NextMeasurement> = values.par_iter().map(reported).collect();
         let hundredths = |m: &NextMeasurement| (100.0 * m.probability_after).round() as i64;
-        all.sort_by_key(|m| (-hundredths(m), m.repeats_to_95.unwrap_or(usize::MAX)));
+        all.sort_by_key(|m| (-hundredths(m), m.second_instrument, m.repeats_to_95.unwrap_or(usize::MAX)));
         all
     }
 
@@ -108,11 +108,12 @@ impl<'a> Outlook<'a> {
         let ranked: Vec<&Ranked> = candidates.iter().map(|(place, _)| self.ranked[*place]).collect();
         let conditions = words::conditions(simulator, data, &ranked, experiment);
         let what = words::phrase(simulator, experiment, &conditions);
-        let once = experiment.kind == Kind::Weighing;
+        let once = experiment.modes == 0;
         let mut measurement = NextMeasurement {
             kind: experiment.kind,
             place: experiment.place.clone(),
             kg: experiment.hung.map(|(_, kg)| kg),
+            second_instrument: experiment.second_instrument,
             mode: (experiment.kind == Kind::FurtherMode).then_some(experiment.modes),
             points: words::point_names(simulator, experiment),
             conditions,

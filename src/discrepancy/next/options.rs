@@ -38,6 +38,7 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
         modes: simulator.modes(),
         hung: None,
         weighed: None,
+        second_instrument: false,
         points: Vec::new(),
         place: None,
     };
@@ -45,17 +46,18 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
     if simulator.available_modes() > simulator.modes() {
         all.push(Experiment { kind: Kind::FurtherMode, modes: simulator.modes() + 1, ..plain.clone() });
     }
-    let of_instrument =
-        |r: &&&Ranked| matches!(r.candidate.target, Target::FrequencyScale(_) | Target::FrequencyOffset(_));
-    if ranked.iter().any(|r| of_instrument(&r)) {
-        all.push(Experiment { kind: Kind::SecondInstrument, ..plain.clone() });
-    }
     if let Some(structure) = simulator.structure() {
         all.extend(hung_masses(structure, &plain));
         all.extend(weighings(structure, ranked, &plain));
-        if data.shapes.is_none() {
-            all.extend(mode_shapes(simulator, structure, &plain));
-        }
+    }
+    if ranked.iter().any(|r| matches!(r.candidate.target, Target::FrequencyScale(_) | Target::FrequencyOffset(_))) {
+        let useful = |e: &&Experiment| matches!(e.kind, Kind::MoreRows | Kind::HungMass | Kind::Weighing);
+        let second: Vec<Experiment> =
+            all.iter().filter(useful).map(|e| with_second_instrument(e, plain.modes)).collect();
+        all.extend(second);
+    }
+    if let Some(structure) = simulator.structure().filter(|_| data.shapes.is_none()) {
+        all.extend(mode_shapes(simulator, structure, &plain));
     }
     let with = |kind: Kind, place: Option<String>, conditions: Vec<Condition>| Experiment {
         kind,
@@ -81,6 +83,13 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
     }
     all.extend(further_settings(simulator, ranked, &plain));
     all
+}
+
+/// The same measurement with a second instrument. A known mass does not tell all springs from the scale of the instrument, and a
+/// second instrument does not tell all springs from all masses; both together do. `modes`: modes measured, also beside a weighing.
+fn with_second_instrument(e: &Experiment, modes: usize) -> Experiment {
+    let kind = if e.kind == Kind::MoreRows { Kind::SecondInstrument } else { e.kind };
+    Experiment { kind, second_instrument: true, modes, ..e.clone() }
 }
 
 /// A mass at each attachment point.

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::condition::Condition;
-use super::experiment::{Experiment, Kind};
+use super::experiment::Experiment;
 use crate::discrepancy::data::{Values, TIME};
 use crate::discrepancy::declared::WEIGHING_STD;
 use crate::discrepancy::effect::FittedEffect;
@@ -165,7 +165,7 @@ impl<'a> Predictor<'a> {
             let first = sizes.len();
             let (mut own, mut slopes) = (vec![0.0; effect.target.sizes()], vec![0.0; psi.len()]);
             let acts = match effect.target {
-                Target::FrequencyScale(_) | Target::FrequencyOffset(_) => experiment.kind != Kind::SecondInstrument,
+                Target::FrequencyScale(_) | Target::FrequencyOffset(_) => !experiment.second_instrument,
                 Target::SettingOffset(k) | Target::SettingScale(k) => setting(k).is_some(),
                 _ => true,
             };

@@ -36,6 +36,9 @@ pub(super) fn conditions(
     experiment.conditions.iter().map(values).collect()
 }
 
+/// How a second instrument is used.
+const WITH_SECOND: &str = "with a second instrument, which does not have the faults of the first";
+
 /// What is measured, as a noun.
 pub(super) fn phrase(
     simulator: &Simulator,
@@ -51,10 +54,12 @@ pub(super) fn phrase(
         Kind::FurtherMode => format!("the frequency of mode {} with those measured so far", experiment.modes),
         Kind::HungMass => {
             let kg = experiment.hung.map_or(0.0, |(_, kg)| kg);
-            format!("the frequencies with a known mass of {kg} kg fixed to {place}")
+            let second = if experiment.second_instrument { format!(", {WITH_SECOND}") } else { String::new() };
+            format!("the frequencies with a known mass of {kg} kg fixed to {place}{second}")
         }
-        Kind::SecondInstrument => {
-            "the frequencies with a second instrument, which does not have the faults of the first".to_owned()
+        Kind::SecondInstrument => format!("the frequencies {WITH_SECOND}"),
+        Kind::Weighing if experiment.second_instrument => {
+            format!("the mass of {place} by weighing, and the frequencies {WITH_SECOND}")
         }
         Kind::Weighing => format!("the mass of {place} by weighing"),
         Kind::FurtherRange => format!("the frequencies at a value of {place} that was not met so far"),
@@ -100,14 +105,15 @@ fn four_digits(number: f64) -> String {
 
 /// The sentence of a measurement whose other fields are known; `what` is its [`phrase`].
 pub(super) fn sentence(what: &str, m: &NextMeasurement) -> String {
-    let rows = match (m.kind, m.conditions.len()) {
-        (Kind::Weighing, 1) => String::new(),
-        (Kind::Weighing, _) => ", once in each of these conditions".to_owned(),
+    let weighed_only = m.kind == Kind::Weighing && !m.second_instrument;
+    let rows = match (weighed_only, m.conditions.len()) {
+        (true, 1) => String::new(),
+        (true, _) => ", once in each of these conditions".to_owned(),
         (_, 1) => format!(", in {} rows", m.repeats),
         (_, _) => format!(", in {} rows in each of these conditions", m.repeats),
     };
     let reached = match m.repeats_to_95 {
-        _ if m.kind == Kind::Weighing => String::new(),
+        _ if weighed_only => String::new(),
         Some(1) => format!("; one row reaches {WANTED}"),
         Some(repeats) => format!("; {repeats} rows reach {WANTED}"),
         None => format!("; {MOST_REPEATS} rows do not reach {WANTED}"),

@@ -25,19 +25,18 @@ pub struct Hidden {
 }
 
 /// What is done in a further measurement.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Done {
-    MoreRows,
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Done {
     /// A body of so many kg is fixed to a mass.
-    Hung(String, f64),
+    pub hung: Option<(String, f64)>,
     /// An instrument without the faults of the first is used.
-    SecondInstrument,
+    pub second_instrument: bool,
     /// A mass is weighed.
-    Weighed(String),
+    pub weighed: Option<String>,
     /// One more mode is measured.
-    FurtherMode,
-    /// Mode shapes are measured at these masses.
-    Shapes(Vec<String>),
+    pub further_mode: bool,
+    /// Masses at which mode shapes are measured.
+    pub points: Vec<String>,
 }
 
 /// Noise of a component of a measured shape as a share of the root mean square of the shape.
@@ -51,7 +50,7 @@ impl Hidden {
     pub fn follow(&self, seed: u64, done: &Done, conditions: &[Condition], repeats: usize) -> Option<(String, String)> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut structure = self.structure.clone();
-        if *done == Done::FurtherMode {
+        if done.further_mode {
             structure.modes += 1;
         }
         let balance = BALANCE.0 * normal(&mut rng);
@@ -65,26 +64,25 @@ impl Hidden {
                 cells.push(cell);
             }
         }
-        let name = match done {
-            Done::Hung(mass, _) => format!("hung_kg_{mass}"),
-            Done::Weighed(mass) => format!("weighed_kg_{mass}"),
-            Done::SecondInstrument => "second_instrument".to_owned(),
-            Done::Shapes(points) => {
-                let mode = |mode: usize| points.iter().map(move |point| format!("phi{mode}_{point}"));
-                (1..=structure.modes).flat_map(mode).collect::<Vec<_>>().join(",")
-            }
-            Done::MoreRows | Done::FurtherMode => return Some((structure.toml(), csv(&structure, &rows, None))),
-        };
+        let mut names = Vec::new();
+        names.extend(done.hung.iter().map(|(mass, _)| format!("hung_kg_{mass}")));
+        names.extend(done.weighed.iter().map(|mass| format!("weighed_kg_{mass}")));
+        names.extend(done.second_instrument.then(|| "second_instrument".to_owned()));
+        if !done.points.is_empty() {
+            let mode = |mode: usize| done.points.iter().map(move |point| format!("phi{mode}_{point}"));
+            names.extend((1..=structure.modes).flat_map(mode));
+        }
         let table = csv(&structure, &rows, None);
-        let lines = table.lines().zip(std::iter::once(name).chain(cells));
-        let toml = match done {
-            Done::Shapes(points) => {
-                let declared = format!("mode_shapes = {{ points = {points:?}, noise = {SHAPE_NOISE:?} }}\n");
-                structure.toml().replacen("measurement_noise", &format!("{declared}measurement_noise"), 1)
-            }
-            _ => structure.toml(),
+        let lines = table.lines().zip(std::iter::once(names).chain(cells));
+        let mut toml = structure.toml();
+        if !done.points.is_empty() {
+            let declared = format!("mode_shapes = {{ points = {:?}, noise = {SHAPE_NOISE:?} }}\n", done.points);
+            toml = toml.replacen("measurement_noise", &format!("{declared}measurement_noise"), 1);
+        }
+        let joined = |(line, cells): (&str, Vec<String>)| {
+            std::iter::once(line.to_owned()).chain(cells).collect::<Vec<_>>().join(",") + "\n"
         };
-        Some((toml, lines.map(|(line, cell)| format!("{line},{cell}\n")).collect()))
+        Some((toml, lines.map(joined).collect()))
     }
 
     /// A row in a condition, `place` hours after the last one, and the value of each effect in it.
@@ -129,7 +127,7 @@ impl Hidden {
     }
 }
 
-/// The frequencies of a row, and the cell of the column that says what was done.
+/// The frequencies of a row, and the cells of the columns that say what was done.
 fn measured(
     rng: &mut ChaCha8Rng,
     structure: &Structure,
@@ -137,39 +135,37 @@ fn measured(
     (mut row, gains): (Row, Vec<f64>),
     done: &Done,
     balance: f64,
-) -> Option<(Row, String)> {
+) -> Option<(Row, Vec<String>)> {
     let mass = |name: &str| (0..structure.masses_kg.len()).find(|m| mass_name(*m) == name);
     let of_instrument = |e: &Effect| matches!(e.target, Target::Scale(_) | Target::Offset);
-    let acts = |e: &Effect| *done != Done::SecondInstrument || !of_instrument(e);
+    let acts = |e: &Effect| !done.second_instrument || !of_instrument(e);
     let effects = hidden.effects.iter().zip(&gains).filter(|(e, _)| acts(e));
     let mut all = effects.map(|(e, gain)| (e.target.clone(), *gain)).collect::<Vec<_>>();
-    if let Done::Hung(name, kg) = done {
+    if let Some((name, kg)) = &done.hung {
         all.push((Target::Body(mass(name)?), *kg));
     }
     let all = all.iter().map(|(target, gain)| (target, *gain)).collect::<Vec<_>>();
     let free = hidden.population.iter().map(|(mean, sd)| mean + sd * normal(rng)).collect::<Vec<_>>();
     let clean = structure.log_frequencies(row.set, &free, &all)?;
     row.log_f = clean.iter().map(|f| Some(f + (structure.noise * normal(rng)).ln_1p())).collect();
-    let cell = match done {
-        Done::Hung(_, kg) => number(*kg),
-        Done::Weighed(name) => {
-            let body = mass(name)?;
-            let gain = |(e, gain): (&Effect, &f64)| match e.target {
-                Target::Mass(m) if m == body => *gain,
-                Target::Masses => *gain,
-                _ => 0.0,
-            };
-            let share = 1.0 + hidden.effects.iter().zip(&gains).map(gain).sum::<f64>();
-            number(structure.masses_kg[body] * share * (1.0 + balance + BALANCE.1 * normal(rng)))
-        }
-        Done::Shapes(names) => {
-            let points = names.iter().map(|name| mass(name)).collect::<Option<Vec<_>>>()?;
-            let std = SHAPE_NOISE / (points.len() as f64).sqrt();
-            let shapes = structure.shapes(row.set, &free, &all, &points)?;
-            let noisy = shapes.into_iter().flatten().map(|x| number(x + std * normal(rng)));
-            noisy.collect::<Vec<_>>().join(",")
-        }
-        _ => "1".to_owned(),
-    };
-    Some((row, cell))
+    let mut cells = Vec::new();
+    cells.extend(done.hung.iter().map(|(_, kg)| number(*kg)));
+    if let Some(name) = &done.weighed {
+        let body = mass(name)?;
+        let gain = |(e, gain): (&Effect, &f64)| match e.target {
+            Target::Mass(m) if m == body => *gain,
+            Target::Masses => *gain,
+            _ => 0.0,
+        };
+        let share = 1.0 + hidden.effects.iter().zip(&gains).map(gain).sum::<f64>();
+        cells.push(number(structure.masses_kg[body] * share * (1.0 + balance + BALANCE.1 * normal(rng))));
+    }
+    cells.extend(done.second_instrument.then(|| "1".to_owned()));
+    if !done.points.is_empty() {
+        let points = done.points.iter().map(|name| mass(name)).collect::<Option<Vec<_>>>()?;
+        let std = SHAPE_NOISE / (points.len() as f64).sqrt();
+        let shapes = structure.shapes(row.set, &free, &all, &points)?;
+        cells.extend(shapes.into_iter().flatten().map(|x| number(x + std * normal(rng))));
+    }
+    Some((row, cells))
 }
