@@ -5,23 +5,12 @@ use std::path::{Path, PathBuf};
 use anyhow::{bail, Context as _};
 use serde::Deserialize;
 
+use super::tables::{read_tables, TableArgs, Tables};
 use crate::discrepancy::data::Data;
 use crate::discrepancy::describe::Cause;
-use crate::measurement::{Covariate, ModalMeasurement};
+use crate::measurement::ModalMeasurement;
 use crate::quantity::{Digest, Timestamp};
 use crate::simulator::Simulator;
-
-/// Tables that have been read.
-pub(super) struct Read {
-    pub(super) measurements: Vec<ModalMeasurement>,
-    pub(super) covariates: Vec<Covariate>,
-    pub(super) notes: Vec<String>,
-    /// Whether the tables state times.
-    pub(super) timed: bool,
-}
-
-/// Reads tables for a structure.
-type ReadTables<'a> = dyn Fn(&Simulator, &[PathBuf]) -> anyhow::Result<Read> + 'a;
 
 /// What is needed of an earlier result.
 #[derive(Deserialize)]
@@ -49,14 +38,14 @@ pub(super) fn join(
     simulator: &Simulator,
     earlier: &Path,
     (data, further): (&[PathBuf], &[PathBuf]),
-    read: &ReadTables<'_>,
+    how: &TableArgs<'_>,
 ) -> anyhow::Result<Joined> {
     let text = std::fs::read_to_string(earlier).with_context(|| format!("cannot read {}", earlier.display()))?;
     let result: EarlierResult = serde_json::from_str(&text).with_context(|| {
         format!("{} is not the result of a diagnosis: write it with `modalwatch diagnose --json`", earlier.display())
     })?;
     let then = simulator_then(simulator, &result)?;
-    let old = read(&then, data)?;
+    let old = read_tables(&then, data, how)?;
     let digest = Data::new(&then, &old.measurements).digest;
     if digest != result.data_digest {
         bail!(
@@ -66,7 +55,7 @@ pub(super) fn join(
             result.data_digest
         );
     }
-    let new = read(simulator, further).context("the tables of --further")?;
+    let new = read_tables(simulator, further, how).context("the tables of --further")?;
     joined(simulator, result, old, new)
 }
 
@@ -95,18 +84,7 @@ fn simulator_then(simulator: &Simulator, earlier: &EarlierResult) -> anyhow::Res
 }
 
 /// Joins the rows of both tables.
-fn joined(simulator: &Simulator, earlier: EarlierResult, old: Read, new: Read) -> anyhow::Result<Joined> {
-    for covariate in &new.covariates {
-        let before = old.covariates.iter().find(|c| c.name == covariate.name);
-        if let Some(before) = before.filter(|before| before.kind != covariate.kind) {
-            bail!(
-                "the column {} is {:?} in the tables of --data and {:?} in those of --further: it must be of one kind",
-                covariate.name,
-                before.kind,
-                covariate.kind
-            );
-        }
-    }
+fn joined(simulator: &Simulator, earlier: EarlierResult, old: Tables, new: Tables) -> anyhow::Result<Joined> {
     if old.timed != new.timed {
         let (with, without) = if old.timed { ("--data", "--further") } else { ("--further", "--data") };
         bail!(

@@ -164,3 +164,95 @@ fn complete(order: &[Option<usize>]) -> Vec<usize> {
     // In ascending order, so that a row in the usual order remains as it is.
     order.iter().map(|listed| listed.or_else(|| left.next()).unwrap_or_default()).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::discrepancy::response::Responses;
+    use crate::physics::effect::Target;
+    use crate::physics::Node;
+    use crate::quantity::{Hertz, Timestamp};
+    use crate::simulator::definition::StructureDefinition;
+
+    fn simulator() -> Simulator {
+        let text = include_str!("../../models/three-dof/structure.toml");
+        let text = format!("mode_shapes = {{ points = [\"m1\", \"m2\"], noise = 0.02 }}\n{text}");
+        Simulator::new(StructureDefinition::parse_toml(&text).unwrap()).unwrap()
+    }
+
+    /// Measurements whose shapes have another norm and sign in each row.
+    fn measurement(second: i64, frequencies_hz: &[f64], shapes: &DMatrix<f64>) -> ModalMeasurement {
+        let norm = [1.0, -2.5, 0.1][second as usize % 3];
+        ModalMeasurement {
+            measured_at: Timestamp::from_micros(1_000_000 * second).unwrap(),
+            frequencies_hz: frequencies_hz.iter().map(|f| Hertz::new(*f).ok()).collect(),
+            std_hz: None,
+            mode_shapes: Some(shapes.column_iter().map(|s| Some(s.iter().map(|x| norm * x).collect())).collect()),
+            covariates: BTreeMap::new(),
+            settings: BTreeMap::new(),
+        }
+    }
+
+    #[test]
+    fn a_row_with_its_modes_in_another_order_is_put_in_the_usual_one() {
+        let simulator = simulator();
+        let (hz, shapes) = simulator.frequencies_and_shapes(&[4.0, 5.0, 6.0]).unwrap();
+        let mut rows: Vec<ModalMeasurement> = (0..9).map(|row| measurement(row, &hz, &shapes)).collect();
+        rows[4].frequencies_hz.swap(1, 2);
+        rows[4].mode_shapes.as_mut().unwrap().swap(1, 2);
+        let (measured, orders) = MeasuredShapes::new(&simulator, &rows.iter().collect::<Vec<_>>()).unwrap();
+        assert_eq!(measured.reordered, 1);
+        for (row, order) in orders.iter().enumerate() {
+            assert_eq!(*order, if row == 4 { [0, 2, 1] } else { [0, 1, 2] }, "row {row}");
+        }
+        let largest = measured.coordinates.iter().flatten().fold(0.0, |a: f64, z| a.max(z.abs()));
+        assert!(largest < 1e-12, "all rows have the same shapes, whatever norm and sign: {largest}");
+    }
+
+    /// Compares coordinates of shapes and their derivatives with the solution of one eigenproblem for each row.
+    #[test]
+    fn interpolated_shapes_equal_those_of_single_rows() {
+        let simulator = simulator();
+        let (hz, shapes) = simulator.frequencies_and_shapes(&[4.0, 5.0, 6.0]).unwrap();
+        let (measured, _) = MeasuredShapes::new(&simulator, &[&measurement(0, &hz, &shapes)]).unwrap();
+        let reference = &measured.reference;
+        let sets: [Vec<Target>; 2] = [
+            vec![Target::Springs(vec![3]), Target::FrequencyOffset(Some(1)), Target::Springs((0..6).collect())],
+            vec![
+                Target::FrequencyScale(Some(2)),
+                Target::AddedSpring(Node::Dof(0), Node::Dof(2)),
+                Target::Masses(vec![0, 1, 2]),
+            ],
+        ];
+        for targets in sets {
+            let row = |i: usize| {
+                let (a, b, c) = ((0.37 * i as f64).sin(), (0.91 * i as f64).cos(), (1.7 * i as f64).sin());
+                [0.15 * a, 0.1 * b, 0.05 * c]
+            };
+            let rows: Vec<[f64; 3]> = (0..400).map(row).collect();
+            let theta = DMatrix::from_fn(3, rows.len(), |k, _| 4.0 + k as f64);
+            let sizes = DMatrix::from_fn(3, rows.len(), |k, row| rows[row][k]);
+            let many = Responses::new(&simulator, Some(reference), &targets, &theta, &sizes).unwrap();
+            assert_eq!((many.modes(), many.outputs()), (3, 6));
+            for (place, sizes) in rows.iter().enumerate().step_by(7) {
+                let (one, shapes) = simulator.respond_tracked(&[4.0, 5.0, 6.0], reference, &targets, sizes).unwrap();
+                let shapes = shapes.unwrap();
+                for (mode, f) in one.frequencies_hz.iter().enumerate() {
+                    assert!((many.value(place, mode) - f.ln()).abs() < 1e-6, "{targets:?}");
+                }
+                for (own, coordinate) in shapes.coordinates.iter().enumerate() {
+                    // The smallest noise of a shape that can be reached is about 1e-3.
+                    assert!((many.value(place, 3 + own) - coordinate).abs() < 1e-5, "{targets:?}");
+                    for k in 0..3 {
+                        let (by, exact) = (many.by_parameter(place, 3 + own)[k], shapes.by_parameter[(own, k)]);
+                        assert!((by - exact).abs() < 1e-4, "{targets:?}, parameter {k}: {by} {exact}");
+                        let (by, exact) = (many.by_size(place, 3 + own)[k], shapes.by_size[(own, k)]);
+                        assert!((by - exact).abs() < 1e-3, "{targets:?}, size {k}: {by} {exact}");
+                    }
+                }
+            }
+        }
+    }
+}

@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::model::{structure_at, SimulationModel};
+use super::settings::CorrectedParameters;
 use super::simulate::Simulator;
 use crate::physics;
 use crate::physics::effect::{modes_under, Target};
@@ -23,15 +24,8 @@ impl Simulator {
         points: &[usize],
     ) -> Result<Option<DMatrix<f64>>, physics::Error> {
         let SimulationModel::Matrices { structure, bindings } = self.model() else { return Ok(None) };
-        let (mut theta, mut first) = (theta.to_vec(), 0);
-        for target in targets {
-            match target {
-                Target::SettingOffset(column) => theta[*column] += sizes[first],
-                Target::SettingScale(column) | Target::ParameterScale(column) => theta[*column] *= 1.0 + sizes[first],
-                _ => {}
-            }
-            first += target.sizes();
-        }
+        // Corrections of a setting in one mode only do not change its shape by more than its frequency: they are left out.
+        let theta = CorrectedParameters::new(theta, targets, sizes, usize::MAX).theta;
         let (modes, order) = modes_under(&structure_at(structure, bindings, &theta)?, count, targets, sizes)?;
         Ok(Some(shapes_at(&modes, points).select_columns(&order)))
     }

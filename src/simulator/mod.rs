@@ -44,12 +44,15 @@ mod model;
 mod moved;
 mod parse;
 pub mod population;
+mod respond;
+pub mod settings;
 mod shapes;
 mod simulate;
 pub mod table;
 mod training;
 
 pub use model::{Binding, SimulationModel};
+pub use respond::Response;
 pub use shapes::{Linearised, ShapeResponse};
-pub use simulate::{DerivedStiffness, Error, Response, Simulator};
+pub use simulate::{DerivedStiffness, Error, Simulator};
 pub use training::TrainingSet;

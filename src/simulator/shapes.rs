@@ -3,7 +3,8 @@
 use nalgebra::DMatrix;
 
 use super::model::{chained, structure_at, SimulationModel};
-use super::simulate::{Response, Simulator};
+use super::respond::Response;
+use super::simulate::Simulator;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
 use crate::physics::shapes::{modes_to_pair, shape_sensitivity, shapes_at};
@@ -122,13 +123,13 @@ impl Simulator {
             return Ok((self.respond(theta, reference.len(), targets, sizes)?, None));
         };
         let moved = self.moved(theta, targets, sizes);
-        let changed = structure_at(structure, bindings, &moved.theta)?;
+        let changed = structure_at(structure, bindings, moved.theta())?;
         let (response, shapes) =
             respond_tracked(&changed, &moved.targets, &moved.sizes, &instrumented.dofs, reference)?;
         let (by_parameter, by_size) =
-            moved.chain(chained(&response.by_spring, bindings, &moved.theta), response.by_size);
+            moved.chain(&chained(&response.by_spring, bindings, moved.theta()), response.by_size);
         let response = Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size };
-        let (by_parameter, by_size) = moved.chain(chained(&shapes.by_spring, bindings, &moved.theta), shapes.by_size);
+        let (by_parameter, by_size) = moved.chain(&chained(&shapes.by_spring, bindings, moved.theta()), shapes.by_size);
         Ok((response, Some(ShapeResponse { coordinates: shapes.coordinates, by_parameter, by_size })))
     }
 }

@@ -2,7 +2,7 @@
 
 use super::condition::{anchors, combinations, contrasts, Condition, Contrast};
 use super::experiment::{Experiment, Kind};
-use crate::discrepancy::data::{Data, Values};
+use crate::discrepancy::data::{Data, Origin, Values};
 use crate::discrepancy::rank::Ranked;
 use crate::measurement::CovariateValue;
 use crate::physics::effect::Target;
@@ -75,7 +75,9 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
     let last = present[0].row;
     let mut pairs: Vec<(&Contrast, &Contrast)> = Vec::new();
     for (index, a) in contrasts.iter().enumerate() {
-        pairs.extend(contrasts[index + 1..].iter().filter(|b| b.covariate != a.covariate).map(|b| (a, b)));
+        let free = |c: &Contrast| data.column(&c.covariate).is_some_and(|column| column.origin == Origin::Covariate);
+        let others = contrasts[index + 1..].iter().filter(|b| b.covariate != a.covariate && free(a) && free(b));
+        pairs.extend(others.map(|b| (a, b)));
     }
     for (a, b) in pairs.into_iter().take(MOST_PAIRS) {
         let place = Some(format!("{} and {}", a.covariate, b.covariate));
@@ -141,7 +143,7 @@ fn mode_shapes(simulator: &Simulator, structure: &Structure, plain: &Experiment)
 /// negative is not extended below 0, and one in per cent not above 100.
 fn beyond(data: &Data, rows: &[usize], contrast: &Contrast) -> Vec<f64> {
     let Some(column) = data.column(&contrast.covariate) else { return Vec::new() };
-    if !matches!(column.values, Values::Numbers(_)) {
+    if !matches!(column.values, Values::Numbers(_)) || column.origin != Origin::Covariate {
         return Vec::new();
     }
     let numbers = column.numbers(rows);
@@ -164,7 +166,8 @@ fn beyond(data: &Data, rows: &[usize], contrast: &Contrast) -> Vec<f64> {
 fn further_settings(simulator: &Simulator, ranked: &[&Ranked], plain: &Experiment) -> Vec<Experiment> {
     let mut columns: Vec<usize> = Vec::new();
     for r in ranked {
-        if let Target::SettingOffset(column) | Target::SettingScale(column) = r.candidate.target {
+        let of_gain = if let Target::ModeGain { column, .. } = r.candidate.target { Some(column) } else { None };
+        for column in r.candidate.target.settings().into_iter().chain(of_gain) {
             if !columns.contains(&column) {
                 columns.push(column);
             }

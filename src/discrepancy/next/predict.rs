@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::condition::Condition;
 use super::experiment::Experiment;
-use crate::discrepancy::data::{Values, TIME};
+use crate::discrepancy::data::{Column, Origin, Values, TIME};
 use crate::discrepancy::declared::WEIGHING_STD;
 use crate::discrepancy::effect::FittedEffect;
 use crate::discrepancy::fit::Fit;
@@ -141,6 +141,11 @@ impl<'a> Predictor<'a> {
             return Input::Number(0.0);
         }
         let Some(name) = law.covariate.as_deref() else { return Input::Number(0.0) };
+        let here = self.inputs[index][condition.row];
+        if let (Some(Origin::Product(first, second)), Input::Pair(a, b)) = (data.column(name).map(|c| c.origin), here) {
+            let moved = |column: usize| Self::change(&data.columns[column], condition);
+            return Input::Pair(a + moved(first), b + moved(second));
+        }
         match condition.changed.get(name) {
             // A covariate that stays at a value is not delayed.
             Some(CovariateValue::Number(value)) if law.kind == LawKind::Lagged => Input::Lagged(*value, 0.0),
@@ -150,7 +155,15 @@ impl<'a> Predictor<'a> {
                 Some(Values::Numbers(times)) => Input::Number(times.last().copied().unwrap_or(0.0)),
                 _ => Input::Missing,
             },
-            None => self.inputs[index][condition.row],
+            None => here,
+        }
+    }
+
+    /// Value of a numeric column in a condition minus that in its row; 0 if it is not changed.
+    fn change(column: &Column, condition: &Condition) -> f64 {
+        match (&column.values, condition.changed.get(&column.name)) {
+            (Values::Numbers(values), Some(CovariateValue::Number(value))) => value - values[condition.row],
+            _ => 0.0,
         }
     }
 
@@ -166,8 +179,8 @@ impl<'a> Predictor<'a> {
             let (mut own, mut slopes) = (vec![0.0; effect.target.sizes()], vec![0.0; psi.len()]);
             let acts = match effect.target {
                 Target::FrequencyScale(_) | Target::FrequencyOffset(_) => !experiment.second_instrument,
-                Target::SettingOffset(k) | Target::SettingScale(k) => setting(k).is_some(),
-                _ => true,
+                Target::ModeGain { column, .. } => setting(column).is_some(),
+                _ => effect.target.settings().into_iter().all(|k| setting(k).is_some()),
             };
             if acts {
                 effect.sizes(self.input(index, condition), psi, &mut own, &mut slopes);

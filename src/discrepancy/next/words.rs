@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::condition::Condition;
 use super::experiment::{Experiment, Kind, NextMeasurement};
 use super::value::{MOST_REPEATS, WANTED};
-use crate::discrepancy::data::{Data, TIME};
+use crate::discrepancy::data::{Data, Origin};
 use crate::discrepancy::rank::Ranked;
 use crate::measurement::CovariateValue;
 use crate::simulator::Simulator;
@@ -17,8 +17,14 @@ pub(super) fn conditions(
     ranked: &[&Ranked],
     experiment: &Experiment,
 ) -> Vec<BTreeMap<String, CovariateValue>> {
-    let mut names: Vec<&str> = ranked.iter().filter_map(|r| r.candidate.covariate.as_deref()).collect();
-    names.retain(|name| *name != TIME);
+    let mut names: Vec<&str> = Vec::new();
+    for column in ranked.iter().filter_map(|r| data.column(r.candidate.covariate.as_deref()?)) {
+        match column.origin {
+            Origin::Product(first, second) => names.extend([first, second].map(|c| data.columns[c].name.as_str())),
+            Origin::Time => {}
+            _ => names.push(&column.name),
+        }
+    }
     let values = |condition: &Condition| {
         let mut names: Vec<&str> = names.clone();
         names.extend(condition.changed.keys().map(String::as_str));
