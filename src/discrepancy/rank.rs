@@ -9,6 +9,7 @@ use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
 use super::setting_starts::{Guess, PresentSettings};
 use super::study::Study;
+use super::weighing::log_density;
 use crate::physics::effect::Target;
 use crate::simulator::law::LawKind;
 
@@ -82,10 +83,11 @@ impl Trial {
 /// best candidate. `rows`: indices of the rows that are used.
 ///
 /// ```text
-///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) − cost ) − ln(number of laws) + ln prior,    r = (1 − ρ)/(1 + ρ)
+///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) + w_law − w_fit − cost ) − ln(number of laws) + ln prior
+///  r = (1 − ρ)/(1 + ρ)
 /// ```
 ///
-/// E: evidence by Laplace's method; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
+/// E: evidence by Laplace's method; w: log density of the bodies that were weighed, 0 without any; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
 /// with the largest estimated gain in a score test are fitted. The first `known` effects of the fit belong to the structure:
 /// their numbers may be wrong, so that a further effect of the same kind is allowed for them. `None` if the frequencies cannot
 /// be computed.
@@ -122,7 +124,7 @@ pub fn rank(
         tried.extend(unscreened(study, rows, fit, candidates));
     }
     tried.extend(corrections(study, rows, fit, candidates));
-    let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln();
+    let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln() + log_density(study.data, &t.fit, 1.0);
     let mut order: Vec<(usize, f64)> = tried.iter().map(|t| (t.candidate, evidence(t))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     let refined: Vec<usize> = order.iter().take(REFINED).map(|o| o.0).collect();
@@ -173,9 +175,11 @@ fn by_probability(
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
         own.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
         let Some(first) = own.first() else { continue };
+        let weighed = log_density(study.data, fit, independent_share);
         let gain = |t: &&Trial| {
+            let weighed = log_density(study.data, &t.fit, independent_share) - weighed;
             let inside = fit.outside.nats - t.fit.outside.nats;
-            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats
+            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats + weighed
         };
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();

@@ -256,7 +256,7 @@ impl Afterwards {
         let springs = simulator.structure().map_or(0, |s| s.springs().len());
         let masses = simulator.structure().map_or(0, |s| s.masses().len());
         // A factor on all springs or masses is a factor on all frequencies only if no spring or mass is added.
-        let added = |t: &Target| matches!(t, Target::AddedSpring(..) | Target::Oscillator(_));
+        let added = |t: &Target| matches!(t, Target::AddedSpring(..) | Target::AddedMass(_) | Target::Oscillator(_));
         let alone = !targets.iter().any(added);
         let (mut steps, mut structural) = (Vec::new(), Vec::new());
         let mut first = 0;

@@ -108,9 +108,12 @@ impl<'a> Study<'a> {
         &self.free
     }
 
-    /// False if the target acts on a setting that was not set in this row; true for every other target.
+    /// Whether an effect on this target acts in a row: one on a setting does not where it was not set, and one of the instrument
+    /// does not where a second instrument was used.
     pub fn is_set(&self, row: usize, target: &Target) -> bool {
+        let of_instrument = matches!(target, Target::FrequencyScale(_) | Target::FrequencyOffset(_));
         let columns = if let Target::ModeGain { column, .. } = target { vec![*column] } else { target.settings() };
-        columns.iter().all(|k| self.data.settings[row][*k].is_some())
+        let set = columns.iter().all(|k| self.data.settings[row][*k].is_some());
+        set && !(of_instrument && self.data.second_instrument[row])
     }
 }

@@ -9,7 +9,7 @@ use std::f64::consts::TAU;
 
 use nalgebra::DMatrix;
 
-use super::modes::{frequency_sensitivity, modes, FrequencySensitivity};
+use super::modes::{frequency_sensitivity, modes, FrequencySensitivity, Modes};
 use super::structure::{Error, Mass, Node, Spring, Structure};
 
 /// Smallest share of a stiffness, mass or frequency that an effect may leave.
@@ -63,6 +63,8 @@ pub enum Target {
     AddedSpring(Node, Node),
     /// An additional body of g₁ kg on a spring tuned to g₂ Hz, attached to a degree of freedom.
     Oscillator(usize),
+    /// A rigid body of g kg, fixed to a degree of freedom.
+    AddedMass(usize),
     /// Mode i of the data is mode `order[i]` of the structure. This target has no size.
     ModeOrder(Vec<usize>),
 }
@@ -123,6 +125,7 @@ pub struct Response {
 ///
 /// ```text
 ///  ∂f/∂g:   k(1 + g):  Σ k ∂f/∂k      m(1 + g):  Σ m ∂f/∂m      f(1 + g):  f      f + g:  1      added spring:  ∂f/∂k
+///  added mass:  ∂f/∂m
 ///  oscillator (m, ν), k = (2πν)² m:   ∂f/∂m + (2πν)² ∂f/∂k,   8π² ν m ∂f/∂k
 /// ```
 ///
@@ -138,6 +141,22 @@ pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &
     let modes = modes(&changed.structure, needed)?;
     let sensitivity = frequency_sensitivity(&changed.structure, &modes);
     Ok(changed.response(&columns, sizes, &modes.frequencies_hz, &sensitivity))
+}
+
+/// The modes of a structure under effects, and for each of `count` modes of the data the index of the mode of the structure.
+/// Effects of the instrument do not change them.
+///
+/// # Errors
+/// As [`respond`].
+pub fn modes_under(
+    structure: &Structure,
+    count: usize,
+    targets: &[Target],
+    sizes: &[f64],
+) -> Result<(Modes, Vec<usize>), Error> {
+    let changed = Changed::new(structure, count, &columns(targets), sizes)?;
+    let needed = changed.order.iter().max().map_or(count, |highest| highest + 1);
+    Ok((modes(&changed.structure, needed)?, changed.order))
 }
 
 /// A structure with effects applied to its springs and masses.
@@ -198,6 +217,10 @@ impl Changed {
                     changed.springs.push(Spring::between("", host, own, n_per_m));
                     changed.masses.push(Mass::at("", changed.dofs, kg));
                     changed.dofs += 1;
+                }
+                Target::AddedMass(dof) => {
+                    added[number].1 = changed.masses.len();
+                    changed.masses.push(Mass::at("", *dof, size));
                 }
                 Target::ModeOrder(modes) => order.clone_from(modes),
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
@@ -272,6 +295,7 @@ impl Changed {
                 [scale * sum / (1.0 + sizes[0]), 0.0]
             }
             Target::AddedSpring(..) => [scale * by_spring(self.added[number].0), 0.0],
+            Target::AddedMass(_) => [scale * by_mass(self.added[number].1), 0.0],
             Target::Oscillator(_) => {
                 let (spring, mass) = self.added[number];
                 let (frequency_hz, kg) = (sizes[1], self.structure.masses[mass].kg);
@@ -324,7 +348,11 @@ pub fn measured(
                     return Err(Error::Effect { number, size });
                 }
             }
-            Target::Springs(_) | Target::Masses(_) | Target::AddedSpring(..) | Target::Oscillator(_) => {
+            Target::Springs(_)
+            | Target::Masses(_)
+            | Target::AddedSpring(..)
+            | Target::AddedMass(_)
+            | Target::Oscillator(_) => {
                 return Err(Error::Effect { number, size });
             }
             _ => {}

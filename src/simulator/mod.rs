@@ -32,6 +32,7 @@
 
 mod batched;
 mod beam;
+mod changed;
 mod check;
 pub mod definition;
 pub mod effect;

@@ -7,6 +7,7 @@ mod further;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
+mod next;
 mod places;
 mod settings;
 mod spectrum;

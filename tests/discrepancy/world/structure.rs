@@ -49,8 +49,13 @@ pub enum Target {
     Offset,
     Setting,
     AddedSpring(Node, usize),
-    Oscillator { host: usize, hz: f64 },
+    Oscillator {
+        host: usize,
+        hz: f64,
+    },
     SkippedMode(usize),
+    /// A body whose kg are the gain, fixed to a mass.
+    Body(usize),
 }
 
 impl Structure {
@@ -105,7 +110,7 @@ impl Structure {
     pub fn log_frequencies(&self, set: f64, free: &[f64], gains: &[(&Target, f64)]) -> Option<Vec<f64>> {
         let Changed { masses_kg, springs, kept } = self.changed(set, free, gains)?;
         let all_hz = frequencies_hz(&masses_kg, &springs)?;
-        let mut hz = kept.iter().map(|&m| all_hz[m]).collect::<Vec<_>>();
+        let mut hz = kept.iter().map(|&m| all_hz.get(m).copied()).collect::<Option<Vec<_>>>()?;
         for (target, gain) in gains {
             match target {
                 Target::Scale(None) => hz.iter_mut().for_each(|f| *f *= 1.0 + gain),
@@ -153,6 +158,7 @@ impl Structure {
                     springs.push((Some(host), masses_kg.len(), kg * (TAU * hz).powi(2)));
                     masses_kg.push(kg);
                 }
+                Target::Body(mass) => masses_kg[mass] += gain,
                 Target::SkippedMode(skipped) => kept = (0..=self.modes).filter(|&m| m != skipped).collect(),
                 Target::Scale(_) | Target::Offset => {}
             }
