@@ -13,6 +13,7 @@ use crate::baseline::library::find_structure;
 use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::{Data, MOST_LEVELS};
 use crate::discrepancy::extend::extend as extend_structure;
+use crate::discrepancy::learned::extension::extend_learned;
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -137,6 +138,9 @@ pub struct ExtendArgs {
     /// Folder for structure.json, baseline.safetensors and baseline.json
     #[arg(long)]
     out: PathBuf,
+    /// Add a discrepancy learned from the covariates and settings instead of the causes: not understood, but predictable
+    #[arg(long)]
+    learned: bool,
     /// Only write the structure; its model can be trained later with `modalwatch train`
     #[arg(long)]
     no_training: bool,
@@ -162,20 +166,26 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
         let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;
     }
-    let extended = extend_structure(&simulator, &data, &outcome)?;
-    for added in &extended.added {
+    let (definition, added, left_out) = if args.learned {
+        let extended = extend_learned(&simulator, &data, &outcome)?;
+        (extended.definition, vec![extended.added], extended.left_out)
+    } else {
+        let extended = extend_structure(&simulator, &data, &outcome)?;
+        (extended.definition, extended.added, extended.left_out)
+    };
+    for added in &added {
         println!("added: {added}");
     }
-    for left in &extended.left_out {
+    for left in &left_out {
         println!("not added: {left}");
     }
-    let text = serde_json::to_string_pretty(&extended.definition)?;
+    let text = serde_json::to_string_pretty(&definition)?;
     write_whole(&args.out.join("structure.json"), format!("{text}\n").as_bytes())?;
     println!("structure: {}", args.out.join("structure.json").display());
     if args.no_training {
         return Ok(());
     }
-    let simulator = Simulator::new(extended.definition)?;
+    let simulator = Simulator::new(definition)?;
     let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
     let settings = TrainSettings { epochs, seed: args.study.seed, ..TrainSettings::default() };
     let flow = FlowSettings::default();

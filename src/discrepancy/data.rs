@@ -75,7 +75,9 @@ impl Data {
             };
             m.frequencies_hz.iter().enumerate().map(cell).unzip()
         };
-        let (log_frequencies, noise) = sorted.iter().map(row).unzip();
+        // A discrepancy that was learned before is known: what is left is diagnosed.
+        let corrected: Vec<_> = sorted.iter().map(|m| simulator.corrected(m)).collect();
+        let (log_frequencies, noise) = corrected.iter().map(|m| row(&&**m)).unzip();
         let setting = |m: &&ModalMeasurement| {
             simulator.space().iter().map(|p| m.settings.get(&p.name).copied()).collect::<Vec<_>>()
         };

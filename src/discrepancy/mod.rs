@@ -10,7 +10,8 @@
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
 //! - [`misfit`]: deviations before and after; [`gain`]: errors before and after on rows held out;
 //! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its text; [`report`]: the HTML page;
-//! - [`extend`]: a new version of the structure with the causes as effects.
+//! - [`extend`]: a new version of the structure with the causes as effects;
+//! - [`learned`]: a discrepancy learned from the data, where no cause explains the deviation.
 //!
 //! # Words
 //!
@@ -38,6 +39,7 @@ pub mod fit;
 pub mod gain;
 pub mod grammar;
 pub mod holdout;
+pub mod learned;
 pub mod misfit;
 pub mod model;
 mod naming;
@@ -213,15 +215,22 @@ fn run(
     if found && gain.is_none() {
         notes.push(why_no_gain(holdout.len()).to_owned());
     }
+    let verdict = verdict(selection.slots.len(), ambiguous, left.as_ref());
+    let offered = if verdict == DiagnosisVerdict::NoneOfThese {
+        learned::offer::offer(&study, &training, &holdout, &selection.base).ok()
+    } else {
+        None
+    };
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
-        verdict: verdict(selection.slots.len(), ambiguous, left.as_ref()),
+        verdict,
         summary: String::new(),
         misfit,
         causes,
         alternatives,
         remainder: left,
         gain,
+        learned: offered.as_ref().map(|offered| offered.offer.clone()),
         notes,
         training_rows: training.len(),
         holdout_rows: holdout.len(),
@@ -241,6 +250,7 @@ fn run(
         maybe_damage,
         holdout,
         training,
+        offered,
     })
 }
 

@@ -34,6 +34,7 @@ mod batched;
 mod beam;
 mod check;
 pub mod definition;
+pub mod discrepancy;
 pub mod effect;
 mod expectation;
 mod instrumented;

@@ -2,6 +2,7 @@
 
 mod figures;
 mod gain;
+mod learned;
 mod residuals;
 
 use super::data::{Data, TIME};
@@ -33,6 +34,9 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
     ];
     if let Some(left) = &d.remainder {
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
+    }
+    if let Some(offered) = &outcome.offered {
+        sections.push(("Not understood, but predictable".to_owned(), learned::learned(offered, outcome)));
     }
     sections.push(("Gain on the rows held out".to_owned(), d.gain.as_ref().map_or_else(|| no_gain(d), gain::gain)));
     sections.push(("Notes".to_owned(), notes(d)));
