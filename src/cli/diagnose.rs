@@ -13,7 +13,7 @@ use crate::baseline::library::find_structure;
 use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::{Data, MOST_LEVELS};
 use crate::discrepancy::extend::extend as extend_structure;
-use crate::discrepancy::learned::extension::extend_learned;
+use crate::discrepancy::learned::extension::{extend_learned, offer_anyway};
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -57,6 +57,9 @@ pub struct DiagnoseArgs {
     /// Write the report as one HTML page
     #[arg(long)]
     report: Option<PathBuf>,
+    /// Learn a discrepancy from the covariates and settings, whatever the verdict
+    #[arg(long)]
+    learned: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
@@ -90,7 +93,10 @@ pub struct TableArgs<'a> {
 /// # Errors
 /// Invalid files, or data that do not allow a diagnosis.
 pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
-    let Study { simulator, data, outcome } = studied(&args.study)?;
+    let Study { simulator, data, mut outcome } = studied(&args.study)?;
+    if args.learned {
+        offer_anyway(&simulator, &data, &mut outcome)?;
+    }
     if let Some(path) = &args.report {
         let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;

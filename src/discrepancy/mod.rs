@@ -217,7 +217,8 @@ fn run(
     }
     let verdict = verdict(selection.slots.len(), ambiguous, left.as_ref());
     let offered = if verdict == DiagnosisVerdict::NoneOfThese {
-        learned::offer::offer(&study, &training, &holdout, &selection.base).ok()
+        let offered = learned::offer::offer(&study, &training, &holdout, &selection.base);
+        offered.map_err(|why| notes.push(format!("the deviation cannot be predicted either: {why}"))).ok()
     } else {
         None
     };

@@ -61,6 +61,23 @@ fn in_brackets(inputs: &[String]) -> String {
     }
 }
 
+/// Learns a discrepancy whatever the verdict of a diagnosis is, and adds the offer to the diagnosis unless it has one.
+///
+/// # Errors
+/// [`WhyNot`].
+pub fn offer_anyway(simulator: &Simulator, data: &Data, outcome: &mut Outcome) -> Result<(), WhyNot> {
+    if outcome.offered.is_some() {
+        return Ok(());
+    }
+    let bare = simulator.without_effects();
+    let study = Study::new(&bare, data);
+    let offered = offer(&study, &outcome.training, &outcome.holdout, &outcome.before)?;
+    outcome.diagnosis.summary = format!("{} {}", outcome.diagnosis.summary, offered.offer.summary);
+    outcome.diagnosis.learned = Some(offered.offer.clone());
+    outcome.offered = Some(offered);
+    Ok(())
+}
+
 /// Adds a discrepancy, learned from the rows that were searched for causes, to the structure. The causes of the diagnosis are not
 /// added, because the discrepancy contains what they would explain.
 ///

@@ -1,6 +1,6 @@
 //! Learning a discrepancy: population and processes in turn.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
 use super::change::{change_in_time, ChangeInTime};
 use super::hyperparameter::{Hyperparameters, ModeRows};
@@ -16,6 +16,13 @@ use crate::simulator::discrepancy::process::Support;
 /// Greatest number of support points and of rows that are learned from.
 const MOST_SUPPORT: usize = 64;
 const MOST_ROWS: usize = 1_500;
+
+/// Greatest number of rows from which hyperparameters are estimated: σ and ℓ need fewer rows than the function itself.
+const HYPERPARAMETER_ROWS: usize = 400;
+
+/// Steps to which coefficients and support points are rounded, so that the structure file stays small; both are of the order of 1.
+const COEFFICIENT_STEP: f64 = 1e-7;
+const POINT_STEP: f64 = 1e-6;
 
 /// Rounds of population and processes: the first population contains the discrepancy in its spread and noise.
 const ROUNDS: usize = 3;
@@ -65,7 +72,8 @@ pub fn learn(
     u: &[Option<Vec<f64>>],
 ) -> Result<Learned, WhyNot> {
     let rows: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(MOST_ROWS).max(1)).copied().collect();
-    let points = support_points(inputs, &rows, u);
+    let mut points = support_points(inputs, &rows, u);
+    points.iter_mut().flatten().for_each(|value| *value = rounded(*value, POINT_STEP));
     if inputs.is_empty() || points.is_empty() {
         return Err(WhyNot::NoInput);
     }
@@ -130,10 +138,13 @@ fn hyperparameters(support: &Support, rows: &Rows, before: &[Option<Hyperparamet
     use rayon::prelude::*;
     let one = |mode: usize| {
         let (places, variance) = rows.of_mode(mode);
+        let stride = places.len().div_ceil(HYPERPARAMETER_ROWS).max(1);
+        let variance: Vec<f64> = variance.iter().step_by(stride).copied().collect();
+        let places: Vec<usize> = places.into_iter().step_by(stride).collect();
         let own = ModeRows {
             u: places.iter().filter_map(|place| rows.u[*place].as_deref()).collect(),
             residual: rows.residual[mode].select_rows(&places),
-            variance,
+            variance: DVector::from_vec(variance),
         };
         own.fit(support, before[mode].as_ref()).filter(|found| found.nats > LEAST_NATS)
     };
@@ -153,8 +164,10 @@ fn definition(
             mode: own.mode + 1,
             std: of_mode.std,
             lengths: of_mode.lengths.clone(),
-            weights: own.mean.iter().copied().collect(),
-            factor: (0..points.len()).map(|i| (0..=i).map(|j| own.factor[(i, j)]).collect()).collect(),
+            weights: own.mean.iter().map(|w| rounded(*w, COEFFICIENT_STEP)).collect(),
+            factor: (0..points.len())
+                .map(|i| (0..=i).map(|j| rounded(own.factor[(i, j)], COEFFICIENT_STEP)).collect())
+                .collect(),
         })
     };
     DiscrepancyDefinition {
@@ -163,6 +176,12 @@ fn definition(
         points: points.to_vec(),
         modes: coefficients.iter().filter_map(mode).collect(),
     }
+}
+
+fn rounded(value: f64, step: f64) -> f64 {
+    // The inverse of a step is exact, so that the decimals are too.
+    let per_step = step.recip().round();
+    (value * per_step).round() / per_step
 }
 
 /// The data with the mean of the discrepancy subtracted. Where the inputs are not known, its prior variance is added to the noise.

@@ -170,3 +170,88 @@ fn conditions(rows: &Rows, basis: &Basis, precision: &Precision) -> DMatrix<f64>
     let size = basis.modes.len() * basis.points();
     DMatrix::from_fn(found.len(), size, |i, k| found[i][(0, k)])
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::discrepancy::data::Data;
+    use crate::discrepancy::learned::input::{choose, standardised};
+    use crate::discrepancy::learned::learn::learn;
+    use crate::discrepancy::study::Study;
+    use crate::measurement::{CovariateValue, ModalMeasurement};
+    use crate::physics::effect::Target;
+    use crate::quantity::{Hertz, Timestamp};
+    use crate::simulator::definition::StructureDefinition;
+    use crate::simulator::Simulator;
+
+    const CHAIN: &str = r#"
+        id = "chain"
+        modes = 3
+        measurement_noise = { relative = 0.001 }
+        mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 1.2 }, { name = "m3", kg = 0.8 }]
+        spring = [
+            { name = "k1", from = "ground", to = "m1", n_per_m = 4000.0 },
+            { name = "k2", from = "m1", to = "m2", n_per_m = 3000.0 },
+            { name = "k3", from = "m2", to = "m3", n_per_m = 2000.0 },
+        ]
+        parameter = [{ name = "k1", prior = { uniform = [2000.0, 6000.0] }, sets = { spring = "k1" } }]
+        covariate = [{ name = "temperature_c" }]
+    "#;
+
+    /// Measurements of a chain whose second spring is 5 % softer than stated, and changes as the sine of the temperature.
+    fn measurements(simulator: &Simulator) -> Vec<ModalMeasurement> {
+        let mut found = Vec::new();
+        for hour in 0..160 {
+            let temperature_c = 10.0 + 9.0 * (2.399 * f64::from(hour)).sin();
+            let change = -0.05 + 0.03 * (0.4 * temperature_c).sin();
+            let targets = [Target::Springs(vec![1])];
+            let response =
+                simulator.respond(&[4000.0 + 20.0 * f64::from(hour % 7 - 3)], 3, &targets, &[change]).unwrap();
+            let noise = |mode: usize| 1.0 + 0.001 * (f64::from(37 * hour) * (1.3 + mode as f64)).sin();
+            let frequencies = response.frequencies_hz.iter().enumerate();
+            found.push(ModalMeasurement {
+                measured_at: Timestamp::from_micros(3_600_000_000 * i64::from(hour)).unwrap(),
+                frequencies_hz: frequencies.map(|(mode, hz)| Some(Hertz::new(hz * noise(mode)).unwrap())).collect(),
+                std_hz: None,
+                mode_shapes: None,
+                covariates: [("temperature_c".to_owned(), CovariateValue::Number(temperature_c))].into(),
+                settings: std::collections::BTreeMap::new(),
+            });
+        }
+        found
+    }
+
+    #[test]
+    fn the_discrepancy_is_orthogonal_to_the_simulation_and_leaves_its_parameters() {
+        let simulator = Simulator::new(StructureDefinition::parse_toml(CHAIN).unwrap()).unwrap();
+        let data = Data::new(&simulator, &measurements(&simulator));
+        let study = Study::new(&simulator, &data);
+        let all: Vec<usize> = (0..data.rows()).collect();
+        let base = study.fit(&all, &[], None).unwrap();
+        let chosen = choose(&simulator, &data, &all);
+        let u = standardised(&simulator, &data, &chosen.inputs);
+        let learned = learn(&study, &all, &base, &chosen.inputs, &u).unwrap();
+        assert!(learned.change.is_none(), "{:?}", learned.change);
+        // The stiffness stays where the simulation alone puts it, although it is not the true one.
+        let moved = (learned.fit.mean[0] / base.mean[0] - 1.0).abs();
+        assert!(moved < 0.003, "k1 moved by {moved}, from {}", base.mean[0]);
+        assert!((base.mean[0] / 4000.0 - 1.0).abs() > 0.01, "the discrepancy has moved k1");
+
+        let weights = vec![1.0; data.rows()];
+        let rows = Rows::new(&study, &all, &base, &u, &weights).unwrap();
+        let hyperparameters =
+            vec![Some(Hyperparameters { std: 0.01, lengths: vec![0.5], nats: 0.0 }); simulator.modes()];
+        let points = DMatrix::from_fn(30, 1, |i, _| u[5 * i].as_ref().unwrap()[0]);
+        let support = Support::new(points, vec![false]);
+        let basis = Basis::new(&support, &hyperparameters, &rows).unwrap();
+        let found = posterior(&rows, &basis).unwrap();
+        let all_coefficients = DVector::from_iterator(90, found.iter().flat_map(|c| c.mean.iter().copied()));
+        let g = basis.times(&all_coefficients);
+        let precision = rows.precision(&basis.extra).unwrap();
+        let product = super::super::rows::along(&precision.times(&rows.slopes[0]), &g).sum();
+        let size = super::super::rows::along(&precision.times(&rows.slopes[0]), &rows.slopes[0]).sum();
+        // The part of the discrepancy along the derivative by k1, as a change of k1 in N/m.
+        assert!((product / size).abs() < 1e-6, "{}", product / size);
+        assert!(g[0].amax() > 1e-3, "there is no discrepancy");
+    }
+}

@@ -23,6 +23,7 @@ pub struct DiscrepancyDefinition {
 /// An input of a learned discrepancy: a covariate or a setting.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = DiscrepancyInputDefinition)]
 pub struct InputDefinition {
     /// Name of a declared covariate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -51,6 +52,7 @@ fn one() -> f64 {
 /// The process of one mode.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
+#[schema(as = DiscrepancyModeDefinition)]
 pub struct ModeDefinition {
     /// The mode, counted from 1.
     pub mode: usize,

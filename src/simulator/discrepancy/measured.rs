@@ -133,3 +133,153 @@ impl Simulator {
 fn rows(discrepancy: &Discrepancy) -> Vec<Vec<f64>> {
     discrepancy.support().points().row_iter().map(|row| row.iter().copied().collect()).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::quantity::Timestamp;
+    use crate::simulator::definition::StructureDefinition;
+
+    const TOWER: &str = r#"
+        id = "tower"
+        modes = 2
+        measurement_noise = { relative = 0.001 }
+        mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 1.0 }]
+        spring = [
+            { name = "k1", from = "ground", to = "m1", n_per_m = 1000.0 },
+            { name = "k2", from = "m1", to = "m2", n_per_m = 800.0 },
+        ]
+        parameter = [{ name = "k1", prior = { uniform = [500.0, 1500.0] }, sets = { spring = "k1" } }]
+        covariate = [{ name = "temperature_c" }, { name = "operator", kind = "category" }]
+
+        [discrepancy]
+        inputs = [
+            { covariate = "temperature_c", centre = 10.0, scale = 5.0, seen = [0.0, 20.0] },
+            { covariate = "operator", levels = ["A", "B"] },
+        ]
+        points = [[-1.0, 0.0], [0.0, 1.0], [1.5, 0.0]]
+        [[discrepancy.mode]]
+        mode = 2
+        std = 0.01
+        lengths = [1.0, 2.0]
+        weights = [0.5, -1.0, 0.8]
+        factor = [[0.3], [0.1, 0.2], [0.0, 0.1, 0.4]]
+    "#;
+
+    fn tower() -> Simulator {
+        Simulator::new(StructureDefinition::parse_toml(TOWER).unwrap()).unwrap()
+    }
+
+    fn measurement(temperature_c: Option<f64>, operator: &str) -> ModalMeasurement {
+        let operator = ("operator".to_owned(), CovariateValue::Category(operator.to_owned()));
+        let temperature = temperature_c.map(|t| ("temperature_c".to_owned(), CovariateValue::Number(t)));
+        ModalMeasurement {
+            measured_at: Timestamp::from_micros(0).unwrap(),
+            frequencies_hz: vec![Hertz::new(3.0).map(Some).unwrap(), Hertz::new(8.0).map(Some).unwrap()],
+            std_hz: Some(vec![None, Some(0.02)]),
+            mode_shapes: None,
+            covariates: [operator].into_iter().chain(temperature).collect(),
+            settings: BTreeMap::new(),
+        }
+    }
+
+    #[test]
+    fn each_mistake_of_a_discrepancy_is_named_with_its_place() {
+        let cases = [
+            ("measurement_noise = { relative = 0.001 }", "", "/discrepancy", "measurement_noise above 0"),
+            (
+                "covariate = \"operator\", l",
+                "covariate = \"lab\", l",
+                "/discrepancy/inputs/1/covariate",
+                "no [[covariate]] \"lab\"",
+            ),
+            (
+                "covariate = \"operator\", levels = [\"A\", \"B\"]",
+                "covariate = \"operator\", seen = [0.0, 1.0]",
+                "/discrepancy/inputs/1/levels",
+                "list its levels",
+            ),
+            (
+                "covariate = \"operator\", l",
+                "setting = \"k9\", l",
+                "/discrepancy/inputs/1/setting",
+                "no parameter \"k9\"",
+            ),
+            (
+                "covariate = \"operator\", l",
+                "setting = \"k1\", covariate = \"operator\", l",
+                "/discrepancy/inputs/1",
+                "either a covariate or a setting",
+            ),
+            ("scale = 5.0", "scale = 0.0", "/discrepancy/inputs/0/scale", "above 0"),
+            ("seen = [0.0, 20.0]", "seen = [20.0, 0.0]", "/discrepancy/inputs/0/seen", "ascending order"),
+            ("[0.0, 1.0], [1.5", "[0.0, 2.0], [1.5", "/discrepancy/points/1", "an index of its levels, 0 to 1"),
+            ("[0.0, 1.0], [1.5", "[0.0], [1.5", "/discrepancy/points/1", "2 finite numbers"),
+            ("mode = 2", "mode = 3", "/discrepancy/mode/0/mode", "modes 1 to 2"),
+            ("std = 0.01", "std = -0.01", "/discrepancy/mode/0/std", "above 0 and below 1"),
+            ("lengths = [1.0, 2.0]", "lengths = [1.0]", "/discrepancy/mode/0/lengths", "2 finite numbers"),
+            ("weights = [0.5, -1.0, 0.8]", "weights = [0.5]", "/discrepancy/mode/0/weights", "3 finite numbers"),
+            ("factor = [[0.3]", "factor = [[1.3]", "/discrepancy/mode/0/factor", "more than 1"),
+            ("[0.1, 0.2], ", "[0.1], ", "/discrepancy/mode/0/factor", "lower triangle of 3 rows"),
+        ];
+        for (text, by, pointer, message) in cases {
+            assert!(TOWER.contains(text), "{text}");
+            let error = StructureDefinition::parse_toml(&TOWER.replacen(text, by, 1)).unwrap_err();
+            let found = error.problems.iter().any(|p| p.pointer == pointer && p.message.contains(message));
+            assert!(found, "{by}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_measurement_is_corrected_by_the_mean_and_gets_the_variance() {
+        let tower = tower();
+        let own = measurement(Some(12.0), "B");
+        let corrected = tower.corrected(&own);
+        let moments = tower.discrepancy().unwrap().at(Some(&[0.4, 1.0]))[1];
+        assert!(moments.mean.abs() > 1e-4 && moments.variance > 0.0 && moments.variance < 1e-4, "{moments:?}");
+        let hz = |mode: usize| corrected.frequencies_hz[mode].unwrap().get();
+        assert!((hz(1) - 8.0 * (-moments.mean).exp()).abs() < 1e-12 && (hz(0) - 3.0).abs() < 1e-12);
+        let std = corrected.std_hz.as_ref().unwrap();
+        let expected = (0.02 * (-moments.mean).exp()).hypot(hz(1) * moments.variance.sqrt());
+        assert!((std[1].unwrap() - expected).abs() < 1e-12 && (std[0].unwrap() - 0.003).abs() < 1e-12, "{std:?}");
+
+        // Without an input, the prior: no correction, σ = 1 % of 8 Hz.
+        let (blind, unknown) = (measurement(None, "A"), measurement(Some(12.0), "C"));
+        for (own, reservations) in [(&blind, (1, 0)), (&unknown, (0, 1))] {
+            let corrected = tower.corrected(own);
+            assert!((corrected.frequencies_hz[1].unwrap().get() - 8.0).abs() < 1e-12);
+            assert!((corrected.std_hz.as_ref().unwrap()[1].unwrap() - 0.02_f64.hypot(0.08)).abs() < 1e-12);
+            let (missing, beyond) = tower.discrepancy_reservations(own);
+            assert_eq!((missing.len(), beyond.len()), reservations);
+        }
+        assert_eq!(tower.discrepancy_reservations(&measurement(Some(22.5), "A")).1, ["temperature_c"]);
+        assert_eq!(tower.discrepancy_reservations(&measurement(Some(21.5), "A")).1.len(), 0);
+    }
+
+    /// Over many drawn functions, ln f minus the mean of g has the variance of g.
+    #[test]
+    fn simulated_measurements_contain_the_discrepancy() {
+        let tower = tower();
+        let discrepancy = tower.discrepancy().unwrap();
+        let (mut squares, mut sum, mut count) = (0.0, 0.0, 0.0);
+        for seed in 0..4_000 {
+            for ((covariates, settings), factors) in tower.draw_discrepancy(&[vec![1000.0]], seed).unwrap() {
+                let inputs = discrepancy.inputs(&covariates, &settings);
+                let moments = discrepancy.at(inputs.u.as_deref())[1];
+                let unit = (factors[1].ln() - moments.mean) / moments.variance.sqrt();
+                assert!((factors[0] - 1.0).abs() < 1e-15);
+                squares += unit * unit;
+                sum += unit;
+                count += 1.0;
+            }
+        }
+        // Standard errors over 4,000 draws: 0.016 of the mean and 0.022 of the variance; four of them.
+        assert!(
+            (sum / count).abs() < 0.064 && (squares / count - 1.0).abs() < 0.09,
+            "{} {}",
+            sum / count,
+            squares / count
+        );
+        assert_eq!(tower.typical_discrepancy_variance()[0], 0.0);
+    }
+}
