@@ -133,7 +133,7 @@ fn figures(modes: usize, before: &[Predicted], after: &[Predicted], held_out: bo
     let density = |rows: &[Predicted]| stats::mean(&rows.iter().map(|row| row.log_density).collect::<Vec<f64>>());
     let differences: Vec<f64> = after.iter().zip(before).map(|(b, a)| b.log_density - a.log_density).collect();
     let (n, mean) = (differences.len(), stats::mean(&differences));
-    let mut sums = vec![0.0; BLOCKS];
+    let mut sums = [0.0; BLOCKS];
     for (place, difference) in differences.iter().enumerate() {
         sums[place * BLOCKS / n] += difference - mean;
     }

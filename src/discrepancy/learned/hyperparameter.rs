@@ -49,12 +49,17 @@ pub struct ModeRows<'a> {
     pub variance: DVector<f64>,
 }
 
+/// x = (ln σ, ln ℓ) with the same length along all inputs.
+fn start_at(inputs: usize, ln_std: f64, ln_length: f64) -> DVector<f64> {
+    DVector::from_fn(1 + inputs, |i, _| if i == 0 { ln_std } else { ln_length })
+}
+
 impl ModeRows<'_> {
     /// The most probable hyperparameters, from `start` if it is given; `None` if the correlations are not finite.
     pub fn fit(&self, support: &Support, start: Option<&Hyperparameters>) -> Option<Hyperparameters> {
         let inputs = self.u.first()?.len();
         let size = (self.residual.norm_squared() / self.u.len() as f64).sqrt().max(STDS.0);
-        let middle = self.at(inputs, (0.5 * size).ln(), LENGTH.0.ln());
+        let middle = start_at(inputs, (0.5 * size).ln(), LENGTH.0.ln());
         let mut best: Option<(DVector<f64>, f64)> = None;
         let starts: Vec<DVector<f64>> = match start {
             Some(s) => vec![DVector::from_iterator(
@@ -62,7 +67,7 @@ impl ModeRows<'_> {
                 std::iter::once(s.std.ln()).chain(s.lengths.iter().map(|l| l.ln())),
             )],
             // A smooth and a rough function can both be local maxima.
-            None => vec![middle.clone(), self.at(inputs, (0.5 * size).ln(), 0.0)],
+            None => vec![middle.clone(), start_at(inputs, (0.5 * size).ln(), 0.0)],
         };
         for start in starts {
             let found = self.ascend(support, start, &middle)?;
@@ -73,10 +78,6 @@ impl ModeRows<'_> {
         let (x, _) = best?;
         let nats = self.log_marginal(support, &x)?.0 - self.without();
         Some(Hyperparameters { std: x[0].exp(), lengths: x.iter().skip(1).map(|l| l.exp()).collect(), nats })
-    }
-
-    fn at(&self, inputs: usize, ln_std: f64, ln_length: f64) -> DVector<f64> {
-        DVector::from_fn(1 + inputs, |i, _| if i == 0 { ln_std } else { ln_length })
     }
 
     /// Log marginal likelihood without a discrepancy, nats, without the constant.

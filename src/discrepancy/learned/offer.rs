@@ -131,10 +131,10 @@ fn in_words(inputs: &[String], change: Option<&ChangeInTime>, gain: &LearnedGain
         )
     };
     if let Some(change) = change {
-        text.push_str(&format!(
-            " It is not added to a structure, because among the rows it would be learned from {}, which may be damage.",
-            change.in_words(time_unit)
-        ));
+        let what = change.in_words(time_unit);
+        text.push_str(" It is not added to a structure, because among the rows it would be learned from ");
+        text.push_str(&what);
+        text.push_str(", which may be damage.");
     }
     text
 }

@@ -22,7 +22,8 @@ pub(super) fn learned(offered: &Offered, outcome: &Outcome) -> String {
     let modes = offered.learned.discrepancy.modes();
     let sizes: Vec<String> =
         offer.size_percent.iter().enumerate().map(|(m, s)| format!("mode {} {} %", m + 1, digits(*s))).collect();
-    let refused: String = offer.refused.iter().map(|text| format!("<p>{}.</p>", escaped(text))).collect();
+    let refused: Vec<String> = offer.refused.iter().map(|text| format!("<p>{}.</p>", escaped(text))).collect();
+    let refused = refused.concat();
     let mut curves: Vec<(f64, String)> = Vec::new();
     for mode in (0..modes.len()).filter(|mode| modes[*mode].is_some()) {
         for input in 0..offer.inputs.len() {
