@@ -291,7 +291,8 @@ fn an_input_that_follows_time_is_refused_and_said() {
     for row in &mut rows {
         row.temperature_c = -5.0 + 0.2 * row.day + 2.0 * rng.sample::<f64, _>(StandardNormal);
     }
-    let (text, _) = csv(&mut rng, &rows, |row| [0.0, 0.0, Unknown::Product.change(row).1, 0.0]);
+    let wave = |row: &Row| 0.05 * ((row.humidity_percent - 60.0) / 8.0).sin();
+    let (text, _) = csv(&mut rng, &rows, |row| [0.0, 0.0, Unknown::Product.change(row).1 + wave(row), 0.0]);
     let answer = answer(&chain_toml(), &text, &["--learned"]);
     let refused = answer["learned"]["refused"].as_array().unwrap();
     assert!(refused.iter().any(|r| r.as_str().unwrap().starts_with("temperature_c follows time")), "{answer:#}");

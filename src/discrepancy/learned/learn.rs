@@ -72,18 +72,16 @@ pub fn learn(
     u: &[Option<Vec<f64>>],
 ) -> Result<Learned, WhyNot> {
     let rows: Vec<usize> = rows.iter().step_by(rows.len().div_ceil(MOST_ROWS).max(1)).copied().collect();
-    let mut points = support_points(inputs, &rows, u);
-    points.iter_mut().flatten().for_each(|value| *value = rounded(*value, POINT_STEP));
-    if inputs.is_empty() || points.is_empty() {
+    if inputs.is_empty() || rows.iter().all(|row| u[*row].is_none()) {
         return Err(WhyNot::NoInput);
     }
-    let matrix = DMatrix::from_fn(points.len(), inputs.len(), |point, input| points[point][input]);
-    let support = Support::new(matrix, inputs.iter().map(InputDefinition::is_category).collect());
     let mut fit = base.clone();
     let mut weights: Vec<f64> = study.view(&rows, base).ok_or(WhyNot::NoFit)?.iter().map(|view| view.weight).collect();
     let mut modes: Vec<Option<Hyperparameters>> = vec![None; study.simulator.modes()];
     let mut round = 0;
     loop {
+        let points = support_points(inputs, &rows, u, &shortest_lengths(inputs.len(), &modes));
+        let support = support(inputs, &points);
         let residuals = Rows::new(study, &rows, &fit, u, &weights).ok_or(WhyNot::NoFit)?;
         modes = hyperparameters(&support, &residuals, &modes);
         let basis = Basis::new(&support, &modes, &residuals).ok_or(WhyNot::NoFit)?;
@@ -106,30 +104,44 @@ pub fn learn(
     }
 }
 
+/// The support with these points, `[points][inputs]`.
+fn support(inputs: &[InputDefinition], points: &[Vec<f64>]) -> Support {
+    let matrix = DMatrix::from_fn(points.len(), inputs.len(), |point, input| points[point][input]);
+    Support::new(matrix, inputs.iter().map(InputDefinition::is_category).collect())
+}
+
+/// The shortest correlation length of any mode along each input, `[inputs]`; 1 before lengths are known.
+fn shortest_lengths(inputs: usize, modes: &[Option<Hyperparameters>]) -> Vec<f64> {
+    let of = |input: usize| modes.iter().flatten().map(|own| own.lengths[input]).reduce(f64::min).unwrap_or(1.0);
+    (0..inputs).map(of).collect()
+}
+
 /// Points for the support among the inputs of the rows: the one nearest to the middle, then always the one farthest from those
-/// before, so that they cover what was seen. Fewer where the rows have fewer different inputs.
-fn support_points(inputs: &[InputDefinition], rows: &[usize], u: &[Option<Vec<f64>>]) -> Vec<Vec<f64>> {
+/// before, in units of `lengths`, so that they cover what was seen most densely along the inputs that matter. Fewer where the rows
+/// have fewer different inputs.
+fn support_points(
+    inputs: &[InputDefinition],
+    rows: &[usize],
+    u: &[Option<Vec<f64>>],
+    lengths: &[f64],
+) -> Vec<Vec<f64>> {
     let known: Vec<&Vec<f64>> = rows.iter().filter_map(|row| u[*row].as_ref()).collect();
-    let lengths = vec![1.0; inputs.len()];
-    let metric =
-        Support::new(DMatrix::zeros(0, inputs.len()), inputs.iter().map(InputDefinition::is_category).collect());
+    let metric = support(inputs, &[]);
     let middle: Vec<f64> = vec![0.0; inputs.len()];
-    let nearest = known.iter().min_by(|a, b| {
-        let distance = |v: &[f64]| metric.squared_distance(v, &middle, &lengths);
-        distance(a).total_cmp(&distance(b))
-    });
-    let Some(first) = nearest else { return Vec::new() };
+    let distance = |v: &[f64]| metric.squared_distance(v, &middle, lengths);
+    let Some(first) = known.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))) else { return Vec::new() };
     let mut points = vec![(*first).clone()];
     let mut left: Vec<f64> = vec![f64::INFINITY; known.len()];
     while points.len() < MOST_SUPPORT {
         let newest = &points[points.len() - 1];
         for (left, candidate) in left.iter_mut().zip(&known) {
-            *left = left.min(metric.squared_distance(candidate, newest, &lengths));
+            *left = left.min(metric.squared_distance(candidate, newest, lengths));
         }
         let farthest = (0..known.len()).max_by(|a, b| left[*a].total_cmp(&left[*b]));
-        let Some(place) = farthest.filter(|place| left[*place] > 1e-12) else { break };
+        let Some(place) = farthest.filter(|place| left[*place] > 1e-9) else { break };
         points.push(known[place].clone());
     }
+    points.iter_mut().flatten().for_each(|value| *value = rounded(*value, POINT_STEP));
     points
 }
 
