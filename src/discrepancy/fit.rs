@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::effect::FittedEffect;
+use super::outside::Outside;
 
 /// The posterior maximum of the model (see `model.rs`) for one set of effects.
 #[derive(Debug, Clone)]
@@ -13,8 +14,10 @@ pub struct Fit {
     pub mean: Vec<f64>,
     /// Standard deviation σ of each parameter between rows, `[d]`; 0 for one that is set in every row.
     pub spread: Vec<f64>,
-    /// Factor s on the stated noise of each mode, `[m]`.
+    /// Factor s on the stated noise of the frequency of each mode, `[m]`.
     pub noise_factor: Vec<f64>,
+    /// Factor on the stated noise of the shape of each mode, `[m]`; empty if no shapes were measured.
+    pub shape_noise_factor: Vec<f64>,
     /// Numbers ψ of each effect.
     pub psi: Vec<Vec<f64>>,
     /// Degrees of freedom ν of the t distribution; infinite for a normal distribution.
@@ -27,6 +30,10 @@ pub struct Fit {
     pub log_likelihood: f64,
     /// ln ∫ p(y) by Laplace's method, nats.
     pub log_evidence: f64,
+    /// Posterior standard deviation of ln s of each mode, `[m]`.
+    pub noise_factor_ln_std: Vec<f64>,
+    /// Settings outside their priors.
+    pub outside: Outside,
     /// Number of unknowns: means, ψ, spreads and noise factors.
     pub unknowns: usize,
 }

@@ -1,6 +1,6 @@
 //! Properties of the data that limit what a diagnosis can find.
 
-use super::data::{Column, Data, Values, MOST_LEVELS};
+use super::data::{Column, Data, Origin, Values, MOST_LEVELS};
 use super::fit::Fit;
 use super::grammar::spread;
 use crate::simulator::Simulator;
@@ -9,7 +9,7 @@ use crate::stats;
 /// Two covariates whose correlation exceeds this cannot be distinguished.
 const COLLINEAR: f64 = 0.98;
 
-/// Noise factor above which a mode scatters more than stated.
+/// Noise factor above which a shape scatters more than stated.
 const NOISY: f64 = 2.0;
 
 /// Share of independent rows below which the correlation in time is reported.
@@ -29,7 +29,7 @@ pub(super) fn notes(
 ) -> Vec<String> {
     let mut notes = modes_seldom_measured(simulator, data, rows);
     let mut numeric: Vec<(&str, Vec<f64>)> = Vec::new();
-    for column in &data.columns {
+    for column in data.columns.iter().filter(|column| !matches!(column.origin, Origin::Product(..))) {
         match &column.values {
             Values::Numbers(values) => {
                 let Some(filled) = filled(column, values, rows, &mut notes) else { continue };
@@ -48,16 +48,8 @@ pub(super) fn notes(
             Values::Categories(names, indices) => notes.extend(unusable_categories(&column.name, names, indices, rows)),
         }
     }
-    notes.extend(outside_priors(simulator, data, rows, fit));
-    for (mode, factor) in fit.noise_factor.iter().enumerate() {
-        if *factor > NOISY {
-            notes.push(format!(
-                "mode {} scatters {factor:.1} times as much as its stated noise, beyond the scatter that the spread of the \
-                 parameters explains",
-                mode + 1
-            ));
-        }
-    }
+    notes.extend(outside_priors(simulator, fit));
+    notes.extend(of_shapes(simulator, data, rows, fit));
     if independent_share < CORRELATED {
         notes.push(format!(
             "residuals of successive rows are correlated: the rows carry as much information as {:.0} % of their number would if \
@@ -67,6 +59,32 @@ pub(super) fn notes(
     }
     if rows.len() < FEW_ROWS {
         notes.push(format!("{} rows are few: small effects cannot be detected", rows.len()));
+    }
+    notes
+}
+
+/// Notes on mode shapes: in how many rows they were measured, their order and their noise.
+fn of_shapes(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit) -> Vec<String> {
+    let Some(shapes) = &data.shapes else { return Vec::new() };
+    let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
+    let measured = shapes.rows_with_shapes(rows);
+    let mut notes =
+        vec![format!("mode shapes at {} are compared in {measured} of {} rows", points.join(", "), rows.len())];
+    if shapes.reordered > 0 {
+        notes.push(format!(
+            "in {} rows the modes were listed in another order than in the others, as their shapes show: they were put in the same \
+             order",
+            shapes.reordered
+        ));
+    }
+    for (mode, factor) in fit.shape_noise_factor.iter().enumerate() {
+        if *factor > NOISY {
+            notes.push(format!(
+                "the shape of mode {} scatters {factor:.1} times as much as the noise of the structure file states, beyond the \
+                 scatter that the spread of the parameters explains",
+                mode + 1
+            ));
+        }
     }
     notes
 }
@@ -123,16 +141,9 @@ fn unusable_categories(name: &str, names: &[String], indices: &[Option<usize>], 
     }
 }
 
-/// Notes on settings and estimated parameters outside their priors.
-fn outside_priors(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit) -> Vec<String> {
+/// Notes on estimated parameters outside their priors.
+fn outside_priors(simulator: &Simulator, fit: &Fit) -> Vec<String> {
     let mut notes = Vec::new();
-    for (k, p) in simulator.space().iter().enumerate() {
-        let set = rows.iter().filter_map(|r| data.settings[*r][k]);
-        let outside = set.filter(|v| !p.prior().contains(v)).count();
-        if outside > 0 {
-            notes.push(format!("{outside} settings of {} lie outside its prior, {} to {}", p.name, p.lower, p.upper));
-        }
-    }
     for &k in &fit.free {
         let p = &simulator.space().as_slice()[k];
         if !p.prior().contains(&fit.mean[k]) {

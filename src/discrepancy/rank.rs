@@ -7,6 +7,7 @@ use super::effect::FittedEffect;
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
+use super::setting_starts::{Guess, PresentSettings};
 use super::study::Study;
 use crate::physics::effect::Target;
 use crate::simulator::law::LawKind;
@@ -21,7 +22,12 @@ const REFINED: usize = 5;
 /// Evidence that a covariate must add to a constant effect on the same target, nats.
 const COVARIATE_NATS: f64 = 3.0;
 
-/// If an arbitrary constant for each mode has an estimated gain below this, no constant effect can be accepted, nats.
+/// Constant effects that are fitted if an arbitrary constant is significant: all in structures of up to about ten bodies. They are not
+/// chosen by the score test alone, because it is a linear estimate at size 0, and constant effects are often large: parameters
+/// have adapted to them, and the estimate of the true one can lie far below that of others.
+const CONSTANTS: usize = 80;
+
+/// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
@@ -56,6 +62,11 @@ struct Trial {
 }
 
 impl Trial {
+    /// Log evidence with the cost of settings outside their priors and of numbers that are not fitted, nats.
+    fn merit(&self) -> f64 {
+        self.fit.log_evidence - self.fit.outside.nats - self.cost_nats
+    }
+
     /// Fits the effect of a score test, starting from its first guess; `None` if the fit fails.
     fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, candidate: &Candidate, promise: &Promise) -> Option<Self> {
         let effect =
@@ -100,13 +111,18 @@ pub fn rank(
 
     let fitted = |promise: &&Promise| Trial::new(study, rows, fit, &candidates[promise.candidate], promise);
     let mut tried: Vec<Trial> = most_promising(&promised, candidates).par_iter().filter_map(fitted).collect();
-    // No constant effect can gain more than an arbitrary constant for each mode.
+    // No constant effect can gain more than an arbitrary constant for each output.
     let ones = DVector::from_element(rows.len(), 1.0);
-    let constant = whitened.free_score(&whitened.mode_sums(study.simulator.modes()), &ones);
+    let constant = whitened.free_score(&whitened.output_sums(study.outputs()), &ones);
     if constant.nats > CONSTANT_NATS {
+        let left = promised.iter().filter(|p| candidates[p.candidate].covariate.is_none());
+        let left = left.filter(|p| !tried.iter().any(|t| t.candidate == p.candidate)).take(CONSTANTS);
+        let constants: Vec<Trial> = left.collect::<Vec<_>>().par_iter().filter_map(fitted).collect();
+        tried.extend(constants);
         tried.extend(unscreened(study, rows, fit, candidates));
     }
-    let evidence = |t: &Trial| t.fit.log_evidence - t.cost_nats + candidates[t.candidate].weight.ln();
+    tried.extend(corrections(study, rows, fit, candidates));
+    let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln();
     let mut order: Vec<(usize, f64)> = tried.iter().map(|t| (t.candidate, evidence(t))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     let refined: Vec<usize> = order.iter().take(REFINED).map(|o| o.0).collect();
@@ -117,7 +133,7 @@ pub fn rank(
         .collect();
     tried.extend(further.par_iter().filter_map(fitted).collect::<Vec<_>>());
 
-    let best = tried.iter().max_by(|a, b| a.fit.log_evidence.total_cmp(&b.fit.log_evidence));
+    let best = tried.iter().max_by(|a, b| a.merit().total_cmp(&b.merit()));
     let share = best.map_or(Some(1.0), |t| independent_share(study, rows, &t.fit))?;
     Some((by_probability(study, fit, candidates, &tried, share), share))
 }
@@ -155,9 +171,12 @@ fn by_probability(
     let mut ranked: Vec<Ranked> = Vec::new();
     for (index, candidate) in candidates.iter().enumerate() {
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
-        own.sort_by(|a, b| (b.fit.log_evidence - b.cost_nats).total_cmp(&(a.fit.log_evidence - a.cost_nats)));
+        own.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
         let Some(first) = own.first() else { continue };
-        let gain = |t: &&Trial| independent_share * (t.fit.log_evidence - fit.log_evidence) - t.cost_nats;
+        let gain = |t: &&Trial| {
+            let inside = fit.outside.nats - t.fit.outside.nats;
+            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats
+        };
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();
         let laws = own.iter().map(|t| (t.law, gain(t))).collect();
@@ -223,12 +242,16 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
         let fit = study.fit(rows, &effects, Some(&Start::with(fit, psi.clone())))?;
         Some(Trial { candidate: *index, law: LawKind::Constant, fit, cost_nats: 0.0 })
     };
-    let all: Vec<Trial> = jobs.par_iter().filter_map(fitted).collect();
     // Only the best tuning of an oscillator is kept.
+    best_of_each(jobs.par_iter().filter_map(fitted).collect())
+}
+
+/// The best trial of each candidate.
+fn best_of_each(trials: Vec<Trial>) -> Vec<Trial> {
     let mut best: Vec<Trial> = Vec::new();
-    for one in all {
+    for one in trials {
         match best.iter_mut().find(|b| b.candidate == one.candidate) {
-            Some(known) if known.fit.log_evidence >= one.fit.log_evidence => {}
+            Some(known) if known.merit() >= one.merit() => {}
             Some(known) => *known = one,
             None => best.push(one),
         }
@@ -236,16 +259,43 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
     best
 }
 
+/// Fits the corrections of settings that have no score test, from their first guesses.
+fn corrections(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Vec<Trial> {
+    let present = PresentSettings {
+        simulator: study.simulator,
+        data: study.data,
+        rows,
+        corrected: study.corrected_settings(rows, fit),
+        any_outside: fit.outside.rows > 0,
+    };
+    if present.corrected.is_empty() {
+        return Vec::new();
+    }
+    let present_target = |target: &Target| fit.effects.iter().any(|e| e.target == *target);
+    let mut jobs: Vec<(usize, Guess)> = Vec::new();
+    for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| !present_target(&c.target)) {
+        jobs.extend(present.guesses(candidate).into_iter().map(|guess| (index, guess)));
+    }
+    let fitted = |(index, guess): &(usize, Guess)| {
+        let effect = candidates[*index].effect(study.simulator, study.data, rows, guess.law, false, guess.step_days);
+        let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
+        let found = study.fit(rows, &effects, Some(&Start::with(fit, Some(guess.psi.clone()))))?;
+        let cost_nats = if guess.law == LawKind::Step { STEP_TIMES.ln() } else { 0.0 };
+        Some(Trial { candidate: *index, law: guess.law, fit: found, cost_nats })
+    };
+    best_of_each(jobs.par_iter().filter_map(fitted).collect())
+}
+
 /// Effective number of independent rows as a share of all rows: (1 − ρ)/(1 + ρ), with ρ the correlation of successive whitened
 /// residuals; 1 if ρ is within three standard errors of 0. `None` if the frequencies cannot be computed in some row.
 fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64> {
     let views = study.view(rows, fit)?;
-    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.simulator.modes()];
+    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.outputs()];
     for view in &views {
         let factor = view.covariance.clone().cholesky()?.l();
         let white = factor.solve_lower_triangular(&view.residual)?;
-        for (place, mode) in view.present.iter().enumerate() {
-            series[*mode].push(white[place] * view.weight.sqrt());
+        for (place, output) in view.present.iter().enumerate() {
+            series[*output].push(white[place] * view.weight.sqrt());
         }
     }
     let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);

@@ -18,7 +18,7 @@ use super::grammar::{spread, Candidate};
 use super::model::RowView;
 use super::study::Study;
 use crate::physics::effect::Target;
-use crate::simulator::law::{lagged, LawKind};
+use crate::simulator::law::{lagged, Input, Law, LawKind};
 use crate::stats;
 
 /// Share of the information about a number that must remain after projecting out the numbers that are fitted already.
@@ -54,11 +54,11 @@ pub struct Whitened {
     pub nuisance: Vec<DMatrix<f64>>,
     /// Inverse of ⟨N, N⟩ plus the prior information, `[N, N]`.
     inverse: DMatrix<f64>,
-    /// L⁻¹, the modes present and √w of each row.
+    /// L⁻¹, the outputs present and √w of each row.
     factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
 }
 
-/// Products of one direction T in the space of frequencies with residual and derivatives, for each row: w TᵀV⁻¹e, `[rows]`;
+/// Products of one direction T in the space of outputs with residual and derivatives, for each row: w TᵀV⁻¹e, `[rows]`;
 /// w TᵀV⁻¹T, `[rows]`; w TᵀV⁻¹N, `[rows, N]`.
 pub struct Sums {
     along: DVector<f64>,
@@ -67,13 +67,13 @@ pub struct Sums {
     nuisance: DMatrix<f64>,
 }
 
-/// The same products for the unit direction of each mode.
-pub struct ModeSums {
-    /// `[rows, modes]`
+/// The same products for the unit direction of each of the first outputs.
+pub struct OutputSums {
+    /// `[rows, outputs]`
     along: DMatrix<f64>,
-    /// `[rows, modes·modes]`
+    /// `[rows, outputs·outputs]`
     square: DMatrix<f64>,
-    /// `[rows, N·modes]`
+    /// `[rows, N·outputs]`
     nuisance: DMatrix<f64>,
 }
 
@@ -123,7 +123,8 @@ impl Whitened {
         Some(Self { residual, nuisance, inverse, factors })
     }
 
-    /// Products of the direction whose component is `direction(index of the row, mode)`, in ln f per unit of the number.
+    /// Products of the direction whose component is `direction(index of the row, output)`, in the unit of the output (ln f, or rad
+    /// for a shape) per unit of the number.
     pub fn sums(&self, direction: impl Fn(usize, usize) -> f64) -> Sums {
         let rows = self.factors.len();
         let mut sums = Sums {
@@ -169,38 +170,39 @@ impl Whitened {
         self.solve(&score, &information, &cross)
     }
 
-    /// Products of the unit direction of each mode.
-    pub fn mode_sums(&self, modes: usize) -> ModeSums {
+    /// Products of the unit direction of each of the first `outputs` outputs.
+    pub fn output_sums(&self, outputs: usize) -> OutputSums {
         let (rows, columns) = (self.factors.len(), self.inverse.nrows());
-        let mut sums = ModeSums {
-            along: DMatrix::zeros(rows, modes),
-            square: DMatrix::zeros(rows, modes * modes),
-            nuisance: DMatrix::zeros(rows, modes * columns),
+        let mut sums = OutputSums {
+            along: DMatrix::zeros(rows, outputs),
+            square: DMatrix::zeros(rows, outputs * outputs),
+            nuisance: DMatrix::zeros(rows, outputs * columns),
         };
         for (place, (inverse, present, root)) in self.factors.iter().enumerate() {
             let along = inverse.tr_mul(&self.residual[place]) * *root;
             let square = inverse.tr_mul(inverse) * (root * root);
             let with = inverse.tr_mul(&self.nuisance[place]) * *root;
-            for (i, a) in present.iter().enumerate() {
+            for (i, a) in present.iter().enumerate().take_while(|(_, a)| **a < outputs) {
                 sums.along[(place, *a)] = along[i];
-                for (j, b) in present.iter().enumerate() {
-                    sums.square[(place, b * modes + a)] = square[(i, j)];
+                for (j, b) in present.iter().enumerate().take_while(|(_, b)| **b < outputs) {
+                    sums.square[(place, b * outputs + a)] = square[(i, j)];
                 }
                 for column in 0..columns {
-                    sums.nuisance[(place, column * modes + a)] = with[(i, column)];
+                    sums.nuisance[(place, column * outputs + a)] = with[(i, column)];
                 }
             }
         }
         sums
     }
 
-    /// The score test of an arbitrary response of each mode to one function of the row, `[rows]`.
-    pub fn free_score(&self, sums: &ModeSums, function: &DVector<f64>) -> Score {
-        let modes = sums.along.ncols();
+    /// The score test of an arbitrary response of each output to one function of the row, `[rows]`.
+    pub fn free_score(&self, sums: &OutputSums, function: &DVector<f64>) -> Score {
+        let outputs = sums.along.ncols();
         let score = sums.along.tr_mul(function);
-        let information = sums.square.tr_mul(&function.component_mul(function)).reshape_generic(Dyn(modes), Dyn(modes));
+        let information =
+            sums.square.tr_mul(&function.component_mul(function)).reshape_generic(Dyn(outputs), Dyn(outputs));
         let columns = self.inverse.nrows();
-        let cross = sums.nuisance.tr_mul(function).reshape_generic(Dyn(modes), Dyn(columns));
+        let cross = sums.nuisance.tr_mul(function).reshape_generic(Dyn(outputs), Dyn(columns));
         self.solve(&score, &information, &cross)
     }
 
@@ -240,8 +242,8 @@ pub fn promises(
 ) -> Option<Vec<Promise>> {
     let mut targets: Vec<&Target> = Vec::new();
     for candidate in candidates {
-        let screened = !matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_));
-        if screened && !targets.contains(&&candidate.target) {
+        let unscreened = matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_));
+        if !unscreened && !candidate.target.is_switch() && !targets.contains(&&candidate.target) {
             targets.push(&candidate.target);
         }
     }
@@ -256,12 +258,28 @@ pub fn promises(
         }
     }
     let bases_of = |input: &(Option<&str>, Option<&str>)| {
-        let candidate = candidates.iter().find(|c| c.input() == *input).expect("every input belongs to a candidate");
-        bases(candidate, study.data, rows)
+        // A switched target follows fewer laws than the others.
+        let candidate = candidates.iter().find(|c| c.input() == *input && !c.target.is_switch());
+        candidate.map_or_else(Vec::new, |candidate| bases(candidate, study.data, rows))
     };
     let bases: Vec<Vec<Basis>> = inputs.par_iter().map(bases_of).collect();
     let ones = DVector::from_element(rows.len(), 1.0);
-    let of_target = |(column, target): (usize, &&Target)| {
+    let mut columns = Vec::with_capacity(targets.len());
+    let mut next = 0;
+    for target in &targets {
+        columns.push(next);
+        next += target.sizes();
+    }
+    let of_target = |(place, target): (usize, &&Target)| {
+        let column = columns[place];
+        if let Target::ModeGain { mode, .. } = target {
+            let candidate = candidates.iter().position(|c| c.target == **target);
+            let beyond = DVector::from_iterator(rows.len(), directions.iter().map(|d| d[(*mode, column)]));
+            let basis =
+                Basis { values: vec![beyond, ones.clone()], ..Basis::new(LawKind::Constant, Vec::new(), Vec::new()) };
+            let sums = whitened.sums(|_, other| f64::from(u8::from(other == *mode)));
+            return candidate.map_or_else(Vec::new, |index| best_of_each_law(whitened, &sums, index, &[basis], None));
+        }
         let sums = whitened.sums(|place, mode| {
             let set = f64::from(u8::from(study.is_set(rows[place], target)));
             directions[place][(mode, column)] * set
@@ -391,6 +409,14 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
                     let basis = vec![rows.iter().map(|row| followed[*row].0 - mean).collect()];
                     all.push(Basis::new(law, basis, vec![lag]));
                 }
+            }
+            LawKind::Product => {
+                let pairs = data.inputs(&Law::of_product(&column.name), None);
+                let values = |part: fn(f64, f64) -> f64| -> Vec<f64> {
+                    let of = |row: &usize| if let Input::Pair(u, v) = pairs[*row] { part(u, v) } else { 0.0 };
+                    rows.iter().map(of).collect()
+                };
+                all.push(Basis::new(law, vec![values(|u, _| u), values(|_, v| v), values(|u, v| u * v)], Vec::new()));
             }
             LawKind::Constant | LawKind::Category => {}
         }

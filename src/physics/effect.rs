@@ -33,8 +33,32 @@ pub enum Target {
     SettingOffset(usize),
     /// A parameter that the experimenter sets, p → p(1 + g).
     SettingScale(usize),
+    /// A parameter that the experimenter sets was given in another unit, p → factor·p where g = 1; unchanged where g = 0.
+    SettingUnit {
+        /// Column of the parameter.
+        column: usize,
+        /// Unit in which it was given, in units of the parameter; −1 for the opposite sign.
+        factor: f64,
+    },
+    /// A parameter that the experimenter sets was measured from the other end, p → g₂ − p where g₁ = 1; unchanged where g₁ = 0.
+    SettingMirror(usize),
+    /// Two parameters that the experimenter sets were exchanged where g = 1.
+    SettingExchange(usize, usize),
     /// Any parameter, p → p(1 + g). An emulator, which has no springs, uses this target.
     ParameterScale(usize),
+    /// Any parameter, p → p + g in the unit of the parameter.
+    ParameterOffset(usize),
+    /// A target on a setting that acts on the frequency of one mode only.
+    InMode(usize, Box<Target>),
+    /// The response of one mode to a parameter: ln f(p) → ln f(r) + (1 + g₁)(ln f(p) − ln f(r)) + g₂, with r the reference.
+    ModeGain {
+        /// The mode.
+        mode: usize,
+        /// Column of the parameter.
+        column: usize,
+        /// Value r of the parameter at which the gain changes nothing, in its unit.
+        reference: f64,
+    },
     /// An additional spring of stiffness g, N/m, between two nodes.
     AddedSpring(Node, Node),
     /// An additional body of g₁ kg on a spring tuned to g₂ Hz, attached to a degree of freedom.
@@ -44,12 +68,41 @@ pub enum Target {
 }
 
 impl Target {
-    /// Number of sizes: 2 for an oscillator, 0 for an order of modes, otherwise 1.
+    /// Number of sizes: 2 for an oscillator, a mirrored setting and the gain of a mode, 0 for an order of modes, otherwise 1.
     pub fn sizes(&self) -> usize {
         match self {
-            Self::Oscillator(_) => 2,
+            Self::Oscillator(_) | Self::SettingMirror(_) | Self::ModeGain { .. } => 2,
             Self::ModeOrder(_) => 0,
+            Self::InMode(_, target) => target.sizes(),
             _ => 1,
+        }
+    }
+
+    /// Whether the first size is a switch: 1 in the rows in which the target acts, 0 in the others.
+    pub fn is_switch(&self) -> bool {
+        match self {
+            Self::SettingUnit { .. } | Self::SettingMirror(_) | Self::SettingExchange(..) => true,
+            Self::InMode(_, target) => target.is_switch(),
+            _ => false,
+        }
+    }
+
+    /// Whether the target changes parameters, or the response to them, instead of the structure or the instrument.
+    pub fn acts_on_parameters(&self) -> bool {
+        let others = matches!(self, Self::ParameterScale(_) | Self::ParameterOffset(_) | Self::ModeGain { .. });
+        others || !self.settings().is_empty()
+    }
+
+    /// Columns of the settings that the target corrects; empty for other targets.
+    pub fn settings(&self) -> Vec<usize> {
+        match self {
+            Self::SettingOffset(column)
+            | Self::SettingScale(column)
+            | Self::SettingUnit { column, .. }
+            | Self::SettingMirror(column) => vec![*column],
+            Self::SettingExchange(one, other) => vec![*one, *other],
+            Self::InMode(_, target) => target.settings(),
+            _ => Vec::new(),
         }
     }
 }
@@ -80,55 +133,35 @@ pub struct Response {
 /// If the number of sizes is not that of the targets.
 pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &[f64]) -> Result<Response, Error> {
     let columns = columns(targets);
-    let total = columns.last().map_or(0, |(first, target)| first + target.sizes());
-    assert_eq!(sizes.len(), total, "one size for each target, two for an oscillator");
     let changed = Changed::new(structure, count, &columns, sizes)?;
     let needed = changed.order.iter().max().map_or(count, |highest| highest + 1);
     let modes = modes(&changed.structure, needed)?;
     let sensitivity = frequency_sensitivity(&changed.structure, &modes);
-
-    let structural: Vec<f64> = changed.order.iter().map(|mode| modes.frequencies_hz[*mode]).collect();
-    let rows = structural.len();
-    let (scale, offset_hz) = instrument(&columns, sizes, rows);
-    let mut by_size = DMatrix::zeros(rows, total);
-    for (number, (first, target)) in columns.iter().enumerate() {
-        for row in 0..rows {
-            let own = &sizes[*first..first + target.sizes()];
-            let slopes = match target {
-                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
-                    [structural[row] * scale[row] / (1.0 + own[0]), 0.0]
-                }
-                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => [1.0, 0.0],
-                _ => changed.slopes(number, target, own, row, scale[row], &sensitivity),
-            };
-            for which in 0..target.sizes() {
-                by_size[(row, first + which)] = slopes[which];
-            }
-        }
-    }
-    let slope = |row: usize, spring: usize| {
-        scale[row] * sensitivity.by_spring[(changed.order[row], spring)] * changed.spring_factor[spring]
-    };
-    let by_spring = DMatrix::from_fn(rows, structure.springs().len(), slope);
-    let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
-    Ok(Response { frequencies_hz, by_spring, by_size })
+    Ok(changed.response(&columns, sizes, &modes.frequencies_hz, &sensitivity))
 }
 
 /// A structure with effects applied to its springs and masses.
-struct Changed {
-    structure: Structure,
+pub(super) struct Changed {
+    pub(super) structure: Structure,
     /// Factor on each spring of the structure without effects.
-    spring_factor: Vec<f64>,
+    pub(super) spring_factor: Vec<f64>,
     /// Index of the spring, and of the mass of an oscillator, that each target adds.
     added: Vec<(usize, usize)>,
     /// Mode of the structure behind each mode of the data.
-    order: Vec<usize>,
+    pub(super) order: Vec<usize>,
 }
 
 impl Changed {
     /// Applies the targets to the springs and masses of a structure. `count`: number of modes wanted; `columns`: each target with
     /// the column of its first size in `sizes`.
-    fn new(structure: &Structure, count: usize, columns: &[(usize, &Target)], sizes: &[f64]) -> Result<Self, Error> {
+    pub(super) fn new(
+        structure: &Structure,
+        count: usize,
+        columns: &[(usize, &Target)],
+        sizes: &[f64],
+    ) -> Result<Self, Error> {
+        let total = columns.last().map_or(0, |(first, target)| first + target.sizes());
+        assert_eq!(sizes.len(), total, "one size for each target, two for an oscillator");
         let mut spring_factor = vec![1.0; structure.springs().len()];
         let mut mass_factor = vec![1.0; structure.masses().len()];
         let mut changed = structure.clone();
@@ -170,7 +203,8 @@ impl Changed {
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                     factor()?;
                 }
-                Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
+                // The simulator applies these to the parameters, or to the frequencies of single modes.
+                _ => {}
             }
         }
         // Springs and masses that targets added follow those of the structure and have no factor. The sizes were checked above,
@@ -180,20 +214,54 @@ impl Changed {
         Ok(Self { structure: changed, spring_factor, added, order })
     }
 
-    /// Derivatives of the frequency of one mode of the data (`row`) with respect to the sizes of target `number`, which acts on
-    /// springs or masses; zeros for other targets. `scale` is the scale of the instrument.
-    fn slopes(
+    /// Frequencies as the instrument reports them and their derivatives, from all frequencies of the structure, Hz, and their
+    /// derivatives.
+    pub(super) fn response(
         &self,
-        number: usize,
-        target: &Target,
+        columns: &[(usize, &Target)],
+        sizes: &[f64],
+        frequencies_hz: &[f64],
+        sensitivity: &FrequencySensitivity,
+    ) -> Response {
+        let structural: Vec<f64> = self.order.iter().map(|mode| frequencies_hz[*mode]).collect();
+        let rows = structural.len();
+        let (scale, offset_hz) = instrument(columns, sizes, rows);
+        let mut by_size = DMatrix::zeros(rows, sizes.len());
+        for (number, (first, target)) in columns.iter().enumerate() {
+            for row in 0..rows {
+                let own = &sizes[*first..first + target.sizes()];
+                let slopes = match target {
+                    Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
+                        [structural[row] * scale[row] / (1.0 + own[0]), 0.0]
+                    }
+                    Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => [1.0, 0.0],
+                    _ => self.slopes((number, target), own, self.order[row], scale[row], sensitivity),
+                };
+                for which in 0..target.sizes() {
+                    by_size[(row, first + which)] = slopes[which];
+                }
+            }
+        }
+        let slope = |row: usize, spring: usize| {
+            scale[row] * sensitivity.by_spring[(self.order[row], spring)] * self.spring_factor[spring]
+        };
+        let by_spring = DMatrix::from_fn(rows, self.spring_factor.len(), slope);
+        let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
+        Response { frequencies_hz, by_spring, by_size }
+    }
+
+    /// Derivatives of the quantity in row `row` of `sensitivity` with respect to the sizes of a target, given with its number,
+    /// that acts on springs or masses; zeros for other targets. `scale` is the scale of the instrument.
+    pub(super) fn slopes(
+        &self,
+        (number, target): (usize, &Target),
         sizes: &[f64],
         row: usize,
         scale: f64,
         sensitivity: &FrequencySensitivity,
     ) -> [f64; 2] {
-        let mode = self.order[row];
-        let by_spring = |spring: usize| sensitivity.by_spring[(mode, spring)];
-        let by_mass = |mass: usize| sensitivity.by_mass[(mode, mass)];
+        let by_spring = |spring: usize| sensitivity.by_spring[(row, spring)];
+        let by_mass = |mass: usize| sensitivity.by_mass[(row, mass)];
         match target {
             Target::Springs(indices) => {
                 let sum: f64 = indices.iter().map(|i| by_spring(*i) * self.structure.springs[*i].n_per_m).sum();
@@ -256,8 +324,10 @@ pub fn measured(
                     return Err(Error::Effect { number, size });
                 }
             }
-            Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
-            _ => return Err(Error::Effect { number, size }),
+            Target::Springs(_) | Target::Masses(_) | Target::AddedSpring(..) | Target::Oscillator(_) => {
+                return Err(Error::Effect { number, size });
+            }
+            _ => {}
         }
     }
     let needed = order.iter().max().map_or(count, |highest| highest + 1);
@@ -303,7 +373,7 @@ fn instrument(columns: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<
 }
 
 /// Each target with the column of its first size.
-fn columns(targets: &[Target]) -> Vec<(usize, &Target)> {
+pub(super) fn columns(targets: &[Target]) -> Vec<(usize, &Target)> {
     let mut first = 0;
     let column = |target| {
         let column = (first, target);

@@ -36,7 +36,7 @@ covariate = [{ name = "temperature_c" }, { name = "humidity_percent" }]
 
 const PER_BATCH: i64 = 10;
 
-/// A batch of one day. k4 changes with the product of temperature and humidity. k1 loses 8 % while it is colder than 4 °C, and
+/// A batch of one day. k4 changes as a wave over temperature and humidity. k1 loses 8 % while it is colder than 4 °C, and
 /// always if the loss `stays`.
 fn batch(day: f64, stays: bool, rng: &mut impl rand::Rng) -> Vec<Value> {
     let mut one = |i: i64| {
@@ -45,7 +45,7 @@ fn batch(day: f64, stays: bool, rng: &mut impl rand::Rng) -> Vec<Value> {
         let h = (60.0 + 15.0 * normal()).clamp(5.0, 100.0);
         let k1 = 1000.0 * (1.0 + 0.006 * normal()) * if stays || t < 4.0 { 0.92 } else { 1.0 };
         let k2 = 1400.0 * (1.0 + 0.006 * normal());
-        let k4 = 1100.0 * (1.0 + 0.06 * (t - 10.0) / 10.0 * (h - 60.0) / 15.0);
+        let k4 = 1100.0 * (1.0 + 0.06 * (2.0 * (t - 10.0) / 10.0 + 1.5 * (h - 60.0) / 15.0).sin());
         let springs = [(None, 0, k1), (Some(0), 1, k2), (Some(1), 2, 900.0), (Some(2), 3, k4), (None, 3, 700.0)];
         let exact = world::frequencies_hz(&[1.0, 0.8, 1.2, 0.9], &springs).unwrap();
         let f: Vec<f64> = exact.iter().map(|f| f * (1.0 + 0.002 * normal())).collect();

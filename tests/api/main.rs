@@ -17,6 +17,8 @@ mod learned;
 mod needs;
 mod openapi;
 mod operations;
+mod reference;
 mod restart;
 mod ruler_frame;
+mod tables;
 mod views;

@@ -4,8 +4,10 @@
 
 use std::collections::BTreeMap;
 
-use modalwatch::measurement::check::{check_measurements, Expectation};
-use modalwatch::measurement::csv::{read, write, CsvOptions, Times};
+use modalwatch::measurement::body::RawBatch;
+use modalwatch::measurement::check::{check_each, check_measurements, Expectation, Purpose};
+use modalwatch::measurement::csv::{read, write, CsvOptions};
+use modalwatch::measurement::shape::InstrumentedPoints;
 use modalwatch::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
 use modalwatch::quantity::{Hertz, Timestamp};
@@ -30,7 +32,7 @@ fn space() -> ParameterSpace {
 }
 
 fn options() -> CsvOptions {
-    CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: None }
+    CsvOptions::default()
 }
 
 prop_compose! {
@@ -70,6 +72,7 @@ proptest! {
         rows.dedup_by_key(|m| m.measured_at);
         let (covariates, space) = (covariates(), space());
         let expectation = Expectation {
+            purpose: Purpose::Assessment,
             modes: 3,
             frequency_limits_hz: (0.01, 100.0),
             covariates: &covariates,
@@ -98,6 +101,7 @@ proptest! {
 fn the_ways_a_table_is_written_are_read_alike() {
     let (covariates, space) = (covariates(), space());
     let expectation = Expectation {
+        purpose: Purpose::Assessment,
         modes: 3,
         frequency_limits_hz: (0.01, 100.0),
         covariates: &covariates,
@@ -143,6 +147,62 @@ fn the_ways_a_table_is_written_are_read_alike() {
     }
 }
 
+/// Mode shapes come in JSON only: each measurement is judged by itself, and named.
+#[test]
+fn measurements_are_judged_one_by_one() {
+    let text = r#"{"measurements": [
+        {"measured_at": "2026-01-01T00:00:00Z", "frequencies_hz": [1, 2], "mode_shapes": [[1, 0.5], null]},
+        {"measured_at": "2026-01-01T00:01:00Z", "frequencies_hz": [1, 2], "mode_shapes": [[1, 0.5, 2], null]},
+        {"measured_at": "2026-01-01T00:02:00Z", "frequencies_hz": [1, 2, 3]},
+        {"measured_at": "2026-01-01T00:03:00Z", "frequencies_hz": [1, null], "settings": {"k1": 90}},
+        {"measured_at": "2026-01-01T00:03:00Z", "frequencies_hz": [1, 2]},
+        {"measured_at": "1969-01-01T00:00:00Z", "frequencies_hz": [1, -2]}
+    ]}"#;
+    let points = InstrumentedPoints {
+        names: vec!["roof".to_owned(), "floor".to_owned()],
+        nominal: vec![vec![0.9, 0.45], vec![-0.45, 0.9]],
+    };
+    let space = space();
+    let expectation = |purpose| Expectation {
+        purpose,
+        modes: 2,
+        frequency_limits_hz: (0.01, 100.0),
+        covariates: &[],
+        instrumented: Some(&points),
+        space: &space,
+        now: Timestamp::now(),
+        max_measurements: 100,
+    };
+    let of = |purpose| {
+        let raw = RawBatch::of_post(text.as_bytes(), None).unwrap().measurements;
+        let each = check_each(raw, &expectation(purpose)).into_iter();
+        each.map(|checked| checked.err().map_or_else(String::new, |p| format!("{}: {}", p.pointer, p.message)))
+            .collect()
+    };
+    let reasons = [
+        ["", ""],
+        ["/measurements/1/mode_shapes/0: 3 numbers, expected 2"; 2],
+        ["/measurements/2/frequencies_hz: 3 frequencies, expected 2"; 2],
+        ["/measurements/3/settings/k1: 90 N/m is outside the prior of k1", ""],
+        ["/measurements/4/measured_at: another measurement of this batch has the same time"; 2],
+        [
+            "/measurements/5/measured_at: 1969-01-01T00:00:00Z is before 1970",
+            "/measurements/5/frequencies_hz/1: natural frequency",
+        ],
+    ];
+    for (purpose, column) in [(Purpose::Assessment, 0), (Purpose::Diagnosis, 1)] {
+        let found: Vec<String> = of(purpose);
+        assert_eq!(found.len(), reasons.len());
+        for (found, expected) in found.iter().zip(reasons) {
+            let expected = expected[column];
+            assert!(
+                found.starts_with(expected) && found.is_empty() == expected.is_empty(),
+                "{found} instead of {expected}"
+            );
+        }
+    }
+}
+
 #[test]
 fn invalid_or_ambiguous_values_are_refused_with_their_line() {
     let refused = |text: &str| read(text.as_bytes(), 3, &covariates(), &options()).unwrap_err().remove(0);
@@ -162,4 +222,46 @@ fn invalid_or_ambiguous_values_are_refused_with_their_line() {
         assert_eq!(problem.pointer, place, "{text}: {problem:?}");
         assert!(problem.message.contains(message), "{text}: {problem:?}");
     }
+}
+
+/// Reads a table of a structure with two modes and the instrumented points `m2` and `m4`.
+fn with_shapes(table: &str) -> Result<Vec<Option<Vec<Option<Vec<f64>>>>>, String> {
+    let options = CsvOptions { points: vec!["m2".to_owned(), "m4".to_owned()], ..options() };
+    let rows = read(table.as_bytes(), 2, &[], &options).map_err(|problems| problems[0].message.clone())?;
+    Ok(rows.into_iter().map(|row| row.mode_shapes).collect())
+}
+
+#[test]
+fn a_table_carries_mode_shapes_in_columns_of_modes_and_points() {
+    // The columns may come in any order, and those of a mode may be left out.
+    let header = "measured_at,f1_hz,f2_hz,phi2_m4,PHI2_m2";
+    let table = format!(
+        "{header}\n2026-03-01T12:00:00Z,1.0,2.0,-0.5,0.25\n2026-03-01T13:00:00Z,1.0,2.0,,\n2026-03-01T14:00:00Z,1.0,2.0,4,3\n"
+    );
+    let shape = |m2: f64, m4: f64| Some(vec![None, Some(vec![m2, m4])]);
+    assert_eq!(with_shapes(&table).unwrap(), [shape(0.25, -0.5), None, shape(3.0, 4.0)]);
+}
+
+#[test]
+fn incomplete_shapes_in_a_table_are_refused_with_what_is_missing() {
+    let row = "2026-03-01T12:00:00Z,1.0,2.0";
+    let cases = [
+        ("phi1_m2", "0.1", "missing column phi1_m4"),
+        (
+            "phi1_m2,phi1_m3",
+            "0.1,0.2",
+            "m3\" is not an instrumented point of the structure; mode_shapes.points lists m2, m4",
+        ),
+        ("phi3_m2,phi3_m4", "0.1,0.2", "the structure has 2 modes"),
+        ("phi1_m2,phi1_m4", "0.1,", "the shape of mode 1 has 1 of 2 components"),
+        ("phi1_m2,phi1_m4", "0.1,x", "\"x\" is not a number"),
+        ("phi1_m2,phi1_m4,phi1_m2", "0.1,0.2,0.3", "appears twice"),
+    ];
+    for (columns, cells, expected) in cases {
+        let message = with_shapes(&format!("measured_at,f1_hz,f2_hz,{columns}\n{row},{cells}\n")).unwrap_err();
+        assert!(message.contains(expected), "{columns}: {message}");
+    }
+    // Without instrumented points such a column is unknown.
+    let table = format!("measured_at,f1_hz,f2_hz,phi1_m2\n{row},0.1\n");
+    assert!(read(table.as_bytes(), 2, &[], &options()).unwrap_err()[0].message.contains("unknown column"));
 }

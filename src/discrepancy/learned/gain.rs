@@ -108,11 +108,11 @@ fn predicted(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Predict
     let one = |view: RowView| {
         let mut residuals = vec![f64::NAN; study.simulator.modes()];
         let mut inside = 0;
-        for (i, mode) in view.present.iter().enumerate() {
+        for (i, mode) in view.present[..view.frequencies].iter().enumerate() {
             residuals[*mode] = view.residual[i];
             inside += usize::from(view.residual[i].abs() <= edge * view.covariance[(i, i)].sqrt());
         }
-        Predicted { log_density: view.log_density, residuals, inside, present: view.present.len() }
+        Predicted { log_density: view.log_density, residuals, inside, present: view.frequencies }
     };
     Some(study.view(rows, fit)?.into_iter().map(one).collect())
 }

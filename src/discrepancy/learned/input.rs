@@ -1,6 +1,6 @@
 //! The inputs of a learned discrepancy: covariates and settings that are not functions of time.
 
-use crate::discrepancy::data::{Column, Data, Values, MOST_LEVELS, TIME};
+use crate::discrepancy::data::{Data, Origin, Values, MOST_LEVELS};
 use crate::simulator::discrepancy::definition::InputDefinition;
 use crate::simulator::discrepancy::input::MOST_INPUTS;
 use crate::simulator::Simulator;
@@ -48,7 +48,7 @@ pub fn choose(simulator: &Simulator, data: &Data, rows: &[usize]) -> Chosen {
             add(input, follows_time(&values));
         }
     }
-    for column in data.columns.iter().filter(|c| is_covariate(simulator, c)) {
+    for column in data.columns.iter().filter(|c| c.origin == Origin::Covariate) {
         match &column.values {
             Values::Numbers(all) => {
                 let values: Vec<f64> = rows.iter().map(|row| all[*row]).collect();
@@ -68,13 +68,6 @@ pub fn choose(simulator: &Simulator, data: &Data, rows: &[usize]) -> Chosen {
         }
     }
     chosen
-}
-
-/// Whether a column is a covariate that was measured: not time, and neither a setting nor a product, which are columns of their own.
-fn is_covariate(simulator: &Simulator, column: &Column) -> bool {
-    let name = column.name.as_str();
-    let setting = name.strip_prefix("set_").unwrap_or(name);
-    name != TIME && !name.contains(" × ") && simulator.space().position(setting).is_none()
 }
 
 /// The input for a number with these values, NaN if missing; `None` if it does not vary or is missing in most rows. Its name is not

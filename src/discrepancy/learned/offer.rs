@@ -78,7 +78,10 @@ fn deviations(study: &Study<'_>, fit: &Fit) -> Option<Vec<Vec<f64>>> {
     let all: Vec<usize> = (0..study.data.rows()).collect();
     let one = |view: &RowView| {
         let mut of_row = vec![f64::NAN; study.simulator.modes()];
-        view.present.iter().zip(view.residual.iter()).for_each(|(mode, residual)| of_row[*mode] = *residual);
+        view.present[..view.frequencies]
+            .iter()
+            .zip(view.residual.iter())
+            .for_each(|(mode, residual)| of_row[*mode] = *residual);
         of_row
     };
     Some(study.view(&all, fit)?.iter().map(one).collect())

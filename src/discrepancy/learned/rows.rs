@@ -43,7 +43,9 @@ impl Rows {
             present: Vec::with_capacity(rows.len()),
         };
         for (place, view) in views.into_iter().enumerate() {
-            for (i, mode) in view.present.iter().enumerate() {
+            // Shapes have no discrepancy: only the frequencies are learned from.
+            let frequencies = view.frequencies;
+            for (i, mode) in view.present[..frequencies].iter().enumerate() {
                 found.residual[*mode][place] = view.residual[i];
                 for (slopes, k) in found.slopes.iter_mut().zip(study.free()) {
                     if study.data.settings[view.row][*k].is_none() {
@@ -51,8 +53,9 @@ impl Rows {
                     }
                 }
             }
-            found.covariances.push(view.covariance / weights[place]);
-            found.present.push(view.present);
+            let covariance = view.covariance.view((0, 0), (frequencies, frequencies)).into_owned();
+            found.covariances.push(covariance / weights[place]);
+            found.present.push(view.present[..frequencies].to_vec());
         }
         Some(found)
     }
