@@ -15,6 +15,7 @@ use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend as extend_structure;
 use crate::discrepancy::gain::GainMethod;
+use crate::discrepancy::learned::extension::{extend_learned, offer_anyway};
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -68,6 +69,9 @@ pub struct DiagnoseArgs {
     /// Write the report as one HTML page
     #[arg(long)]
     report: Option<PathBuf>,
+    /// Learn a discrepancy from the covariates and settings, whatever the verdict
+    #[arg(long)]
+    learned: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
@@ -78,7 +82,10 @@ pub struct DiagnoseArgs {
 /// # Errors
 /// Invalid files, or data that do not allow a diagnosis.
 pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
-    let Study { simulator, data, outcome } = studied(&args.study)?;
+    let Study { simulator, data, mut outcome } = studied(&args.study)?;
+    if args.learned {
+        offer_anyway(&simulator, &data, &mut outcome)?;
+    }
     if let Some(path) = &args.report {
         let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;
@@ -140,6 +147,9 @@ pub struct ExtendArgs {
     /// Folder for structure.json, baseline.safetensors and baseline.json
     #[arg(long)]
     out: PathBuf,
+    /// Add a discrepancy learned from the covariates and settings instead of the causes: not understood, but predictable
+    #[arg(long)]
+    learned: bool,
     /// Only write the structure; its model can be trained later with `modalwatch train`
     #[arg(long)]
     no_training: bool,
@@ -165,20 +175,26 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
         let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;
     }
-    let extended = extend_structure(&simulator, &data, &outcome)?;
-    for added in &extended.added {
+    let (definition, added, left_out) = if args.learned {
+        let extended = extend_learned(&simulator, &data, &outcome)?;
+        (extended.definition, vec![extended.added], extended.left_out)
+    } else {
+        let extended = extend_structure(&simulator, &data, &outcome)?;
+        (extended.definition, extended.added, extended.left_out)
+    };
+    for added in &added {
         println!("added: {added}");
     }
-    for left in &extended.left_out {
+    for left in &left_out {
         println!("not added: {left}");
     }
-    let text = serde_json::to_string_pretty(&extended.definition)?;
+    let text = serde_json::to_string_pretty(&definition)?;
     write_whole(&args.out.join("structure.json"), format!("{text}\n").as_bytes())?;
     println!("structure: {}", args.out.join("structure.json").display());
     if args.no_training {
         return Ok(());
     }
-    let simulator = Simulator::new(extended.definition)?;
+    let simulator = Simulator::new(definition)?;
     let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
     let settings = TrainSettings { epochs, seed: args.study.seed, ..TrainSettings::default() };
     let flow = FlowSettings::default();

@@ -117,7 +117,9 @@ impl Data {
             };
             m.frequencies_hz.iter().enumerate().map(cell).unzip()
         };
-        let (mut log_frequencies, mut noise): (Vec<Vec<f64>>, Vec<Vec<f64>>) = sorted.iter().map(row).unzip();
+        // A discrepancy that was learned before is known: what is left is diagnosed.
+        let known: Vec<_> = sorted.iter().map(|m| simulator.corrected(m)).collect();
+        let (mut log_frequencies, mut noise): (Vec<Vec<f64>>, Vec<Vec<f64>>) = known.iter().map(|m| row(&&**m)).unzip();
         let shapes = MeasuredShapes::new(simulator, &sorted).map(|(shapes, orders)| {
             for ((log_frequencies, noise), order) in log_frequencies.iter_mut().zip(&mut noise).zip(&orders) {
                 *log_frequencies = order.iter().map(|listed| log_frequencies[*listed]).collect();

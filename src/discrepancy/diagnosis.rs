@@ -6,6 +6,7 @@ use super::describe::Cause;
 use super::fit::Fit;
 use super::gain::{Gain, GainMethod};
 use super::grammar::Class;
+use super::learned::offer::{LearnedOffer, Offered};
 use super::misfit::{Misfit, Remainder};
 use super::next::experiment::NextMeasurement;
 use super::outside::OutsideSetting;
@@ -78,6 +79,9 @@ pub struct Diagnosis {
     pub remainder: Option<Remainder>,
     /// Gain from the causes on rows that they were not fitted to; `null` when no cause was found.
     pub gain: Option<Gain>,
+    /// A discrepancy that could be learned, where no known cause explains the deviation.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub learned: Option<LearnedOffer>,
     /// Properties of the data that limit the diagnosis.
     pub notes: Vec<String>,
     /// Rows that were searched for causes.
@@ -113,6 +117,8 @@ pub struct Outcome {
     pub holdout: Vec<usize>,
     /// Rows that were searched for causes.
     pub training: Vec<usize>,
+    /// The discrepancy that could be learned.
+    pub offered: Option<Offered>,
 }
 
 impl Diagnosis {
@@ -137,6 +143,10 @@ impl Diagnosis {
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
             text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");
+        }
+        if let Some(learned) = &self.learned {
+            text.push(' ');
+            text.push_str(&learned.summary);
         }
         if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, self.causes.len() > 1)) {
             text.push_str(&gain);

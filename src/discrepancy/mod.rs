@@ -13,7 +13,8 @@
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`);
 //! - [`diagnosis`]: the result; [`describe`], `naming` and `notes`: its text; [`report`]: the HTML page;
 //! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
-//! - [`extend`]: a new version of the structure with the causes as effects.
+//! - [`extend`]: a new version of the structure with the causes as effects;
+//! - [`learned`]: a discrepancy learned from the data, where no cause explains the deviation.
 //!
 //! # Words
 //!
@@ -44,6 +45,7 @@ pub mod fit;
 pub mod gain;
 pub mod grammar;
 pub mod holdout;
+pub mod learned;
 pub mod misfit;
 pub mod model;
 mod naming;
@@ -245,9 +247,17 @@ fn run(
     if found && gain.is_none() {
         notes.push(NO_GAIN.to_owned());
     }
+    let unexplained = left.is_some() || many_outside;
+    let verdict = verdict(selection.slots.len(), ambiguous, unexplained, !scatter.is_empty());
+    let offered = if verdict == DiagnosisVerdict::NoneOfThese {
+        let offered = learned::offer::offer(&study, &training, &holdout, &selection.base);
+        offered.map_err(|why| notes.push(format!("the deviation cannot be predicted either: {why}"))).ok()
+    } else {
+        None
+    };
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
-        verdict: verdict(selection.slots.len(), ambiguous, left.is_some() || many_outside, !scatter.is_empty()),
+        verdict,
         summary: String::new(),
         settings_outside,
         scatter,
@@ -257,6 +267,7 @@ fn run(
         next_measurements,
         remainder: left,
         gain,
+        learned: offered.as_ref().map(|offered| offered.offer.clone()),
         notes,
         training_rows: training.len(),
         holdout_rows: holdout.len(),
@@ -276,6 +287,7 @@ fn run(
         maybe_damage,
         holdout,
         training,
+        offered,
     })
 }
 

@@ -35,6 +35,7 @@ mod beam;
 mod changed;
 mod check;
 pub mod definition;
+pub mod discrepancy;
 pub mod effect;
 mod expectation;
 mod instrumented;

@@ -2,6 +2,7 @@
 
 mod figures;
 mod gain;
+mod learned;
 mod next;
 mod residuals;
 
@@ -37,6 +38,9 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
     }
     if let Some(left) = &d.remainder {
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
+    }
+    if let Some(offered) = &outcome.offered {
+        sections.push(("Not understood, but predictable".to_owned(), learned::learned(offered, outcome)));
     }
     sections.push((
         "Gain on rows that were not used for the fit".to_owned(),
