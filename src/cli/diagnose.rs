@@ -6,6 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::next::join;
 use super::output::write_whole;
 use super::tables::{read_tables, TableArgs};
 use super::training::{print_record, sizes, train_into};
@@ -45,6 +46,12 @@ pub struct StudyArgs {
     /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
+    /// Result of an earlier diagnosis of the same data, as JSON, to be decided with the rows of --further
+    #[arg(long, requires = "further")]
+    next: Option<PathBuf>,
+    /// CSV file of what was measured after the earlier diagnosis; several files are joined in the order given
+    #[arg(long, requires = "next")]
+    further: Vec<PathBuf>,
     /// Refuse a table in which a row cannot be used, instead of leaving the row out
     #[arg(long)]
     strict: bool,
@@ -103,9 +110,14 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
         ignore: &args.ignore,
         strict: args.strict,
     };
-    let tables = read_tables(&simulator, &args.data, &how)?;
-    let data = Data::new(&simulator, &tables.measurements);
-    let data = if tables.timed { data } else { data.by_order() };
+    let (data, mut notes, earlier) = if let Some(path) = &args.next {
+        let joined = join(&simulator, path, (&args.data, &args.further), &how)?;
+        (joined.data, joined.notes, Some(joined.earlier))
+    } else {
+        let tables = read_tables(&simulator, &args.data, &how)?;
+        let data = Data::new(&simulator, &tables.measurements);
+        (if tables.timed { data } else { data.by_order() }, tables.notes, None)
+    };
     let bar = ProgressBar::new_spinner();
     let style = ProgressStyle::with_template("{spinner} {elapsed} {msg}");
     bar.set_style(style.context("the template of the progress bar")?);
@@ -113,7 +125,10 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     let progress = |step: Step| bar.set_message(step.to_string());
     let mut outcome = run(&simulator, &data, &args.holdout, args.seed, &progress)?;
     bar.finish_and_clear();
-    outcome.diagnosis.notes.splice(0..0, tables.notes);
+    if let Some(earlier) = earlier {
+        notes.extend(outcome.diagnosis.changes_since(&earlier));
+    }
+    outcome.diagnosis.notes.splice(0..0, notes);
     Ok(Study { simulator, data, outcome })
 }
 
@@ -187,6 +202,9 @@ fn print(d: &Diagnosis) {
             "instead of cause {}: {} ({:+.1} nats); distinguished by {}",
             a.instead_of, a.cause.sentence, a.log_evidence_difference, a.discriminating_measurement
         );
+    }
+    for m in d.next_measurements.iter().take(5) {
+        println!("next: {}", m.sentence);
     }
     for m in d.misfit.iter().take(8) {
         let what = m.mode.map_or_else(|| m.parameter.clone().unwrap_or_default(), |mode| format!("mode {mode}"));

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 use crate::discrepancy::data::MOST_LEVELS;
+use crate::discrepancy::declared::{mistake, WEIGHED_KG};
 use crate::measurement::check::{check_each, Expectation, FieldPath, Problem, Purpose, RawMeasurement};
 use crate::measurement::csv::{self, CsvOptions, Offered, SettingColumn, Times};
 use crate::measurement::order::Ordered;
@@ -89,11 +90,15 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         ignore: how.ignore.to_vec(),
         time_column: how.time.map(str::to_owned),
         settings: setting_columns(simulator, how.settings)?,
+        points: simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone()),
     };
     let mut covariates = simulator.covariates().to_vec();
     let mut rows = Rows::default();
     for file in &files {
         rows.notes.extend(add_covariates(file, &mut covariates, &mut options)?);
+    }
+    if let Some(wrong) = covariates.iter().find_map(|c| mistake(simulator, &c.name)) {
+        anyhow::bail!(wrong);
     }
     let expectation = Expectation {
         purpose: Purpose::Diagnosis,
@@ -279,7 +284,16 @@ impl Rows {
     /// Drops the rows without any frequency: nothing was measured there.
     fn drop_empty(&mut self) {
         let before = self.used.len();
-        self.used.retain(|row| row.raw.frequencies_hz.iter().any(Option::is_some));
+        let has_frequency = |row: &Row| row.raw.frequencies_hz.iter().any(Option::is_some);
+        let weighed = |row: &Row| row.raw.covariates.keys().any(|name| name.starts_with(WEIGHED_KG));
+        let unused = self.used.iter().filter(|row| weighed(row) && !has_frequency(row)).count();
+        if unused > 0 {
+            self.notes.push(format!(
+                "{unused} weighed masses are not used, because they stand in rows without a frequency: state them in rows of \
+                 frequencies that were measured in the same conditions"
+            ));
+        }
+        self.used.retain(has_frequency);
         let empty = before - self.used.len();
         if empty > 0 {
             self.notes.push(format!("{empty} rows without any frequency were ignored"));
