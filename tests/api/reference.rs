@@ -2,7 +2,7 @@
 
 use serde_json::{json, Value};
 
-use crate::helpers::{created, measurements, problem, spawn, time, Service};
+use crate::helpers::{created, eventually, measurements, problem, spawn, time, Service};
 
 const REFERENCE: &str = "/v1/structures/three-dof/reference";
 const UNDAMAGED: [f64; 3] = [4.0, 5.0, 6.0];
@@ -149,4 +149,25 @@ async fn a_period_that_makes_no_sense_is_refused_with_the_field() {
     let empty = json!({ "from": time(50 * DAY_S), "to": time(60 * DAY_S) });
     let refused = problem(service.post(REFERENCE, &empty).await, 422, "unusable_baseline").await;
     assert!(refused["detail"].as_str().unwrap().contains("no batch was measured from 2026-02-20"), "{refused}");
+}
+
+/// Each declaration lets the batches be assessed again, while those of the declaration before are still being assessed.
+#[tokio::test]
+async fn references_declared_in_quick_succession_do_not_block_the_service() {
+    let (service, _folder) = spawn();
+    let mut ids = Vec::new();
+    for number in 0..24 {
+        ids.push(day(&service, number, untouched).await);
+    }
+    for _ in 0..8 {
+        created(service.post(REFERENCE, &json!({ "batches": ids[..2] })).await).await;
+    }
+    let posted = tokio::time::timeout(std::time::Duration::from_secs(20), day(&service, 24, untouched));
+    posted.await.expect("a batch is assessed while others are assessed again");
+    eventually("all batches are compared with the last reference", async || {
+        let history = service.read("/v1/structures/three-dof/history?limit=100").await;
+        let items = history["items"].as_array().unwrap();
+        items[2..].iter().all(|item| item["state"] == "assessed").then_some(())
+    })
+    .await;
 }
