@@ -10,6 +10,7 @@ mod learned;
 mod needs;
 mod next;
 mod places;
+mod reliability;
 mod settings;
 mod spectrum;
 mod tables;
