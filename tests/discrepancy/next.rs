@@ -105,8 +105,8 @@ impl Folder {
 fn followed(world: &World, earlier: &Value, recommended: &Value) -> Option<Value> {
     let done = done(recommended);
     let enough = recommended["repeats_to_95"].as_u64().map_or(MOST_REPEATS, |n| n as usize);
-    let repeats =
-        if matches!(done, Done::Weighed(_)) { 1 } else { enough.max(recommended["repeats"].as_u64()? as usize) };
+    let once = done.weighed.is_some() && !done.second_instrument;
+    let repeats = if once { 1 } else { enough.max(recommended["repeats"].as_u64()? as usize) };
     let (toml, csv) = world.hidden.follow(world.seed, &done, &conditions(recommended), repeats)?;
     let output = Folder::new(world, earlier).next(&toml, &csv, &[]);
     assert!(output.status.success(), "{}: {}", world.description, String::from_utf8_lossy(&output.stderr));
