@@ -1,9 +1,10 @@
 //! Frequencies and mode shapes, and their derivatives, for many rows that differ in a few numbers.
 //!
-//! Rows differ in the sizes of effects and in settings, and the frequencies and the coordinates of shapes are smooth functions of both. The eigenproblem is
-//! therefore solved only at Chebyshev nodes of these numbers, between which the results are interpolated. Numbers with few
-//! different values (categories, steps) are used exactly. Effects that multiply all frequencies by one factor, and effects of the
-//! instrument, need no eigenproblem and are applied afterwards. If interpolation saves nothing, every different row is solved.
+//! Rows differ in the sizes of effects and in settings, and the frequencies and the coordinates of shapes are smooth functions of
+//! both. The eigenproblem is therefore solved only at Chebyshev nodes of these numbers, between which the results are interpolated.
+//! Numbers with few different values (categories, steps) are used exactly. Effects that multiply all frequencies by one factor, and
+//! effects of the instrument, need no eigenproblem and are applied afterwards. If interpolation saves nothing, every different row
+//! is solved.
 
 use std::collections::HashMap;
 
@@ -92,6 +93,20 @@ impl Responses {
         let picked: Vec<usize> = after.structural.iter().flat_map(own).collect();
         let inner = Self::structural(simulator, reference, &left, theta, &sizes.select_rows(&picked))?;
         after.apply(&inner, targets, sizes)
+    }
+
+    /// Responses of consecutive rows from their values, `[rows][outputs][1 + parameters + sizes]`, of which the first `modes`
+    /// outputs are frequencies.
+    pub(super) fn from_values(
+        (modes, outputs): (usize, usize),
+        parameters: usize,
+        sizes: usize,
+        values: Vec<f64>,
+    ) -> Self {
+        let width = 1 + parameters + sizes;
+        let block = outputs * width;
+        let places = (0..values.len() / block).map(|row| row * block).collect();
+        Self { modes, outputs, parameters, width, values, places }
     }
 
     /// As [`Self::new`], but solves the eigenproblem for all targets.

@@ -2,28 +2,33 @@
 //!
 //! The columns are `measured_at`, `f1_hz` …, and optionally `std_f1_hz` …, the declared covariates by name, `set_<parameter>`, and
 //! `phi<mode>_<point>` for the component of a mode's shape at an instrumented point. An empty cell is a missing value; of a shape,
-//! all components are missing or none. The separator is `,`, `;` or tab; it is detected from the header or read
+//! all components are missing or none. [`read`] refuses a table with a mistake; [`read_rows`] gives the rows one
+//! by one, so that those with a mistake can be left out. The separator is `,`, `;` or tab; it is detected from the header or read
 //! from a first line `sep=;`. With `;` or tab, decimal commas are accepted. Additions by spreadsheets are accepted: a byte order
 //! mark, CRLF, blanks around cells, empty lines, and columns with neither a name nor values.
 
 use std::collections::BTreeMap;
 
 use super::check::{FieldPath, Problem, RawMeasurement};
+use super::shape_columns::{missing_columns, ShapeCells, ShapeColumn};
 use super::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use crate::quantity::{shown, Hertz, Timestamp};
 
 /// How the times of measurements are found.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Times {
     /// The column `measured_at` is required.
+    #[default]
     Required,
+    /// Without a column `measured_at`, the rows have no times.
+    Optional,
     /// Without a column `measured_at`, row i (from 0) gets the time 1970-01-01T00:00:00Z plus i seconds. This is for files whose
     /// times do not matter.
     RowNumber,
 }
 
 /// How a table is read.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct CsvOptions {
     /// How times are found.
     pub times: Times,
@@ -31,8 +36,30 @@ pub struct CsvOptions {
     pub ignore: Vec<String>,
     /// Name of the time column, if it is not `measured_at`.
     pub time_column: Option<String>,
+    /// Columns of settings that are not named `set_<parameter>`.
+    pub settings: Vec<SettingColumn>,
     /// Names of the instrumented points, at which mode shapes are measured; empty if the structure has none.
     pub points: Vec<String>,
+}
+
+/// A column that holds the values of a setting.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SettingColumn {
+    /// The parameter.
+    pub parameter: String,
+    /// Name of the column.
+    pub column: String,
+}
+
+/// A table whose header is valid.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    /// Whether it has a column of times.
+    pub timed: bool,
+    /// The parameters of its columns of settings.
+    pub settings: Vec<String>,
+    /// Its rows; of a row that cannot be read, its first mistake.
+    pub rows: Vec<Result<RawMeasurement, Problem>>,
 }
 
 /// A column that the structure does not declare, and its probable meaning.
@@ -40,6 +67,12 @@ pub struct CsvOptions {
 pub enum Offered {
     /// A covariate of this kind.
     Covariate(Covariate),
+    /// A column with values and without a name, such as the numbers of the rows in tables written by data frames. The name `""` in
+    /// [`CsvOptions::ignore`] ignores it.
+    Unnamed {
+        /// Number of the column, from 1.
+        number: usize,
+    },
     /// Text with too many different values for a category.
     Ignored {
         /// Name of the column.
@@ -69,8 +102,8 @@ pub fn offered(
     let mut records = reader(text, separator).into_records().skip(usize::from(named_separator(text).is_some()));
     let Some(header) = records.next() else { return Ok(Vec::new()) };
     let header = header.map_err(|e| problem(&e))?;
-    let unknown: Vec<usize> =
-        (0..header.len()).filter(|i| column(&header[*i], covariates, options).is_none()).collect();
+    let is_unknown = |name: &str| matches!(column(name, covariates, options), None | Some(Column::Unnamed));
+    let unknown: Vec<usize> = (0..header.len()).filter(|i| is_unknown(&header[*i])).collect();
     let mut cells: Vec<std::collections::BTreeSet<String>> = vec![std::collections::BTreeSet::new(); unknown.len()];
     let (mut numbers, mut others) = (vec![0; unknown.len()], vec![0; unknown.len()]);
     for record in records {
@@ -86,16 +119,19 @@ pub fn offered(
     }
     let offer = |(position, index): (usize, &usize)| {
         let (name, values) = (header[*index].to_owned(), cells[position].len());
+        if name.is_empty() {
+            return (values > 0).then_some(Offered::Unnamed { number: index + 1 });
+        }
         // A few cells that are not numbers do not make the column text: `read` then reports them with their lines.
-        if numbers[position] >= 9 * others[position] {
+        Some(if numbers[position] >= 9 * others[position] {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Number })
         } else if values <= most_categories {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Category })
         } else {
             Offered::Ignored { name, values }
-        }
+        })
     };
-    Ok(unknown.iter().enumerate().map(offer).collect())
+    Ok(unknown.iter().enumerate().filter_map(offer).collect())
 }
 
 fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
@@ -142,10 +178,7 @@ enum Column {
     Std(usize),
     Covariate(String, CovariateKind),
     Setting(String),
-    /// Component of the shape of a mode at a point, by their indices.
-    Shape(usize, usize),
-    /// A component at a point that is not instrumented.
-    ShapeElsewhere(String),
+    Shape(ShapeColumn),
 }
 
 /// Reads a table of a structure with `modes` modes.
@@ -158,6 +191,20 @@ pub fn read(
     covariates: &[Covariate],
     options: &CsvOptions,
 ) -> Result<Vec<RawMeasurement>, Vec<Problem>> {
+    let table = read_rows(bytes, modes, covariates, options)?;
+    table.rows.into_iter().collect::<Result<_, _>>().map_err(|problem| vec![problem])
+}
+
+/// Reads a table of a structure with `modes` modes, each row by itself.
+///
+/// # Errors
+/// The mistakes of the header, with its line; text that is not a table.
+pub fn read_rows(
+    bytes: &[u8],
+    modes: usize,
+    covariates: &[Covariate],
+    options: &CsvOptions,
+) -> Result<Table, Vec<Problem>> {
     let text = text(bytes)?;
     let separator = separator(text);
     let mut reader = reader(text, separator);
@@ -174,15 +221,20 @@ pub fn read(
         return Err(vec![Problem::new("line 1", "the table is empty: its first line must name the columns")]);
     };
     let columns = columns(&header, line_of(text, &header), modes, covariates, options)?;
-    let mut measurements = Vec::new();
+    let mut rows = Vec::new();
     while let Some(record) = next()? {
         let line = line_of(text, &record);
         if record.iter().all(str::is_empty) {
             continue;
         }
-        measurements.push(row(&record, line, &columns, modes, separator != b',', measurements.len(), options.times)?);
+        rows.push(row(&record, line, &columns, modes, separator != b',', rows.len(), options.times));
     }
-    Ok(measurements)
+    let parameter = |column: &Column| match column {
+        Column::Setting(parameter) => Some(parameter.clone()),
+        _ => None,
+    };
+    let settings = columns.iter().filter_map(parameter).collect();
+    Ok(Table { timed: columns.contains(&Column::Time), settings, rows })
 }
 
 /// The separator that the table specifies, or else the most frequent one in its header.
@@ -218,15 +270,15 @@ fn columns(
                     shown(name)
                 ));
             }
-            Some(Column::Frequency(mode) | Column::Std(mode) | Column::Shape(mode, _)) if *mode >= modes => {
+            Some(Column::Frequency(mode) | Column::Std(mode) | Column::Shape(ShapeColumn::At { mode, .. }))
+                if *mode >= modes =>
+            {
                 add(format!("column {}: the structure has {modes} modes", shown(name)));
             }
-            Some(Column::ShapeElsewhere(point)) => {
+            Some(Column::Shape(ShapeColumn::Elsewhere { point })) => {
+                let (name, point, points) = (shown(name), shown(point), options.points.join(", "));
                 add(format!(
-                    "column {}: {} is not an instrumented point of the structure; mode_shapes.points lists {}",
-                    shown(name),
-                    shown(point),
-                    options.points.join(", ")
+                    "column {name}: {point} is not an instrumented point of the structure; mode_shapes.points lists {points}"
                 ));
             }
             Some(other) if ![Column::Ignored, Column::Unnamed].contains(other) && columns.contains(other) => {
@@ -244,16 +296,19 @@ fn columns(
         add(format!("missing column {}: the structure has {modes} modes", missing.join(", ")));
     }
     for mode in 0..modes {
-        let lacks = |point: &usize| !columns.contains(&Column::Shape(mode, *point));
-        let missing: Vec<usize> = (0..options.points.len()).filter(lacks).collect();
-        if !missing.is_empty() && missing.len() < options.points.len() {
-            let names: Vec<String> =
-                missing.iter().map(|point| format!("phi{}_{}", mode + 1, options.points[*point])).collect();
-            add(format!("missing column {}: a shape needs a component at each point", names.join(", ")));
+        let has = |point: usize| columns.contains(&Column::Shape(ShapeColumn::At { mode, point }));
+        let missing = missing_columns(mode, has, &options.points);
+        if !missing.is_empty() {
+            add(format!("missing column {}: a shape needs a component at each point", missing.join(", ")));
         }
     }
     if options.times == Times::Required && !columns.contains(&Column::Time) {
         add("missing column measured_at: RFC 3339 with an offset, such as 2026-03-01T12:00:00Z".to_owned());
+    }
+    for SettingColumn { parameter, column } in &options.settings {
+        if !header.iter().any(|name| name.eq_ignore_ascii_case(column)) {
+            add(format!("missing column {}, which holds the settings of {parameter}", shown(column)));
+        }
     }
     if problems.is_empty() {
         Ok(columns)
@@ -264,15 +319,18 @@ fn columns(
 
 fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<Column> {
     let lower = name.to_ascii_lowercase();
-    if name.is_empty() {
-        return Some(Column::Unnamed);
-    }
     let mode = |text: &str| {
         let number: usize = text.strip_prefix('f')?.strip_suffix("_hz")?.parse().ok()?;
         number.checked_sub(1)
     };
     if options.ignore.iter().any(|ignored| ignored.eq_ignore_ascii_case(name)) {
         return Some(Column::Ignored);
+    }
+    if name.is_empty() {
+        return Some(Column::Unnamed);
+    }
+    if let Some(setting) = options.settings.iter().find(|setting| setting.column.eq_ignore_ascii_case(name)) {
+        return Some(Column::Setting(setting.parameter.clone()));
     }
     if options.time_column.as_ref().map_or(lower == "measured_at", |column| column.eq_ignore_ascii_case(name)) {
         return Some(Column::Time);
@@ -286,15 +344,11 @@ fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<
     if let Some(mode) = lower.strip_prefix("std_").and_then(mode) {
         return Some(Column::Std(mode));
     }
-    // The names of parameters and points are case-sensitive.
+    // The names of parameters are case-sensitive.
     if lower.starts_with("set_") {
         return Some(Column::Setting(name["set_".len()..].to_owned()));
     }
-    let number = lower.strip_prefix("phi").filter(|_| !options.points.is_empty())?.split('_').next()?;
-    let mode = number.parse::<usize>().ok()?.checked_sub(1)?;
-    let point = name.get("phi".len() + number.len() + 1..)?;
-    let place = options.points.iter().position(|known| known == point);
-    Some(place.map_or_else(|| Column::ShapeElsewhere(point.to_owned()), |place| Column::Shape(mode, place)))
+    ShapeColumn::of(name, &options.points).map(Column::Shape)
 }
 
 fn row(
@@ -305,10 +359,10 @@ fn row(
     decimal_comma: bool,
     index: usize,
     times: Times,
-) -> Result<RawMeasurement, Vec<Problem>> {
+) -> Result<RawMeasurement, Problem> {
     if record.len() != columns.len() {
         let message = format!("{} cells, but the header has {}", record.len(), columns.len());
-        return Err(vec![Problem::new(format!("line {line}"), message)]);
+        return Err(Problem::new(format!("line {line}"), message));
     }
     let mut raw = RawMeasurement {
         path: FieldPath::Csv { line },
@@ -319,20 +373,22 @@ fn row(
         covariates: BTreeMap::new(),
         settings: BTreeMap::new(),
     };
-    let mut shapes: Vec<Vec<Option<f64>>> = Vec::new();
+    let mut shapes = ShapeCells::default();
     for (column, cell) in columns.iter().zip(record).filter(|(_, cell)| !cell.is_empty()) {
         let number = |name: String| {
-            number(cell, decimal_comma)
-                .map_err(|message| vec![Problem::new(format!("line {line}, column {name}"), message)])
+            number(cell, decimal_comma).map_err(|message| Problem::new(format!("line {line}, column {name}"), message))
         };
         match column {
-            Column::Ignored | Column::ShapeElsewhere(_) => {}
+            Column::Ignored | Column::Shape(ShapeColumn::Elsewhere { .. }) => {}
             Column::Unnamed => {
                 let message =
                     format!("{} is in a column without a name: name the column in the first line", shown(cell));
-                return Err(vec![Problem::new(format!("line {line}"), message)]);
+                return Err(Problem::new(format!("line {line}"), message));
             }
-            Column::Time => raw.measured_at = Some(cell.to_owned()),
+            Column::Time => {
+                let is_number = decimal_comma && self::number(cell, decimal_comma).is_ok();
+                raw.measured_at = Some(if is_number { cell.replace(',', ".") } else { cell.to_owned() });
+            }
             Column::Frequency(mode) => raw.frequencies_hz[*mode] = Some(number(format!("f{}_hz", mode + 1))?),
             Column::Std(mode) => {
                 let value = number(format!("std_f{}_hz", mode + 1))?;
@@ -347,15 +403,15 @@ fn row(
             Column::Setting(name) => {
                 raw.settings.insert(name.clone(), number(format!("set_{name}"))?);
             }
-            Column::Shape(mode, point) => {
-                if shapes.is_empty() {
-                    shapes = vec![vec![None; points(columns)]; modes];
-                }
-                shapes[*mode][*point] = Some(number(format!("phi{}, component {}", mode + 1, point + 1))?);
+            Column::Shape(ShapeColumn::At { mode, point }) => {
+                shapes.enter(*mode, *point, number(format!("phi{}, point {}", mode + 1, point + 1))?);
             }
         }
     }
-    raw.mode_shapes = whole_shapes(shapes).map_err(|message| vec![Problem::new(format!("line {line}"), message)])?;
+    let point = |column: &Column| if let Column::Shape(ShapeColumn::At { point, .. }) = column { point + 1 } else { 0 };
+    // The columns of a mode state all points or none.
+    let points = columns.iter().map(point).max().unwrap_or(0);
+    raw.mode_shapes = shapes.shapes(modes, points).map_err(|message| Problem::new(format!("line {line}"), message))?;
     // A row without any standard deviation gets `None`, as if the table had no such columns.
     raw.std_hz = raw.std_hz.filter(|stds| stds.iter().any(Option::is_some));
     if times == Times::RowNumber && !columns.contains(&Column::Time) {
@@ -364,32 +420,6 @@ fn row(
         raw.measured_at = Some(time.to_string());
     }
     Ok(raw)
-}
-
-/// Number of points at which the columns state shapes; the columns of a mode state all points or none.
-fn points(columns: &[Column]) -> usize {
-    let number = |column: &Column| if let Column::Shape(_, point) = column { point + 1 } else { 0 };
-    columns.iter().map(number).max().unwrap_or(0)
-}
-
-/// The shapes of a row; `None` if it has none.
-///
-/// # Errors
-/// The mode whose shape has only some of its components.
-fn whole_shapes(shapes: Vec<Vec<Option<f64>>>) -> Result<Option<Vec<Option<Vec<f64>>>>, String> {
-    let mut whole = Vec::with_capacity(shapes.len());
-    for (mode, components) in shapes.into_iter().enumerate() {
-        let (count, given) = (components.len(), components.iter().flatten().count());
-        let shape: Option<Vec<f64>> = components.into_iter().collect();
-        if given > 0 && given < count {
-            return Err(format!(
-                "the shape of mode {0} has {given} of {count} components: fill all columns phi{0}_…, or leave all of them empty",
-                mode + 1
-            ));
-        }
-        whole.push(shape.filter(|_| given > 0));
-    }
-    Ok(whole.iter().any(Option::is_some).then_some(whole))
 }
 
 fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {

@@ -3,7 +3,9 @@
 use nalgebra::DMatrix;
 
 use super::model::{chained, structure_at, SimulationModel};
-use super::simulate::{Response, Simulator};
+use super::respond::Response;
+use super::settings::CorrectedParameters;
+use super::simulate::Simulator;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
 use crate::physics::shapes::{modes_to_pair, shape_sensitivity, shapes_at};
@@ -121,14 +123,21 @@ impl Simulator {
         else {
             return Ok((self.respond(theta, reference.len(), targets, sizes)?, None));
         };
-        let moved = self.moved(theta, targets, sizes);
-        let changed = structure_at(structure, bindings, &moved.theta)?;
-        let (response, shapes) =
-            respond_tracked(&changed, &moved.targets, &moved.sizes, &instrumented.dofs, reference)?;
-        let (by_parameter, by_size) =
-            moved.chain(chained(&response.by_spring, bindings, &moved.theta), response.by_size);
+        let own = self.sizes().len();
+        let targets: Vec<Target> = self.effects().iter().map(|e| &e.target).chain(targets).cloned().collect();
+        let sizes: Vec<f64> = self.sizes().iter().chain(sizes).copied().collect();
+        // Corrections of single modes are not part of what all modes have in common.
+        let corrected = CorrectedParameters::new(theta, &targets, &sizes, usize::MAX);
+        let structure = structure_at(structure, bindings, &corrected.theta)?;
+        let (response, shapes) = respond_tracked(&structure, &targets, &sizes, &instrumented.dofs, reference)?;
+        let chain = |by_spring: &DMatrix<f64>, by_size: DMatrix<f64>| {
+            let by_corrected = chained(by_spring, bindings, &corrected.theta);
+            let by_size = by_size + &by_corrected * &corrected.by_size;
+            (by_corrected * &corrected.by_theta, by_size.columns(own, sizes.len() - own).into_owned())
+        };
+        let (by_parameter, by_size) = chain(&response.by_spring, response.by_size);
         let response = Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size };
-        let (by_parameter, by_size) = moved.chain(chained(&shapes.by_spring, bindings, &moved.theta), shapes.by_size);
+        let (by_parameter, by_size) = chain(&shapes.by_spring, shapes.by_size);
         Ok((response, Some(ShapeResponse { coordinates: shapes.coordinates, by_parameter, by_size })))
     }
 }

@@ -12,11 +12,11 @@ use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinit
 use super::effect::{self, SimulationEffect};
 use super::instrumented::Instrumented;
 use super::model::{chained, changes, structure_at, Binding, SimulationModel};
-use super::moved::MovedParameters;
+use super::settings::CorrectedParameters;
 use super::table::Table;
 use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::effect::{measured, respond, Target};
+use crate::physics::effect::Target;
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_with, Structure};
 use crate::quantity::{Digest, StructureId};
 
@@ -62,17 +62,6 @@ struct Parts {
     checked: check::Checked,
     /// Prepared when it is first needed; `None` for a simulation that cannot be batched.
     batched: OnceLock<Option<BatchedRuns>>,
-}
-
-/// Frequencies under effects and their derivatives.
-#[derive(Debug, Clone)]
-pub struct Response {
-    /// Frequencies as the instrument reports them, Hz, `[m]`.
-    pub frequencies_hz: Vec<f64>,
-    /// Derivatives with respect to the parameters, Hz per parameter unit, `[m, d]`.
-    pub by_parameter: DMatrix<f64>,
-    /// Derivatives with respect to the sizes of the further effects, Hz per unit of the size, `[m, sizes]`.
-    pub by_size: DMatrix<f64>,
 }
 
 /// The stiffness of a spring that a parameter sets through a law.
@@ -144,6 +133,11 @@ impl Simulator {
         effect::sizes(self.effects(), covariates)
     }
 
+    /// Sizes of the effects of the structure file, `[sizes]`, in the units of their targets.
+    pub(super) fn sizes(&self) -> &[f64] {
+        &self.sizes
+    }
+
     /// Id of the structure.
     pub fn id(&self) -> &StructureId {
         &self.parts.checked.id
@@ -194,15 +188,8 @@ impl Simulator {
     /// table has no runs near them.
     pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
         let Some(table) = self.table() else { return false };
-        let mut moved = theta.to_vec();
-        let mut first = 0;
-        for effect in self.effects() {
-            if let Target::ParameterScale(column) = effect.target {
-                moved[column] *= 1.0 + self.sizes[first];
-            }
-            first += effect.target.sizes();
-        }
-        table.is_outside(&moved)
+        let targets: Vec<Target> = self.effects().iter().map(|e| e.target.clone()).collect();
+        table.is_outside(&CorrectedParameters::new(theta, &targets, &self.sizes, 0).theta)
     }
 
     /// The stiffnesses that parameters set; empty for a table.
@@ -343,45 +330,6 @@ impl Simulator {
                 Ok((frequencies, jacobian.rows(0, self.modes()).into_owned()))
             }
         }
-    }
-
-    /// The lowest `modes` frequencies at parameters `theta` (`[d]`, parameter units) under the effects of the structure file
-    /// and the further effects `targets`, and their derivatives with respect to the parameters and to the sizes of the further
-    /// effects, `sizes` (`[sizes]`, in the units of the targets).
-    ///
-    /// # Errors
-    /// As [`Self::frequencies_hz`] and [`respond`].
-    pub fn respond(
-        &self,
-        theta: &[f64],
-        modes: usize,
-        targets: &[Target],
-        sizes: &[f64],
-    ) -> Result<Response, physics::Error> {
-        let moved = self.moved(theta, targets, sizes);
-        let theta = &moved.theta;
-        let (frequencies_hz, by_parameter, by_size) = match self.model() {
-            SimulationModel::Matrices { structure, bindings } => {
-                let changed = structure_at(structure, bindings, theta)?;
-                let response = respond(&changed, modes, &moved.targets, &moved.sizes)?;
-                let by_parameter = chained(&response.by_spring, bindings, theta);
-                (response.frequencies_hz, by_parameter, response.by_size)
-            }
-            SimulationModel::Table(table) => {
-                let (frequencies, jacobian) = table.frequencies_and_jacobian(theta);
-                let measured = measured(&frequencies, &jacobian, modes, &moved.targets, &moved.sizes)?;
-                (measured.frequencies_hz, measured.by_parameter, measured.by_size)
-            }
-        };
-        let (by_parameter, by_size) = moved.chain(by_parameter, by_size);
-        Ok(Response { frequencies_hz, by_parameter, by_size })
-    }
-
-    /// The parameters `theta` (`[d]`) under the effects of the structure file and the further effects `targets` of the sizes
-    /// `sizes`.
-    pub(super) fn moved(&self, theta: &[f64], targets: &[Target], sizes: &[f64]) -> MovedParameters {
-        let own: Vec<Target> = self.effects().iter().map(|e| e.target.clone()).collect();
-        MovedParameters::new(theta, (own.as_slice(), &*self.sizes), (targets, sizes))
     }
 
     /// Natural frequencies at the nominal stiffnesses, or in the middle of the prior of a table, Hz, `[m]`.
