@@ -199,9 +199,9 @@ fn lag_one(values: &[f64]) -> f64 {
 /// The most significant dependence of the residuals of a fit on a function of the covariates, including functions that no
 /// candidate has. The inner `None` means that there are no functions, the outer one that the frequencies cannot be computed.
 ///
-/// Each function is tested with an arbitrary response of each frequency and each coordinate of a mode shape, and along the target of each cause found, since a cause with
-/// the wrong law leaves a residual there. Twice the estimated gain of the score test, times the share of independent rows, is
-/// compared with a χ² distribution.
+/// Each function is tested with an arbitrary response of each frequency and each coordinate of a mode shape, and along the target
+/// of each cause found, since a cause with the wrong law leaves a residual there. Twice the estimated gain of the score test, times
+/// the share of independent rows, is compared with a χ² distribution.
 ///
 /// Source: Rao (1948), for score tests.
 pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share: f64) -> Option<Option<Remainder>> {
