@@ -217,8 +217,7 @@ fn run(
     progress: &Progress<'_>,
 ) -> Result<Outcome, Error> {
     let bare = simulator.without_effects();
-    let mut known: Vec<FittedEffect> = simulator.effects().iter().map(FittedEffect::known).collect();
-    known.extend(data.hung.iter().map(|(dof, column)| FittedEffect::hung(*dof, &column.name)));
+    let known = known_effects(simulator, data);
     let study = Study::new(&bare, data);
     progress(Step::Showing);
     let candidates = candidates(simulator, data, &training);
@@ -231,8 +230,7 @@ fn run(
     let measured = |mode: usize| training.iter().any(|row| data.log_frequencies[*row][mode].is_finite());
     let scatter = excess_scatter(&selection.fit, measured);
     let corrected = study.corrected_settings(&training, &selection.fit);
-    let settings_outside =
-        if corrected.is_empty() { Vec::new() } else { outside_settings(simulator, data, &training, &corrected) };
+    let settings_outside = outside_settings(simulator, data, &training, &corrected);
     let many_outside = selection.fit.outside.rows as f64 > FEW_OUTSIDE * training.len() as f64;
 
     let Named { causes, alternatives, ambiguous, maybe_damage, next_measurements } =
@@ -289,6 +287,12 @@ fn run(
         training,
         offered,
     })
+}
+
+/// The effects of the structure, then the known masses that were hung.
+fn known_effects(simulator: &Simulator, data: &Data) -> Vec<FittedEffect> {
+    let hung = data.hung.iter().map(|(dof, column)| FittedEffect::hung(*dof, &column.name));
+    simulator.effects().iter().map(FittedEffect::known).chain(hung).collect()
 }
 
 /// The verdict for a number of causes, whether one of them is ambiguous, whether a deviation remains that they do not explain,

@@ -103,7 +103,9 @@ pub(super) fn outside_settings(
         [ends.0, ends.1]
     };
     let mut found = Vec::new();
-    for (k, p) in simulator.space().iter().enumerate() {
+    // Without settings, nothing was corrected.
+    let parameters = if corrected.is_empty() { 0 } else { simulator.space().len() };
+    for (k, p) in simulator.space().iter().enumerate().take(parameters) {
         let places: Vec<usize> = (0..rows.len()).filter(|place| data.settings[rows[*place]][k].is_some()).collect();
         let given: Vec<f64> = places.iter().filter_map(|place| data.settings[rows[*place]][k]).collect();
         let after: Vec<f64> = places.iter().map(|place| corrected[*place][k]).collect();

@@ -233,7 +233,17 @@ fn a_body_that_was_weighed_and_a_second_instrument_tell_exact_equivalents_apart(
         let now = recommended[0]["probability_now"].as_f64().unwrap();
         // The scale and the springs differ by a second instrument, the masses from both by weighing.
         let weighed = best("weighing");
-        assert!(weighed > now + 0.1, "{now} -> {weighed}");
+        // Weighing decides about the masses and leaves the odds of the others as they are: U = p + Σ p_i²/(1 − p), with p that of the
+        // masses and p_i those of the others.
+        let named: Vec<(bool, f64)> = list(&earlier, "causes")
+            .iter()
+            .map(|c| (c["target"]["kind"] == "mass_group", c["probability"].as_f64().unwrap()))
+            .collect();
+        let sum = |masses: bool| named.iter().filter(|(m, _)| *m == masses).map(|(_, p)| p).sum::<f64>();
+        let total = sum(true) + sum(false);
+        let others: f64 = named.iter().filter(|(m, _)| !m).map(|(_, p)| p * p).sum::<f64>() / sum(false);
+        let expected = (sum(true) + others) / total;
+        assert!((weighed - expected).abs() < 0.05, "{now} -> {weighed}, by the odds {expected}");
         // Each of the two leaves a pair undecided; both together decide.
         let both = recommended[0]["probability_after"].as_f64().unwrap();
         assert!(both > 0.9 && recommended[0]["second_instrument"] == true, "{}", recommended[0]["sentence"]);

@@ -58,8 +58,9 @@ impl ModeRows<'_> {
     /// The most probable hyperparameters, from `start` if it is given; `None` if the correlations are not finite.
     pub fn fit(&self, support: &Support, start: Option<&Hyperparameters>) -> Option<Hyperparameters> {
         let inputs = self.u.first()?.len();
-        let size = (self.residual.norm_squared() / self.u.len() as f64).sqrt().max(STDS.0);
-        let middle = start_at(inputs, (0.5 * size).ln(), LENGTH.0.ln());
+        let size = (self.residual.norm_squared() / self.u.len() as f64).sqrt();
+        let std = (0.5 * size).clamp(STDS.0, STDS.1);
+        let middle = start_at(inputs, std.ln(), LENGTH.0.ln());
         let mut best: Option<(DVector<f64>, f64)> = None;
         let starts: Vec<DVector<f64>> = match start {
             Some(s) => vec![DVector::from_iterator(
@@ -67,7 +68,7 @@ impl ModeRows<'_> {
                 std::iter::once(s.std.ln()).chain(s.lengths.iter().map(|l| l.ln())),
             )],
             // A smooth and a rough function can both be local maxima.
-            None => vec![middle.clone(), start_at(inputs, (0.5 * size).ln(), 0.0)],
+            None => vec![middle.clone(), start_at(inputs, std.ln(), 0.0)],
         };
         for start in starts {
             let found = self.ascend(support, start, &middle)?;

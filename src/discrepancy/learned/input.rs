@@ -180,7 +180,7 @@ mod tests {
     fn what_follows_time_is_recognised() {
         let wave: Vec<f64> = (0..100).map(|i| (0.3 * f64::from(i)).sin()).collect();
         assert_eq!(follows_time(&wave), None);
-        let rising: Vec<f64> = (0..100).map(|i| f64::from(i) + 30.0 * wave[i as usize]).collect();
+        let rising: Vec<f64> = (0..100).map(|i| f64::from(i) + 15.0 * wave[i as usize]).collect();
         assert!(follows_time(&rising).unwrap().contains("rank correlation"));
         let step: Vec<f64> = (0..100).map(|i| f64::from(u8::from(i > 80))).collect();
         assert!(follows_time(&step).unwrap().contains("never falls"));

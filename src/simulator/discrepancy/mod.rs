@@ -9,7 +9,7 @@
 //! - [`input`]: the inputs u of a measurement; `check`: checks of a structure file;
 //! - [`measured`]: measurements corrected by it, and its simulation.
 //!
-//! `crate::discrepancy::learned` learns it. Every answer about a structure with a learned discrepancy uses corrected measurements:
+//! The module `learned` of the diagnosis learns it. Every answer about a structure with a learned discrepancy uses corrected measurements:
 //! the mean of g is subtracted from ln f, and its variance is added to that of the noise. The trained model of the structure does
 //! not know about it.
 
