@@ -9,9 +9,10 @@ use serde::{Deserialize, Serialize};
 use tracing::{error, info};
 
 use super::error::{Error, JobError};
-use super::jobs::Jobs;
+use super::jobs::{DiagnosisRequest, Jobs};
 use super::structures::ActiveStructures;
 use super::supervise::supervise;
+use crate::discrepancy::Holdout;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{DiagnosisTrigger, LatestDiagnoses, NewAuditEntry, RejectedEpisode, Store};
 
@@ -61,10 +62,11 @@ impl DiagnosisSettings {
         self.after_rejected_episode && long_enough
     }
 
-    /// Whether the schedule starts a diagnosis at the time `now`, when the latest one started at `latest`.
-    fn is_scheduled(&self, latest: Option<Timestamp>, now: Timestamp) -> bool {
+    /// Whether the schedule starts a diagnosis at the time `now`. `since` is the start of the latest one or, if there is none, the
+    /// arrival of the first batch.
+    fn is_scheduled(&self, since: Timestamp, now: Timestamp) -> bool {
         let span = i64::from(self.every_days) * MICROS_A_DAY;
-        span > 0 && latest.is_none_or(|latest| now.micros() - latest.micros() >= span)
+        span > 0 && now.micros() - since.micros() >= span
     }
 }
 
@@ -140,7 +142,9 @@ impl AutomaticDiagnoses {
         now: Timestamp,
     ) -> Result<(), JobError> {
         let Some((trigger, alarm)) = self.due(structure, episode, settings, now).await? else { return Ok(()) };
-        let Some(request) = self.jobs.request_for_all(structure).await? else { return Ok(()) };
+        // The rejected batches are the newest measurements: held out, they would not be searched for causes.
+        let holdout = if alarm.is_some() { Holdout::Last(0.0) } else { DiagnosisRequest::default().holdout };
+        let Some(request) = self.jobs.request_for_all(structure, holdout).await? else { return Ok(()) };
         let entry = NewAuditEntry {
             structure: Some(structure.to_string()),
             ..NewAuditEntry::local(
@@ -181,7 +185,10 @@ impl AutomaticDiagnoses {
                 return Ok(Some((DiagnosisTrigger::RejectedEpisode, Some(episode.alarm))));
             }
         }
-        Ok(settings.is_scheduled(latest.any, now).then_some((DiagnosisTrigger::Schedule, None)))
+        let first = if latest.any.is_none() { self.store.batches().first_received(structure).await? } else { None };
+        let since = latest.any.or(first);
+        let scheduled = since.is_some_and(|since| settings.is_scheduled(since, now));
+        Ok(scheduled.then_some((DiagnosisTrigger::Schedule, None)))
     }
 }
 
@@ -210,12 +217,11 @@ mod tests {
     }
 
     #[test]
-    fn the_schedule_counts_days_from_the_latest_diagnosis() {
+    fn a_scheduled_diagnosis_follows_the_one_before_it_after_the_days_of_the_settings() {
         let weekly = DiagnosisSettings { every_days: 7, ..DiagnosisSettings::default() };
-        assert!(weekly.is_scheduled(None, at(0)));
-        assert!(!weekly.is_scheduled(Some(at(0)), at(7 * DAY - 1)));
-        assert!(weekly.is_scheduled(Some(at(0)), at(7 * DAY)));
-        assert!(!DiagnosisSettings::default().is_scheduled(None, at(0)), "there is no schedule by default");
+        assert!(!weekly.is_scheduled(at(0), at(7 * DAY - 1)));
+        assert!(weekly.is_scheduled(at(0), at(7 * DAY)));
+        assert!(!DiagnosisSettings::default().is_scheduled(at(0), at(1_000 * DAY)), "there is no schedule by default");
     }
 
     #[test]

@@ -21,7 +21,7 @@ use super::own_task::in_own_task;
 use super::structures::{ActiveStructure, ActiveStructures};
 use super::versions::Versions;
 use crate::baseline::train::Trained;
-use crate::discrepancy::FEWEST_ROWS;
+use crate::discrepancy::{Holdout, FEWEST_ROWS};
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::simulator::Simulator;
 use crate::store::{
@@ -94,10 +94,14 @@ impl Jobs {
 
     /// The request for all batches of a structure, or for the newest ones if all have more measurements than a diagnosis can use.
     /// `None` if the structure has too few measurements for a diagnosis.
-    pub(super) async fn request_for_all(&self, structure: &StructureId) -> Result<Option<DiagnosisRequest>, Error> {
+    pub(super) async fn request_for_all(
+        &self,
+        structure: &StructureId,
+        holdout: Holdout,
+    ) -> Result<Option<DiagnosisRequest>, Error> {
         let stored = self.store.batches().batch_sizes(structure).await?;
         let batches = newest(&stored);
-        Ok((!batches.is_empty()).then(|| DiagnosisRequest { batches, ..DiagnosisRequest::default() }))
+        Ok((!batches.is_empty()).then(|| DiagnosisRequest { batches, holdout, ..DiagnosisRequest::default() }))
     }
 
     /// Starts a diagnosis that nobody requested; `alarm` is the number of the alarm because of which it is started.
