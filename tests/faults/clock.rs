@@ -8,7 +8,7 @@ use modalwatch::measurement::MeasurementBatch;
 use modalwatch::quantity::StructureId;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, eventually, Service};
+use crate::helpers::{command, created, eventually, within, Service};
 use crate::kit::{audit, batch, body, define_as, history, post, ready, Acknowledged, BATCHES};
 use crate::needs;
 
@@ -141,7 +141,7 @@ async fn a_diagnosis_runs_on_schedule_only_after_new_batches_and_a_restart_does_
         Service::spawn(command.env("MODALWATCH__DIAGNOSIS__EVERY_DAYS", "7"))
     };
     let ended = async |service: &Service, wanted: usize| {
-        let listed = eventually("a diagnosis on schedule", async || {
+        let listed = within(Duration::from_mins(3), "a diagnosis on schedule", async || {
             let listed = service.read("/v1/structures/three-dof/diagnoses").await["items"].as_array().unwrap().clone();
             let ended = listed.iter().all(|item| item["state"] != "running");
             (listed.len() >= wanted && ended).then_some(listed)
