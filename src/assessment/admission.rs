@@ -17,6 +17,10 @@ struct Reservations {
     marginalised: BTreeMap<String, Vec<usize>>,
     /// By covariate: measurements whose value lies outside the range from which its effect was learnt.
     beyond: BTreeMap<String, Vec<usize>>,
+    /// By input of the learned discrepancy: measurements that lack it.
+    inputs_missing: BTreeMap<String, Vec<usize>>,
+    /// By input of the learned discrepancy: measurements whose value lies outside those that it was learned from.
+    inputs_beyond: BTreeMap<String, Vec<usize>>,
 }
 
 /// The observations that can be passed to the flow, each with the index of its measurement in the batch.
@@ -40,6 +44,12 @@ pub(super) fn admit(
         }
         for name in &admitted.covariates_beyond {
             found.beyond.entry(name.clone()).or_default().push(*index);
+        }
+        for name in admitted.inputs_missing {
+            found.inputs_missing.entry(name).or_default().push(*index);
+        }
+        for name in admitted.inputs_beyond {
+            found.inputs_beyond.entry(name).or_default().push(*index);
         }
         match admitted.observation {
             Some(observation) => {
@@ -68,6 +78,22 @@ impl Reservations {
             let message = format!(
                 "{} measurements have a {name} outside the range that its effect was learnt from: the nearest end of the range is \
                  used",
+                rows.len()
+            );
+            findings.push(Finding::new(FindingCode::Extrapolated, FindingEffect::HoldAlarm, message).of(rows));
+        }
+        for (name, rows) in self.inputs_missing {
+            let message = format!(
+                "{} measurements lack {name}, which the learned discrepancy depends on: they are not corrected, and the variance of \
+                 the discrepancy before any data is added to that of their noise",
+                rows.len()
+            );
+            findings.push(Finding::new(FindingCode::CovariateMissing, FindingEffect::HoldAlarm, message).of(rows));
+        }
+        for (name, rows) in self.inputs_beyond {
+            let message = format!(
+                "{} measurements have a {name} outside the values that the discrepancy was learned from: the correction is uncertain \
+                 there, and its variance is added to that of the noise",
                 rows.len()
             );
             findings.push(Finding::new(FindingCode::Extrapolated, FindingEffect::HoldAlarm, message).of(rows));

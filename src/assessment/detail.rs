@@ -60,7 +60,8 @@ pub struct ParameterDetail {
     pub threshold: Option<f64>,
 }
 
-/// Frequencies of one mode: measured, and predicted by the posterior samples without noise.
+/// Frequencies of one mode: measured, and predicted by the posterior samples and the mean of the learned discrepancy, without
+/// noise.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModeDetail {
     /// Frequencies of the measurements shown, Hz.
@@ -101,13 +102,14 @@ pub fn detail(
             grid,
         }
     };
+    let discrepancy = mean_discrepancy(baseline, measurements);
     let rows = evenly(pooled.theta().nrows(), SIMULATIONS);
     let mut predicted = vec![Vec::with_capacity(rows.len()); baseline.simulator().modes()];
     for &row in &rows {
         let theta: Vec<f64> = pooled.theta().row(row).iter().copied().collect();
         let simulator = samples.asked[row / pooled.draws()].simulator(baseline.simulator());
         for (mode, frequency_hz) in simulator.frequencies_hz(&theta)?.into_iter().enumerate() {
-            predicted[mode].push(frequency_hz);
+            predicted[mode].push(frequency_hz * discrepancy[mode].exp());
         }
     }
     let shown = evenly(measurements.len(), SHOWN_MEASUREMENTS);
@@ -124,6 +126,19 @@ pub fn detail(
         parameters: baseline.space().iter().enumerate().map(parameter).collect(),
         modes: predicted.into_iter().enumerate().map(mode).collect(),
     })
+}
+
+/// Mean over some measurements of the mean of the learned discrepancy of each mode, a difference in ln f, `[m]`; 0 without one.
+fn mean_discrepancy(baseline: &Baseline, measurements: &[ModalMeasurement]) -> Vec<f64> {
+    let mut sum = vec![0.0; baseline.simulator().modes()];
+    let Some(discrepancy) = baseline.simulator().discrepancy() else { return sum };
+    for measurement in measurements {
+        let inputs = discrepancy.inputs(&measurement.covariates, &measurement.settings);
+        for (sum, moments) in sum.iter_mut().zip(discrepancy.at(inputs.u.as_deref())) {
+            *sum += moments.mean / measurements.len() as f64;
+        }
+    }
+    sum
 }
 
 /// Grid points over the prior and at its bounds, closer together where the samples and the undamaged population are.

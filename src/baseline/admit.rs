@@ -19,14 +19,21 @@ pub struct Admitted {
     pub covariates_missing: Vec<String>,
     /// Covariates outside the range that an effect was fitted to.
     pub covariates_beyond: Vec<String>,
+    /// Inputs of the learned discrepancy that the measurement lacks.
+    pub inputs_missing: Vec<String>,
+    /// Inputs outside those that the discrepancy was learned from.
+    pub inputs_beyond: Vec<String>,
 }
 
 impl Baseline {
-    /// Prepares a measurement for the inference; the structure's noise is used where none is given.
+    /// Prepares a measurement for the inference: it is corrected by the learned discrepancy of the structure, and the structure's
+    /// noise is used where none is given.
     ///
     /// A mode with less noise than the model was trained for gets the smallest trained noise, and a mode with more is
     /// treated as missing. Both make the posterior wider than necessary; neither extrapolates.
     pub fn admit(&self, measurement: &ModalMeasurement) -> Admitted {
+        let (inputs_missing, inputs_beyond) = self.simulator.discrepancy_reservations(measurement);
+        let measurement = &*self.simulator.corrected(measurement);
         let mut frequencies_hz: Vec<Option<f64>> =
             measurement.frequencies_hz.iter().map(|f| f.map(Hertz::get)).collect();
         let mut noise_multiple = vec![1.0; frequencies_hz.len()];
@@ -67,6 +74,8 @@ impl Baseline {
             above_range,
             covariates_missing: sizes.missing,
             covariates_beyond: sizes.beyond,
+            inputs_missing,
+            inputs_beyond,
         }
     }
 }

@@ -234,7 +234,10 @@ fn noise_std(simulator: &Simulator, moments: &[(f64, f64)], noise: f64) -> anyho
         "structure {} has no measurement noise: state it in measurement_noise",
         simulator.id()
     );
-    let std_hz: Vec<f64> = frequencies.iter().enumerate().map(|(mode, f)| noise * simulator.std_hz(mode, *f)).collect();
+    // The uncertainty of a learned discrepancy is part of the noise of every measurement.
+    let discrepancy = simulator.typical_discrepancy_variance();
+    let std_hz = |(mode, f): (usize, &f64)| (noise * simulator.std_hz(mode, *f)).hypot(f * discrepancy[mode].sqrt());
+    let std_hz: Vec<f64> = frequencies.iter().enumerate().map(std_hz).collect();
     let covariance = fisher_covariance(simulator, &jacobian, &std_hz, &[])
         .context("the Fisher information of the frequencies is not finite")?;
     let std = |(k, p): (usize, &Parameter)| covariance[(k, k)].sqrt() * (p.upper - p.lower);

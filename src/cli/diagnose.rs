@@ -6,6 +6,7 @@ use anyhow::Context as _;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::next::join;
 use super::output::write_whole;
 use super::tables::{read_tables, TableArgs};
 use super::training::{print_record, sizes, train_into};
@@ -14,6 +15,7 @@ use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend as extend_structure;
 use crate::discrepancy::gain::GainMethod;
+use crate::discrepancy::learned::extension::{extend_learned, offer_anyway};
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -45,6 +47,12 @@ pub struct StudyArgs {
     /// Columns to ignore, separated by commas
     #[arg(long, value_delimiter = ',')]
     ignore: Vec<String>,
+    /// Result of an earlier diagnosis of the same data, as JSON, to be decided with the rows of --further
+    #[arg(long, requires = "further")]
+    next: Option<PathBuf>,
+    /// CSV file of what was measured after the earlier diagnosis; several files are joined in the order given
+    #[arg(long, requires = "next")]
+    further: Vec<PathBuf>,
     /// Refuse a table in which a row cannot be used, instead of leaving the row out
     #[arg(long)]
     strict: bool,
@@ -61,6 +69,9 @@ pub struct DiagnoseArgs {
     /// Write the report as one HTML page
     #[arg(long)]
     report: Option<PathBuf>,
+    /// Learn a discrepancy from the covariates and settings, whatever the verdict
+    #[arg(long)]
+    learned: bool,
     /// Print the result as JSON
     #[arg(long)]
     json: bool,
@@ -71,7 +82,10 @@ pub struct DiagnoseArgs {
 /// # Errors
 /// Invalid files, or data that do not allow a diagnosis.
 pub fn diagnose(args: &DiagnoseArgs) -> anyhow::Result<()> {
-    let Study { simulator, data, outcome } = studied(&args.study)?;
+    let Study { simulator, data, mut outcome } = studied(&args.study)?;
+    if args.learned {
+        offer_anyway(&simulator, &data, &mut outcome)?;
+    }
     if let Some(path) = &args.report {
         let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;
@@ -103,9 +117,14 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
         ignore: &args.ignore,
         strict: args.strict,
     };
-    let tables = read_tables(&simulator, &args.data, &how)?;
-    let data = Data::new(&simulator, &tables.measurements);
-    let data = if tables.timed { data } else { data.by_order() };
+    let (data, mut notes, earlier) = if let Some(path) = &args.next {
+        let joined = join(&simulator, path, (&args.data, &args.further), &how)?;
+        (joined.data, joined.notes, Some(joined.earlier))
+    } else {
+        let tables = read_tables(&simulator, &args.data, &how)?;
+        let data = Data::new(&simulator, &tables.measurements);
+        (if tables.timed { data } else { data.by_order() }, tables.notes, None)
+    };
     let bar = ProgressBar::new_spinner();
     let style = ProgressStyle::with_template("{spinner} {elapsed} {msg}");
     bar.set_style(style.context("the template of the progress bar")?);
@@ -113,7 +132,10 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     let progress = |step: Step| bar.set_message(step.to_string());
     let mut outcome = run(&simulator, &data, &args.holdout, args.seed, &progress)?;
     bar.finish_and_clear();
-    outcome.diagnosis.notes.splice(0..0, tables.notes);
+    if let Some(earlier) = earlier {
+        notes.extend(outcome.diagnosis.changes_since(&earlier));
+    }
+    outcome.diagnosis.notes.splice(0..0, notes);
     Ok(Study { simulator, data, outcome })
 }
 
@@ -125,6 +147,9 @@ pub struct ExtendArgs {
     /// Folder for structure.json, baseline.safetensors and baseline.json
     #[arg(long)]
     out: PathBuf,
+    /// Add a discrepancy learned from the covariates and settings instead of the causes: not understood, but predictable
+    #[arg(long)]
+    learned: bool,
     /// Only write the structure; its model can be trained later with `modalwatch train`
     #[arg(long)]
     no_training: bool,
@@ -150,20 +175,26 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
         let html = report::html(&simulator, &data, &outcome).context("the report cannot be drawn")?;
         write_whole(path, html.as_bytes())?;
     }
-    let extended = extend_structure(&simulator, &data, &outcome)?;
-    for added in &extended.added {
+    let (definition, added, left_out) = if args.learned {
+        let extended = extend_learned(&simulator, &data, &outcome)?;
+        (extended.definition, vec![extended.added], extended.left_out)
+    } else {
+        let extended = extend_structure(&simulator, &data, &outcome)?;
+        (extended.definition, extended.added, extended.left_out)
+    };
+    for added in &added {
         println!("added: {added}");
     }
-    for left in &extended.left_out {
+    for left in &left_out {
         println!("not added: {left}");
     }
-    let text = serde_json::to_string_pretty(&extended.definition)?;
+    let text = serde_json::to_string_pretty(&definition)?;
     write_whole(&args.out.join("structure.json"), format!("{text}\n").as_bytes())?;
     println!("structure: {}", args.out.join("structure.json").display());
     if args.no_training {
         return Ok(());
     }
-    let simulator = Simulator::new(extended.definition)?;
+    let simulator = Simulator::new(definition)?;
     let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
     let settings = TrainSettings { epochs, seed: args.study.seed, ..TrainSettings::default() };
     let flow = FlowSettings::default();
@@ -187,6 +218,9 @@ fn print(d: &Diagnosis) {
             "instead of cause {}: {} ({:+.1} nats); distinguished by {}",
             a.instead_of, a.cause.sentence, a.log_evidence_difference, a.discriminating_measurement
         );
+    }
+    for m in d.next_measurements.iter().take(5) {
+        println!("next: {}", m.sentence);
     }
     for m in d.misfit.iter().take(8) {
         let what = m.mode.map_or_else(|| m.parameter.clone().unwrap_or_default(), |mode| format!("mode {mode}"));

@@ -11,6 +11,7 @@ mod doctor;
 mod healthcheck;
 mod measurements;
 mod model;
+mod next;
 mod output;
 mod parameter;
 mod reload;

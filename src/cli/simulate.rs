@@ -8,8 +8,8 @@ use clap::Args;
 use super::output::write_whole;
 use super::parameter::parameter_moments;
 use crate::baseline::library::find_structure;
-use crate::measurement::{at_intervals, csv};
-use crate::quantity::Timestamp;
+use crate::measurement::{at_intervals, csv_output};
+use crate::quantity::{Hertz, Timestamp};
 use crate::simulator::population::Population;
 
 /// Simulate measurements of a structure as CSV.
@@ -53,8 +53,16 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let drawn = population.draw(&simulator, args.measurements, args.noise, args.seed)?;
     let start = Timestamp::parse(&args.start).context("--start")?;
     let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
-    let measurements = at_intervals(&rows, start, args.interval_s, None)?;
-    let text = csv::write(&measurements);
+    let mut measurements = at_intervals(&rows, start, args.interval_s, None)?;
+    let theta: Vec<Vec<f64>> = drawn.theta.row_iter().map(|row| row.iter().copied().collect()).collect();
+    let discrepancy = simulator.draw_discrepancy(&theta, args.seed)?;
+    for (measurement, ((covariates, settings), factors)) in measurements.iter_mut().zip(discrepancy) {
+        for (frequency, factor) in measurement.frequencies_hz.iter_mut().zip(factors) {
+            *frequency = frequency.map(|f| Hertz::new(f.get() * factor)).transpose()?;
+        }
+        (measurement.covariates, measurement.settings) = (covariates, settings);
+    }
+    let text = csv_output::write(&measurements);
     match &args.out {
         Some(path) => write_whole(path, text.as_bytes())?,
         None => print!("{text}"),

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 
 use crate::discrepancy::data::MOST_LEVELS;
+use crate::discrepancy::declared::{mistake, WEIGHED_KG};
 use crate::measurement::check::{check_each, Expectation, FieldPath, Problem, Purpose, RawMeasurement};
 use crate::measurement::csv::{self, CsvOptions, Offered, SettingColumn, Times};
 use crate::measurement::order::Ordered;
@@ -65,6 +66,8 @@ struct Row {
 /// The rows that are still used, and those that were left out.
 #[derive(Default)]
 struct Rows {
+    /// Number of rows read.
+    read: usize,
     /// Files with a column of times.
     timed: BTreeSet<usize>,
     used: Vec<Row>,
@@ -87,11 +90,15 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         ignore: how.ignore.to_vec(),
         time_column: how.time.map(str::to_owned),
         settings: setting_columns(simulator, how.settings)?,
+        points: simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone()),
     };
     let mut covariates = simulator.covariates().to_vec();
     let mut rows = Rows::default();
     for file in &files {
         rows.notes.extend(add_covariates(file, &mut covariates, &mut options)?);
+    }
+    if let Some(wrong) = covariates.iter().find_map(|c| mistake(simulator, &c.name)) {
+        anyhow::bail!(wrong);
     }
     let expectation = Expectation {
         purpose: Purpose::Diagnosis,
@@ -99,9 +106,9 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         ..simulator.expectation(Timestamp::now(), usize::MAX)
     };
     for (index, file) in files.iter().enumerate() {
-        rows.read(index, file, &expectation, &options)?;
+        rows.add(index, file, &expectation, &options)?;
     }
-    let all = rows.used.len() + rows.left_out.len();
+    let all = rows.read;
     rows.drop_empty();
     rows.settle_times(&files, how, expectation.now)?;
     rows.drop_unset();
@@ -218,8 +225,8 @@ fn named(files: &[File<'_>], left_out: &[(usize, Problem)], options: &CsvOptions
 }
 
 impl Rows {
-    /// Reads the rows of a file.
-    fn read(
+    /// Adds the rows of a file.
+    fn add(
         &mut self,
         index: usize,
         (path, bytes): &File<'_>,
@@ -242,7 +249,8 @@ impl Rows {
             );
         }
         // The rows of a table without times follow those of the tables before it.
-        let earlier_rows = self.used.len();
+        let earlier_rows = self.read;
+        self.read += table.rows.len();
         for (number, row) in table.rows.into_iter().enumerate() {
             match row {
                 Ok(mut raw) => {
@@ -276,7 +284,16 @@ impl Rows {
     /// Drops the rows without any frequency: nothing was measured there.
     fn drop_empty(&mut self) {
         let before = self.used.len();
-        self.used.retain(|row| row.raw.frequencies_hz.iter().any(Option::is_some));
+        let has_frequency = |row: &Row| row.raw.frequencies_hz.iter().any(Option::is_some);
+        let weighed = |row: &Row| row.raw.covariates.keys().any(|name| name.starts_with(WEIGHED_KG));
+        let unused = self.used.iter().filter(|row| weighed(row) && !has_frequency(row)).count();
+        if unused > 0 {
+            self.notes.push(format!(
+                "{unused} weighed masses are not used, because they stand in rows without a frequency: state them in rows of \
+                 frequencies that were measured in the same conditions"
+            ));
+        }
+        self.used.retain(has_frequency);
         let empty = before - self.used.len();
         if empty > 0 {
             self.notes.push(format!("{empty} rows without any frequency were ignored"));

@@ -108,6 +108,12 @@ struct SingleUpdate {
 pub fn update(args: &UpdateArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
     let measurements = read_measurements(&simulator, &args.data, &args.ignore)?;
+    // The flow corrects measurements by the learned discrepancy itself.
+    let corrected = |m: &ModalMeasurement| simulator.corrected(m).into_owned();
+    let measurements = match args.method {
+        Method::Cinn => measurements,
+        Method::Sensitivity | Method::Tmcmc => measurements.iter().map(corrected).collect(),
+    };
     anyhow::ensure!(
         simulator.effects().is_empty() || matches!(args.method, Method::Cinn),
         "{} has effects that differ between measurements: only --method cinn accounts for them",

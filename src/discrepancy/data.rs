@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use super::declared::{declared, is_marked, Declared, Weighing, SECOND_INSTRUMENT};
+use super::shapes::MeasuredShapes;
 use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::quantity::{Digest, Hertz};
 use crate::simulator::law::{lagged, Input, Law, LawKind};
@@ -72,18 +74,36 @@ pub struct Data {
     pub noise: Vec<Vec<f64>>,
     /// Values of the parameters that the experimenter set, `[n][d]`, in their own units.
     pub settings: Vec<Vec<Option<f64>>>,
+    /// Mode shapes; `None` if none was measured.
+    pub shapes: Option<MeasuredShapes>,
     /// Covariates, settings that vary, their products by pairs, and time, in this order.
     pub columns: Vec<Column>,
+    /// Known masses that were hung: the degree of freedom, and kg in each row.
+    pub hung: Vec<(usize, Column)>,
+    /// Bodies that were weighed.
+    pub weighings: Vec<Weighing>,
+    /// Whether a row was measured with a second instrument, `[n]`.
+    pub second_instrument: Vec<bool>,
+    /// Whether a row was measured after an earlier diagnosis, to decide between its candidates, `[n]`.
+    pub further: Vec<bool>,
     /// Digest of the measurements.
     pub digest: Digest,
 }
 
 impl Data {
     /// Sorts n measurements by time and converts them to rows. Frequencies become logarithms, and a noise that a measurement
-    /// does not state is that of the structure.
+    /// does not state is that of the structure. In rows with mode shapes, the modes are put in the order that their shapes show.
     pub fn new(simulator: &Simulator, measurements: &[ModalMeasurement]) -> Self {
-        let mut sorted: Vec<&ModalMeasurement> = measurements.iter().collect();
-        sorted.sort_by_key(|m| m.measured_at);
+        Self::joined(simulator, measurements, &[])
+    }
+
+    /// As [`Self::new`], for the measurements of an earlier diagnosis and those that were taken after it, which are never held
+    /// out.
+    pub fn joined(simulator: &Simulator, earlier: &[ModalMeasurement], further: &[ModalMeasurement]) -> Self {
+        let mut flagged: Vec<(&ModalMeasurement, bool)> = earlier.iter().map(|m| (m, false)).collect();
+        flagged.extend(further.iter().map(|m| (m, true)));
+        flagged.sort_by_key(|(m, _)| m.measured_at);
+        let (sorted, further): (Vec<&ModalMeasurement>, Vec<bool>) = flagged.into_iter().unzip();
         let start = sorted.first().map_or(0, |m| m.measured_at.micros());
         let times_days: Vec<f64> =
             sorted.iter().map(|m| (m.measured_at.micros() - start) as f64 / MICROS_A_DAY).collect();
@@ -97,7 +117,16 @@ impl Data {
             };
             m.frequencies_hz.iter().enumerate().map(cell).unzip()
         };
-        let (log_frequencies, noise) = sorted.iter().map(row).unzip();
+        // A discrepancy that was learned before is known: what is left is diagnosed.
+        let known: Vec<_> = sorted.iter().map(|m| simulator.corrected(m)).collect();
+        let (mut log_frequencies, mut noise): (Vec<Vec<f64>>, Vec<Vec<f64>>) = known.iter().map(|m| row(&&**m)).unzip();
+        let shapes = MeasuredShapes::new(simulator, &sorted).map(|(shapes, orders)| {
+            for ((log_frequencies, noise), order) in log_frequencies.iter_mut().zip(&mut noise).zip(&orders) {
+                *log_frequencies = order.iter().map(|listed| log_frequencies[*listed]).collect();
+                *noise = order.iter().map(|listed| noise[*listed]).collect();
+            }
+            shapes
+        });
         let setting = |m: &&ModalMeasurement| {
             simulator.space().iter().map(|p| m.settings.get(&p.name).copied()).collect::<Vec<_>>()
         };
@@ -107,22 +136,45 @@ impl Data {
                 *names.entry(name).or_default() |= matches!(value, CovariateValue::Category(_));
             }
         }
-        let mut columns: Vec<Column> =
-            names.into_iter().map(|(name, category)| column(name, category, &sorted)).collect();
+        let (mut columns, mut hung, mut weighings): (Vec<Column>, _, _) = (Vec::new(), Vec::new(), Vec::new());
+        let kg_in = |m: &&ModalMeasurement, name: &str| match m.covariates.get(name) {
+            Some(CovariateValue::Number(kg)) => *kg,
+            _ => 0.0,
+        };
+        for (name, category) in names {
+            let kg = || sorted.iter().map(|m| kg_in(m, name));
+            match declared(simulator, name) {
+                None => columns.push(column(name, category, &sorted)),
+                Some(Declared::SecondInstrument) => {}
+                Some(Declared::Hung(dof)) => {
+                    let values = Values::Numbers(kg().collect());
+                    hung.push((dof, Column { name: name.to_owned(), origin: Origin::Covariate, values }));
+                }
+                Some(Declared::Weighed(mass)) => {
+                    weighings.extend(kg().enumerate().filter_map(|(row, kg)| Weighing::new(simulator, row, mass, kg)));
+                }
+            }
+        }
         let settings: Vec<Vec<Option<f64>>> = sorted.iter().map(setting).collect();
         let names = simulator.space().iter().map(|p| p.name.as_str());
         columns.extend(names.enumerate().filter_map(|(k, name)| setting_column(name, k, &settings)));
         columns.extend(products(&columns));
         let values = Values::Numbers(times_days.clone());
         columns.push(Column { name: TIME.to_owned(), origin: Origin::Time, values });
+        let second = |m: &&ModalMeasurement| m.covariates.get(SECOND_INSTRUMENT).is_some_and(is_marked);
         let content = serde_json::to_vec(&sorted).expect("measurements can be written as JSON");
         Self {
             settings,
+            second_instrument: sorted.iter().map(second).collect(),
+            hung,
+            weighings,
+            further,
             digest: Digest::of(&[&content]),
             times_days,
             time_unit: "day",
             log_frequencies,
             noise,
+            shapes,
             columns,
         }
     }
@@ -163,7 +215,8 @@ impl Data {
     ///
     /// The result is for all rows because a lagged covariate depends on all earlier ones.
     pub fn inputs(&self, law: &Law, lag_days: Option<f64>) -> Vec<Input> {
-        let Some(column) = law.covariate.as_deref().and_then(|name| self.column(name)) else {
+        let hung = |name: &str| self.hung.iter().map(|(_, column)| column).find(|c| c.name == name);
+        let Some(column) = law.covariate.as_deref().and_then(|name| self.column(name).or_else(|| hung(name))) else {
             return vec![if law.covariate.is_none() { Input::Number(0.0) } else { Input::Missing }; self.rows()];
         };
         match &column.values {

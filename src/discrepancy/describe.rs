@@ -61,7 +61,7 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
         }
         Target::InMode(_, target) => self::unit(simulator, target),
         Target::AddedSpring(..) => plain("N/m"),
-        Target::Oscillator(_) => plain("kg"),
+        Target::Oscillator(_) | Target::AddedMass(_) => plain("kg"),
         Target::ModeOrder(_) => plain(""),
         _ => relative(),
     }

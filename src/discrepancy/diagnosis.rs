@@ -6,7 +6,9 @@ use super::describe::Cause;
 use super::fit::Fit;
 use super::gain::{Gain, GainMethod};
 use super::grammar::Class;
+use super::learned::offer::{LearnedOffer, Offered};
 use super::misfit::{Misfit, Remainder};
+use super::next::experiment::NextMeasurement;
 use super::outside::OutsideSetting;
 use super::rank::Ranked;
 use super::scatter::ExcessScatter;
@@ -43,7 +45,7 @@ pub struct Alternative {
     pub instead_of: usize,
     /// Its log evidence minus that of the chosen cause, prior included, nats.
     pub log_evidence_difference: f64,
-    /// A measurement that would distinguish the two.
+    /// The measurement, of those that are possible, that best distinguishes the two if both are equally probable.
     #[serde(rename = "told_apart_by")]
     pub discriminating_measurement: String,
 }
@@ -69,11 +71,17 @@ pub struct Diagnosis {
     pub causes: Vec<Cause>,
     /// Causes that were not chosen.
     pub alternatives: Vec<Alternative>,
+    /// Measurements that would decide between the candidates of a cause that is not sure, the best first.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub next_measurements: Vec<NextMeasurement>,
     /// Deviation that no cause explains.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub remainder: Option<Remainder>,
     /// Gain from the causes on rows that they were not fitted to; `null` when no cause was found.
     pub gain: Option<Gain>,
+    /// A discrepancy that could be learned, where no known cause explains the deviation.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub learned: Option<LearnedOffer>,
     /// Properties of the data that limit the diagnosis.
     pub notes: Vec<String>,
     /// Rows that were searched for causes.
@@ -109,15 +117,36 @@ pub struct Outcome {
     pub holdout: Vec<usize>,
     /// Rows that were searched for causes.
     pub training: Vec<usize>,
+    /// The discrepancy that could be learned.
+    pub offered: Option<Offered>,
 }
 
 impl Diagnosis {
+    /// How the probabilities of the causes that an earlier diagnosis named have changed, one sentence for each.
+    pub fn changes_since(&self, earlier: &[Cause]) -> Vec<String> {
+        let same = |a: &Cause, b: &Cause| (&a.target, &a.covariate) == (&b.target, &b.covariate);
+        let change = |before: &Cause| {
+            let others = self.alternatives.iter().map(|a| &a.cause);
+            let now = self.causes.iter().chain(others).find(|now| same(now, before));
+            let now = now.map_or_else(|| "below that of those listed".to_owned(), |c| format!("{:.3}", c.probability));
+            format!(
+                "with the further rows, the probability of \u{201c}{}\u{201d} is {now}; it was {:.3}",
+                before.sentence, before.probability
+            )
+        };
+        earlier.iter().map(change).collect()
+    }
+
     /// The answer in words.
     pub(super) fn in_words(&self) -> String {
         let mut text = self.settings_outside.iter().map(|s| capitalised(&s.sentence()) + ". ").collect::<String>();
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
             text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");
+        }
+        if let Some(learned) = &self.learned {
+            text.push(' ');
+            text.push_str(&learned.summary);
         }
         if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, self.causes.len() > 1)) {
             text.push_str(&gain);
@@ -176,8 +205,10 @@ impl Diagnosis {
             DiagnosisVerdict::Ambiguous => {
                 let each = |c: &Cause| format!("{} (probability {:.2})", c.sentence, c.probability);
                 let each: Vec<String> = self.causes.iter().map(each).collect();
+                let next = self.next_measurements.first().map_or_else(String::new, |m| format!(" {}", m.sentence));
                 format!(
-                    "The simulation does not account for one cause, and these data cannot tell which of the following it is: {}.",
+                    "The simulation does not account for one cause, and these data cannot tell which of the following it is: \
+                     {}.{next}",
                     each.join("; or ")
                 )
             }

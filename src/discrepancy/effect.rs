@@ -1,5 +1,6 @@
 //! Effects whose numbers are fitted to measurements: candidates, and the effects that the structure already has.
 
+use super::declared::WEIGHING_STD;
 use crate::physics::effect::Target;
 use crate::simulator::effect::SimulationEffect;
 use crate::simulator::law::{Input, Law, LawKind};
@@ -47,6 +48,22 @@ impl FittedEffect {
         };
         let numbers = names.into_iter().zip(&effect.psi).zip(effect.psi_std()).map(number).collect();
         Self { target: effect.target.clone(), law: effect.law.clone(), numbers }
+    }
+
+    /// A known mass that was hung at a degree of freedom in some rows; `column` holds its kg in each row.
+    ///
+    /// The effect is kg·s, where the factor s is 1 within the error of a weighing.
+    pub fn hung(dof: usize, column: &str) -> Self {
+        let law = Law {
+            kind: LawKind::Linear,
+            covariate: Some(column.to_owned()),
+            reference: 0.0,
+            with_level: false,
+            levels: Vec::new(),
+        };
+        let name = "slope_per_unit".to_owned();
+        let number = Number { name, prior_mean: 1.0, prior_std: WEIGHING_STD, bounds: (0.9, 1.1) };
+        Self { target: Target::AddedMass(dof), law, numbers: vec![number] }
     }
 
     /// Index of the lag among the numbers, if the law has one.

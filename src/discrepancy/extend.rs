@@ -63,19 +63,21 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
         return Err(Error::Unexplained);
     }
     let bare = simulator.without_effects();
-    let known = simulator.effects().len();
+    // The effects of the structure, and masses that were hung in some rows.
+    let given = outcome.after.effects.len() - outcome.causes.len();
     let (mut added, mut left_out) = (Vec::new(), Vec::new());
-    let mut effects: Vec<FittedEffect> = outcome.after.effects[..known].to_vec();
-    let mut psi: Vec<Option<Vec<f64>>> = outcome.after.psi[..known].iter().cloned().map(Some).collect();
+    let mut effects: Vec<FittedEffect> = outcome.after.effects[..given].to_vec();
+    let mut psi: Vec<Option<Vec<f64>>> = outcome.after.psi[..given].iter().cloned().map(Some).collect();
     // A cause that is left out of the structure stays in the fit, because the numbers of the others would compensate for it.
-    let mut written = vec![true; known];
+    let mut written = vec![true; simulator.effects().len()];
+    written.resize(given, false);
     for (place, ranked) in outcome.causes.iter().enumerate() {
         let sentence = &outcome.diagnosis.causes[place].sentence;
-        let effect = &outcome.after.effects[known + place];
+        let effect = &outcome.after.effects[given + place];
         if let Some(why) = why_left_out(data, ranked, effect, outcome.maybe_damage[place]) {
             left_out.push(format!("{sentence}: {why}"));
             written.push(false);
-            psi.push(Some(outcome.after.psi[known + place].clone()));
+            psi.push(Some(outcome.after.psi[given + place].clone()));
             effects.push(effect.clone());
         } else if effect.law.kind == LawKind::Lagged {
             let effect = without_lag(&bare, data, &outcome.training, ranked, effect);
@@ -89,7 +91,7 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
         } else {
             added.push(sentence.clone());
             written.push(true);
-            psi.push(Some(outcome.after.psi[known + place].clone()));
+            psi.push(Some(outcome.after.psi[given + place].clone()));
             effects.push(effect.clone());
         }
     }

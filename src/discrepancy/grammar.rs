@@ -250,7 +250,7 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
         target if !target.settings().is_empty() => {
             (Class::SetUp, if category || covariate.is_none() { 1.0 } else { 0.3 })
         }
-        Target::Oscillator(_) => (Class::Structure, 0.4),
+        Target::Oscillator(_) | Target::AddedMass(_) => (Class::Structure, 0.4),
         _ => (Class::SetUp, 0.5),
     }
 }
@@ -406,7 +406,9 @@ impl Candidate {
                 let kg: f64 = structure.map_or(0.0, |s| s.masses().iter().map(|m| m.kg).sum());
                 0.15 * if mean > 0.0 { mean } else { kg * lowest.powi(2) }
             }
-            Target::Oscillator(host) => 0.05 * simulator.structure().map_or(1.0, |s| s.kg_at(*host)),
+            Target::Oscillator(host) | Target::AddedMass(host) => {
+                0.05 * simulator.structure().map_or(1.0, |s| s.kg_at(*host))
+            }
             Target::ModeOrder(_)
             | Target::SettingUnit { .. }
             | Target::SettingExchange(..)

@@ -40,20 +40,29 @@ impl std::str::FromStr for Holdout {
 }
 
 impl Holdout {
-    /// Splits the rows into those that are searched for causes and those held out.
+    /// Splits the rows into those that are searched for causes and those held out. Rows that were measured after an earlier
+    /// diagnosis are always searched.
     ///
     /// # Errors
     /// The reason, as the end of a sentence that starts with "the hold-out": a share outside 0 to 1, or a column or category
     /// that the data do not have.
     pub(super) fn split(&self, data: &Data) -> Result<(Vec<usize>, Vec<usize>), String> {
-        let all = 0..data.rows();
+        let (further, all): (Vec<usize>, Vec<usize>) = (0..data.rows()).partition(|row| data.further[*row]);
+        let (mut searched, held) = self.split_of(data, all)?;
+        searched.extend(further);
+        searched.sort_unstable();
+        Ok((searched, held))
+    }
+
+    /// Splits `all` rows, which are in order of time.
+    fn split_of(&self, data: &Data, all: Vec<usize>) -> Result<(Vec<usize>, Vec<usize>), String> {
         match self {
             Self::Last(share) => {
                 if !(0.0..1.0).contains(share) {
                     return Err(format!("last:{share} must have a share from 0 to below 1"));
                 }
-                let first = data.rows() - (share * data.rows() as f64).round() as usize;
-                Ok((all.clone().take(first).collect(), all.skip(first).collect()))
+                let first = all.len() - (share * all.len() as f64).round() as usize;
+                Ok((all[..first].to_vec(), all[first..].to_vec()))
             }
             Self::Where { covariate, level } => {
                 let column = data.column(covariate).ok_or_else(|| {
@@ -67,7 +76,7 @@ impl Holdout {
                     let names = names.join(", ");
                     return Err(format!("asks for {covariate} = {level}, but its categories are {names}"));
                 };
-                Ok(all.partition(|row| indices[*row] != Some(wanted)))
+                Ok(all.into_iter().partition(|row| indices[*row] != Some(wanted)))
             }
         }
     }

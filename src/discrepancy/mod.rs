@@ -3,7 +3,7 @@
 //! [`diagnose`] fits the simulation to measurements, ranks every combination of target, law and covariate as a possible cause of
 //! the deviations, and measures on rows held out what the causes gain.
 //!
-//! - [`data`]: measurements, covariates and settings by row; [`holdout`]: the rows held out;
+//! - [`data`]: measurements, covariates and settings by row; [`shapes`]: their mode shapes; [`holdout`]: the rows held out;
 //! - [`grammar`]: the candidates; [`effect`]: an effect whose numbers are fitted;
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
@@ -11,8 +11,10 @@
 //! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated;
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`);
-//! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its text; [`report`]: the HTML page;
-//! - [`extend`]: a new version of the structure with the causes as effects.
+//! - [`diagnosis`]: the result; [`describe`], `naming` and `notes`: its text; [`report`]: the HTML page;
+//! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
+//! - [`extend`]: a new version of the structure with the causes as effects;
+//! - [`learned`]: a discrepancy learned from the data, where no cause explains the deviation.
 //!
 //! # Words
 //!
@@ -20,6 +22,7 @@
 //! |---|---|
 //! | row | one measurement: its frequencies, covariates and settings |
 //! | modes present | the modes that were measured in a row |
+//! | outputs | what the simulation predicts for a row: ln f of each mode and, if shapes were measured, their coordinates |
 //! | setting | value of a parameter that the experimenter set; a parameter that is not set in every row is free |
 //! | cause | an effect that the simulation lacks; a candidate is a possible cause |
 //! | numbers ψ | the coefficients of the law of an effect, and the tuning frequency of an oscillator |
@@ -33,18 +36,20 @@
 mod blocks;
 mod corrected;
 pub mod data;
+pub mod declared;
 pub mod describe;
 pub mod diagnosis;
-mod discriminate;
 pub mod effect;
 pub mod extend;
 pub mod fit;
 pub mod gain;
 pub mod grammar;
 pub mod holdout;
+pub mod learned;
 pub mod misfit;
 pub mod model;
 mod naming;
+pub mod next;
 mod notes;
 pub mod outside;
 mod problem;
@@ -58,11 +63,14 @@ pub mod screen;
 pub mod select;
 mod setting_candidates;
 mod setting_starts;
+pub mod shapes;
 pub mod study;
 pub mod target_name;
+mod weighing;
 
 pub use diagnosis::{Alternative, Diagnosis, DiagnosisVerdict, Outcome};
 pub use holdout::Holdout;
+pub use next::experiment::NextMeasurement;
 pub use progress::{Progress, Step};
 
 use crate::simulator::Simulator;
@@ -209,7 +217,8 @@ fn run(
     progress: &Progress<'_>,
 ) -> Result<Outcome, Error> {
     let bare = simulator.without_effects();
-    let known: Vec<FittedEffect> = simulator.effects().iter().map(FittedEffect::known).collect();
+    let mut known: Vec<FittedEffect> = simulator.effects().iter().map(FittedEffect::known).collect();
+    known.extend(data.hung.iter().map(|(dof, column)| FittedEffect::hung(*dof, &column.name)));
     let study = Study::new(&bare, data);
     progress(Step::Showing);
     let candidates = candidates(simulator, data, &training);
@@ -226,7 +235,8 @@ fn run(
         if corrected.is_empty() { Vec::new() } else { outside_settings(simulator, data, &training, &corrected) };
     let many_outside = selection.fit.outside.rows as f64 > FEW_OUTSIDE * training.len() as f64;
 
-    let Named { causes, alternatives, ambiguous, maybe_damage } = name(simulator, data, &selection, known.len());
+    let Named { causes, alternatives, ambiguous, maybe_damage, next_measurements } =
+        name(simulator, &study, &training, &selection, known.len());
     progress(Step::Measuring);
     let found = !selection.slots.is_empty();
     let blocks = Blocks::new(data, &training);
@@ -237,17 +247,27 @@ fn run(
     if found && gain.is_none() {
         notes.push(NO_GAIN.to_owned());
     }
+    let unexplained = left.is_some() || many_outside;
+    let verdict = verdict(selection.slots.len(), ambiguous, unexplained, !scatter.is_empty());
+    let offered = if verdict == DiagnosisVerdict::NoneOfThese {
+        let offered = learned::offer::offer(&study, &training, &holdout, &selection.base);
+        offered.map_err(|why| notes.push(format!("the deviation cannot be predicted either: {why}"))).ok()
+    } else {
+        None
+    };
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
-        verdict: verdict(selection.slots.len(), ambiguous, left.is_some() || many_outside, !scatter.is_empty()),
+        verdict,
         summary: String::new(),
         settings_outside,
         scatter,
         misfit,
         causes,
         alternatives,
+        next_measurements,
         remainder: left,
         gain,
+        learned: offered.as_ref().map(|offered| offered.offer.clone()),
         notes,
         training_rows: training.len(),
         holdout_rows: holdout.len(),
@@ -267,6 +287,7 @@ fn run(
         maybe_damage,
         holdout,
         training,
+        offered,
     })
 }
 

@@ -1,17 +1,18 @@
 //! Selection of the candidates that a diagnosis names as causes, and of the alternatives that it reports.
 
-use super::data::Data;
 use super::describe::{self, Cause};
 use super::diagnosis::{Alternative, SURE};
-use super::discriminate::discriminating_measurement;
 use super::grammar::Class;
+use super::next::experiment::NextMeasurement;
+use super::next::Outlook;
 use super::rank::Ranked;
 use super::select::Selection;
+use super::study::Study;
 use crate::simulator::Simulator;
 
 /// An answer that is not sure names candidates until their probabilities sum to this, at most so many.
 const COVERED: f64 = 0.985;
-const MOST_NAMED: usize = 3;
+const MOST_NAMED: usize = 8;
 
 /// Alternatives that are reported in any case.
 const MOST_ALTERNATIVES: usize = 5;
@@ -28,12 +29,27 @@ pub(super) struct Named {
     pub(super) ambiguous: bool,
     /// For each slot, whether possible damage is among several candidates named.
     pub(super) maybe_damage: Vec<bool>,
+    /// Measurements that would decide between the candidates of the first cause that is not sure, the best first.
+    pub(super) next_measurements: Vec<NextMeasurement>,
 }
 
-/// Names the causes and their alternatives; the structure has `known` effects already.
-pub(super) fn name(simulator: &Simulator, data: &Data, selection: &Selection, known: usize) -> Named {
-    let bare = simulator.without_effects();
-    let mut all = Named { causes: Vec::new(), alternatives: Vec::new(), ambiguous: false, maybe_damage: Vec::new() };
+/// Names the causes and their alternatives. `rows`: rows in which causes were searched; `known`: number of effects that were in
+/// place before.
+pub(super) fn name(
+    simulator: &Simulator,
+    study: &Study<'_>,
+    rows: &[usize],
+    selection: &Selection,
+    known: usize,
+) -> Named {
+    let data = study.data;
+    let mut all = Named {
+        causes: Vec::new(),
+        alternatives: Vec::new(),
+        ambiguous: false,
+        maybe_damage: Vec::new(),
+        next_measurements: Vec::new(),
+    };
     for (index, slot) in selection.slots.iter().enumerate() {
         let best = &slot.ranked[0];
         let described = |r: &Ranked| {
@@ -51,17 +67,22 @@ pub(super) fn name(simulator: &Simulator, data: &Data, selection: &Selection, kn
         if selection.slots.len() == 1 {
             all.causes.extend(named.iter().skip(1).map(|place| described(&slot.ranked[*place])));
         }
-        for (place, other) in slot.ranked.iter().enumerate().skip(1) {
-            let near = place <= MOST_NEARLY && other.log_odds > best.log_odds - NEARLY_NATS;
-            if near || named.contains(&place) || place <= MOST_ALTERNATIVES {
-                all.alternatives.push(Alternative {
-                    cause: described(other),
-                    instead_of: index + 1,
-                    log_evidence_difference: other.log_odds - best.log_odds,
-                    discriminating_measurement: discriminating_measurement(&bare, data, best, other),
-                });
-            }
+        let shown = |(place, other): &(usize, &Ranked)| {
+            let near = *place <= MOST_NEARLY && other.log_odds > best.log_odds - NEARLY_NATS;
+            near || named.contains(place) || *place <= MOST_ALTERNATIVES
+        };
+        let shown: Vec<&Ranked> = slot.ranked.iter().enumerate().filter(shown).map(|(_, r)| r).collect();
+        let outlook = Outlook::new(study, rows, shown.clone(), selection.independent_share);
+        if unsure && all.next_measurements.is_empty() {
+            all.next_measurements = outlook.next_measurements();
         }
+        let alternative = |(place, other): (usize, &&Ranked)| Alternative {
+            cause: described(other),
+            instead_of: index + 1,
+            log_evidence_difference: other.log_odds - best.log_odds,
+            discriminating_measurement: outlook.distinguishing(0, place),
+        };
+        all.alternatives.extend(shown.iter().enumerate().skip(1).map(alternative));
     }
     all
 }

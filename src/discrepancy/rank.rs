@@ -9,6 +9,7 @@ use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
 use super::setting_starts::{Guess, PresentSettings};
 use super::study::Study;
+use super::weighing::log_density;
 use crate::physics::effect::Target;
 use crate::simulator::law::LawKind;
 
@@ -22,7 +23,12 @@ const REFINED: usize = 5;
 /// Evidence that a covariate must add to a constant effect on the same target, nats.
 const COVARIATE_NATS: f64 = 3.0;
 
-/// If an arbitrary constant for each mode has an estimated gain below this, no constant effect can be accepted, nats.
+/// Constant effects that are fitted if an arbitrary constant is significant: all in structures of up to about ten bodies. They are not
+/// chosen by the score test alone, because it is a linear estimate at size 0, and constant effects are often large: parameters
+/// have adapted to them, and the estimate of the true one can lie far below that of others.
+const CONSTANTS: usize = 80;
+
+/// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
@@ -77,10 +83,11 @@ impl Trial {
 /// best candidate. `rows`: indices of the rows that are used.
 ///
 /// ```text
-///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) − cost ) − ln(number of laws) + ln prior,    r = (1 − ρ)/(1 + ρ)
+///  ln odds = ln Σ_laws exp( r·(ln E_law − ln E_fit) + w_law − w_fit − cost ) − ln(number of laws) + ln prior
+///  r = (1 − ρ)/(1 + ρ)
 /// ```
 ///
-/// E: evidence by Laplace's method; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
+/// E: evidence by Laplace's method; w: log density of the bodies that were weighed, 0 without any; r: share of independent rows; ρ: correlation of successive residuals. Only the candidates
 /// with the largest estimated gain in a score test are fitted. The first `known` effects of the fit belong to the structure:
 /// their numbers may be wrong, so that a further effect of the same kind is allowed for them. `None` if the frequencies cannot
 /// be computed.
@@ -106,14 +113,18 @@ pub fn rank(
 
     let fitted = |promise: &&Promise| Trial::new(study, rows, fit, &candidates[promise.candidate], promise);
     let mut tried: Vec<Trial> = most_promising(&promised, candidates).par_iter().filter_map(fitted).collect();
-    // No constant effect can gain more than an arbitrary constant for each mode.
+    // No constant effect can gain more than an arbitrary constant for each output.
     let ones = DVector::from_element(rows.len(), 1.0);
-    let constant = whitened.free_score(&whitened.mode_sums(study.simulator.modes()), &ones);
+    let constant = whitened.free_score(&whitened.output_sums(study.outputs()), &ones);
     if constant.nats > CONSTANT_NATS {
+        let left = promised.iter().filter(|p| candidates[p.candidate].covariate.is_none());
+        let left = left.filter(|p| !tried.iter().any(|t| t.candidate == p.candidate)).take(CONSTANTS);
+        let constants: Vec<Trial> = left.collect::<Vec<_>>().par_iter().filter_map(fitted).collect();
+        tried.extend(constants);
         tried.extend(unscreened(study, rows, fit, candidates));
     }
     tried.extend(corrections(study, rows, fit, candidates));
-    let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln();
+    let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln() + log_density(study.data, &t.fit, 1.0);
     let mut order: Vec<(usize, f64)> = tried.iter().map(|t| (t.candidate, evidence(t))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     let refined: Vec<usize> = order.iter().take(REFINED).map(|o| o.0).collect();
@@ -164,9 +175,11 @@ fn by_probability(
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
         own.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
         let Some(first) = own.first() else { continue };
+        let weighed = log_density(study.data, fit, independent_share);
         let gain = |t: &&Trial| {
+            let weighed = log_density(study.data, &t.fit, independent_share) - weighed;
             let inside = fit.outside.nats - t.fit.outside.nats;
-            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats
+            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats + weighed
         };
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();
@@ -183,8 +196,8 @@ fn by_probability(
     ranked
 }
 
-/// Removes candidates that a simpler candidate explains as well. A law with a level also explains a constant, so its covariate
-/// must add evidence to the constant effect on the same target; an oscillator must add evidence to a heavier host.
+/// Removes candidates that a simpler candidate explains as well: a law with a level also explains a constant, so its covariate must
+/// add evidence to the constant effect on the same target.
 fn drop_equivalents(ranked: &mut Vec<Ranked>) {
     let best = |r: &Ranked| r.laws.iter().map(|l| l.1).fold(f64::NEG_INFINITY, f64::max);
     let constants: Vec<(Target, f64)> = ranked
@@ -193,11 +206,6 @@ fn drop_equivalents(ranked: &mut Vec<Ranked>) {
         .map(|r| (r.candidate.target.clone(), best(r)))
         .collect();
     ranked.retain(|r| {
-        // An oscillator tuned far from all modes acts as an added mass, which has one number less.
-        if let Target::Oscillator(host) = r.candidate.target {
-            let heavier = constants.iter().find(|c| c.0 == Target::Masses(vec![host])).map(|c| c.1);
-            return heavier.is_none_or(|heavier| best(r) > heavier + COVARIATE_NATS);
-        }
         let constant = constants.iter().find(|c| c.0 == r.candidate.target).map(|c| c.1);
         r.candidate.covariate.is_none() || constant.is_none_or(|constant| best(r) > constant + COVARIATE_NATS)
     });
@@ -281,12 +289,12 @@ fn corrections(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candi
 /// residuals; 1 if ρ is within three standard errors of 0. `None` if the frequencies cannot be computed in some row.
 fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64> {
     let views = study.view(rows, fit)?;
-    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.simulator.modes()];
+    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.outputs()];
     for view in &views {
         let factor = view.covariance.clone().cholesky()?.l();
         let white = factor.solve_lower_triangular(&view.residual)?;
-        for (place, mode) in view.present.iter().enumerate() {
-            series[*mode].push(white[place] * view.weight.sqrt());
+        for (place, output) in view.present.iter().enumerate() {
+            series[*output].push(white[place] * view.weight.sqrt());
         }
     }
     let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);

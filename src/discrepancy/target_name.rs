@@ -86,6 +86,7 @@ fn name_of(simulator: &Simulator, target: &Target) -> TargetName {
             between = Some([node(*from), node(*to)]);
             ("added_spring", String::new())
         }
+        Target::AddedMass(dof) => ("added_mass", node(Node::Dof(*dof))),
         Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
         Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
     };

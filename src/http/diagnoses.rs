@@ -53,6 +53,10 @@ struct ExtensionBody {
     epochs: Option<u64>,
     /// Use the model even if it fails its calibration; every assessment then carries a finding.
     accept_uncalibrated: bool,
+    /// Add a discrepancy learned from the data instead of the causes. It is refused where the diagnosis found nothing or possible
+    /// damage, where a stiffness changes among the measurements, and where the discrepancy predicts measurements that it has not
+    /// seen no better.
+    learned: bool,
 }
 
 /// A diagnosis with its job.
@@ -283,9 +287,9 @@ pub async fn extend(
             return Err(ApiError::invalid_field(pointer, message));
         }
     }
-    let ExtensionBody { samples, epochs, accept_uncalibrated } = body;
+    let ExtensionBody { samples, epochs, accept_uncalibrated, learned } = body;
     let size = |number: Option<u64>| number.map(|n| n as usize);
-    let training = ExtensionTraining { samples: size(samples), epochs: size(epochs), accept_uncalibrated };
+    let training = ExtensionTraining { samples: size(samples), epochs: size(epochs), accept_uncalibrated, learned };
     let record = shared.monitor.jobs().start_extension(&id, training).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{id}"))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())

@@ -201,7 +201,10 @@ impl Ingest {
 }
 
 fn missing_covariates(active: &ActiveStructure, measurement: &ModalMeasurement, path: FieldPath) -> Vec<Problem> {
-    let missing = active.simulator.effect_sizes(&measurement.covariates).missing;
+    let mut missing = active.simulator.effect_sizes(&measurement.covariates).missing;
+    missing.extend(active.simulator.discrepancy_reservations(measurement).0);
+    missing.sort();
+    missing.dedup();
     let problem = |name: String| {
         let message = format!("{name} is missing: the simulation of this structure depends on it");
         Problem::new(path.of_covariate(&name), message)

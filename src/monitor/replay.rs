@@ -131,7 +131,13 @@ impl Replay {
     async fn assess_all(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
         let at_a_time = self.assessor.compute.places_behind();
         let has_baseline = AtomicBool::new(true);
-        let computed = stream::iter(batches).map(|id| self.compute_waiting(structure, id)).buffered(at_a_time);
+        // Each in a task of its own: a future of this stream that was given a thread is not polled while a batch below is assessed
+        // again, and that would wait for the thread for ever.
+        let compute = |id: String| {
+            let (replay, structure) = (self.clone(), structure.clone());
+            in_own_task(async move { replay.compute_waiting(&structure, id).await })
+        };
+        let computed = stream::iter(batches).map(compute).buffered(at_a_time);
         let stored = computed.map_ok(|waiting| {
             // The write is queued here, and therefore in the order of the stream, however long it takes to complete.
             let queued = match waiting {

@@ -6,6 +6,8 @@ use super::definition::{
     DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Prior, Sets, SimulationKind,
     StructureDefinition,
 };
+use super::discrepancy;
+use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::{self, Instrumented};
 use super::layout::{check_kg, check_names, check_spring, Layout, Problems};
@@ -30,6 +32,7 @@ pub(super) struct Checked {
     pub space: ParameterSpace,
     pub covariates: Vec<Covariate>,
     pub effects: Vec<SimulationEffect>,
+    pub discrepancy: Option<Discrepancy>,
     pub instrumented: Option<Instrumented>,
 }
 
@@ -67,11 +70,12 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
         definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
+    let discrepancy = discrepancy::check::check(definition, &covariates, &mut problems);
     let instrumented = instrumented::check(definition, &model, &mut problems);
     if !problems.is_empty() {
         return Err(problems);
     }
-    Ok(Checked { id, model, nominal_frequencies_hz, space, covariates, effects, instrumented })
+    Ok(Checked { id, model, nominal_frequencies_hz, space, covariates, effects, discrepancy, instrumented })
 }
 
 /// The parts of a structure; `None` for a table, which has none, or if a beam has mistakes.

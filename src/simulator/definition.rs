@@ -8,6 +8,7 @@ use std::fmt;
 use serde::de::{self, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
 
+use super::discrepancy::definition::DiscrepancyDefinition;
 use super::law::LawKind;
 use crate::measurement::CovariateKind;
 use crate::parameter::DamageDirection;
@@ -57,6 +58,9 @@ pub struct StructureDefinition {
     /// Influences on the structure or the instrument besides the parameters.
     #[serde(rename = "effect", default, skip_serializing_if = "Vec::is_empty")]
     pub effects: Vec<EffectDefinition>,
+    /// Deviation of the simulation that was learned from data, because no effect explains it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub discrepancy: Option<DiscrepancyDefinition>,
     /// Digest of the definition that this definition extends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parent: Option<String>,

@@ -32,14 +32,17 @@
 
 mod batched;
 mod beam;
+mod changed;
 mod check;
 pub mod definition;
+pub mod discrepancy;
 pub mod effect;
 mod expectation;
 mod instrumented;
 pub mod law;
 mod layout;
 mod model;
+mod moved;
 mod parse;
 pub mod population;
 mod respond;
@@ -51,6 +54,6 @@ mod training;
 
 pub use model::{Binding, SimulationModel};
 pub use respond::Response;
-pub use shapes::Linearised;
+pub use shapes::{Linearised, ShapeResponse};
 pub use simulate::{DerivedStiffness, Error, Simulator};
 pub use training::TrainingSet;

@@ -9,6 +9,7 @@ use nalgebra::DMatrix;
 use super::batched::BatchedRuns;
 use super::check;
 use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinition};
+use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::Instrumented;
 use super::model::{chained, changes, structure_at, Binding, SimulationModel};
@@ -112,6 +113,11 @@ impl Simulator {
     /// Effects of the structure file.
     pub fn effects(&self) -> &[SimulationEffect] {
         &self.parts.checked.effects
+    }
+
+    /// The learned discrepancy of the structure file.
+    pub fn discrepancy(&self) -> Option<&Discrepancy> {
+        self.parts.checked.discrepancy.as_ref()
     }
 
     /// The simulation under effects of the sizes `sizes`, `[sizes]`, in the order of the effects and in the units of their

@@ -2,6 +2,8 @@
 
 mod figures;
 mod gain;
+mod learned;
+mod next;
 mod residuals;
 
 use super::data::{Data, TIME};
@@ -31,8 +33,14 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
         ("Residuals".to_owned(), residual_plots(d, &drawn)),
         ("Deviations before any cause is added".to_owned(), misfits(d)),
     ];
+    if !d.next_measurements.is_empty() {
+        sections.insert(3, ("What to measure next".to_owned(), next::next_measurements(&d.next_measurements)));
+    }
     if let Some(left) = &d.remainder {
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
+    }
+    if let Some(offered) = &outcome.offered {
+        sections.push(("Not understood, but predictable".to_owned(), learned::learned(offered, outcome)));
     }
     sections.push((
         "Gain on rows that were not used for the fit".to_owned(),
@@ -76,7 +84,7 @@ fn causes(d: &Diagnosis) -> String {
             "These causes explain only a part of the deviation: do not rely on them before the rest is understood."
         }
         DiagnosisVerdict::Ambiguous => {
-            "One of these is the cause. The next section lists measurements that would distinguish them."
+            "One of these is the cause. A section below lists the measurements that would decide between them."
         }
         _ if d.causes.iter().any(|c| c.probability <= SURE) => {
             "For a cause with a low probability, the next section lists the alternatives and the measurements that would \

@@ -8,6 +8,7 @@ use crate::baseline::train::{train, Trained};
 use crate::baseline::Baseline;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend;
+use crate::discrepancy::learned::extension::extend_learned;
 use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -51,6 +52,8 @@ pub struct ExtensionTraining {
     pub epochs: Option<usize>,
     /// Use the flow even if it fails its calibration; every assessment then has a finding about it.
     pub accept_uncalibrated: bool,
+    /// Add a learned discrepancy instead of the causes.
+    pub learned: bool,
 }
 
 /// A job that computes on measurements of a structure.
@@ -93,14 +96,19 @@ impl Study {
         flow.units = before.map_or(flow.units, |m| m.architecture.units);
         // The fits of the diagnosis are not stored; they are computed again, with the same result, from the same data and seed.
         let (data, outcome) = self.outcome()?;
-        let extended = extend(&self.simulator, &data, &outcome).map_err(|e| e.to_string())?;
-        let simulator = Simulator::new(extended.definition.clone()).map_err(|e| e.to_string())?;
+        let (definition, added, left_out) = if training.learned {
+            let extended = extend_learned(&self.simulator, &data, &outcome).map_err(|e| e.to_string())?;
+            (extended.definition, vec![extended.added], extended.left_out)
+        } else {
+            let extended = extend(&self.simulator, &data, &outcome).map_err(|e| e.to_string())?;
+            (extended.definition, extended.added, extended.left_out)
+        };
+        let simulator = Simulator::new(definition).map_err(|e| e.to_string())?;
         let settings = TrainSettings { epochs, seed: self.request.seed, ..TrainSettings::default() };
         let trained = train(&simulator, samples, noise_range, &flow, &settings, |epoch| {
             self.progress.report(&self.id, format!("training: epoch {} of {epochs}", epoch.epoch));
         });
         self.progress.report(&self.id, "switching");
-        let (added, left_out) = (extended.added, extended.left_out);
         Ok(TrainedExtension { added, left_out, simulator, trained: trained.map_err(|e| e.to_string())? })
     }
 

@@ -1,5 +1,7 @@
 //! Hidden effects: their targets, laws and sizes.
 
+use std::sync::Arc;
+
 use rand::seq::IndexedRandom;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
@@ -39,11 +41,16 @@ pub const OUTSIDE: [&str; 3] = [
 /// Joins the names of two columns that an effect depends on.
 pub const AND: &str = " and ";
 
+/// A function of one column.
+type Curve = Arc<dyn Fn(f64) -> f64 + Send + Sync>;
+
 /// An effect: its target and its value in each row.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Effect {
     pub target: Target,
     pub signal: Vec<f64>,
+    /// The value as a function of its numeric column, if it depends on the present value of one alone.
+    pub curve: Option<Curve>,
     pub truth: Truth,
 }
 
@@ -52,6 +59,7 @@ struct Shape {
     covariate: Option<&'static str>,
     level: Option<&'static str>,
     values: Vec<f64>,
+    curve: Option<Curve>,
     size: f64,
 }
 
@@ -119,7 +127,8 @@ pub fn draw_effect(
         _ => None,
     };
     let (covariate, level) = (shape.covariate.map(str::to_owned), shape.level.map(str::to_owned));
-    Some(Effect { target, signal, truth: Truth { kind, name, between, law, covariate, level, size } })
+    let curve = shape.curve.map(|curve| -> Curve { Arc::new(move |c| scale * curve(c)) });
+    Some(Effect { target, signal, curve, truth: Truth { kind, name, between, law, covariate, level, size } })
 }
 
 /// Draws two nodes that no spring connects.
@@ -149,7 +158,7 @@ fn draw_scale(rng: &mut ChaCha8Rng, structure: &Structure, kind: &str) -> f64 {
 
 /// Draws a law of size ±1 with the given sign; a bilinear law always becomes stiffer in the cold.
 fn draw_shape(rng: &mut ChaCha8Rng, weather: &Weather, rows: &[Row], law: &str, sign: f64) -> Option<Shape> {
-    let plain = |covariate, level, values| Some(Shape { covariate, level, values, size: sign });
+    let plain = |covariate, level, values| Some(Shape { covariate, level, values, curve: None, size: sign });
     let training = training_rows(rows.len());
     match law {
         "constant" => plain(None, None, vec![sign; rows.len()]),
@@ -189,19 +198,19 @@ fn draw_curve(rng: &mut ChaCha8Rng, rows: &[Row], training: usize, law: &str, si
     let column = rows.iter().map(|r| r.column(covariate)).collect::<Vec<_>>();
     let (low, high) = quantiles(column.clone());
     let width = high - low;
-    let curve: Box<dyn Fn(f64) -> f64> = match law {
-        "linear" => Box::new(move |c| c - reference),
+    let curve: Curve = match law {
+        "linear" => Arc::new(move |c| c - reference),
         "bilinear" => {
             let (knee_c, ratio) = (rng.random_range(-2.0..5.0), rng.random_range(3.0..10.0));
             let cold = column[..training].iter().filter(|c| **c < knee_c).count();
             if cold * 10 < training {
                 return None;
             }
-            Box::new(move |c: f64| ratio * (c - knee_c).min(0.0) + (c - knee_c).max(0.0))
+            Arc::new(move |c: f64| ratio * (c - knee_c).min(0.0) + (c - knee_c).max(0.0))
         }
         "quadratic" => {
             let bend = rng.random_range(0.4..1.5) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-            Box::new(move |c| {
+            Arc::new(move |c| {
                 let z = (c - reference) / width;
                 z + bend * z * z
             })
@@ -210,7 +219,7 @@ fn draw_curve(rng: &mut ChaCha8Rng, rows: &[Row], training: usize, law: &str, si
             let range =
                 column.iter().copied().fold(f64::MIN, f64::max) - column.iter().copied().fold(f64::MAX, f64::min);
             let rate = rng.random_range(1.0..3.0) / range * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-            Box::new(move |c| (rate * (c - reference)).exp() - 1.0)
+            Arc::new(move |c| (rate * (c - reference)).exp() - 1.0)
         }
     };
     let range = curve(high) - curve(low);
@@ -221,8 +230,9 @@ fn draw_curve(rng: &mut ChaCha8Rng, rows: &[Row], training: usize, law: &str, si
         return None;
     }
     let size = if law == "bilinear" { -1.0 } else { sign };
-    let values = column.iter().map(|c| size * curve(*c) / range).collect();
-    Some(Shape { covariate: Some(covariate), level: None, values, size })
+    let scaled: Curve = Arc::new(move |c| size * curve(c) / range);
+    let values = column.iter().map(|c| scaled(*c)).collect();
+    Some(Shape { covariate: Some(covariate), level: None, values, curve: Some(scaled), size })
 }
 
 /// Draws an effect that no law of the program describes.
@@ -268,5 +278,5 @@ pub fn draw_outside(
         level: None,
         size: range,
     };
-    Effect { target, signal, truth }
+    Effect { target, signal, curve: None, truth }
 }

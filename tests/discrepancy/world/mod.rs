@@ -4,6 +4,7 @@
 //! program is not repeated here and so hidden.
 
 mod effect;
+mod follow;
 mod likelihood;
 mod measure;
 mod numbers;
@@ -17,12 +18,13 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 pub use effect::{Truth, AND};
+pub use follow::{Done, Hidden};
 pub use numbers::{mean, mean_and_sd, number, quantiles, rfc3339, rounded, EPOCH_2024_S};
 pub use structure::{frequencies_hz, structure_toml};
 
 use effect::{draw_effect, draw_outside, Effect, OUTSIDE};
 use likelihood::{Data, Fit};
-use measure::{csv, measure};
+use measure::{csv, measure, Shapes};
 use rows::{draw_rows, training_rows, Row, Weather};
 use structure::Structure;
 
@@ -40,7 +42,7 @@ pub enum Kind {
 }
 
 /// A structure file, measurements, and the effects hidden in them.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct World {
     /// Seed it was drawn from.
     pub seed: u64,
@@ -63,7 +65,26 @@ pub struct World {
     pub holdout_log_density: (f64, f64),
     /// The world in one line.
     pub description: String,
+    /// What only the world knows, to measure in it again.
+    pub hidden: Hidden,
 }
+
+impl World {
+    /// Structure file and measurements with mode shapes at half of the masses; the frequencies are the same.
+    pub fn with_shapes(&self) -> (String, String) {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(SHAPES);
+        let Hidden { structure, effects, rows, .. } = &self.hidden;
+        let shapes = Shapes::measure(&mut rng, structure, effects, rows);
+        let names = shapes.points.iter().map(|p| format!("\"{}\"", structure::mass_name(*p))).collect::<Vec<_>>();
+        let declared = format!("mode_shapes = {{ points = [{}], noise = {:?} }}\n", names.join(", "), shapes.noise);
+        let toml = self.structure_toml.replacen("measurement_noise", &format!("{declared}measurement_noise"), 1);
+        (toml, csv(structure, rows, Some(&shapes)))
+    }
+}
+
+/// Random stream of the mode shapes, which no other part of a world uses.
+const SHAPES: u64 = 1 << 32;
 
 /// Targets and laws of single effects.
 pub const SINGLE_FAMILIES: &[(&str, &str)] = &[
@@ -205,13 +226,13 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
         }
     }
     let scored = unseen.iter().filter(|r| !r.outlier).count() as f64;
-    let hidden = effects.iter().map(|e| e.truth.clone()).collect::<Vec<_>>();
+    let all_truths = effects.iter().map(|e| e.truth.clone()).collect::<Vec<_>>();
     let (truths, outside_target) =
-        if outside.is_some() { (Vec::new(), hidden.first().cloned()) } else { (hidden, None) };
+        if outside.is_some() { (Vec::new(), all_truths.first().cloned()) } else { (all_truths, None) };
     Some(World {
         seed: 0,
         structure_toml: structure.toml(),
-        csv: csv(&structure, &rows),
+        csv: csv(&structure, &rows, None),
         description: describe(&structure, rows.len(), &truths, outside, nats),
         truths,
         outside,
@@ -225,6 +246,7 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
             log_likelihood(&[], &base, unseen)? / scored,
             log_likelihood(&all, &truth, unseen)? / scored,
         ),
+        hidden: Hidden { structure, population, effects, rows },
     })
 }
 

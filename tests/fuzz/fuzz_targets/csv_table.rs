@@ -6,7 +6,8 @@ use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
 use modalwatch::measurement::check::{check_measurements, Expectation, Purpose};
-use modalwatch::measurement::csv::{offered, read, write, CsvOptions, Times};
+use modalwatch::measurement::csv::{offered, read, CsvOptions, Times};
+use modalwatch::measurement::csv_output::write;
 use modalwatch::measurement::{Covariate, CovariateKind, ModalMeasurement};
 use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
 use modalwatch::quantity::Timestamp;
@@ -50,7 +51,8 @@ fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
 }
 
 fuzz_target!(|bytes: &[u8]| {
-    let options = CsvOptions { time_column: Some("Zeit".to_owned()), ..CsvOptions::default() };
+    let points = vec!["m1".to_owned(), "m2".to_owned()];
+    let options = CsvOptions { time_column: Some("Zeit".to_owned()), points, ..CsvOptions::default() };
     let _ = offered(bytes, &covariates(), &options, 5);
     let _ = read(bytes, 3, &covariates(), &options);
     let _ = checked(bytes, Times::RowNumber);
