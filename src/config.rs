@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::access::AccessSettings;
 use crate::http::HttpSettings;
+use crate::monitor::automatic_diagnoses::DiagnosisSettings;
 use crate::monitor::retention::RetentionSettings;
 use crate::monitor::MonitorSettings;
 use crate::mqtt::MqttSettings;
@@ -41,6 +42,8 @@ pub struct Config {
     pub access: AccessSettings,
     /// Storing and assessing batches.
     pub monitor: MonitorSettings,
+    /// Diagnoses that the service starts by itself.
+    pub diagnosis: DiagnosisSettings,
     /// Webhooks.
     pub notify: NotifySettings,
     /// MQTT broker.
@@ -61,6 +64,7 @@ impl Default for Config {
             http: HttpSettings::default(),
             access: AccessSettings::default(),
             monitor: MonitorSettings::default(),
+            diagnosis: DiagnosisSettings::default(),
             notify: NotifySettings::default(),
             mqtt: MqttSettings::default(),
             store: StoreSettings::default(),
@@ -205,7 +209,7 @@ impl Config {
             let value = self.retention.measurements_days.to_string();
             return Err(Error::Range { key: "retention.measurements_days", value, must: "at most 36500" });
         }
-        if let Some((key, value, must)) = self.monitor.alarm.problem() {
+        if let Some((key, value, must)) = self.monitor.alarm.problem().or_else(|| self.diagnosis.problem()) {
             return Err(Error::Range { key, value, must });
         }
         Ok(())

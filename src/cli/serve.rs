@@ -57,6 +57,7 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     monitor.replay().resume_all();
     upkeep.silence().watch();
     upkeep.retention().watch();
+    upkeep.diagnoses().watch(config.diagnosis);
     let metrics = PrometheusBuilder::new()
         .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
         .install_recorder()?;

@@ -87,7 +87,7 @@ use select::select;
 use study::Study;
 
 /// Smallest number of rows that a verdict can be based on.
-const FEWEST_ROWS: usize = 8;
+pub const FEWEST_ROWS: usize = 8;
 
 /// Smallest number of rows that must remain for the search if others are held out; with fewer, none are held out, and the gain is
 /// measured by cross-validation.

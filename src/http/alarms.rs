@@ -14,7 +14,7 @@ use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, U
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
 use crate::baseline::manifest::ParameterIdentifiability;
-use crate::monitor::stored::{Acknowledgement, Episode, MaintenanceWindow};
+use crate::monitor::stored::{Acknowledgement, Episode, JobState, MaintenanceWindow};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
 
 /// Maximum length of a name or note, characters.
@@ -110,6 +110,19 @@ struct AlarmItem {
     #[serde(skip_serializing_if = "Option::is_none")]
     undamaged_version: Option<u32>,
     acknowledgement: Option<AcknowledgementItem>,
+    /// The latest diagnosis that the service started because of this alarm.
+    #[schema(required)]
+    diagnosis: Option<AlarmDiagnosis>,
+}
+
+/// The diagnosis that the service started because of an alarm.
+#[derive(Debug, Serialize, ToSchema)]
+struct AlarmDiagnosis {
+    diagnosis: String,
+    state: JobState,
+    /// Its verdict, once it is done.
+    #[schema(required)]
+    verdict: Option<String>,
 }
 
 /// Acknowledgement of an alarm.
@@ -170,6 +183,7 @@ impl From<Episode> for AlarmItem {
             ended_at: e.ended_at,
             noticed_at: e.noticed_at,
             acknowledgement: e.acknowledgement.map(|a| AcknowledgementItem { at: a.at, by: a.by, note: a.note }),
+            diagnosis: e.diagnosis.map(|d| AlarmDiagnosis { diagnosis: d.id, state: d.state, verdict: d.verdict }),
         }
     }
 }

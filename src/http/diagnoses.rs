@@ -15,7 +15,7 @@ use super::openapi::{BodyRefused, Busy, Conflict, DiagnosisPath, Invalid, Struct
 use super::request::{json_body, structure_id, whole_number, ApiPath};
 use super::shared::Shared;
 use crate::discrepancy::Diagnosis;
-use crate::monitor::stored::{DiagnosisRecord, JobState};
+use crate::monitor::stored::{DiagnosisRecord, DiagnosisTrigger, JobState};
 use crate::monitor::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -66,6 +66,10 @@ struct DiagnosisAnswer {
     diagnosis: String,
     structure: StructureId,
     structure_digest: String,
+    trigger: DiagnosisTrigger,
+    /// Number of the alarm because of which the service started it.
+    #[schema(required)]
+    alarm: Option<i64>,
     state: JobState,
     #[serde(skip_serializing_if = "Option::is_none")]
     progress: Option<String>,
@@ -96,6 +100,10 @@ struct ExtensionAnswer {
 #[schema(as = ListedDiagnosis)]
 struct Listed {
     diagnosis: String,
+    trigger: DiagnosisTrigger,
+    /// Number of the alarm because of which the service started it.
+    #[schema(required)]
+    alarm: Option<i64>,
     state: JobState,
     created_at: Timestamp,
     verdict: Option<String>,
@@ -135,6 +143,8 @@ fn answer(record: DiagnosisRecord, progress: Option<String>) -> Result<Diagnosis
         diagnosis: record.id,
         structure: record.structure,
         structure_digest: record.structure_digest.to_string(),
+        trigger: record.trigger,
+        alarm: record.alarm,
         state: record.state,
         progress,
         failure: record.failure,
@@ -169,9 +179,14 @@ pub async fn create(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let body: DiagnosisBody = json_body(&headers, body, shared.limits).await?;
-    let holdout = body.holdout.as_deref().unwrap_or("last:0.25").parse();
+    let all = DiagnosisRequest::default();
+    let holdout = body.holdout.as_deref().map(str::parse).transpose();
     let holdout = holdout.map_err(|message: String| ApiError::invalid_field("/holdout", message))?;
-    let request = DiagnosisRequest { batches: body.batches, holdout, seed: body.seed.unwrap_or(1) };
+    let request = DiagnosisRequest {
+        batches: body.batches,
+        holdout: holdout.unwrap_or(all.holdout),
+        seed: body.seed.unwrap_or(all.seed),
+    };
     let record = shared.monitor.jobs().start_diagnosis(&id, request).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{}", record.id))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
@@ -198,6 +213,8 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
             verdict: text("verdict"),
             summary: text("summary"),
             diagnosis: record.id,
+            trigger: record.trigger,
+            alarm: record.alarm,
             state: record.state,
             created_at: record.created_at,
             extension: record.extension_state,

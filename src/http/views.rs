@@ -15,7 +15,7 @@ use super::shared::Shared;
 use crate::access::Grant;
 use crate::alarm::machine::State as AlarmState;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
-use crate::monitor::stored::{JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
+use crate::monitor::stored::{DiagnosisTrigger, JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
 use crate::monitor::ActiveStructure;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
@@ -83,6 +83,9 @@ struct JobItem {
     job: String,
     structure: StructureId,
     kind: JobKind,
+    /// Why a diagnosis was started; `null` for an extension.
+    #[schema(required)]
+    trigger: Option<DiagnosisTrigger>,
     state: JobState,
     #[schema(required)]
     progress: Option<String>,
@@ -230,6 +233,7 @@ pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response
         job: job.id,
         structure: job.structure,
         kind: job.kind,
+        trigger: job.trigger,
         state: job.state,
         progress,
         failure: job.failure,

@@ -8,7 +8,7 @@ use tokio::sync::broadcast;
 
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
-use crate::store::{JobKind, JobState};
+use crate::store::{DiagnosisTrigger, JobKind, JobState};
 
 /// Number of events buffered for a slow subscriber. A subscriber that falls further behind is notified and continues with the
 /// newest events.
@@ -50,6 +50,8 @@ pub enum News {
         state: JobState,
         /// What it is doing now; `None` when it has ended.
         progress: Option<String>,
+        /// Why it was started; `None` for an extension.
+        trigger: Option<DiagnosisTrigger>,
     },
     /// A structure was defined, or its version or undamaged reference changed.
     Structure {

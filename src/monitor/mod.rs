@@ -11,12 +11,13 @@
 //! | [`Alarms`] | read and acknowledge alarms, charts, maintenance |
 //! | [`Jobs`], [`Versions`] | diagnose, extend a structure, undo an extension |
 //! | [`Models`] | replace a trained baseline |
-//! | [`Upkeep`] | health, gauges, backups, retention, silence |
+//! | [`Upkeep`] | health, gauges, backups, retention, silence, diagnoses that nobody requested |
 //! | [`Archive`] | export and import a structure |
 
 mod alarms;
 pub mod archive;
 mod assessor;
+pub mod automatic_diagnoses;
 mod backups;
 pub mod compute;
 mod error;
@@ -48,6 +49,7 @@ use std::time::Instant;
 pub use self::alarms::Alarms;
 use self::archive::Archive;
 use self::assessor::Assessor;
+use self::automatic_diagnoses::AutomaticDiagnoses;
 pub use self::backups::Backups;
 use self::compute::Compute;
 pub use self::error::{BackupError, DeclareError, Error, IngestError, JobError, LeftOutBatch, ReloadError};
@@ -130,6 +132,7 @@ impl Monitor {
             probe: WriterProbe::new(store.clone()),
             backups: Backups::new(store.clone(), Arc::clone(&structures)),
             retention: Retention::new(store.clone()),
+            diagnoses: AutomaticDiagnoses::new(store.clone(), Arc::clone(&structures), jobs.clone()),
             silence: Silence::new(store.clone(), Arc::clone(&structures), Arc::clone(&alarms), silence_after_s),
             sources: Arc::default(),
             started: Instant::now(),
@@ -187,7 +190,7 @@ impl Monitor {
         &self.models
     }
 
-    /// The health of the service, its gauges, backups, retention and alarms of silence.
+    /// The health of the service, its gauges, backups, retention, alarms of silence, and diagnoses that nobody requested.
     pub fn upkeep(&self) -> &Upkeep {
         &self.upkeep
     }

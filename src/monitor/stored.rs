@@ -2,8 +2,8 @@
 
 pub use crate::store::{
     backup, schema_version, Acknowledgement, AuditEntry, AuditQuery, BatchRecord, ChartMark, ChartSeries, Delivery,
-    DeliveryState, DiagnosisRecord, Episode, Error, EventFilter, Exceedance, HistoryEntry, HistoryQuery, JobKind,
-    JobRecord, JobState, LatestAssessment, MaintenanceWindow, MeasurementPlace, MeasurementQuery, NewAuditEntry,
-    PutStructure, QuantityMark, QuantitySeries, QuarantinedMessage, ReferenceRecord, SeriesWindow, StoredChartPoint,
-    StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
+    DeliveryState, DiagnosisRecord, DiagnosisTrigger, Episode, EpisodeDiagnosis, Error, EventFilter, Exceedance,
+    HistoryEntry, HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, MaintenanceWindow, MeasurementPlace,
+    MeasurementQuery, NewAuditEntry, PutStructure, QuantityMark, QuantitySeries, QuarantinedMessage, ReferenceRecord,
+    SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
 };

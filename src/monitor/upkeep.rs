@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::automatic_diagnoses::AutomaticDiagnoses;
 use super::backups::Backups;
 use super::compute::Compute;
 use super::error::Error;
@@ -43,6 +44,7 @@ pub struct Upkeep {
     pub(super) backups: Backups,
     pub(super) retention: Retention,
     pub(super) silence: Silence,
+    pub(super) diagnoses: AutomaticDiagnoses,
     pub(super) sources: Arc<Mutex<Vec<FindingSource>>>,
     pub(super) started: Instant,
 }
@@ -61,6 +63,11 @@ impl Upkeep {
     /// Opens and ends alarms for structures that send no batches.
     pub fn silence(&self) -> &Silence {
         &self.silence
+    }
+
+    /// Starts diagnoses after rejected batches and on schedule.
+    pub fn diagnoses(&self) -> &AutomaticDiagnoses {
+        &self.diagnoses
     }
 
     /// Number of free places in the queue of assessments.

@@ -4,6 +4,7 @@ use sqlx::FromRow;
 
 use super::column::{elements, list, timestamp};
 use super::database::Database;
+use super::diagnosis::{job_state, JobState};
 use super::error::Error;
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
@@ -37,6 +38,19 @@ pub struct Episode {
     pub noticed_at: Timestamp,
     /// Who acknowledged it, when, and with which note.
     pub acknowledgement: Option<Acknowledgement>,
+    /// The latest diagnosis that the service started because of it.
+    pub diagnosis: Option<EpisodeDiagnosis>,
+}
+
+/// A diagnosis that was started because of an alarm.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EpisodeDiagnosis {
+    /// Its id.
+    pub id: String,
+    /// Its state.
+    pub state: JobState,
+    /// Its verdict; `None` until it is done.
+    pub verdict: Option<String>,
 }
 
 impl Episode {
@@ -87,6 +101,23 @@ struct EpisodeRow {
     acknowledged_at_us: Option<i64>,
     acknowledged_by: Option<String>,
     acknowledgement_note: Option<String>,
+    diagnosis_id: Option<String>,
+    diagnosis_state: Option<String>,
+    diagnosis_verdict: Option<String>,
+}
+
+/// Selects [`EpisodeRow`]s; a condition follows.
+macro_rules! select_episodes {
+    ($condition:expr) => {
+        concat!(
+            "select e.*, d.diagnosis_id, d.state as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict
+             from alarm_episode e
+             left join diagnosis d on d.diagnosis_id =
+                 (select max(diagnosis_id) from diagnosis where structure_id = e.structure_id and alarm = e.episode)
+             where ",
+            $condition
+        )
+    };
 }
 
 /// The kind of the alarms of a series.
@@ -145,11 +176,10 @@ impl Alarms<'_> {
         open_only: bool,
         limit: usize,
     ) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sqlx::query_as(
-            "select * from alarm_episode where structure_id = $1 and episode < $2
-               and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
-             order by episode desc limit $4",
-        )
+        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(
+            "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
+             order by episode desc limit $4"
+        ))
         .bind(structure.as_str())
         .bind(before.unwrap_or(i64::MAX))
         .bind(open_only)
@@ -169,12 +199,12 @@ impl Alarms<'_> {
         newest: i64,
         numbers: &[i64],
     ) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sqlx::query_as(concat!(
-            "select * from alarm_episode where structure_id = $1
+        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(concat!(
+            "e.structure_id = $1
                and (episode > $2 or (ended_at_us is null and withdrawn = 0) or episode in (select value from ",
             elements!("$3"),
             ")) order by episode",
-        ))
+        )))
         .bind(structure.as_str())
         .bind(newest)
         .bind(list(numbers))
@@ -209,7 +239,7 @@ impl Alarms<'_> {
                     .execute(transaction.connection())
                     .await?;
                     let row: Option<EpisodeRow> =
-                        sqlx::query_as("select * from alarm_episode where structure_id = $1 and episode = $2")
+                        sqlx::query_as(select_episodes!("e.structure_id = $1 and episode = $2"))
                             .bind(&id)
                             .bind(number)
                             .fetch_optional(transaction.connection())
@@ -336,6 +366,12 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         (Some(at), Some(by)) => Some(Acknowledgement { at: timestamp(what, at)?, by, note: row.acknowledgement_note }),
         _ => None,
     };
+    let diagnosis = match (row.diagnosis_id, row.diagnosis_state) {
+        (Some(id), Some(state)) => {
+            Some(EpisodeDiagnosis { id, state: job_state(&state)?, verdict: row.diagnosis_verdict })
+        }
+        _ => None,
+    };
     Ok(Episode {
         number: row.episode,
         kind: row.kind,
@@ -348,5 +384,6 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         peak_shift: row.peak_shift,
         noticed_at: timestamp(what, row.noticed_at_us)?,
         acknowledgement,
+        diagnosis,
     })
 }

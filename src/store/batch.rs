@@ -252,6 +252,20 @@ impl Batches<'_> {
         row.map(|(at,)| timestamp("batch", at)).transpose()
     }
 
+    /// When the first batch of a structure arrived.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn first_received(self, structure: &StructureId) -> Result<Option<Timestamp>, Error> {
+        let row: Option<(i64,)> = sqlx::query_as(
+            "select received_at_us from measurement_batch where structure_id = $1 order by batch_id limit 1",
+        )
+        .bind(structure.as_str())
+        .fetch_optional(&self.database.reader)
+        .await?;
+        row.map(|(at,)| timestamp("batch", at)).transpose()
+    }
+
     /// All batches of a structure with their numbers of measurements, in the order of their first measurement.
     ///
     /// # Errors

@@ -19,6 +19,53 @@ pub enum JobState {
     Failed,
 }
 
+/// Why a diagnosis was started.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum DiagnosisTrigger {
+    /// Somebody requested it.
+    Requested,
+    /// The service started it because of an alarm of the kind `simulation_does_not_fit`.
+    RejectedEpisode,
+    /// The service started it on schedule.
+    Schedule,
+}
+
+impl DiagnosisTrigger {
+    /// The name in tables and answers.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Requested => "requested",
+            Self::RejectedEpisode => "rejected_episode",
+            Self::Schedule => "schedule",
+        }
+    }
+
+    /// The trigger with a name.
+    pub(super) fn from_stored(text: &str) -> Result<Self, Error> {
+        let all = [Self::Requested, Self::RejectedEpisode, Self::Schedule];
+        let unknown = || Error::Row { what: "diagnosis", detail: format!("unknown reason of its start {text:?}") };
+        all.into_iter().find(|trigger| trigger.as_str() == text).ok_or_else(unknown)
+    }
+}
+
+/// A diagnosis that is about to run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewDiagnosis {
+    /// Its id.
+    pub id: String,
+    /// The structure.
+    pub structure: StructureId,
+    /// Digest of the version to diagnose.
+    pub structure_digest: Digest,
+    /// The request, JSON.
+    pub request: String,
+    /// Why it is started.
+    pub trigger: DiagnosisTrigger,
+    /// Number of the alarm because of which it is started.
+    pub alarm: Option<i64>,
+}
+
 /// A stored diagnosis.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DiagnosisRecord {
@@ -30,6 +77,10 @@ pub struct DiagnosisRecord {
     pub structure_digest: Digest,
     /// The request, JSON.
     pub request: String,
+    /// Why it was started.
+    pub trigger: DiagnosisTrigger,
+    /// Number of the alarm because of which it was started.
+    pub alarm: Option<i64>,
     /// Its state.
     pub state: JobState,
     /// Why it failed.
@@ -54,6 +105,8 @@ struct DiagnosisRow {
     structure_id: String,
     structure_digest: String,
     request: String,
+    started_by: String,
+    alarm: Option<i64>,
     state: String,
     failure: Option<String>,
     result: Option<String>,
@@ -64,8 +117,9 @@ struct DiagnosisRow {
     extension: Option<String>,
 }
 
-const COLUMNS: &str = "diagnosis_id, structure_id, structure_digest, request, state, failure, result, created_at_us, \
-                       finished_at_us, extension_state, extension_failure, extension";
+const COLUMNS: &str =
+    "diagnosis_id, structure_id, structure_digest, request, started_by, alarm, state, failure, result, \
+                       created_at_us, finished_at_us, extension_state, extension_failure, extension";
 
 /// The state with a name.
 pub(super) fn job_state(text: &str) -> Result<JobState, Error> {
@@ -83,6 +137,8 @@ fn record(row: DiagnosisRow) -> Result<DiagnosisRecord, Error> {
         id: row.diagnosis_id,
         structure_digest: Digest::from_stored(row.structure_digest),
         request: row.request,
+        trigger: DiagnosisTrigger::from_stored(&row.started_by)?,
+        alarm: row.alarm,
         state: job_state(&row.state)?,
         failure: row.failure,
         result: row.result,
@@ -105,30 +161,24 @@ impl Diagnoses<'_> {
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn insert_diagnosis(
-        self,
-        id: &str,
-        structure: &StructureId,
-        structure_digest: &Digest,
-        request: &str,
-        now: Timestamp,
-    ) -> Result<(), Error> {
-        let (id, structure, digest) = (id.to_owned(), structure.to_string(), structure_digest.to_string());
-        let (request, now) = (request.to_owned(), now.micros());
+    pub async fn insert_diagnosis(self, new: NewDiagnosis, now: Timestamp) -> Result<(), Error> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
                     sqlx::query(
-                    "insert into diagnosis (diagnosis_id, structure_id, structure_digest, request, state, created_at_us)
-                     values ($1, $2, $3, $4, 'running', $5)",
-                )
-                .bind(&id)
-                .bind(&structure)
-                .bind(&digest)
-                .bind(&request)
-                .bind(now)
-                .execute(transaction.connection())
-                .await?;
+                        "insert into diagnosis (diagnosis_id, structure_id, structure_digest, request, started_by, alarm, state,
+                             created_at_us)
+                         values ($1, $2, $3, $4, $5, $6, 'running', $7)",
+                    )
+                    .bind(&new.id)
+                    .bind(new.structure.as_str())
+                    .bind(new.structure_digest.as_str())
+                    .bind(&new.request)
+                    .bind(new.trigger.as_str())
+                    .bind(new.alarm)
+                    .bind(now.micros())
+                    .execute(transaction.connection())
+                    .await?;
                     Ok(())
                 })
             })

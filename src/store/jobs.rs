@@ -3,7 +3,7 @@
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
-use super::diagnosis::{job_state, Diagnoses, JobState};
+use super::diagnosis::{job_state, Diagnoses, DiagnosisTrigger, JobState};
 use super::error::Error;
 use crate::quantity::{StructureId, Timestamp};
 
@@ -26,6 +26,8 @@ pub struct JobRecord {
     pub structure: StructureId,
     /// Its kind.
     pub kind: JobKind,
+    /// Why a diagnosis was started.
+    pub trigger: Option<DiagnosisTrigger>,
     /// Its state.
     pub state: JobState,
     /// Why it failed.
@@ -45,6 +47,7 @@ struct JobRow {
     diagnosis_id: String,
     structure_id: String,
     extension: bool,
+    started_by: Option<String>,
     state: String,
     failure: Option<String>,
     created_at_us: i64,
@@ -64,6 +67,7 @@ impl Diagnoses<'_> {
         // The inner select chooses the newest jobs before their results, which can be long, are read.
         let rows: Vec<JobRow> = sqlx::query_as(
             "select d.diagnosis_id, d.structure_id, j.extension,
+                    case when j.extension then null else d.started_by end as started_by,
                     case when j.extension then d.extension_state else d.state end as state,
                     case when j.extension then d.extension_failure else d.failure end as failure,
                     j.created_at_us,
@@ -98,6 +102,7 @@ fn record(row: JobRow) -> Result<JobRecord, Error> {
         id: row.diagnosis_id,
         structure: StructureId::parse(&row.structure_id).map_err(|e| bad_row(what)(&e))?,
         kind: if row.extension { JobKind::Extension } else { JobKind::Diagnosis },
+        trigger: row.started_by.as_deref().map(DiagnosisTrigger::from_stored).transpose()?,
         state: job_state(&row.state)?,
         failure: row.failure,
         created_at: timestamp(what, row.created_at_us)?,

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod automatic_diagnosis;
 mod bad_input;
 mod batches;
 mod bulk;

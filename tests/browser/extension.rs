@@ -75,10 +75,10 @@ async fn extension_ended(service: &Service) -> Value {
     .await
 }
 
-/// Presses a button of the diagnosis and confirms what the dialog asks.
-fn press_and_confirm(page: &mut Page, button: &str) {
+/// Presses a button of a section and confirms what the dialog asks.
+fn press_and_confirm(page: &mut Page, section: &str, button: &str) {
     let find = format!(
-        "[...document.querySelectorAll('#diagnosis button')].find((b) => b.textContent === '{button}' && !b.hidden)"
+        "[...document.querySelectorAll('#{section} button')].find((b) => b.textContent === '{button}' && !b.hidden)"
     );
     page.wait_for(&format!("Boolean({find})"));
     page.evaluate(&format!("{find}.click()"));
@@ -105,9 +105,15 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_
     let mut page = Page::open();
     page.visit(&at(&service, "#/structures/tiny"));
     page.evaluate("window.sameLoad = true");
-    press_and_confirm(&mut page, "Diagnose");
+    press_and_confirm(&mut page, "diagnosis", "Diagnose");
     page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('k2 falls by')");
-    press_and_confirm(&mut page, "Extend the model");
+    // The card says what was found, how sure this is, what is gained, and why the diagnosis ran.
+    let card = page.wait_for("document.querySelector('#latest-diagnosis:not([hidden])')?.textContent");
+    let card = card.as_str().unwrap();
+    for part in ["The cause is found", "k2 falls by", "> 99.9 %", " % → ", "held-out measurements", "on request"] {
+        assert!(card.contains(part), "{part} is not in the card: {card}");
+    }
+    press_and_confirm(&mut page, "latest-diagnosis", "Extend the model");
 
     // The progress bar of the job grows while the page is shown.
     page.evaluate("location.hash = '#/jobs'");
@@ -121,11 +127,14 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_
 
     page.evaluate("location.hash = '#/structures/tiny'");
     page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('The model has been extended')");
+    page.wait_for(
+        "document.getElementById('latest-diagnosis').textContent.includes('has been extended by this diagnosis')",
+    );
     let after = service.read("/v1/structures/tiny").await;
     assert_eq!(after["digest"], extended["extension"]["result"]["structure_digest"]);
     assert_ne!(after["digest"], before["digest"]);
 
-    press_and_confirm(&mut page, "Undo last extension");
+    press_and_confirm(&mut page, "diagnosis", "Undo last extension");
     page.wait_for("document.getElementById('notices').textContent.includes('The previous version has been restored')");
     let back = service.read("/v1/structures/tiny").await;
     assert_eq!((&back["digest"], &back["model"]["digest"]), (&before["digest"], &before["model"]["digest"]));

@@ -14,4 +14,5 @@ mod helpers;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
+mod rejected;
 mod sign_in;

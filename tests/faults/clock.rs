@@ -1,12 +1,14 @@
 //! Clock jumps: `faketime` changes the system clock of the running program; the monotonic clock of its timers is not affected.
 
 use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
 
 use modalwatch::measurement::MeasurementBatch;
 use modalwatch::quantity::StructureId;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, eventually, Service};
+use crate::helpers::{command, created, eventually, within, Service};
 use crate::kit::{audit, batch, body, define_as, history, post, ready, Acknowledged, BATCHES};
 use crate::needs;
 
@@ -21,6 +23,15 @@ fn set(file: &Path, time: &str) {
     let beside = file.with_extension("new");
     std::fs::write(&beside, format!("{time}\n")).unwrap();
     std::fs::rename(&beside, file).unwrap();
+}
+
+/// Command line of a service whose clock is [`set`] by a file.
+fn command_with_clock(data: &Path, file: &Path) -> Command {
+    let mut command = command(data);
+    command.env("LD_PRELOAD", LIBRARY).env("FAKETIME_TIMESTAMP_FILE", file).env("FAKETIME_NO_CACHE", "1");
+    // Only the system clock can be set; the monotonic clock never jumps.
+    command.env("FAKETIME_DONT_FAKE_MONOTONIC", "1").env("DONT_FAKE_MONOTONIC", "1");
+    command
 }
 
 /// Open silence alarms of a structure.
@@ -44,10 +55,7 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     let folder = tempfile::tempdir().unwrap();
     let (data, file) = (folder.path().join("data"), folder.path().join("clock"));
     set(&file, "+0");
-    let mut command = command(&data);
-    command.env("LD_PRELOAD", LIBRARY).env("FAKETIME_TIMESTAMP_FILE", &file).env("FAKETIME_NO_CACHE", "1");
-    // Only the system clock can be set; the monotonic clock never jumps.
-    command.env("FAKETIME_DONT_FAKE_MONOTONIC", "1").env("DONT_FAKE_MONOTONIC", "1");
+    let mut command = command_with_clock(&data, &file);
     let mut service = Service::spawn(command.env("MODALWATCH__MONITOR__ALARM__SILENCE_AFTER_S", "3600"));
     let mut acknowledged = Acknowledged::default();
     let mut number = 0;
@@ -119,4 +127,48 @@ async fn a_clock_that_jumps_or_stands_still_keeps_batches_in_order_and_answers_c
     assert_eq!(history(&service).await.len(), 13);
     assert!(service.stop("TERM").success());
     audit(&data, &acknowledged).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_diagnosis_runs_on_schedule_only_after_new_batches_and_a_restart_does_not_repeat_it() {
+    if !needs::installed(Path::new(LIBRARY)) {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (data, file) = (folder.path().join("data"), folder.path().join("clock"));
+    let weekly = || {
+        let mut command = command_with_clock(&data, &file);
+        Service::spawn(command.env("MODALWATCH__DIAGNOSIS__EVERY_DAYS", "7"))
+    };
+    let ended = async |service: &Service, wanted: usize| {
+        let listed = within(Duration::from_mins(3), "a diagnosis on schedule", async || {
+            let listed = service.read("/v1/structures/three-dof/diagnoses").await["items"].as_array().unwrap().clone();
+            let ended = listed.iter().all(|item| item["state"] != "running");
+            (listed.len() >= wanted && ended).then_some(listed)
+        });
+        let listed = listed.await;
+        assert_eq!(listed.len(), wanted, "{listed:?}");
+        assert!(listed.iter().all(|item| item["trigger"] == "schedule" && item["state"] == "done"), "{listed:?}");
+    };
+    // Longer than two checks of the service, which come every five seconds.
+    let two_checks = || tokio::time::sleep(Duration::from_secs(11));
+
+    set(&file, "+0");
+    let mut service = weekly();
+    created(service.post(BATCHES, &body(&batch("logger", 0, 40))).await).await;
+    two_checks().await;
+    ended(&service, 0).await;
+    set(&file, "+8d");
+    ended(&service, 1).await;
+    // Another week without a batch.
+    set(&file, "+16d");
+    two_checks().await;
+    ended(&service, 1).await;
+    created(service.post(BATCHES, &body(&batch("logger", 1, 40))).await).await;
+    ended(&service, 2).await;
+    service.kill();
+    let service = weekly();
+    created(service.post(BATCHES, &body(&batch("logger", 2, 40))).await).await;
+    two_checks().await;
+    ended(&service, 2).await;
 }

@@ -1,7 +1,7 @@
 //! Diagnoses and extensions as one list of jobs.
 
 use modalwatch::quantity::Digest;
-use modalwatch::store::{JobKind, JobState};
+use modalwatch::store::{DiagnosisTrigger, JobKind, JobState, LatestDiagnoses, NewDiagnosis};
 
 use super::{at, bridge, open};
 
@@ -10,7 +10,16 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
     let (store, _folder) = open().await;
     let digest = Digest::of(&[b"v1"]);
     for (id, time) in [("d1", 10), ("d2", 20), ("d3", 30)] {
-        store.diagnoses().insert_diagnosis(id, &bridge(), &digest, "{}", at(time)).await.unwrap();
+        let automatic = id == "d2";
+        let new = NewDiagnosis {
+            id: id.to_owned(),
+            structure: bridge(),
+            structure_digest: digest.clone(),
+            request: "{}".to_owned(),
+            trigger: if automatic { DiagnosisTrigger::RejectedEpisode } else { DiagnosisTrigger::Requested },
+            alarm: automatic.then_some(3),
+        };
+        store.diagnoses().insert_diagnosis(new, at(time)).await.unwrap();
     }
     let found = r#"{"verdict": "temperature", "summary": "k2 softens with temperature_c"}"#.to_owned();
     store.diagnoses().finish_diagnosis("d1", Ok((found, None)), at(15)).await.unwrap();
@@ -27,6 +36,15 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
     assert_eq!((done.verdict.as_deref(), done.finished_at), (Some("temperature"), Some(at(15))));
     assert_eq!(done.summary.as_deref(), Some("k2 softens with temperature_c"));
     let failed = of(diagnosis, "d2");
+    assert_eq!(jobs.iter().map(|job| job.trigger).collect::<Vec<_>>(), {
+        let requested = Some(DiagnosisTrigger::Requested);
+        [None, requested, Some(DiagnosisTrigger::RejectedEpisode), requested]
+    });
+    let latest = async |until| store.diagnoses().latest(&bridge(), at(until)).await.unwrap();
+    let started = LatestDiagnoses { any: Some(at(30)), automatic: Some(at(20)) };
+    assert_eq!(latest(31).await, started);
+    // A start in the future was noted while the clock was wrong.
+    assert_eq!(latest(20).await, LatestDiagnoses { any: Some(at(10)), automatic: None });
     assert_eq!((failed.state, failed.failure.as_deref(), failed.summary), (JobState::Failed, Some("no data"), None));
 
     let added = r#"{"added": ["k2 by temperature_c", "k1 by wind"], "left_out": []}"#.to_owned();

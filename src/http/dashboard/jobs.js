@@ -33,7 +33,11 @@ function rows(items) {
       cell("State", jobChip(job.state)),
       cell("Job", page ? h("a", { href: `#/diagnoses/${encodeURIComponent(job.job)}` }, `${name}: report`) : name),
       cell("Structure", h("a", { href: `#/structures/${encodeURIComponent(job.structure)}` }, job.structure)),
-      cell("Started", age(job.created_at)),
+      cell(
+        "Started",
+        age(job.created_at),
+        job.trigger && job.trigger !== "requested" && h("span", { class: "fine" }, "by the service"),
+      ),
       cell(
         isOpen(job) ? "Progress" : "Ended",
         isOpen(job) ? progress(job.progress, `${name} of ${job.structure}`) : timeElement(job.finished_at),

@@ -85,6 +85,7 @@ export function structure(id) {
     headline,
     jumps,
     alarmList.element,
+    diagnoses.card,
     first,
     h("div", { class: "row spans" }, spans, spanText),
     charts,
@@ -243,6 +244,8 @@ export function structure(id) {
         refresh.grown();
       } else if (name === "job") {
         refresh.diagnoses();
+        // An alarm links to the diagnosis that it started.
+        if (data.trigger === "rejected_episode") refresh.alarms();
         if (data.kind === "extension" && data.state === "done") refresh.all();
       } else if (name === "structure") refresh.all();
     },

@@ -21,9 +21,12 @@ use super::own_task::in_own_task;
 use super::structures::{ActiveStructure, ActiveStructures};
 use super::versions::Versions;
 use crate::baseline::train::Trained;
+use crate::discrepancy::{Holdout, FEWEST_ROWS};
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::simulator::Simulator;
-use crate::store::{DiagnosisRecord, JobKind, JobRecord, JobState, NewVersion, Store, StoredBaseline};
+use crate::store::{
+    DiagnosisRecord, DiagnosisTrigger, JobKind, JobRecord, JobState, NewDiagnosis, NewVersion, Store, StoredBaseline,
+};
 
 /// Largest number of measurements of one diagnosis.
 const MOST_MEASUREMENTS: usize = 200_000;
@@ -85,14 +88,42 @@ impl Jobs {
         structure: &StructureId,
         request: DiagnosisRequest,
     ) -> Result<DiagnosisRecord, JobError> {
+        let (jobs, structure, why) = (self.clone(), structure.clone(), (DiagnosisTrigger::Requested, None));
+        in_own_task(async move { jobs.start_diagnosis_here(structure, request, why).await }).await
+    }
+
+    /// The request for all batches of a structure, or for the newest ones if all have more measurements than a diagnosis can use.
+    /// `None` if the structure has too few measurements for a diagnosis.
+    pub(super) async fn request_for_all(
+        &self,
+        structure: &StructureId,
+        holdout: Holdout,
+    ) -> Result<Option<DiagnosisRequest>, Error> {
+        let stored = self.store.batches().batch_sizes(structure).await?;
+        let batches = newest(&stored);
+        Ok((!batches.is_empty()).then(|| DiagnosisRequest { batches, holdout, ..DiagnosisRequest::default() }))
+    }
+
+    /// Starts a diagnosis that nobody requested; `alarm` is the number of the alarm because of which it is started.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::QueueFull`], [`Error::Store`].
+    pub(super) async fn start_automatic_diagnosis(
+        &self,
+        structure: &StructureId,
+        request: DiagnosisRequest,
+        trigger: DiagnosisTrigger,
+        alarm: Option<i64>,
+    ) -> Result<DiagnosisRecord, JobError> {
         let (jobs, structure) = (self.clone(), structure.clone());
-        in_own_task(async move { jobs.start_diagnosis_here(structure, request).await }).await
+        in_own_task(async move { jobs.start_diagnosis_here(structure, request, (trigger, alarm)).await }).await
     }
 
     async fn start_diagnosis_here(
         self,
         structure: StructureId,
         mut request: DiagnosisRequest,
+        (trigger, alarm): (DiagnosisTrigger, Option<i64>),
     ) -> Result<DiagnosisRecord, JobError> {
         let active = self.structures.get(&structure)?;
         let stored = self.store.batches().batch_sizes(&structure).await?;
@@ -104,9 +135,16 @@ impl Jobs {
             return Err(Error::QueueFull(QueueFull).into());
         }
         let id = uuid::Uuid::now_v7().to_string();
-        let json = serde_json::to_string(&request).expect("a request is plain data");
         let simulator = active.simulator.clone();
-        self.store.diagnoses().insert_diagnosis(&id, &structure, simulator.digest(), &json, Timestamp::now()).await?;
+        let new = NewDiagnosis {
+            id: id.clone(),
+            structure: structure.clone(),
+            structure_digest: simulator.digest().clone(),
+            request: serde_json::to_string(&request).expect("a request is plain data"),
+            trigger,
+            alarm,
+        };
+        self.store.diagnoses().insert_diagnosis(new, Timestamp::now()).await?;
         let (jobs, job) = (self.clone(), id.clone());
         let diagnose = async move {
             let _turn = jobs.turn().await;
@@ -114,7 +152,7 @@ impl Jobs {
             let diagnosed = tokio::task::spawn_blocking(move || study.diagnose()).await;
             diagnosed.map_err(|_| "the diagnosis panicked".to_owned())?
         };
-        self.run(&id, active.simulator.id(), JobKind::Diagnosis, diagnose);
+        self.run(&id, active.simulator.id(), (JobKind::Diagnosis, Some(trigger)), diagnose);
         Ok(self.diagnosis(&id).await?.0)
     }
 
@@ -145,7 +183,7 @@ impl Jobs {
         let begun = self.diagnosis(id).await?.0;
         let (jobs, structure) = (self.clone(), record.structure.clone());
         let extend = async move { jobs.extend(&record, active, training).await.map(|result| (result, None)) };
-        self.run(id, &structure, JobKind::Extension, extend);
+        self.run(id, &structure, (JobKind::Extension, None), extend);
         Ok(begun)
     }
 
@@ -154,10 +192,10 @@ impl Jobs {
         &self,
         id: &str,
         structure: &StructureId,
-        kind: JobKind,
+        (kind, trigger): (JobKind, Option<DiagnosisTrigger>),
         work: impl Future<Output = JobOutput> + Send + 'static,
     ) {
-        self.progress.begin(id, structure, kind);
+        self.progress.begin(id, structure, kind, trigger);
         let (jobs, id, name) = (self.clone(), id.to_owned(), kind_name(kind));
         tokio::spawn(async move {
             let output = work.await;
@@ -305,9 +343,32 @@ impl Jobs {
         Ok(records.into_iter().map(with_progress).collect())
     }
 
+    /// Whether a job of a structure runs or waits, or no job can be added.
+    pub(super) fn is_busy(&self, structure: &StructureId) -> bool {
+        self.progress.has(structure) || self.running() >= MOST_JOBS
+    }
+
     /// Number of jobs that run or wait.
     pub fn running(&self) -> usize {
         self.progress.count()
+    }
+}
+
+/// The newest of the stored batches, given with their sizes in the order of time, that one diagnosis can use; empty if they have too
+/// few measurements.
+fn newest(stored: &[(String, usize)]) -> Vec<String> {
+    let mut found = 0;
+    let fits = |(_, count): &&(String, usize)| {
+        found += count;
+        found <= MOST_MEASUREMENTS
+    };
+    let mut newest: Vec<(String, usize)> = stored.iter().rev().take_while(fits).cloned().collect();
+    newest.reverse();
+    let enough = newest.iter().map(|(_, count)| count).sum::<usize>() >= FEWEST_ROWS;
+    if enough {
+        newest.into_iter().map(|(id, _)| id).collect()
+    } else {
+        Vec::new()
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use crate::monitor::events::{Events, News};
 use crate::quantity::StructureId;
-use crate::store::{JobKind, JobState};
+use crate::store::{DiagnosisTrigger, JobKind, JobState};
 
 /// Least time between two events about the same job.
 const BETWEEN_EVENTS: Duration = Duration::from_millis(200);
@@ -22,6 +22,7 @@ pub(super) struct Progress {
 struct RunningJob {
     structure: StructureId,
     kind: JobKind,
+    trigger: Option<DiagnosisTrigger>,
     progress: String,
     published: Option<Instant>,
 }
@@ -30,7 +31,7 @@ impl RunningJob {
     fn event(&self, id: &str, state: JobState) -> News {
         let (job, structure) = (id.to_owned(), self.structure.clone());
         let progress = (state == JobState::Running).then(|| self.progress.clone());
-        News::Job { job, structure, kind: self.kind, state, progress }
+        News::Job { job, structure, kind: self.kind, state, progress, trigger: self.trigger }
     }
 }
 
@@ -39,9 +40,9 @@ impl Progress {
         Self { running: Arc::default(), events }
     }
 
-    /// Adds a job that waits.
-    pub(super) fn begin(&self, id: &str, structure: &StructureId, kind: JobKind) {
-        let job = RunningJob { structure: structure.clone(), kind, progress: String::new(), published: None };
+    /// Adds a job that waits: a diagnosis with the reason of its start, or an extension.
+    pub(super) fn begin(&self, id: &str, structure: &StructureId, kind: JobKind, trigger: Option<DiagnosisTrigger>) {
+        let job = RunningJob { structure: structure.clone(), kind, trigger, progress: String::new(), published: None };
         self.lock().insert(id.to_owned(), job);
         self.report(id, "waiting");
     }
@@ -68,6 +69,11 @@ impl Progress {
     /// Number of jobs that run or wait.
     pub(super) fn count(&self) -> usize {
         self.lock().len()
+    }
+
+    /// Whether a job of a structure runs or waits.
+    pub(super) fn has(&self, structure: &StructureId) -> bool {
+        self.lock().values().any(|job| job.structure == *structure)
     }
 
     /// What a job is doing now.

@@ -36,6 +36,13 @@ pub struct DiagnosisRequest {
     pub seed: u64,
 }
 
+impl Default for DiagnosisRequest {
+    /// All batches; the last quarter of the measurements is held out.
+    fn default() -> Self {
+        Self { batches: Vec::new(), holdout: Holdout::Last(0.25), seed: 1 }
+    }
+}
+
 /// How an extension is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ExtensionTraining {

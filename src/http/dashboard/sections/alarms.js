@@ -22,6 +22,21 @@ export function alarmWords(alarm) {
   return words(alarm.kind).toLowerCase();
 }
 
+/** What a diagnosis that was started because of an alarm says, with a link to its report once it is done. */
+function diagnosisLine(diagnosis) {
+  if (!diagnosis) return null;
+  const { state, verdict } = diagnosis;
+  const done = state === "done";
+  return h(
+    "span",
+    { class: "fine" },
+    done
+      ? h("a", { href: `#/diagnoses/${encodeURIComponent(diagnosis.diagnosis)}` }, "Diagnosis")
+      : "Diagnosis",
+    done ? `: ${words(verdict).toLowerCase()}` : `: ${state}`,
+  );
+}
+
 /** Dialog to acknowledge an alarm; resolves to the acknowledged alarm. */
 export function acknowledgeDialog(structure, alarm) {
   return ask({
@@ -116,6 +131,7 @@ export function alarms(structure) {
             timeElement(alarm.acknowledgement.at),
             alarm.acknowledgement.note && `: ${alarm.acknowledgement.note}`,
           ),
+        diagnosisLine(alarm.diagnosis),
       ),
       open &&
         !alarm.acknowledgement &&

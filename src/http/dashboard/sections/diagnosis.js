@@ -2,12 +2,10 @@
 
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
-import { age, number, words } from "../format.js";
+import { age, words } from "../format.js";
 import { progress } from "../jobs.js";
 import { jobChip } from "../states.js";
-
-/** Verdicts that name causes by which the model can be extended. */
-const EXTENDS = ["cause", "several", "ambiguous"];
+import { gainWords, isExtendable, latest, triggerWords } from "./latest.js";
 
 export function diagnosis(structure, changed) {
   const content = h("div", null);
@@ -28,13 +26,14 @@ export function diagnosis(structure, changed) {
 
   const load = async () => {
     try {
-      const { items } = await read(at(structure, "/diagnoses"));
+      const [{ items }, { digest }] = await Promise.all([read(at(structure, "/diagnoses")), read(at(structure))]);
       // The list lacks progress and gain; they are read for the newest diagnosis and for those that are running.
       const full = await Promise.all(
         items
           .slice(0, 10)
           .map(async (item) => (isBusy(item) || item === items[0] ? { ...item, ...(await details(item)) } : item)),
       );
+      card.update(full[0], digest);
       back.hidden = !items.some((item) => item.extension === "done" || item.extension?.state === "done");
       refill(
         content,
@@ -51,6 +50,9 @@ export function diagnosis(structure, changed) {
     return {
       progress: answer.progress,
       failure: answer.failure ?? answer.extension?.failure,
+      version: answer.structure_digest,
+      finished_at: answer.finished_at,
+      result: answer.result,
       gain: answer.result?.gain ?? null,
       extension: answer.extension?.state ?? null,
       added: answer.extension?.result?.added,
@@ -60,8 +62,6 @@ export function diagnosis(structure, changed) {
 
   const line = (item) => {
     const done = item.state === "done";
-    const extendable =
-      done && EXTENDS.includes(item.verdict) && (item.extension === null || item.extension === "failed");
     return h(
       "li",
       { dataset: { key: item.diagnosis } },
@@ -71,7 +71,7 @@ export function diagnosis(structure, changed) {
         { class: "grow" },
         item.verdict && h("strong", null, words(item.verdict), ". "),
         item.summary,
-        gainWords(item.gain),
+        item.gain && h("span", { class: "fine" }, icon("chart"), `Gain: ${gainWords(item.gain)}.`),
         isBusy(item) && progress(item.progress ?? "waiting", "diagnosis"),
         item.extension === "done" &&
           h(
@@ -80,10 +80,10 @@ export function diagnosis(structure, changed) {
             `The model has been extended${item.added?.length ? `: ${item.added.join("; ")}` : ""}.`,
           ),
         item.failure && h("span", { class: "fine bad-text" }, item.failure),
-        h("span", { class: "fine" }, "started ", age(item.created_at)),
+        h("span", { class: "fine" }, "started ", age(item.created_at), `, ${triggerWords(item)}`),
       ),
       done && h("a", { class: "button", href: `#/diagnoses/${encodeURIComponent(item.diagnosis)}` }, "Report"),
-      extendable && h("button", { type: "button", class: "primary", onclick: () => extend(item) }, "Extend the model"),
+      isExtendable(item) && h("button", { type: "button", class: "primary", onclick: () => extend(item) }, "Extend the model"),
     );
   };
 
@@ -143,18 +143,6 @@ export function diagnosis(structure, changed) {
       changed();
     }
   };
-  return { element, load };
-}
-
-function gainWords(gain) {
-  if (!gain) return null;
-  const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
-  const { before, after } = gain.rms_error_percent;
-  const alarms = gain.false_alarms_per_1000;
-  return h(
-    "span",
-    { class: "fine" },
-    icon("chart"),
-    `Gain on ${gain.holdout_rows} held-out measurements: mean RMS error of the predicted frequencies ${number(mean(before), 2)} % → ${number(mean(after), 2)} %, false alarms per 1000 batches ${number(alarms.before, 2)} → ${number(alarms.after, 2)}.`,
-  );
+  const card = latest(extend);
+  return { element, card: card.element, load };
 }
