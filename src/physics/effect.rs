@@ -80,55 +80,35 @@ pub struct Response {
 /// If the number of sizes is not that of the targets.
 pub fn respond(structure: &Structure, count: usize, targets: &[Target], sizes: &[f64]) -> Result<Response, Error> {
     let columns = columns(targets);
-    let total = columns.last().map_or(0, |(first, target)| first + target.sizes());
-    assert_eq!(sizes.len(), total, "one size for each target, two for an oscillator");
     let changed = Changed::new(structure, count, &columns, sizes)?;
     let needed = changed.order.iter().max().map_or(count, |highest| highest + 1);
     let modes = modes(&changed.structure, needed)?;
     let sensitivity = frequency_sensitivity(&changed.structure, &modes);
-
-    let structural: Vec<f64> = changed.order.iter().map(|mode| modes.frequencies_hz[*mode]).collect();
-    let rows = structural.len();
-    let (scale, offset_hz) = instrument(&columns, sizes, rows);
-    let mut by_size = DMatrix::zeros(rows, total);
-    for (number, (first, target)) in columns.iter().enumerate() {
-        for row in 0..rows {
-            let own = &sizes[*first..first + target.sizes()];
-            let slopes = match target {
-                Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
-                    [structural[row] * scale[row] / (1.0 + own[0]), 0.0]
-                }
-                Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => [1.0, 0.0],
-                _ => changed.slopes(number, target, own, row, scale[row], &sensitivity),
-            };
-            for which in 0..target.sizes() {
-                by_size[(row, first + which)] = slopes[which];
-            }
-        }
-    }
-    let slope = |row: usize, spring: usize| {
-        scale[row] * sensitivity.by_spring[(changed.order[row], spring)] * changed.spring_factor[spring]
-    };
-    let by_spring = DMatrix::from_fn(rows, structure.springs().len(), slope);
-    let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
-    Ok(Response { frequencies_hz, by_spring, by_size })
+    Ok(changed.response(&columns, sizes, &modes.frequencies_hz, &sensitivity))
 }
 
 /// A structure with effects applied to its springs and masses.
-struct Changed {
-    structure: Structure,
+pub(super) struct Changed {
+    pub(super) structure: Structure,
     /// Factor on each spring of the structure without effects.
-    spring_factor: Vec<f64>,
+    pub(super) spring_factor: Vec<f64>,
     /// Index of the spring, and of the mass of an oscillator, that each target adds.
     added: Vec<(usize, usize)>,
     /// Mode of the structure behind each mode of the data.
-    order: Vec<usize>,
+    pub(super) order: Vec<usize>,
 }
 
 impl Changed {
     /// Applies the targets to the springs and masses of a structure. `count`: number of modes wanted; `columns`: each target with
     /// the column of its first size in `sizes`.
-    fn new(structure: &Structure, count: usize, columns: &[(usize, &Target)], sizes: &[f64]) -> Result<Self, Error> {
+    pub(super) fn new(
+        structure: &Structure,
+        count: usize,
+        columns: &[(usize, &Target)],
+        sizes: &[f64],
+    ) -> Result<Self, Error> {
+        let total = columns.last().map_or(0, |(first, target)| first + target.sizes());
+        assert_eq!(sizes.len(), total, "one size for each target, two for an oscillator");
         let mut spring_factor = vec![1.0; structure.springs().len()];
         let mut mass_factor = vec![1.0; structure.masses().len()];
         let mut changed = structure.clone();
@@ -180,20 +160,54 @@ impl Changed {
         Ok(Self { structure: changed, spring_factor, added, order })
     }
 
-    /// Derivatives of the frequency of one mode of the data (`row`) with respect to the sizes of target `number`, which acts on
-    /// springs or masses; zeros for other targets. `scale` is the scale of the instrument.
-    fn slopes(
+    /// Frequencies as the instrument reports them and their derivatives, from all frequencies of the structure, Hz, and their
+    /// derivatives.
+    pub(super) fn response(
         &self,
-        number: usize,
-        target: &Target,
+        columns: &[(usize, &Target)],
+        sizes: &[f64],
+        frequencies_hz: &[f64],
+        sensitivity: &FrequencySensitivity,
+    ) -> Response {
+        let structural: Vec<f64> = self.order.iter().map(|mode| frequencies_hz[*mode]).collect();
+        let rows = structural.len();
+        let (scale, offset_hz) = instrument(columns, sizes, rows);
+        let mut by_size = DMatrix::zeros(rows, sizes.len());
+        for (number, (first, target)) in columns.iter().enumerate() {
+            for row in 0..rows {
+                let own = &sizes[*first..first + target.sizes()];
+                let slopes = match target {
+                    Target::FrequencyScale(mode) if mode.is_none_or(|mode| mode == row) => {
+                        [structural[row] * scale[row] / (1.0 + own[0]), 0.0]
+                    }
+                    Target::FrequencyOffset(mode) if mode.is_none_or(|mode| mode == row) => [1.0, 0.0],
+                    _ => self.slopes((number, target), own, self.order[row], scale[row], sensitivity),
+                };
+                for which in 0..target.sizes() {
+                    by_size[(row, first + which)] = slopes[which];
+                }
+            }
+        }
+        let slope = |row: usize, spring: usize| {
+            scale[row] * sensitivity.by_spring[(self.order[row], spring)] * self.spring_factor[spring]
+        };
+        let by_spring = DMatrix::from_fn(rows, self.spring_factor.len(), slope);
+        let frequencies_hz = (0..rows).map(|row| structural[row] * scale[row] + offset_hz[row]).collect();
+        Response { frequencies_hz, by_spring, by_size }
+    }
+
+    /// Derivatives of the quantity in row `row` of `sensitivity` with respect to the sizes of a target, given with its number,
+    /// that acts on springs or masses; zeros for other targets. `scale` is the scale of the instrument.
+    pub(super) fn slopes(
+        &self,
+        (number, target): (usize, &Target),
         sizes: &[f64],
         row: usize,
         scale: f64,
         sensitivity: &FrequencySensitivity,
     ) -> [f64; 2] {
-        let mode = self.order[row];
-        let by_spring = |spring: usize| sensitivity.by_spring[(mode, spring)];
-        let by_mass = |mass: usize| sensitivity.by_mass[(mode, mass)];
+        let by_spring = |spring: usize| sensitivity.by_spring[(row, spring)];
+        let by_mass = |mass: usize| sensitivity.by_mass[(row, mass)];
         match target {
             Target::Springs(indices) => {
                 let sum: f64 = indices.iter().map(|i| by_spring(*i) * self.structure.springs[*i].n_per_m).sum();
@@ -303,7 +317,7 @@ fn instrument(columns: &[(usize, &Target)], sizes: &[f64], rows: usize) -> (Vec<
 }
 
 /// Each target with the column of its first size.
-fn columns(targets: &[Target]) -> Vec<(usize, &Target)> {
+pub(super) fn columns(targets: &[Target]) -> Vec<(usize, &Target)> {
     let mut first = 0;
     let column = |target| {
         let column = (first, target);

@@ -67,7 +67,7 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
         definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
-    let instrumented = instrumented::check(definition, &model, &mut problems);
+    let instrumented = instrumented::check(definition, &model, &effects, &mut problems);
     if !problems.is_empty() {
         return Err(problems);
     }

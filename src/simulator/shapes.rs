@@ -2,11 +2,12 @@
 
 use nalgebra::DMatrix;
 
-use super::model::{chained, structure_at, SimulationModel};
+use super::model::{chained, structure_at, Binding, SimulationModel};
 use super::simulate::Simulator;
 use crate::measurement::shape::InstrumentedPoints;
-use crate::physics::shapes::{shape_sensitivity, shapes_at};
-use crate::physics::{self, frequency_sensitivity, modes, Structure};
+use crate::physics::effect::Target;
+use crate::physics::shaped::{respond_shaped, Shaped};
+use crate::physics::{self, Structure};
 
 /// Frequencies and mode shapes at one set of parameters, and their derivatives.
 #[derive(Debug, Clone)]
@@ -37,45 +38,48 @@ impl Simulator {
         self.instrumented().map_or(0.0, |i| i.std)
     }
 
-    /// Frequencies, Hz, `[m]`, and mode shapes of unit norm, `[points, m]`, at parameters `theta` (`[d]`), without noise.
+    /// Frequencies, Hz, `[m]`, and mode shapes of unit norm, `[points, m]`, at parameters `theta` (`[d]`) under the effects, without
+    /// noise.
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn frequencies_and_shapes(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) => {
-                let modes = modes(&structure_at(structure, bindings, theta)?, self.modes())?;
-                let shapes = shapes_at(&modes, &instrumented.dofs);
-                Ok((modes.frequencies_hz, shapes))
+                let shaped = self.shaped(structure, bindings, theta, self.modes(), (&instrumented.dofs, &[]))?;
+                Ok((shaped.response.frequencies_hz, shaped.shapes))
             }
             _ => Ok((self.frequencies_hz(theta)?, DMatrix::zeros(0, 0))),
         }
     }
 
-    /// The modes at parameters `theta` (`[d]`) and their derivatives. If the structure has instrumented points and `with_shapes`
-    /// is true, these are the lowest `count` modes with their shapes; otherwise they are the measured modes without shapes.
+    /// The modes at parameters `theta` (`[d]`) under the effects, and their derivatives. If the structure has instrumented points and
+    /// `with_shapes` is true, these are the lowest `count` modes with their shapes; otherwise they are the measured modes without
+    /// shapes.
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn linearise(&self, theta: &[f64], count: usize, with_shapes: bool) -> Result<Linearised, physics::Error> {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) if with_shapes => {
-                let structure = structure_at(structure, bindings, theta)?;
-                let modes = modes(&structure, count)?;
-                let frequency_slopes = chained(&frequency_sensitivity(&structure, &modes).by_spring, bindings, theta);
                 let springs: Vec<usize> = bindings.iter().map(|b| b.spring).collect();
-                let by_spring = shape_sensitivity(&structure, &modes, &instrumented.dofs, &springs);
+                let Shaped { response, shapes, shape_slopes } =
+                    self.shaped(structure, bindings, theta, count, (&instrumented.dofs, &springs))?;
+                let (moved, factors) = self.moved_by_effects(theta);
+                let mut frequency_slopes = chained(&response.by_spring, bindings, &moved);
+                for (mut slopes, factor) in frequency_slopes.column_iter_mut().zip(&factors) {
+                    slopes *= *factor;
+                }
                 let by_parameter = |of_mode: DMatrix<f64>| {
                     let mut slopes = DMatrix::zeros(of_mode.nrows(), theta.len());
                     for (binding, column) in bindings.iter().zip(of_mode.column_iter()) {
-                        let slope = binding.slope(theta[binding.parameter]);
+                        let slope = binding.slope(moved[binding.parameter]) * factors[binding.parameter];
                         slopes.column_mut(binding.parameter).axpy(slope, &column, 1.0);
                     }
                     slopes
                 };
-                let shapes = shapes_at(&modes, &instrumented.dofs);
-                let shape_slopes = by_spring.into_iter().map(by_parameter).collect();
-                Ok(Linearised { frequencies_hz: modes.frequencies_hz, frequency_slopes, shapes, shape_slopes })
+                let shape_slopes = shape_slopes.into_iter().map(by_parameter).collect();
+                Ok(Linearised { frequencies_hz: response.frequencies_hz, frequency_slopes, shapes, shape_slopes })
             }
             _ => {
                 let (frequencies_hz, frequency_slopes) = self.frequencies_and_jacobian(theta)?;
@@ -83,6 +87,21 @@ impl Simulator {
                 Ok(Linearised { frequencies_hz, frequency_slopes, shapes, shape_slopes })
             }
         }
+    }
+
+    /// The lowest `count` modes of the structure under the effects, with their shapes at the degrees of freedom `points`, and their
+    /// derivatives with respect to the stiffness of `springs`.
+    fn shaped(
+        &self,
+        structure: &Structure,
+        bindings: &[Binding],
+        theta: &[f64],
+        count: usize,
+        (points, springs): (&[usize], &[usize]),
+    ) -> Result<Shaped, physics::Error> {
+        let targets: Vec<Target> = self.effects().iter().map(|effect| effect.target.clone()).collect();
+        let structure = structure_at(structure, bindings, &self.moved_by_effects(theta).0)?;
+        respond_shaped(&structure, count, (&targets, self.sizes()), points, springs)
     }
 
     /// Number of simulated modes to pair with the measured ones: the measured modes and a few above, which can swap with them.

@@ -193,15 +193,25 @@ impl Simulator {
     /// table has no runs near them.
     pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
         let Some(table) = self.table() else { return false };
-        let mut moved = theta.to_vec();
+        table.is_outside(&self.moved_by_effects(theta).0)
+    }
+
+    /// Parameters `theta` (`[d]`) as the effects change them, and the factor on each, `[d]`.
+    pub(super) fn moved_by_effects(&self, theta: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let mut factors = vec![1.0; theta.len()];
         let mut first = 0;
         for effect in self.effects() {
             if let Target::ParameterScale(column) = effect.target {
-                moved[column] *= 1.0 + self.sizes[first];
+                factors[column] *= 1.0 + self.sizes[first];
             }
             first += effect.target.sizes();
         }
-        table.is_outside(&moved)
+        (theta.iter().zip(&factors).map(|(value, factor)| value * factor).collect(), factors)
+    }
+
+    /// Sizes of the effects, in the order of the effects and in the units of their targets, `[sizes]`.
+    pub(super) fn sizes(&self) -> &[f64] {
+        &self.sizes
     }
 
     /// The stiffnesses that parameters set; empty for a table.
