@@ -152,10 +152,10 @@ fn coverage(baseline: &Baseline, worlds: &[Measured], measurements: &[ModalMeasu
     let observations: Vec<_> = measurements.iter().map(|m| baseline.admit(m).observation.unwrap()).collect();
     let samples = baseline.infer(&observations, DRAWS, 3).unwrap();
     let (mut inside, mut width) = ([0.0; 3], 0.0);
-    for column in 0..3 {
+    for (column, inside) in inside.iter_mut().enumerate() {
         for (draws, world) in samples.column(column).chunks_exact(DRAWS).zip(worlds) {
             let (low, high) = (quantile(draws, 0.05), quantile(draws, 0.95));
-            inside[column] += f64::from(u8::from((low..=high).contains(&world.k[column]))) / worlds.len() as f64;
+            *inside += f64::from(u8::from((low..=high).contains(&world.k[column]))) / worlds.len() as f64;
             width += (high - low) / (3 * worlds.len()) as f64;
         }
     }
@@ -245,7 +245,7 @@ fn shapes_under_effects_are_those_of_the_changed_structure() {
 #[test]
 fn derivatives_under_effects_are_those_of_differences() {
     let text = FILE.replace("target = { frequency_scale = 2 }", "target = { parameter = \"k2\" }");
-    for text in [FILE, &text] {
+    for text in [FILE, text.as_str()] {
         let base = Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap();
         let simulator = base.under(&[-0.2, 0.15]);
         let theta = [900.0, 1_100.0, 800.0];
