@@ -23,6 +23,6 @@ pub use chart_points::{chart_points, KnownLimits, NewChartPoint};
 pub use comparison::{assess, Context};
 pub use detail::{detail, BatchDetail, ModeDetail, ParameterDetail};
 pub use quantities::monitored_quantities;
-pub use reference::{undamaged_reference, ReferenceError};
+pub use reference::{undamaged_reference, DoubtfulBatch, ReferenceBatches, ReferenceError};
 pub use result::{Assessment, BatchState};
 pub use samples::{draw, BatchSamples, Draws, Error};

@@ -20,6 +20,7 @@ mod retention;
 mod serve;
 mod simulate;
 mod supervisor;
+mod tables;
 mod token;
 mod train;
 mod training;

@@ -6,12 +6,19 @@ use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::quantity::{Digest, Hertz};
 use crate::simulator::law::{lagged, Input, Law, LawKind};
 use crate::simulator::Simulator;
+use crate::stats;
 
 /// Name of the covariate time, counted from the first row in the unit [`Data::time_unit`].
 pub const TIME: &str = "time";
 
 /// Smallest relative standard deviation of a frequency: data have a finite precision even if no noise is stated.
 const LEAST_NOISE: f64 = 1e-5;
+
+/// Prefix of the name of a column that holds a setting, as in the header of a table.
+const SETTING: &str = "set_";
+
+/// Greatest number of numeric columns whose products are considered.
+const MOST_FACTORS: usize = 6;
 
 /// Greatest number of categories of a covariate.
 pub const MOST_LEVELS: usize = 12;
@@ -27,11 +34,26 @@ pub enum Values {
     Categories(Vec<String>, Vec<Option<usize>>),
 }
 
-/// A covariate with its values.
+/// What a column holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// A covariate that was measured.
+    Covariate,
+    /// A parameter that the experimenter set.
+    Setting,
+    /// The product of two columns with these indices, each minus its mean.
+    Product(usize, usize),
+    /// Time.
+    Time,
+}
+
+/// A quantity that deviations may depend on, with its values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Column {
     /// Its name, which ends with its unit.
     pub name: String,
+    /// What it holds.
+    pub origin: Origin,
     /// Its values.
     pub values: Values,
 }
@@ -50,7 +72,7 @@ pub struct Data {
     pub noise: Vec<Vec<f64>>,
     /// Values of the parameters that the experimenter set, `[n][d]`, in their own units.
     pub settings: Vec<Vec<Option<f64>>>,
-    /// Covariates; the last is time.
+    /// Covariates, settings that vary, their products by pairs, and time, in this order.
     pub columns: Vec<Column>,
     /// Digest of the measurements.
     pub digest: Digest,
@@ -87,10 +109,15 @@ impl Data {
         }
         let mut columns: Vec<Column> =
             names.into_iter().map(|(name, category)| column(name, category, &sorted)).collect();
-        columns.push(Column { name: TIME.to_owned(), values: Values::Numbers(times_days.clone()) });
+        let settings: Vec<Vec<Option<f64>>> = sorted.iter().map(setting).collect();
+        let names = simulator.space().iter().map(|p| p.name.as_str());
+        columns.extend(names.enumerate().filter_map(|(k, name)| setting_column(name, k, &settings)));
+        columns.extend(products(&columns));
+        let values = Values::Numbers(times_days.clone());
+        columns.push(Column { name: TIME.to_owned(), origin: Origin::Time, values });
         let content = serde_json::to_vec(&sorted).expect("measurements can be written as JSON");
         Self {
-            settings: sorted.iter().map(setting).collect(),
+            settings,
             digest: Digest::of(&[&content]),
             times_days,
             time_unit: "day",
@@ -121,6 +148,17 @@ impl Data {
         self.columns.iter().find(|c| c.name == name)
     }
 
+    /// The two factors of a product at each row, each minus its mean.
+    fn pairs(&self, column: &Column) -> Vec<Input> {
+        let numbers = |index: usize| match &self.columns[index].values {
+            Values::Numbers(values) => centred(values),
+            Values::Categories(..) => vec![f64::NAN; self.rows()],
+        };
+        let Origin::Product(first, second) = column.origin else { return vec![Input::Missing; self.rows()] };
+        let pair = |(a, b): (f64, f64)| if (a * b).is_finite() { Input::Pair(a, b) } else { Input::Missing };
+        numbers(first).into_iter().zip(numbers(second)).map(pair).collect()
+    }
+
     /// The input of a law at each row, `[n]`; `lag_days` is used by a law with a lag.
     ///
     /// The result is for all rows because a lagged covariate depends on all earlier ones.
@@ -129,6 +167,7 @@ impl Data {
             return vec![if law.covariate.is_none() { Input::Number(0.0) } else { Input::Missing }; self.rows()];
         };
         match &column.values {
+            Values::Numbers(_) if law.kind == LawKind::Product => self.pairs(column),
             Values::Numbers(values) if law.kind == LawKind::Lagged => {
                 let lag = lag_days.unwrap_or(1.0).max(1e-3);
                 lagged(&self.times_days, values, lag).into_iter().map(|(v, slope)| Input::Lagged(v, slope)).collect()
@@ -143,6 +182,45 @@ impl Data {
             }
         }
     }
+}
+
+/// The column of a setting; `None` if it has the same value wherever it is set.
+fn setting_column(name: &str, k: usize, settings: &[Vec<Option<f64>>]) -> Option<Column> {
+    let values: Vec<f64> = settings.iter().map(|row| row[k].unwrap_or(f64::NAN)).collect();
+    let known = || values.iter().copied().filter(|v| v.is_finite());
+    let (low, high) = known().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+    let name = format!("{SETTING}{name}");
+    (low < high).then_some(Column { name, origin: Origin::Setting, values: Values::Numbers(values) })
+}
+
+/// The products of the numeric columns by pairs, each factor minus its mean; none for more than [`MOST_FACTORS`] columns.
+fn products(columns: &[Column]) -> Vec<Column> {
+    let numeric = |(index, column): (usize, &Column)| {
+        let Values::Numbers(values) = &column.values else { return None };
+        Some((index, centred(values)))
+    };
+    let factors: Vec<(usize, Vec<f64>)> = columns.iter().enumerate().filter_map(numeric).collect();
+    if factors.len() > MOST_FACTORS {
+        return Vec::new();
+    }
+    let mut found = Vec::new();
+    for (place, (first, a)) in factors.iter().enumerate() {
+        for (second, b) in &factors[place + 1..] {
+            found.push(Column {
+                name: format!("{} × {}", columns[*first].name, columns[*second].name),
+                origin: Origin::Product(*first, *second),
+                values: Values::Numbers(a.iter().zip(b).map(|(a, b)| a * b).collect()),
+            });
+        }
+    }
+    found
+}
+
+/// The values minus their mean; NaN stays NaN.
+fn centred(values: &[f64]) -> Vec<f64> {
+    let known: Vec<f64> = values.iter().copied().filter(|v| v.is_finite()).collect();
+    let mean = if known.is_empty() { 0.0 } else { stats::mean(&known) };
+    values.iter().map(|v| v - mean).collect()
 }
 
 impl Column {
@@ -164,7 +242,8 @@ fn column(name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
             Some(CovariateValue::Number(number)) => *number,
             _ => f64::NAN,
         };
-        return Column { name: name.to_owned(), values: Values::Numbers(values().map(number).collect()) };
+        let values = Values::Numbers(values().map(number).collect());
+        return Column { name: name.to_owned(), origin: Origin::Covariate, values };
     }
     let text = |value: &CovariateValue| match value {
         CovariateValue::Category(text) => text.clone(),
@@ -175,5 +254,5 @@ fn column(name: &str, category: bool, sorted: &[&ModalMeasurement]) -> Column {
     levels.dedup();
     let index = |value: Option<&CovariateValue>| value.and_then(|v| levels.binary_search(&text(v)).ok());
     let indices = values().map(index).collect();
-    Column { name: name.to_owned(), values: Values::Categories(levels, indices) }
+    Column { name: name.to_owned(), origin: Origin::Covariate, values: Values::Categories(levels, indices) }
 }

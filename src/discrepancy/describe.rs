@@ -6,32 +6,16 @@ use serde::{Deserialize, Serialize};
 use super::data::{Data, Values, TIME};
 use super::effect::FittedEffect;
 use super::fit::Fit;
-use super::grammar::{Candidate, Class};
+use super::grammar::Class;
 use super::rank::Ranked;
+use super::target_name::{phrase, target_name, TargetName};
 use crate::physics::effect::Target;
-use crate::physics::{Form, Node};
 use crate::simulator::law::{Input, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
 
 /// Half the width of a 90 % interval of a normal distribution, in standard deviations.
 const Z90: f64 = 1.644_853_626_951_472;
-
-/// What a cause acts on.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-pub struct TargetName {
-    /// `spring`, `spring_group`, `mass`, `mass_group`, `frequency_scale`, `frequency_offset`, `setting`, `added_spring`,
-    /// `oscillator`, `mode_assignment`; `beam` for the bending stiffness of a span, `parameter` for one of a table.
-    pub kind: String,
-    /// Name of the spring, mass, beam or parameter; `all` for a group of all; `mode 2` for one mode; empty for all modes.
-    pub name: String,
-    /// Nodes at the ends of an added spring.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub between: Option<[String; 2]>,
-    /// The category that differs.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub level: Option<String>,
-}
 
 /// A number of a cause.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -66,84 +50,16 @@ pub struct Cause {
     pub parameters: Vec<NamedNumber>,
 }
 
-/// The name of a candidate's target.
-pub fn target_name(simulator: &Simulator, candidate: &Candidate) -> TargetName {
-    let structure = || simulator.structure().expect("targets with parts belong to a structure");
-    let spring = |index: usize| structure().springs()[index].name.clone();
-    let span = |index: usize| matches!(structure().springs()[index].form, Form::Bending(_));
-    let node = |node: Node| structure().node_name(node).to_owned();
-    let parameter = |column: usize| simulator.space().as_slice()[column].name.clone();
-    let one_mode = |mode: &Option<usize>| mode.map_or_else(String::new, |m| format!("mode {}", m + 1));
-    let mut between = None;
-    let (kind, name) = match &candidate.target {
-        Target::Springs(indices) if indices.len() == 1 && span(indices[0]) => ("beam", spring(indices[0])),
-        Target::Springs(indices) if indices.len() == 1 => ("spring", spring(indices[0])),
-        Target::Springs(indices) if indices.len() == structure().springs().len() => ("spring_group", "all".to_owned()),
-        Target::Springs(indices) => {
-            let same = |springs: &Vec<usize>| {
-                springs.len() == indices.len() && springs.iter().all(|spring| indices.contains(spring))
-            };
-            let group = simulator.spring_groups().into_iter().find(|(_, springs)| same(springs));
-            ("spring_group", group.map_or_else(|| "several".to_owned(), |(name, _)| name))
-        }
-        Target::Masses(indices) if indices.len() == 1 => ("mass", structure().masses()[indices[0]].name.clone()),
-        Target::Masses(_) => ("mass_group", "all".to_owned()),
-        Target::FrequencyScale(mode) => ("frequency_scale", one_mode(mode)),
-        Target::FrequencyOffset(mode) => ("frequency_offset", one_mode(mode)),
-        Target::SettingOffset(k) | Target::SettingScale(k) => ("setting", parameter(*k)),
-        Target::ParameterScale(k) => ("parameter", parameter(*k)),
-        Target::AddedSpring(from, to) => {
-            between = Some([node(*from), node(*to)]);
-            ("added_spring", String::new())
-        }
-        Target::Oscillator(host) => ("oscillator", node(Node::Dof(*host))),
-        Target::ModeOrder(order) => ("mode_assignment", order_name(order)),
-    };
-    TargetName { kind: kind.to_owned(), name, between, level: candidate.level.clone() }
-}
-
-/// Name of an order of modes: which mode was overlooked, or which modes were swapped.
-fn order_name(order: &[usize]) -> String {
-    if let Some(skipped) = (0..order.len()).find(|m| order[*m] == m + 1 && !order.contains(m)) {
-        return format!("mode {} overlooked", skipped + 1);
-    }
-    let swapped: Vec<String> =
-        order.iter().enumerate().filter(|(i, m)| i != *m).map(|(i, _)| (i + 1).to_string()).collect();
-    format!("modes {} swapped", swapped.join(" and "))
-}
-
-/// A target as the subject of a sentence.
-fn phrase(name: &TargetName) -> String {
-    let of = |what: &str| format!("{what} of {}", name.name);
-    match name.kind.as_str() {
-        "spring" => of("the stiffness"),
-        "beam" => of("the bending stiffness"),
-        "parameter" => format!("the parameter {}", name.name),
-        "spring_group" if name.name == "all" => "the stiffness of all springs together".to_owned(),
-        "spring_group" => of("the stiffness of the springs"),
-        "mass" => format!("the mass {}", name.name),
-        "mass_group" => "the mass of all bodies together".to_owned(),
-        "frequency_scale" if name.name.is_empty() => "the scale of all measured frequencies".to_owned(),
-        "frequency_scale" => of("the scale of the measured frequency"),
-        "frequency_offset" if name.name.is_empty() => "the offset of all measured frequencies".to_owned(),
-        "frequency_offset" => of("the offset of the measured frequency"),
-        "setting" => format!("the setting {}", name.name),
-        "added_spring" => {
-            let [a, b] = name.between.clone().unwrap_or_default();
-            format!("the stiffness of an additional spring between {a} and {b}")
-        }
-        "oscillator" => format!("an additional body on a spring attached to {}", name.name),
-        _ => format!("the order of the modes ({})", name.name),
-    }
-}
-
 /// Unit of the size of a target, and the factor and unit in which a sentence gives it.
 fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
     let relative = || ("share".to_owned(), 100.0, "%".to_owned());
     let plain = |unit: &str| (unit.to_owned(), 1.0, unit.to_owned());
     match target {
         Target::FrequencyOffset(_) => plain("Hz"),
-        Target::SettingOffset(k) => plain(&simulator.space().as_slice()[*k].unit),
+        Target::SettingOffset(k) | Target::SettingMirror(k) | Target::ParameterOffset(k) => {
+            plain(&simulator.space().as_slice()[*k].unit)
+        }
+        Target::InMode(_, target) => self::unit(simulator, target),
         Target::AddedSpring(..) => plain("N/m"),
         Target::Oscillator(_) => plain("kg"),
         Target::ModeOrder(_) => plain(""),
@@ -180,6 +96,9 @@ fn effect_range(data: &Data, effect: &FittedEffect, psi: &[f64], covariance: &DM
     if psi.is_empty() {
         return (0.0, 0.0);
     }
+    if effect.law.kind == LawKind::Product {
+        return range_over_rows(data, effect, psi, covariance);
+    }
     let column = effect.law.covariate.as_deref().and_then(|name| data.column(name));
     let values = column.filter(|_| effect.law.kind != LawKind::Step).map(|c| &c.values);
     let Some(Values::Numbers(values)) = values else {
@@ -194,6 +113,28 @@ fn effect_range(data: &Data, effect: &FittedEffect, psi: &[f64], covariance: &DM
     let ((low, low_slopes), (high, high_slopes)) = (at(0.05), at(0.95));
     let slopes = high_slopes - low_slopes;
     (high - low, (slopes.dot(&(covariance * &slopes))).max(0.0).sqrt())
+}
+
+/// The effect range of an effect of two covariates: its value at the 95 % quantile of its values over the rows minus that at the
+/// 5 % quantile, with its standard deviation.
+fn range_over_rows(data: &Data, effect: &FittedEffect, psi: &[f64], covariance: &DMatrix<f64>) -> (f64, f64) {
+    let at = |input: &Input| {
+        let mut slopes = vec![0.0; psi.len()];
+        let value = effect.law.size(*input, psi, &mut slopes);
+        (value, DVector::from_vec(slopes))
+    };
+    let inputs = data.inputs(&effect.law, None);
+    let mut values: Vec<(f64, DVector<f64>)> = inputs.iter().filter(|i| **i != Input::Missing).map(at).collect();
+    values.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let last = values.len().saturating_sub(1);
+    let quantile = |level: f64| values.get((level * last as f64).round() as usize);
+    let Some(((low, low_slopes), (high, high_slopes))) =
+        quantile(0.05).zip(quantile(0.95)).map(|(a, b)| (a.clone(), b.clone()))
+    else {
+        return (0.0, 0.0);
+    };
+    let slopes = high_slopes - low_slopes;
+    (high - low, slopes.dot(&(covariance * &slopes)).max(0.0).sqrt())
 }
 
 /// A ranked candidate in words and numbers; its effect is number `index` of `fit`. Covariances are divided by the share of
@@ -224,7 +165,7 @@ pub fn cause(
         Some(Values::Numbers(_))
     ) && effect.law.kind != LawKind::Step;
     let mut parameters = Vec::new();
-    if !psi.is_empty() {
+    if !psi.is_empty() && !effect.target.is_switch() {
         let first = if numeric { "swing" } else { "size" };
         parameters.push(number(first.to_owned(), unit.clone(), value, std));
     }
@@ -232,6 +173,9 @@ pub fn cause(
         let unit = match n.name.as_str() {
             "slope_per_unit" | "slope_below_per_unit" | "slope_above_per_unit" => format!("{unit} per {over}"),
             "curvature_per_unit2" => format!("{unit} per {over}²"),
+            "second_slope_per_unit" => format!("{unit} per unit of the second"),
+            "product_per_unit2" => format!("{unit} per unit of both"),
+            "gain" | "level" if matches!(effect.target, Target::ModeGain { .. }) => "share".to_owned(),
             "rate_per_unit" => format!("1/{over}"),
             "knee" => over.clone(),
             "lag_days" => data.time_unit.to_owned(),
@@ -292,6 +236,8 @@ impl Wording<'_> {
         let changes = self.changes(value);
         match self.effect.law.kind {
             _ if self.name.kind == "mode_assignment" => format!("{what} differs from that of the data"),
+            _ if self.name.kind == "mode_gain" => self.gain(&what),
+            _ if self.effect.target.is_switch() => self.correction(&what),
             LawKind::Constant => self.constant(&what, value, &size()),
             LawKind::Step => {
                 let (unit, at) = (self.time_unit, self.effect.law.reference);
@@ -307,6 +253,41 @@ impl Wording<'_> {
                 let shape = if self.effect.law.kind == LawKind::Quadratic { "quadratically" } else { "exponentially" };
                 format!("{what} {changes} {} from the 5 % to the 95 % quantile of {covariate}, {shape}", size())
             }
+            LawKind::Product => format!(
+                "{what} depends on two covariates together, {covariate}: from the 5 % to the 95 % quantile of the effect it {changes} {}",
+                size()
+            ),
+        }
+    }
+
+    /// The sentence of the gain of a mode.
+    fn gain(&self, what: &str) -> String {
+        let (gain, std) = rounded(1.0 + self.psi[0], self.covariance[(0, 0)].max(0.0).sqrt());
+        format!("{what} is {gain} ± {std} times that of the simulation")
+    }
+
+    /// The sentence of a unit, a direction or an exchange of settings.
+    fn correction(&self, what: &str) -> String {
+        let finding = match (self.name.kind.as_str(), self.name.factor) {
+            ("setting_unit", Some(factor)) if factor < 0.0 => {
+                format!("{what} is wrong in its sign: the values must be multiplied by −1")
+            }
+            ("setting_unit", factor) => {
+                let factor = factor.unwrap_or(1.0);
+                format!("{what} is not that of the parameter: the values must be multiplied by {factor}")
+            }
+            ("setting_direction", _) => {
+                let (sum, std) = rounded(self.psi[0], self.covariance[(0, 0)].max(0.0).sqrt());
+                format!("{what} is opposite: it was measured from the other end, and the parameter is {sum} ± {std} {} minus the setting", self.unit)
+            }
+            _ => format!("{what} is exchanged"),
+        };
+        let law = &self.effect.law;
+        let (covariate, unit) = (law.covariate.as_deref().unwrap_or_default(), self.time_unit);
+        match (law.kind, &self.name.level) {
+            (LawKind::Step, _) => format!("{finding} from {unit} {:.0} of the data on", law.reference),
+            (_, Some(level)) => format!("{finding} where {covariate} is {level}"),
+            _ => finding,
         }
     }
 

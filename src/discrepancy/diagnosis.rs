@@ -4,10 +4,12 @@ use serde::{Deserialize, Serialize};
 
 use super::describe::Cause;
 use super::fit::Fit;
-use super::gain::Gain;
+use super::gain::{Gain, GainMethod};
 use super::grammar::Class;
 use super::misfit::{Misfit, Remainder};
+use super::outside::OutsideSetting;
 use super::rank::Ranked;
+use super::scatter::ExcessScatter;
 use crate::quantity::Digest;
 
 /// A cause with a probability above this is named alone.
@@ -23,6 +25,8 @@ pub enum DiagnosisVerdict {
     Several,
     /// One cause out of a few that these data cannot distinguish.
     Ambiguous,
+    /// Some modes scatter more than their stated noise and the spread of the parameters explain, whether or not causes were found.
+    UnexplainedScatter,
     /// The data deviate from the simulation in a way that no known cause explains.
     NoneOfThese,
     /// The simulation explains the data.
@@ -53,6 +57,12 @@ pub struct Diagnosis {
     pub verdict: DiagnosisVerdict,
     /// The answer in one or a few sentences.
     pub summary: String,
+    /// Parameters of which settings lie outside the prior, or outside the runs of a table.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub settings_outside: Vec<OutsideSetting>,
+    /// Modes that scatter more than stated.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub scatter: Vec<ExcessScatter>,
     /// Deviations of the simulation without further causes, the most significant first.
     pub misfit: Vec<Misfit>,
     /// The causes; with an ambiguous verdict, the few of which one is the cause.
@@ -62,7 +72,7 @@ pub struct Diagnosis {
     /// Deviation that no cause explains.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub remainder: Option<Remainder>,
-    /// Gain from the causes on the rows held out; `null` when no cause was found.
+    /// Gain from the causes on rows that they were not fitted to; `null` when no cause was found.
     pub gain: Option<Gain>,
     /// Properties of the data that limit the diagnosis.
     pub notes: Vec<String>,
@@ -104,7 +114,8 @@ pub struct Outcome {
 impl Diagnosis {
     /// The answer in words.
     pub(super) fn in_words(&self) -> String {
-        let mut text = self.finding_in_words();
+        let mut text = self.settings_outside.iter().map(|s| capitalised(&s.sentence()) + ". ").collect::<String>();
+        text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
             text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");
         }
@@ -122,16 +133,31 @@ impl Diagnosis {
                 "No cause was found: the simulation explains these data within their noise.".to_owned()
             }
             DiagnosisVerdict::NoneOfThese => {
-                let left = self.remainder.as_ref().map_or_else(String::new, |r| r.function.clone());
+                let left = match &self.remainder {
+                    Some(left) => format!("the remaining residuals depend on {}", left.function),
+                    None => "settings remain outside the prior".to_owned(),
+                };
                 let partly = if self.causes.is_empty() {
                     String::new()
                 } else {
                     let each: Vec<&str> = self.causes.iter().map(|c| c.sentence.as_str()).collect();
                     format!(" The following explains only a part of the deviation: {}.", each.join("; "))
                 };
+                format!("The data deviate from the simulation in a way that no known cause explains: {left}.{partly}")
+            }
+            DiagnosisVerdict::UnexplainedScatter => {
+                let each: Vec<String> = self.scatter.iter().map(ExcessScatter::sentence).collect();
+                let causes = if self.causes.is_empty() {
+                    "no known cause explains this scatter".to_owned()
+                } else {
+                    let each = |c: &Cause| format!("{} (probability {})", c.sentence, sure(c.probability));
+                    let each: Vec<String> = self.causes.iter().map(each).collect();
+                    format!("the causes found do not explain this scatter: {}", each.join("; and "))
+                };
                 format!(
-                    "The data deviate from the simulation in a way that no known cause explains: the remaining residuals depend \
-                     on {left}.{partly}"
+                    "{}, and it goes with nothing that was recorded: either the stated noise is too small, or something else acts on \
+                     these modes; {causes}.",
+                    capitalised(&each.join("; "))
                 )
             }
             DiagnosisVerdict::Cause => {
@@ -159,6 +185,12 @@ impl Diagnosis {
     }
 }
 
+/// The text with a capital first letter.
+fn capitalised(text: &str) -> String {
+    let mut rest = text.chars();
+    rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
+}
+
 /// The gain in words: change of the error of the mode that improves most, and of the false alarms. `None` if no mode was measured
 /// in the rows held out.
 fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
@@ -171,13 +203,16 @@ fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
     let (before, after) = (rms.before[mode], rms.after[mode]);
     let with = if several { "With them" } else { "With it" };
     let moved = if after < before { "falls" } else { "rises" };
-    let alarms = &gain.false_alarms_per_1000;
+    let rows = match gain.method {
+        GainMethod::HeldOut => format!("on the {} rows held out", gain.holdout_rows),
+        GainMethod::CrossValidation => format!("in cross-validation over {} rows", gain.holdout_rows),
+    };
+    let alarms = gain.false_alarms_per_1000.as_ref().map_or_else(String::new, |alarms| {
+        let (before, after) = (alarms.before, alarms.after);
+        format!(", and the false alarms change from {before:.0} to {after:.0} per 1000 undamaged batches")
+    });
     Some(format!(
-        " {with} in the simulation, the prediction error of mode {} on the {} rows held out {moved} from {before:.2} % to \
-         {after:.2} %, and the false alarms change from {:.0} to {:.0} per 1000 undamaged batches.",
-        mode + 1,
-        gain.holdout_rows,
-        alarms.before,
-        alarms.after
+        " {with} in the simulation, the prediction error of mode {} {rows} {moved} from {before:.2} % to {after:.2} %{alarms}.",
+        mode + 1
     ))
 }

@@ -24,7 +24,8 @@ pub struct FittedEffect {
     pub target: Target,
     /// By how much, and with which covariate.
     pub law: Law,
-    /// The numbers ψ: those of the law, then the frequency of an oscillator.
+    /// The numbers ψ: those of the law, then the frequency of an oscillator; of a switched target those that it has besides the
+    /// switch.
     pub numbers: Vec<Number>,
 }
 
@@ -58,8 +59,13 @@ impl FittedEffect {
     pub fn sizes(&self, input: Input, psi: &[f64], sizes: &mut [f64], slopes: &mut [f64]) {
         match self.target {
             Target::ModeOrder(_) => {}
-            Target::Oscillator(_) => {
+            Target::Oscillator(_) | Target::ModeGain { .. } => {
                 sizes.copy_from_slice(psi);
+                slopes.fill(1.0);
+            }
+            _ if self.target.is_switch() => {
+                sizes[0] = f64::from(u8::from(self.law.acts(input)));
+                sizes[1..].copy_from_slice(psi);
                 slopes.fill(1.0);
             }
             _ => sizes[0] = self.law.size(input, psi, slopes),
@@ -69,7 +75,8 @@ impl FittedEffect {
     /// Index of the size that a number moves.
     pub(super) fn moved(&self, number: usize) -> usize {
         match self.target {
-            Target::Oscillator(_) => number,
+            Target::Oscillator(_) | Target::ModeGain { .. } => number,
+            _ if self.target.is_switch() => number + 1,
             _ => 0,
         }
     }

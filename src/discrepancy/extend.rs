@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::data::{Data, Values, TIME};
+use super::data::{Data, Origin, Values, TIME};
 use super::diagnosis::{DiagnosisVerdict, Outcome};
 use super::effect::FittedEffect;
 use super::fit::{Fit, Start};
@@ -67,11 +67,16 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
     let (mut added, mut left_out) = (Vec::new(), Vec::new());
     let mut effects: Vec<FittedEffect> = outcome.after.effects[..known].to_vec();
     let mut psi: Vec<Option<Vec<f64>>> = outcome.after.psi[..known].iter().cloned().map(Some).collect();
+    // A cause that is left out of the structure stays in the fit, because the numbers of the others would compensate for it.
+    let mut written = vec![true; known];
     for (place, ranked) in outcome.causes.iter().enumerate() {
         let sentence = &outcome.diagnosis.causes[place].sentence;
         let effect = &outcome.after.effects[known + place];
-        if let Some(why) = why_left_out(ranked, effect, outcome.maybe_damage[place]) {
+        if let Some(why) = why_left_out(data, ranked, effect, outcome.maybe_damage[place]) {
             left_out.push(format!("{sentence}: {why}"));
+            written.push(false);
+            psi.push(Some(outcome.after.psi[known + place].clone()));
+            effects.push(effect.clone());
         } else if effect.law.kind == LawKind::Lagged {
             let effect = without_lag(&bare, data, &outcome.training, ranked, effect);
             let law = effect.law.kind.name();
@@ -80,8 +85,10 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
             ));
             psi.push(Some(effect.numbers.iter().map(|n| n.prior_mean).collect()));
             effects.push(effect);
+            written.push(true);
         } else {
             added.push(sentence.clone());
+            written.push(true);
             psi.push(Some(outcome.after.psi[known + place].clone()));
             effects.push(effect.clone());
         }
@@ -93,27 +100,36 @@ pub fn extend(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Result<E
     let all: Vec<usize> = (0..data.rows()).collect();
     // The causes were chosen without the rows held out; their numbers may be fitted to all rows.
     let fit = study.fit(&all, &effects, Some(&Start { fit: &outcome.after, psi })).ok_or(Error::NoFit)?;
-    let definition = extended_definition(simulator, &bare, data, &fit, &added);
+    let definition = extended_definition(simulator, data, &fit, &written, &added);
     // Checks the whole structure: under an effect, the frequencies may not exist for some parameters.
     Simulator::new(definition.clone())?;
     Ok(Extended { definition, added, left_out })
 }
 
 /// Why a cause is not added to the structure; `None` if it is.
-fn why_left_out(ranked: &Ranked, effect: &FittedEffect, maybe_damage: bool) -> Option<&'static str> {
+fn why_left_out(data: &Data, ranked: &Ranked, effect: &FittedEffect, maybe_damage: bool) -> Option<&'static str> {
     if ranked.candidate.class == Class::PossibleDamage {
         return Some("it may be damage, which is not compensated");
     }
     if maybe_damage {
         return Some("these data cannot distinguish it from a stiffness that changes with time, which may be damage");
     }
-    if matches!(effect.target, Target::SettingOffset(_) | Target::SettingScale(_)) {
+    if matches!(effect.target, Target::ModeGain { .. }) || !effect.target.settings().is_empty() {
         return Some("settings are not part of the structure; correct them where they are entered");
     }
     if effect.law.kind == LawKind::Step || effect.law.covariate.as_deref() == Some(TIME) {
         return Some("a change with time cannot be recognised in one batch; define a new structure from that time on");
     }
-    None
+    let origin = effect.law.covariate.as_deref().and_then(|name| data.column(name)).map(|column| column.origin);
+    match origin {
+        Some(Origin::Setting) => {
+            Some("an effect of a structure file depends on a covariate, and this one depends on a setting")
+        }
+        Some(Origin::Product(..)) => {
+            Some("an effect of a structure file depends on one covariate, and this one on two")
+        }
+        _ => None,
+    }
 }
 
 /// A lagged effect in the best of its forms without a lag, at the mean of its prior.
@@ -129,24 +145,28 @@ fn without_lag(
     ranked.candidate.effect(simulator, data, rows, law, effect.law.with_level, 0.0)
 }
 
-/// The definition with the effects of a fit: first those of the structure, then those that were `added`.
+/// The definition with the effects of a fit that are to be `written`: first those of the structure, then those described by
+/// `added`.
 fn extended_definition(
     simulator: &Simulator,
-    bare: &Simulator,
     data: &Data,
     fit: &Fit,
+    written: &[bool],
     added: &[String],
 ) -> StructureDefinition {
+    let bare = simulator.without_effects();
+    let mut added = added.iter();
     let known = simulator.effects().len();
     let mut definition = simulator.definition().clone();
     definition.parent = Some(simulator.digest().to_string());
     let old = std::mem::take(&mut definition.effects);
-    for (place, effect) in fit.effects.iter().enumerate() {
-        let (name, description) = match place.checked_sub(known) {
-            None => (old[place].name.clone(), old[place].description.clone()),
-            Some(new) => (free_name(&definition, &old, place), Some(added[new].clone())),
+    for (place, effect) in fit.effects.iter().enumerate().filter(|(place, _)| written[*place]) {
+        let (name, description) = if place < known {
+            (old[place].name.clone(), old[place].description.clone())
+        } else {
+            (free_name(&definition, &old, place), added.next().cloned())
         };
-        let written = definition_of(bare, data, fit, place, name, description);
+        let written = definition_of(&bare, data, fit, place, name, description);
         let Some(mut written) = written else { continue };
         if let Some(before) = old.get(place) {
             written.seen.clone_from(&before.seen);

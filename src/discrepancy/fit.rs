@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::effect::FittedEffect;
+use super::outside::Outside;
 
 /// The posterior maximum of the model (see `model.rs`) for one set of effects.
 #[derive(Debug, Clone)]
@@ -27,6 +28,10 @@ pub struct Fit {
     pub log_likelihood: f64,
     /// ln ∫ p(y) by Laplace's method, nats.
     pub log_evidence: f64,
+    /// Posterior standard deviation of ln s of each mode, `[m]`.
+    pub noise_factor_ln_std: Vec<f64>,
+    /// Settings outside their priors.
+    pub outside: Outside,
     /// Number of unknowns: means, ψ, spreads and noise factors.
     pub unknowns: usize,
 }

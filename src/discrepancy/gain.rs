@@ -7,6 +7,7 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
+use super::blocks::Blocks;
 use super::fit::Fit;
 use super::model::RowView;
 use super::study::Study;
@@ -19,9 +20,8 @@ const BATCH: usize = 10;
 /// Share of undamaged batches that may raise an alarm.
 const ALARM_RATE: f64 = 0.001;
 
-/// Number of bootstrap samples, and of the blocks of successive rows that they are drawn from.
+/// Number of bootstrap samples.
 const BOOTSTRAPS: usize = 500;
-const BLOCKS: usize = 20;
 
 /// A figure without and with the causes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -45,10 +45,25 @@ pub struct DensityChange {
     pub standard_error: f64,
 }
 
-/// Figures without and with the causes, on rows held out.
+/// How a gain was measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum GainMethod {
+    /// On rows that were used neither to choose nor to fit the causes.
+    #[default]
+    HeldOut,
+    /// By cross-validation: each block of rows is predicted by a fit to the others. The causes were chosen with all rows, so that
+    /// the gain is measured a little too large.
+    CrossValidation,
+}
+
+/// Figures without and with the causes, on rows that were not used to fit them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Gain {
-    /// Number of rows held out.
+    /// How it was measured.
+    #[serde(default)]
+    pub method: GainMethod,
+    /// Number of rows that it was measured on.
     pub holdout_rows: usize,
     /// Root mean square of the residual ln y − M of each mode, per cent.
     pub rms_error_percent: Change<Vec<f64>>,
@@ -61,11 +76,11 @@ pub struct Gain {
     /// Standard deviation of each parameter between batches of ten rows, per cent of the stiffness that it sets.
     pub spread_of_parameters_percent: Change<BTreeMap<String, f64>>,
     /// Batches of ten rows held out, assumed undamaged, that exceed a control limit for 1 false alarm in 1000; the limit is set
-    /// from the first quarter of the other rows as the reference.
-    pub false_alarms_per_1000: Change<f64>,
+    /// from the first quarter of the other rows as the reference. `null` for fewer than 20 rows.
+    pub false_alarms_per_1000: Option<Change<f64>>,
     /// Smallest loss of the stiffness that is identified worst which one batch of ten rows detects with a probability of 90 %, at
-    /// a limit that 999 of 1000 undamaged batches do not exceed.
-    pub smallest_detectable_loss_percent: Change<f64>,
+    /// a limit that 999 of 1000 undamaged batches do not exceed. `null` for fewer than 20 rows.
+    pub smallest_detectable_loss_percent: Option<Change<f64>>,
 }
 
 /// The figures of one fit.
@@ -79,42 +94,55 @@ struct FitFigures {
     errors: Vec<Vec<f64>>,
 }
 
-/// The gain of the fit `after` over the fit `before` on the rows with the indices `holdout`; the scatter over the rows `training`
-/// sets the alarm limits.
+/// What a gain is measured on.
+pub(super) enum Unseen<'a> {
+    /// These rows are held out of the search and of the fits.
+    HeldOut(&'a [usize]),
+    /// Each row that was searched is predicted by fits without its block.
+    LeftOut(&'a Blocks),
+}
+
+/// The gain of the fit `after` over the fit `before`, both to the rows `training`, whose scatter sets the alarm limits.
 ///
-/// The standard error of the difference in log density is that of the mean over blocks of successive rows, and the intervals of
-/// the errors come from a bootstrap over the same blocks, because successive rows are correlated. `None` if the
-/// frequencies cannot be computed in some row.
-pub fn gain(
+/// The standard error of the difference in log density is that of the mean over blocks of rows, and the intervals of the errors
+/// come from a bootstrap over the same blocks, because successive rows are correlated. With rows left out, the causes are chosen
+/// with all rows and only their numbers are fitted without the block. `None` if the frequencies cannot be computed in some row.
+pub(super) fn gain(
     study: &Study<'_>,
     training: &[usize],
-    holdout: &[usize],
-    before: &Fit,
-    after: &Fit,
+    unseen: &Unseen<'_>,
+    (before, after): (&Fit, &Fit),
     seed: u64,
 ) -> Option<Gain> {
-    let (a, b) = (figures_of(study, training, holdout, before)?, figures_of(study, training, holdout, after)?);
-    let n = holdout.len();
+    let of = |fit: &Fit| {
+        let views = match unseen {
+            Unseen::HeldOut(rows) => study.view(rows, fit)?,
+            Unseen::LeftOut(blocks) => blocks.predicted(study, training, fit)?,
+        };
+        figures_of(study, training, &views, fit)
+    };
+    let (a, b) = (of(before)?, of(after)?);
+    let n = a.densities.len();
+    let successive = Blocks::successive(n);
+    let (blocks, method) = match unseen {
+        Unseen::HeldOut(_) => (&successive, GainMethod::HeldOut),
+        Unseen::LeftOut(blocks) => (*blocks, GainMethod::CrossValidation),
+    };
     let differences: Vec<f64> = b.densities.iter().zip(&a.densities).map(|(b, a)| b - a).collect();
     let mean = stats::mean(&differences);
-    let block = |place: usize| place * BLOCKS / n;
-    let sums = (0..BLOCKS).map(|k| {
-        let of = differences.iter().enumerate().filter(|(p, _)| block(*p) == k).map(|(_, d)| d - mean);
-        of.sum::<f64>().powi(2)
-    });
-    let standard_error = sums.sum::<f64>().sqrt() / n as f64;
 
     let mut stream = stats::stream(seed, "bootstrap of the gain");
     let modes = a.rms.len();
+    let places: Vec<Vec<usize>> = (0..blocks.count()).map(|block| blocks.places(block).collect()).collect();
     let mut draws: Vec<Vec<f64>> = vec![Vec::new(); modes];
     for _ in 0..BOOTSTRAPS {
-        let chosen: Vec<usize> = (0..BLOCKS).map(|_| stream.random_range(0..BLOCKS)).collect();
+        let chosen: Vec<usize> = places.iter().map(|_| stream.random_range(0..places.len())).collect();
         for (mode, draws) in draws.iter_mut().enumerate() {
             let rms = |errors: &[Vec<f64>]| {
                 let (mut sum, mut count) = (0.0, 0.0);
-                for k in &chosen {
-                    let places = (k * n).div_ceil(BLOCKS)..((k + 1) * n).div_ceil(BLOCKS).min(n);
-                    for error in errors[places].iter().map(|e| e[mode]).filter(|e| e.is_finite()) {
+                for place in chosen.iter().flat_map(|block| &places[*block]) {
+                    let error = errors[*place][mode];
+                    if error.is_finite() {
                         sum += error * error;
                         count += 1.0;
                     }
@@ -125,7 +153,9 @@ pub fn gain(
         }
     }
     let interval = |d: &Vec<f64>| [stats::quantile(d, 0.05), stats::quantile(d, 0.95)];
+    let enough = n >= 2 * BATCH;
     Some(Gain {
+        method,
         holdout_rows: n,
         rms_error_percent: Change { before: a.rms, after: b.rms },
         rms_difference_interval90: draws.iter().map(interval).collect(),
@@ -133,18 +163,17 @@ pub fn gain(
             before: stats::mean(&a.densities),
             after: stats::mean(&b.densities),
             difference: mean,
-            standard_error,
+            standard_error: blocks.standard_error(&differences, mean),
         },
         coverage90: Change { before: a.coverage, after: b.coverage },
         spread_of_parameters_percent: Change { before: a.spread, after: b.spread },
-        false_alarms_per_1000: Change { before: a.false_alarms, after: b.false_alarms },
-        smallest_detectable_loss_percent: Change { before: a.detectable, after: b.detectable },
+        false_alarms_per_1000: enough.then_some(Change { before: a.false_alarms, after: b.false_alarms }),
+        smallest_detectable_loss_percent: enough.then_some(Change { before: a.detectable, after: b.detectable }),
     })
 }
 
-/// The figures of one fit on the rows `holdout`, with alarm limits from the rows `training`.
-fn figures_of(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fit) -> Option<FitFigures> {
-    let views = study.view(holdout, fit)?;
+/// The figures of one fit for rows that it has not seen, `views`, with alarm limits from the rows `training`.
+fn figures_of(study: &Study<'_>, training: &[usize], views: &[RowView], fit: &Fit) -> Option<FitFigures> {
     let modes = study.simulator.modes();
     let error = |view: &RowView| {
         let mut errors = vec![f64::NAN; modes];
@@ -171,7 +200,7 @@ fn figures_of(study: &Study<'_>, training: &[usize], holdout: &[usize], fit: &Fi
     let coverage = views.iter().map(inside).sum::<usize>() as f64 / cells.max(1) as f64;
 
     let space = study.simulator.space().as_slice();
-    let shifts = shifts(study, &views);
+    let shifts = shifts(study, views);
     let training_views = study.view(training, fit)?;
     let training_shifts = self::shifts(study, &training_views);
     let level = ALARM_RATE / study.free().len().max(1) as f64;

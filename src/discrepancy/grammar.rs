@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-use super::data::{Column, Data, Values, MOST_LEVELS, TIME};
+use super::data::{Column, Data, Origin, Values, MOST_LEVELS, TIME};
 use super::effect::{FittedEffect, Number};
+use super::setting_candidates::{beyond_prior, gain_numbers, setting_targets, sum_of_ends};
 use crate::physics::effect::Target;
 use crate::physics::{Form, Node, Spring, Structure};
 use crate::simulator::law::{Law, LawKind};
@@ -68,10 +69,7 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             all.push(Candidate { target: target.clone(), covariate, level, class, of, weight });
         };
         add(None, None);
-        if matches!(target, Target::Oscillator(_) | Target::ModeOrder(_)) {
-            continue;
-        }
-        for column in &data.columns {
+        for column in data.columns.iter().filter(|column| can_depend(&target, column)) {
             match &column.values {
                 Values::Numbers(_) => {
                     if spread(column, rows) > 0.0 {
@@ -88,7 +86,7 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
                     for level in used.iter().skip(skipped) {
                         add(Some(&column.name), Some(&names[*level]));
                     }
-                    if used.len() > 2 {
+                    if used.len() > 2 && !target.is_switch() {
                         add(Some(&column.name), None);
                     }
                 }
@@ -106,24 +104,48 @@ fn is_category(data: &Data, covariate: Option<&str>) -> bool {
     covariate.and_then(|c| data.column(c)).is_some_and(|c| matches!(c.values, Values::Categories(..)))
 }
 
+/// Whether a target can depend on a column. Oscillators and orders of modes are constant; corrections of settings differ between
+/// categories or change at a time, and a correction that depended on the setting would be another correction.
+fn can_depend(target: &Target, column: &Column) -> bool {
+    let measured = matches!(column.origin, Origin::Covariate | Origin::Time);
+    let category = matches!(column.values, Values::Categories(..));
+    match target {
+        Target::Oscillator(_) | Target::ModeOrder(_) | Target::ModeGain { .. } | Target::InMode(..) => false,
+        target if target.is_switch() => category || column.origin == Origin::Time,
+        Target::FrequencyOffset(_) => measured,
+        target => measured || target.settings().is_empty(),
+    }
+}
+
+/// Standard deviations of the two factors of a product, in their units; 1 for any other column.
+fn factor_widths(data: &Data, rows: &[usize], column: Option<&Column>) -> (f64, f64) {
+    let Some(Origin::Product(first, second)) = column.map(|column| column.origin) else { return (1.0, 1.0) };
+    let width = |index: usize| spread(&data.columns[index], rows).max(f64::MIN_POSITIVE);
+    (width(first), width(second))
+}
+
 /// Every target that could change.
 fn targets(simulator: &Simulator, data: &Data) -> Vec<Target> {
     let modes = simulator.modes();
     let mut targets = simulator.structure().map_or_else(Vec::new, |structure| part_targets(simulator, structure));
     if simulator.table().is_some() {
         // An emulator has no springs: the parameters represent their stiffness.
-        let shares = simulator.space().iter().enumerate().filter(|(_, parameter)| parameter.has_share());
-        targets.extend(shares.map(|(column, _)| Target::ParameterScale(column)));
+        // A parameter that is set in every row has targets of its own.
+        let free = |column: &usize| data.settings.iter().any(|row| row[*column].is_none());
+        targets.extend((0..simulator.space().len()).filter(free).map(|column| {
+            let share = simulator.space().as_slice()[column].has_share();
+            if share {
+                Target::ParameterScale(column)
+            } else {
+                Target::ParameterOffset(column)
+            }
+        }));
     }
     targets.extend([Target::FrequencyScale(None), Target::FrequencyOffset(None)]);
     if modes > 1 {
         targets.extend((0..modes).flat_map(|m| [Target::FrequencyScale(Some(m)), Target::FrequencyOffset(Some(m))]));
     }
-    for column in 0..simulator.space().len() {
-        if data.settings.iter().any(|row| row[column].is_some()) {
-            targets.extend([Target::SettingOffset(column), Target::SettingScale(column)]);
-        }
-    }
+    targets.extend(setting_targets(simulator, data));
     if let Some(structure) = simulator.structure() {
         targets.extend(missing_springs(structure).into_iter().map(|(from, to)| Target::AddedSpring(from, to)));
         targets.extend(structure.attachment_points().iter().map(|point| Target::Oscillator(point.dof)));
@@ -205,12 +227,14 @@ fn missing_springs(structure: &Structure) -> Vec<(Node, Node)> {
 fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Class, f64) {
     let time = covariate == Some(TIME);
     match target {
-        Target::Springs(_) | Target::ParameterScale(_) | Target::AddedSpring(..) => match covariate {
-            _ if time => (Class::PossibleDamage, 1.0),
-            Some(_) if category => (Class::SetUp, 0.5),
-            Some(_) => (Class::Environment, if matches!(target, Target::AddedSpring(..)) { 0.3 } else { 1.0 }),
-            None => (Class::Structure, 0.5),
-        },
+        Target::Springs(_) | Target::ParameterScale(_) | Target::ParameterOffset(_) | Target::AddedSpring(..) => {
+            match covariate {
+                _ if time => (Class::PossibleDamage, 1.0),
+                Some(_) if category => (Class::SetUp, 0.5),
+                Some(_) => (Class::Environment, if matches!(target, Target::AddedSpring(..)) { 0.3 } else { 1.0 }),
+                None => (Class::Structure, 0.5),
+            }
+        }
         Target::Masses(_) => match covariate {
             _ if time => (Class::Structure, 0.4),
             Some(_) if category => (Class::SetUp, 0.5),
@@ -221,11 +245,13 @@ fn plausibility(target: &Target, covariate: Option<&str>, category: bool) -> (Cl
             let one = if mode.is_some() { 0.2 } else { 1.0 };
             (Class::Instrument, if category || covariate.is_none() || time { one } else { 0.4 * one })
         }
-        Target::SettingOffset(_) | Target::SettingScale(_) => {
+        Target::InMode(..) => (Class::SetUp, 0.1),
+        Target::ModeGain { .. } => (Class::Structure, 0.5),
+        target if !target.settings().is_empty() => {
             (Class::SetUp, if category || covariate.is_none() { 1.0 } else { 0.3 })
         }
         Target::Oscillator(_) => (Class::Structure, 0.4),
-        Target::ModeOrder(_) => (Class::SetUp, 0.5),
+        _ => (Class::SetUp, 0.5),
     }
 }
 
@@ -265,8 +291,14 @@ impl Candidate {
         if is_category(data, Some(name)) {
             return vec![LawKind::Category];
         }
-        if name == TIME {
-            return vec![LawKind::Step, LawKind::Linear];
+        if self.target.is_switch() {
+            return vec![LawKind::Step];
+        }
+        match data.column(name).map(|column| column.origin) {
+            Some(Origin::Time) => return vec![LawKind::Step, LawKind::Linear],
+            Some(Origin::Setting) => return vec![LawKind::Linear, LawKind::Quadratic],
+            Some(Origin::Product(..)) => return vec![LawKind::Product],
+            _ => {}
         }
         vec![LawKind::Linear, LawKind::Quadratic, LawKind::Bilinear, LawKind::Exponential, LawKind::Lagged]
     }
@@ -296,7 +328,7 @@ impl Candidate {
         step_days: f64,
     ) -> FittedEffect {
         let column = self.covariate.as_deref().and_then(|c| data.column(c));
-        let size = self.typical_size(simulator);
+        let size = self.typical_size(simulator).max(beyond_prior(simulator, data, rows, &self.target));
         let mut levels = Vec::new();
         let mut reference = if kind == LawKind::Step { step_days } else { 0.0 };
         let mut width = 1.0;
@@ -321,10 +353,14 @@ impl Candidate {
         let law = Law { kind, covariate: self.covariate.clone(), reference, with_level, levels };
         let span = data.times_days.last().copied().unwrap_or(0.0).max(1e-6);
         let free = (f64::NEG_INFINITY, f64::INFINITY);
+        let factors = factor_widths(data, rows, column);
         let number = |name: String| {
             let (prior_mean, prior_std, bounds) = match name.as_str() {
+                "slope_per_unit" if kind == LawKind::Product => (0.0, size / (2.0 * factors.0), free),
                 "slope_per_unit" => (0.0, size / (2.0 * width), free),
                 "slope_below_per_unit" | "slope_above_per_unit" => (0.0, size / width, free),
+                "second_slope_per_unit" => (0.0, size / (2.0 * factors.1), free),
+                "product_per_unit2" => (0.0, size / (4.0 * factors.0 * factors.1), free),
                 "curvature_per_unit2" => (0.0, size / (2.0 * width).powi(2), free),
                 "rate_per_unit" => (0.0, 1.0 / width, (-4.0 / width, 4.0 / width)),
                 "knee" => (middle, width, range),
@@ -335,6 +371,8 @@ impl Candidate {
         };
         let mut numbers: Vec<Number> = match &self.target {
             Target::ModeOrder(_) => Vec::new(),
+            Target::ModeGain { .. } => gain_numbers(),
+            target if target.is_switch() => sum_of_ends(simulator, target, size).into_iter().collect(),
             _ => law.numbers().into_iter().map(number).collect(),
         };
         if let Target::Oscillator(_) = self.target {
@@ -354,7 +392,8 @@ impl Candidate {
             Target::FrequencyScale(_) => 0.01,
             Target::FrequencyOffset(None) => 0.01 * simulator.nominal_frequencies_hz()[0],
             Target::FrequencyOffset(Some(mode)) => 0.01 * simulator.nominal_frequencies_hz()[*mode],
-            Target::SettingOffset(column) => {
+            Target::InMode(_, target) => Self { target: (**target).clone(), ..self.clone() }.typical_size(simulator),
+            Target::ParameterOffset(column) | Target::SettingOffset(column) | Target::SettingMirror(column) => {
                 let p = &simulator.space().as_slice()[*column];
                 0.1 * (p.upper - p.lower)
             }
@@ -368,7 +407,10 @@ impl Candidate {
                 0.15 * if mean > 0.0 { mean } else { kg * lowest.powi(2) }
             }
             Target::Oscillator(host) => 0.05 * simulator.structure().map_or(1.0, |s| s.kg_at(*host)),
-            Target::ModeOrder(_) => 1.0,
+            Target::ModeOrder(_)
+            | Target::SettingUnit { .. }
+            | Target::SettingExchange(..)
+            | Target::ModeGain { .. } => 1.0,
         }
     }
 }

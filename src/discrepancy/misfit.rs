@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ChiSquared, ContinuousCDF as _, FisherSnedecor};
 
-use super::data::{Data, Values, TIME};
+use super::data::{Data, Origin, Values, TIME};
 use super::fit::Fit;
 use super::model::RowView;
 use super::screen::Whitened;
@@ -26,7 +26,7 @@ pub struct Misfit {
     pub covariate: Option<String>,
     /// Effect range (5–95 %) of the fitted curve, per cent of the frequency or stiffness; of a constant, its mean.
     pub size_percent: f64,
-    /// Probability of at least this deviation by chance, times the number of tests (Bonferroni), at most 1.
+    /// Probability of at least this deviation by chance, corrected for the number of tests (Holm), at most 1.
     pub p_value: f64,
 }
 
@@ -77,12 +77,22 @@ pub fn misfits(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<Misfi
             found.push(Misfit { mode: Some(*mode), parameter: None, covariate: None, size_percent, p_value: p });
         }
     }
-    let tests = found.len() as f64;
-    for misfit in &mut found {
-        misfit.p_value = (misfit.p_value * tests).min(1.0);
-    }
     found.sort_by(|a, b| a.p_value.total_cmp(&b.p_value).then(b.size_percent.abs().total_cmp(&a.size_percent.abs())));
+    correct_for_tests(&mut found);
     Some(found)
+}
+
+/// Holm's correction of ascending p-values for their number: the i-th of n, from 0, is multiplied by n − i, and none is smaller than
+/// the one before it.
+///
+/// Source: Holm (1979), Scand. J. Statist. 6.
+fn correct_for_tests(sorted: &mut [Misfit]) {
+    let tests = sorted.len();
+    let mut least: f64 = 0.0;
+    for (index, misfit) in sorted.iter_mut().enumerate() {
+        least = least.max((misfit.p_value * (tests - index) as f64).min(1.0));
+        misfit.p_value = least;
+    }
 }
 
 /// Regressors of a covariate in addition to the constant, `[q][rows]`: the standardised covariate u and u², or an indicator of
@@ -258,7 +268,8 @@ fn functions(data: &Data, rows: &[usize]) -> Vec<CovariateFunction> {
     let mut numeric: Vec<(String, Vec<f64>)> = Vec::new();
     let mut categories: Vec<(String, String, Vec<f64>)> = Vec::new();
     let mut found: Vec<CovariateFunction> = Vec::new();
-    for column in &data.columns {
+    // The products are formed below, from all pairs of columns.
+    for column in data.columns.iter().filter(|column| !matches!(column.origin, Origin::Product(..))) {
         match &column.values {
             Values::Numbers(values) => {
                 let unit = standardised(&rows.iter().map(|r| values[*r]).collect::<Vec<f64>>());

@@ -8,7 +8,9 @@
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
-//! - [`misfit`]: deviations before and after; [`gain`]: errors before and after on rows held out;
+//! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
+//! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated;
+//! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`);
 //! - [`diagnosis`]: the result; [`describe`], `naming`, `discriminate` and `notes`: its text; [`report`]: the HTML page;
 //! - [`extend`]: a new version of the structure with the causes as effects.
 //!
@@ -28,6 +30,8 @@
 //! The frequencies cannot be computed where the structure is a mechanism, or where an effect leaves less than 2 % of a stiffness,
 //! mass or frequency. A fit that needs them there returns `None`.
 
+mod blocks;
+mod corrected;
 pub mod data;
 pub mod describe;
 pub mod diagnosis;
@@ -42,35 +46,50 @@ pub mod misfit;
 pub mod model;
 mod naming;
 mod notes;
+pub mod outside;
 mod problem;
 pub mod progress;
 pub mod rank;
 pub mod report;
 pub mod response;
 mod row;
+pub mod scatter;
 pub mod screen;
 pub mod select;
+mod setting_candidates;
+mod setting_starts;
 pub mod study;
+pub mod target_name;
 
 pub use diagnosis::{Alternative, Diagnosis, DiagnosisVerdict, Outcome};
 pub use holdout::Holdout;
 pub use progress::{Progress, Step};
 
 use crate::simulator::Simulator;
+use blocks::Blocks;
 use data::Data;
 use effect::FittedEffect;
+use gain::Unseen;
 use grammar::candidates;
-use misfit::{misfits, remainder, Remainder};
+use misfit::{misfits, remainder};
 use naming::{name, Named};
+use outside::outside_settings;
+use scatter::excess_scatter;
 use select::select;
 use study::Study;
 
 /// Smallest number of rows that a verdict can be based on.
-const FEWEST_ROWS: usize = 30;
+const FEWEST_ROWS: usize = 8;
 
-/// A remainder is reported if its p-value lies below this, without and with causes.
+/// Smallest number of rows that must remain for the search if others are held out; with fewer, none are held out, and the gain is
+/// measured by cross-validation.
+const FEWEST_BESIDE_HOLDOUT: usize = 30;
+
+/// Share of the rows that may have a setting outside its prior after all corrections without changing the verdict.
+const FEW_OUTSIDE: f64 = 0.05;
+
+/// A remainder is reported if its p-value lies below this.
 const REMAINDER: f64 = 1e-3;
-const REMAINDER_WITH_CAUSES: f64 = 1e-4;
 
 /// A misfit is reported if its p-value lies below this.
 const MISFIT_SHOWN: f64 = 0.01;
@@ -79,14 +98,10 @@ const MISFIT_SHOWN: f64 = 0.01;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// Too few rows.
-    #[error(
-        "{rows} measurements remain for the search for causes ({held_out} are held out): a verdict needs at least {FEWEST_ROWS}"
-    )]
+    #[error("{rows} measurements: a diagnosis needs at least {FEWEST_ROWS}")]
     TooFew {
-        /// Rows left for the search.
+        /// Number of rows.
         rows: usize,
-        /// Rows held out.
-        held_out: usize,
     },
     /// The rows to hold out are not in the data.
     #[error("the hold-out {0}")]
@@ -106,8 +121,10 @@ pub enum Error {
 /// [`rank::rank`] for the probabilities). The seed only affects the bootstrap intervals of the gain. `progress` is called at
 /// each step.
 ///
+/// If fewer than 30 rows would remain beside those held out, all rows are searched and the gain is measured by cross-validation.
+///
 /// # Errors
-/// Fewer than 30 rows to search; a hold-out that names a column or category that the data do not have; natural frequencies
+/// Fewer than 8 rows; a hold-out that names a column or category that the data do not have; natural frequencies
 /// that cannot be computed near the best fit; threads that cannot be started.
 ///
 /// # Example
@@ -170,9 +187,12 @@ pub fn diagnose(
     seed: u64,
     progress: &Progress<'_>,
 ) -> Result<Outcome, Error> {
-    let (training, held) = holdout.split(data).map_err(Error::Holdout)?;
-    if training.len() < FEWEST_ROWS {
-        return Err(Error::TooFew { rows: training.len(), held_out: held.len() });
+    let (mut training, mut held) = holdout.split(data).map_err(Error::Holdout)?;
+    if data.rows() < FEWEST_ROWS {
+        return Err(Error::TooFew { rows: data.rows() });
+    }
+    if training.len() < FEWEST_BESIDE_HOLDOUT {
+        (training, held) = ((0..data.rows()).collect(), Vec::new());
     }
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
@@ -198,25 +218,31 @@ fn run(
     misfit.retain(|m| m.p_value < MISFIT_SHOWN);
     let share = selection.independent_share;
     let left = remainder(&study, &training, &selection.fit, share).ok_or(Error::NoFit)?;
-    let found = !selection.slots.is_empty();
-    let limit = if found { REMAINDER_WITH_CAUSES } else { REMAINDER };
-    let left = left.filter(|r| r.p_value < limit);
+    let left = left.filter(|r| r.p_value < REMAINDER);
+    let measured = |mode: usize| training.iter().any(|row| data.log_frequencies[*row][mode].is_finite());
+    let scatter = excess_scatter(&selection.fit, measured);
+    let corrected = study.corrected_settings(&training, &selection.fit);
+    let settings_outside =
+        if corrected.is_empty() { Vec::new() } else { outside_settings(simulator, data, &training, &corrected) };
+    let many_outside = selection.fit.outside.rows as f64 > FEW_OUTSIDE * training.len() as f64;
 
     let Named { causes, alternatives, ambiguous, maybe_damage } = name(simulator, data, &selection, known.len());
     progress(Step::Measuring);
-    let gain = if found && holdout.len() >= 2 {
-        gain::gain(&study, &training, &holdout, &selection.base, &selection.fit, seed)
-    } else {
-        None
-    };
+    let found = !selection.slots.is_empty();
+    let blocks = Blocks::new(data, &training);
+    let unseen = if holdout.len() >= 2 { Unseen::HeldOut(&holdout) } else { Unseen::LeftOut(&blocks) };
+    let fits = (&selection.base, &selection.fit);
+    let gain = if found { gain::gain(&study, &training, &unseen, fits, seed) } else { None };
     let mut notes = notes::notes(simulator, data, &training, &selection.fit, share);
     if found && gain.is_none() {
-        notes.push(why_no_gain(holdout.len()).to_owned());
+        notes.push(NO_GAIN.to_owned());
     }
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
-        verdict: verdict(selection.slots.len(), ambiguous, left.as_ref()),
+        verdict: verdict(selection.slots.len(), ambiguous, left.is_some() || many_outside, !scatter.is_empty()),
         summary: String::new(),
+        settings_outside,
+        scatter,
         misfit,
         causes,
         alternatives,
@@ -244,10 +270,12 @@ fn run(
     })
 }
 
-/// The verdict for a number of causes, whether one of them is ambiguous, and a deviation that they do not explain.
-fn verdict(causes: usize, ambiguous: bool, remainder: Option<&Remainder>) -> DiagnosisVerdict {
+/// The verdict for a number of causes, whether one of them is ambiguous, whether a deviation remains that they do not explain,
+/// and whether the rows scatter more than noise and spread explain.
+fn verdict(causes: usize, ambiguous: bool, remainder: bool, scatter: bool) -> DiagnosisVerdict {
     match causes {
-        _ if remainder.is_some() => DiagnosisVerdict::NoneOfThese,
+        _ if remainder => DiagnosisVerdict::NoneOfThese,
+        _ if scatter => DiagnosisVerdict::UnexplainedScatter,
         0 => DiagnosisVerdict::NothingFound,
         1 if ambiguous => DiagnosisVerdict::Ambiguous,
         1 => DiagnosisVerdict::Cause,
@@ -256,11 +284,5 @@ fn verdict(causes: usize, ambiguous: bool, remainder: Option<&Remainder>) -> Dia
 }
 
 /// The note that says why the gain was not measured.
-fn why_no_gain(held_out: usize) -> &'static str {
-    if held_out < 2 {
-        "no rows are held out: the gain is not measured"
-    } else {
-        "the causes cannot be extrapolated to the rows held out, because at their covariates a stiffness or mass would not be positive: \
-         the gain is not measured"
-    }
-}
+const NO_GAIN: &str = "the causes cannot be extrapolated to the rows they were not fitted to, because at their covariates a stiffness or mass \
+                       would not be positive: the gain is not measured";

@@ -113,6 +113,12 @@ impl Study<'_> {
         Some((point?, tails))
     }
 
+    /// The parameters of each row after the corrections of its settings under a fit, `[rows][d]`; empty if nothing was set.
+    pub fn corrected_settings(&self, rows: &[usize], fit: &Fit) -> Vec<Vec<f64>> {
+        let problem = Problem::new(self, rows, &fit.effects);
+        problem.corrected_settings(&fit.mean, &problem.sizes(&fit.psi).values)
+    }
+
     /// Residual, covariance and density of each of the rows with the indices `rows` under a fit, `[rows]`; `None` if the
     /// frequencies cannot be computed there.
     pub fn view(&self, rows: &[usize], fit: &Fit) -> Option<Vec<RowView>> {

@@ -1,6 +1,6 @@
 //! Properties of the data that limit what a diagnosis can find.
 
-use super::data::{Column, Data, Values, MOST_LEVELS};
+use super::data::{Column, Data, Origin, Values, MOST_LEVELS};
 use super::fit::Fit;
 use super::grammar::spread;
 use crate::simulator::Simulator;
@@ -8,9 +8,6 @@ use crate::stats;
 
 /// Two covariates whose correlation exceeds this cannot be distinguished.
 const COLLINEAR: f64 = 0.98;
-
-/// Noise factor above which a mode scatters more than stated.
-const NOISY: f64 = 2.0;
 
 /// Share of independent rows below which the correlation in time is reported.
 const CORRELATED: f64 = 0.9;
@@ -29,7 +26,7 @@ pub(super) fn notes(
 ) -> Vec<String> {
     let mut notes = modes_seldom_measured(simulator, data, rows);
     let mut numeric: Vec<(&str, Vec<f64>)> = Vec::new();
-    for column in &data.columns {
+    for column in data.columns.iter().filter(|column| !matches!(column.origin, Origin::Product(..))) {
         match &column.values {
             Values::Numbers(values) => {
                 let Some(filled) = filled(column, values, rows, &mut notes) else { continue };
@@ -48,16 +45,7 @@ pub(super) fn notes(
             Values::Categories(names, indices) => notes.extend(unusable_categories(&column.name, names, indices, rows)),
         }
     }
-    notes.extend(outside_priors(simulator, data, rows, fit));
-    for (mode, factor) in fit.noise_factor.iter().enumerate() {
-        if *factor > NOISY {
-            notes.push(format!(
-                "mode {} scatters {factor:.1} times as much as its stated noise, beyond the scatter that the spread of the \
-                 parameters explains",
-                mode + 1
-            ));
-        }
-    }
+    notes.extend(outside_priors(simulator, fit));
     if independent_share < CORRELATED {
         notes.push(format!(
             "residuals of successive rows are correlated: the rows carry as much information as {:.0} % of their number would if \
@@ -123,16 +111,9 @@ fn unusable_categories(name: &str, names: &[String], indices: &[Option<usize>], 
     }
 }
 
-/// Notes on settings and estimated parameters outside their priors.
-fn outside_priors(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit) -> Vec<String> {
+/// Notes on estimated parameters outside their priors.
+fn outside_priors(simulator: &Simulator, fit: &Fit) -> Vec<String> {
     let mut notes = Vec::new();
-    for (k, p) in simulator.space().iter().enumerate() {
-        let set = rows.iter().filter_map(|r| data.settings[*r][k]);
-        let outside = set.filter(|v| !p.prior().contains(v)).count();
-        if outside > 0 {
-            notes.push(format!("{outside} settings of {} lie outside its prior, {} to {}", p.name, p.lower, p.upper));
-        }
-    }
     for &k in &fit.free {
         let p = &simulator.space().as_slice()[k];
         if !p.prior().contains(&fit.mean[k]) {

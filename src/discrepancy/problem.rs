@@ -2,9 +2,11 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::corrected::corrected_responses;
 use super::data::Data;
 use super::effect::{FittedEffect, Number};
 use super::fit::{Fit, Start};
+use super::outside::{corrected_settings, outside};
 use super::response::Responses;
 use super::row::{Density, RowSums};
 use super::study::Study;
@@ -15,6 +17,12 @@ use crate::simulator::law::Input;
 /// standard deviation of its logarithm.
 const SPREAD_SHARE: f64 = 0.02;
 const SPREAD_LN_STD: f64 = 1.5;
+
+/// With fewer rows than this, the second derivatives of the log posterior replace their expectation in Laplace's approximation.
+const FEW_ROWS: usize = 40;
+
+/// Step of the differences that give the second derivatives, in posterior standard deviations.
+const DIFFERENCE: f64 = 0.02;
 
 /// Prior standard deviation of the logarithm of a noise factor.
 const NOISE_LN_STD: f64 = 0.7;
@@ -209,6 +217,15 @@ impl<'a> Problem<'a> {
         Sizes { values, slopes, moved }
     }
 
+    /// The parameters of each row after the corrections of its settings, `[rows][d]`; empty if nothing was set.
+    pub(super) fn corrected_settings(&self, mean: &[f64], sizes: &DMatrix<f64>) -> Vec<Vec<f64>> {
+        if self.study.limits.iter().all(Option::is_none) {
+            return Vec::new();
+        }
+        let targets: Vec<Target> = self.effects.iter().map(|e| e.target.clone()).collect();
+        corrected_settings(self.study.data, self.rows, mean, &targets, sizes)
+    }
+
     /// Responses of all rows under the effects and `further` targets; `sizes`: `[sizes, rows]`. `None` if the frequencies
     /// cannot be computed in some row.
     pub(super) fn responses(&self, mean: &[f64], sizes: &DMatrix<f64>, further: &[Target]) -> Option<Responses> {
@@ -216,7 +233,7 @@ impl<'a> Problem<'a> {
         let settings = &self.study.data.settings;
         let set = |k: usize, place: usize| settings[self.rows[place]][k].unwrap_or(mean[k]);
         let theta = DMatrix::from_fn(mean.len(), self.rows.len(), set);
-        Responses::new(self.study.simulator, &targets, &theta, sizes)
+        corrected_responses(self.study.simulator, &targets, &theta, sizes, &self.study.limits)
     }
 
     /// Value, gradient and information at a point; `None` if the frequencies cannot be computed in some row.
@@ -304,10 +321,38 @@ impl<'a> Problem<'a> {
         Some(ScoringStep { promised_nats: 0.5 * by.dot(&gradient), by })
     }
 
+    /// The information at a maximum for Laplace's approximation: the expected information, or for few rows minus the second
+    /// derivatives of the log posterior, by central differences of its gradient, which differ from their expectation there.
+    fn information(&self, point: &Point, tails: f64) -> Option<DMatrix<f64>> {
+        let expected = &point.information;
+        if self.rows.len() >= FEW_ROWS {
+            return Some(expected.clone());
+        }
+        let stds = expected.clone().cholesky()?.inverse().diagonal().map(f64::sqrt);
+        let held = self.held(point);
+        let mut observed = expected.clone();
+        for u in (0..self.unknowns()).filter(|u| !held.contains(u)) {
+            let step = DIFFERENCE * stds[u];
+            let at = |sign: f64| {
+                let mut moved = point.eta.clone();
+                moved[u] += sign * step;
+                self.point(&moved, tails).map(|p| p.gradient)
+            };
+            let Some((up, down)) = at(1.0).zip(at(-1.0)) else { return Some(expected.clone()) };
+            let column = (down - up) / (2.0 * step);
+            for v in (0..self.unknowns()).filter(|v| !held.contains(v)) {
+                observed[(v, u)] = column[v];
+            }
+        }
+        let observed = (&observed + observed.transpose()) * 0.5;
+        // Away from a maximum, which a fit that ended at its last step may be, the second derivatives may not be definite.
+        Some(if observed.clone().cholesky().is_some() { observed } else { expected.clone() })
+    }
+
     /// The fit at a point, with Laplace's approximation of the evidence; `None` if the information is singular.
     pub(super) fn fit_at(&self, point: &Point, tails: f64) -> Option<Fit> {
         let (mean, spread, noise_factor, psi) = self.unpack(&point.eta);
-        let factor = point.information.clone().cholesky()?;
+        let factor = self.information(point, tails)?.cholesky()?;
         // The priors are standard normal in these units, so that their factors of 2π cancel those of Laplace's integral.
         let half_log_det: f64 = factor.l_dirty().diagonal().iter().map(|l| l.ln()).sum();
         let means = self.means();
@@ -315,6 +360,9 @@ impl<'a> Problem<'a> {
         let scales: Vec<f64> =
             self.study.free.iter().map(|k| self.scale(*k).1).chain(self.numbers().map(|n| n.prior_std)).collect();
         let covariance = DMatrix::from_fn(means, means, |a, b| inverse[(a, b)] * scales[a] * scales[b]);
+        let first = means + self.study.free.len();
+        let ln_std = |mode: usize| NOISE_LN_STD * inverse[(first + mode, first + mode)].max(0.0).sqrt();
+        let corrected = self.corrected_settings(&mean, &self.sizes(&psi).values);
         Some(Fit {
             effects: self.effects.to_vec(),
             mean,
@@ -324,6 +372,8 @@ impl<'a> Problem<'a> {
             tails,
             covariance,
             free: self.study.free.clone(),
+            noise_factor_ln_std: (0..self.modes()).map(ln_std).collect(),
+            outside: outside(self.study.simulator, self.study.data, self.rows, &corrected),
             log_likelihood: point.log_likelihood,
             log_evidence: point.log_posterior - half_log_det,
             unknowns: self.unknowns(),

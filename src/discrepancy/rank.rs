@@ -7,6 +7,7 @@ use super::effect::FittedEffect;
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::screen::{promises, Promise, Whitened};
+use super::setting_starts::{Guess, PresentSettings};
 use super::study::Study;
 use crate::physics::effect::Target;
 use crate::simulator::law::LawKind;
@@ -56,6 +57,11 @@ struct Trial {
 }
 
 impl Trial {
+    /// Log evidence with the cost of settings outside their priors and of numbers that are not fitted, nats.
+    fn merit(&self) -> f64 {
+        self.fit.log_evidence - self.fit.outside.nats - self.cost_nats
+    }
+
     /// Fits the effect of a score test, starting from its first guess; `None` if the fit fails.
     fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, candidate: &Candidate, promise: &Promise) -> Option<Self> {
         let effect =
@@ -106,7 +112,8 @@ pub fn rank(
     if constant.nats > CONSTANT_NATS {
         tried.extend(unscreened(study, rows, fit, candidates));
     }
-    let evidence = |t: &Trial| t.fit.log_evidence - t.cost_nats + candidates[t.candidate].weight.ln();
+    tried.extend(corrections(study, rows, fit, candidates));
+    let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln();
     let mut order: Vec<(usize, f64)> = tried.iter().map(|t| (t.candidate, evidence(t))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     let refined: Vec<usize> = order.iter().take(REFINED).map(|o| o.0).collect();
@@ -117,7 +124,7 @@ pub fn rank(
         .collect();
     tried.extend(further.par_iter().filter_map(fitted).collect::<Vec<_>>());
 
-    let best = tried.iter().max_by(|a, b| a.fit.log_evidence.total_cmp(&b.fit.log_evidence));
+    let best = tried.iter().max_by(|a, b| a.merit().total_cmp(&b.merit()));
     let share = best.map_or(Some(1.0), |t| independent_share(study, rows, &t.fit))?;
     Some((by_probability(study, fit, candidates, &tried, share), share))
 }
@@ -155,9 +162,12 @@ fn by_probability(
     let mut ranked: Vec<Ranked> = Vec::new();
     for (index, candidate) in candidates.iter().enumerate() {
         let mut own: Vec<&Trial> = tried.iter().filter(|t| t.candidate == index).collect();
-        own.sort_by(|a, b| (b.fit.log_evidence - b.cost_nats).total_cmp(&(a.fit.log_evidence - a.cost_nats)));
+        own.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
         let Some(first) = own.first() else { continue };
-        let gain = |t: &&Trial| independent_share * (t.fit.log_evidence - fit.log_evidence) - t.cost_nats;
+        let gain = |t: &&Trial| {
+            let inside = fit.outside.nats - t.fit.outside.nats;
+            independent_share * (t.fit.log_evidence - fit.log_evidence) + inside - t.cost_nats
+        };
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();
         let laws = own.iter().map(|t| (t.law, gain(t))).collect();
@@ -223,17 +233,48 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
         let fit = study.fit(rows, &effects, Some(&Start::with(fit, psi.clone())))?;
         Some(Trial { candidate: *index, law: LawKind::Constant, fit, cost_nats: 0.0 })
     };
-    let all: Vec<Trial> = jobs.par_iter().filter_map(fitted).collect();
     // Only the best tuning of an oscillator is kept.
+    best_of_each(jobs.par_iter().filter_map(fitted).collect())
+}
+
+/// The best trial of each candidate.
+fn best_of_each(trials: Vec<Trial>) -> Vec<Trial> {
     let mut best: Vec<Trial> = Vec::new();
-    for one in all {
+    for one in trials {
         match best.iter_mut().find(|b| b.candidate == one.candidate) {
-            Some(known) if known.fit.log_evidence >= one.fit.log_evidence => {}
+            Some(known) if known.merit() >= one.merit() => {}
             Some(known) => *known = one,
             None => best.push(one),
         }
     }
     best
+}
+
+/// Fits the corrections of settings that have no score test, from their first guesses.
+fn corrections(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Vec<Trial> {
+    let present = PresentSettings {
+        simulator: study.simulator,
+        data: study.data,
+        rows,
+        corrected: study.corrected_settings(rows, fit),
+        any_outside: fit.outside.rows > 0,
+    };
+    if present.corrected.is_empty() {
+        return Vec::new();
+    }
+    let present_target = |target: &Target| fit.effects.iter().any(|e| e.target == *target);
+    let mut jobs: Vec<(usize, Guess)> = Vec::new();
+    for (index, candidate) in candidates.iter().enumerate().filter(|(_, c)| !present_target(&c.target)) {
+        jobs.extend(present.guesses(candidate).into_iter().map(|guess| (index, guess)));
+    }
+    let fitted = |(index, guess): &(usize, Guess)| {
+        let effect = candidates[*index].effect(study.simulator, study.data, rows, guess.law, false, guess.step_days);
+        let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
+        let found = study.fit(rows, &effects, Some(&Start::with(fit, Some(guess.psi.clone()))))?;
+        let cost_nats = if guess.law == LawKind::Step { STEP_TIMES.ln() } else { 0.0 };
+        Some(Trial { candidate: *index, law: guess.law, fit: found, cost_nats })
+    };
+    best_of_each(jobs.par_iter().filter_map(fitted).collect())
 }
 
 /// Effective number of independent rows as a share of all rows: (1 − ρ)/(1 + ρ), with ρ the correlation of successive whitened

@@ -73,6 +73,13 @@ impl Responses {
         after.apply(&inner, targets, sizes)
     }
 
+    /// Responses of consecutive rows from their values, `[rows][modes][1 + parameters + sizes]`.
+    pub(super) fn from_values(modes: usize, parameters: usize, sizes: usize, values: Vec<f64>) -> Self {
+        let width = 1 + parameters + sizes;
+        let block = modes * width;
+        Self { modes, parameters, width, places: (0..values.len() / block).map(|row| row * block).collect(), values }
+    }
+
     /// As [`Self::new`], but solves the eigenproblem for all targets.
     fn structural(
         simulator: &Simulator,

@@ -18,7 +18,7 @@ use super::grammar::{spread, Candidate};
 use super::model::RowView;
 use super::study::Study;
 use crate::physics::effect::Target;
-use crate::simulator::law::{lagged, LawKind};
+use crate::simulator::law::{lagged, Input, Law, LawKind};
 use crate::stats;
 
 /// Share of the information about a number that must remain after projecting out the numbers that are fitted already.
@@ -240,8 +240,8 @@ pub fn promises(
 ) -> Option<Vec<Promise>> {
     let mut targets: Vec<&Target> = Vec::new();
     for candidate in candidates {
-        let screened = !matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_));
-        if screened && !targets.contains(&&candidate.target) {
+        let unscreened = matches!(candidate.target, Target::Oscillator(_) | Target::ModeOrder(_));
+        if !unscreened && !candidate.target.is_switch() && !targets.contains(&&candidate.target) {
             targets.push(&candidate.target);
         }
     }
@@ -256,12 +256,28 @@ pub fn promises(
         }
     }
     let bases_of = |input: &(Option<&str>, Option<&str>)| {
-        let candidate = candidates.iter().find(|c| c.input() == *input).expect("every input belongs to a candidate");
-        bases(candidate, study.data, rows)
+        // A switched target follows fewer laws than the others.
+        let candidate = candidates.iter().find(|c| c.input() == *input && !c.target.is_switch());
+        candidate.map_or_else(Vec::new, |candidate| bases(candidate, study.data, rows))
     };
     let bases: Vec<Vec<Basis>> = inputs.par_iter().map(bases_of).collect();
     let ones = DVector::from_element(rows.len(), 1.0);
-    let of_target = |(column, target): (usize, &&Target)| {
+    let mut columns = Vec::with_capacity(targets.len());
+    let mut next = 0;
+    for target in &targets {
+        columns.push(next);
+        next += target.sizes();
+    }
+    let of_target = |(place, target): (usize, &&Target)| {
+        let column = columns[place];
+        if let Target::ModeGain { mode, .. } = target {
+            let candidate = candidates.iter().position(|c| c.target == **target);
+            let beyond = DVector::from_iterator(rows.len(), directions.iter().map(|d| d[(*mode, column)]));
+            let basis =
+                Basis { values: vec![beyond, ones.clone()], ..Basis::new(LawKind::Constant, Vec::new(), Vec::new()) };
+            let sums = whitened.sums(|_, other| f64::from(u8::from(other == *mode)));
+            return candidate.map_or_else(Vec::new, |index| best_of_each_law(whitened, &sums, index, &[basis], None));
+        }
         let sums = whitened.sums(|place, mode| {
             let set = f64::from(u8::from(study.is_set(rows[place], target)));
             directions[place][(mode, column)] * set
@@ -391,6 +407,14 @@ fn bases(candidate: &Candidate, data: &Data, rows: &[usize]) -> Vec<Basis> {
                     let basis = vec![rows.iter().map(|row| followed[*row].0 - mean).collect()];
                     all.push(Basis::new(law, basis, vec![lag]));
                 }
+            }
+            LawKind::Product => {
+                let pairs = data.inputs(&Law::of_product(&column.name), None);
+                let values = |part: fn(f64, f64) -> f64| -> Vec<f64> {
+                    let of = |row: &usize| if let Input::Pair(u, v) = pairs[*row] { part(u, v) } else { 0.0 };
+                    rows.iter().map(of).collect()
+                };
+                all.push(Basis::new(law, vec![values(|u, _| u), values(|_, v| v), values(|u, v| u * v)], Vec::new()));
             }
             LawKind::Constant | LawKind::Category => {}
         }

@@ -1,23 +1,19 @@
 //! Naming causes: forward selection by evidence, with a check on blocks of rows left out.
 
-use rayon::prelude::*;
-
+use super::blocks::Blocks;
 use super::effect::FittedEffect;
 use super::fit::{Fit, Start};
 use super::grammar::Candidate;
 use super::progress::{Progress, Step};
 use super::rank::{log_sum, rank, Ranked};
 use super::study::Study;
+use crate::stats;
 
 /// A further cause is accepted if the log odds of all candidates together against no further cause exceed this, nats.
 const ACCEPTED_NATS: f64 = 3.0;
 
 /// Greatest number of causes.
 const MOST_CAUSES: usize = 4;
-
-/// Blocks of successive rows, assigned to folds in turn, that cross-validation leaves out.
-const BLOCKS: usize = 20;
-const FOLDS: usize = 5;
 
 /// An accepted cause with the candidates that it was ranked with.
 #[derive(Debug, Clone)]
@@ -125,23 +121,12 @@ fn refit_without(study: &Study<'_>, rows: &[usize], fit: &Fit, effect: usize) ->
 /// Mean gain in log predictive density of rows left out, second fit minus first, nats per row, and its standard error over
 /// blocks. `None` if the frequencies of either model cannot be computed in some row.
 fn cross_validate(study: &Study<'_>, rows: &[usize], before: &Fit, after: &Fit) -> Option<(f64, f64)> {
-    let block = |place: usize| place * BLOCKS / rows.len();
-    let fold = |number: usize| {
-        let (left, kept): (Vec<usize>, Vec<usize>) = (0..rows.len()).partition(|p| block(*p) % FOLDS == number);
-        let kept: Vec<usize> = kept.iter().map(|p| rows[*p]).collect();
-        let out: Vec<usize> = left.iter().map(|p| rows[*p]).collect();
-        let density = |fit: &Fit| -> Option<Vec<f64>> {
-            let refitted = study.fit(&kept, &fit.effects, Some(&Start::at(fit)))?;
-            Some(study.view(&out, &refitted)?.iter().map(|v| v.log_density).collect())
-        };
-        let (a, b) = (density(before)?, density(after)?);
-        Some(left.iter().zip(b.iter().zip(&a)).map(|(p, (b, a))| (block(*p), b - a)).collect::<Vec<_>>())
+    let blocks = Blocks::new(study.data, rows);
+    let densities = |fit: &Fit| -> Option<Vec<f64>> {
+        Some(blocks.predicted(study, rows, fit)?.iter().map(|view| view.log_density).collect())
     };
-    let gains: Vec<(usize, f64)> =
-        (0..FOLDS).into_par_iter().map(fold).collect::<Option<Vec<_>>>()?.into_iter().flatten().collect();
-    let n = gains.len() as f64;
-    let mean = gains.iter().map(|g| g.1).sum::<f64>() / n;
-    let sums: Vec<f64> =
-        (0..BLOCKS).map(|b| gains.iter().filter(|g| g.0 == b).map(|g| g.1 - mean).sum::<f64>()).collect();
-    Some((mean, sums.iter().map(|s| s * s).sum::<f64>().sqrt() / n))
+    let (before, after) = (densities(before)?, densities(after)?);
+    let gains: Vec<f64> = after.iter().zip(&before).map(|(after, before)| after - before).collect();
+    let mean = stats::mean(&gains);
+    Some((mean, blocks.standard_error(&gains, mean)))
 }

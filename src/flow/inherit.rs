@@ -44,7 +44,7 @@ pub fn inherited_flow(parent: &Flow, architecture: &Architecture, inputs: &[Opti
         let (_, width) = layer.weight().dims2()?;
         let columns = if name == "context.conv1" {
             windows(inputs, own.channels)
-        } else if name.ends_with(".input") {
+        } else if name.rsplit('.').next() == Some("input") {
             shortcut(inputs, width, own)
         } else {
             (0..width).map(Some).collect()

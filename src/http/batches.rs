@@ -19,6 +19,7 @@ use super::shared::Shared;
 use crate::measurement::body::{MessageBody, PostBody, RawBatch};
 use crate::measurement::check::{check_idempotency_key, check_source};
 use crate::measurement::csv::{self, CsvOptions, Times};
+use crate::measurement::times::read_dates;
 use crate::measurement::MeasurementBatch;
 use crate::monitor::{ActiveStructure, Monitor};
 
@@ -39,6 +40,9 @@ pub struct PostQuery {
     source: Option<String>,
     /// CSV columns to ignore, separated by commas.
     ignore: Option<String>,
+    /// Unit of the times of a CSV that are numbers: Unix `seconds` or `milliseconds`, `serial-days` of a spreadsheet, or `decimal-year`.
+    #[param(pattern = "^(seconds|milliseconds|serial-days|decimal-year)$")]
+    time_unit: Option<String>,
 }
 
 /// Headers of a post.
@@ -168,10 +172,16 @@ fn parse_batch(
         Some("text/csv") => {
             let ignore = query.ignore.as_deref().unwrap_or_default().split(',').map(|c| c.trim().to_owned());
             let ignore = ignore.filter(|column| !column.is_empty()).collect();
-            let options = CsvOptions { times: Times::Required, ignore, time_column: None };
+            let options = CsvOptions { times: Times::Required, ignore, ..CsvOptions::default() };
             let simulator = &active.simulator;
             let read = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
-            RawBatch { source: None, idempotency_key, measurements: read.map_err(ApiError::invalid_input)? }
+            let mut measurements = read.map_err(ApiError::invalid_input)?;
+            if let Some(unit) = query.time_unit {
+                let unit =
+                    unit.parse().map_err(|message: String| ApiError::invalid_field("query/time_unit", message))?;
+                read_dates(&mut measurements, unit).map_err(ApiError::invalid_input)?;
+            }
+            RawBatch { source: None, idempotency_key, measurements }
         }
         other => return Err(unsupported_media_type(other, "application/json, text/csv or application/x-ndjson")),
     };

@@ -146,15 +146,6 @@ impl From<monitor::IngestError> for ApiError {
     }
 }
 
-impl From<monitor::DeclareError> for ApiError {
-    fn from(error: monitor::DeclareError) -> Self {
-        match error {
-            monitor::DeclareError::Monitor(error) => error.into(),
-            unusable => Self::invalid("unusable_baseline", unusable.to_string(), Vec::new()),
-        }
-    }
-}
-
 impl From<monitor::JobError> for ApiError {
     fn from(error: monitor::JobError) -> Self {
         use monitor::JobError as E;

@@ -10,7 +10,7 @@ use crate::parameter::ParameterSpace;
 use crate::quantity::{shown, Hertz, Timestamp};
 
 /// Largest number of problems reported for one batch: a table with the wrong separator would have thousands.
-const MOST_PROBLEMS: usize = 20;
+pub(super) const MOST_PROBLEMS: usize = 20;
 
 /// A client's clock may be ahead of the clock of the service by this much, µs.
 const CLOCK_SKEW_MICROS: i64 = 5 * 60 * 1_000_000;
@@ -69,9 +69,22 @@ impl Problem {
     }
 }
 
+/// What measurements are used for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Purpose {
+    /// They are stored and assessed by a trained model: settings must lie within their priors, and times after 1970.
+    #[default]
+    Assessment,
+    /// They show where the simulation is wrong: settings beyond their priors are then a result and not a mistake, and only the
+    /// differences of the times matter.
+    Diagnosis,
+}
+
 /// What the measurements of a structure must satisfy.
 #[derive(Debug, Clone, Copy)]
 pub struct Expectation<'a> {
+    /// What they are used for.
+    pub purpose: Purpose,
     /// Number of modes.
     pub modes: usize,
     /// Limits of plausible frequencies, Hz. A frequency outside them is in a wrong unit or in a wrong column.
@@ -105,6 +118,21 @@ impl FieldPath {
     /// Pointer to a covariate of this measurement, whether it is present or missing.
     pub fn of_covariate(self, name: &str) -> String {
         self.of(&Field::Covariate(name))
+    }
+
+    /// Pointer to the time of this measurement.
+    pub fn of_time(self) -> String {
+        self.of(&Field::Time)
+    }
+
+    /// Pointer to a setting of this measurement, whether it is present or missing.
+    pub fn of_setting(self, name: &str) -> String {
+        self.of(&Field::Setting(name))
+    }
+
+    /// Pointer to the whole measurement.
+    pub fn of_row(self) -> String {
+        self.of(&Field::Frequencies)
     }
 
     /// Pointer to a part of this measurement.
@@ -186,35 +214,53 @@ pub fn check_measurements(
     }
     let mut problems = Problems { found: Vec::new(), more: 0 };
     let mut times = BTreeSet::new();
-    let mut checked = Vec::with_capacity(raw.len());
-    for measurement in raw {
-        let path = measurement.path;
-        let measured_at = check_time(&measurement, expectation.now, &mut problems);
-        if measured_at.is_some_and(|time| !times.insert(time)) {
-            let message =
-                "another measurement of this batch has the same time: a measurement is identified by its time";
-            problems.add(path.of(&Field::Time), message);
-        }
-        let frequencies_hz = check_frequencies(&measurement, expectation, &mut problems);
-        check_std(&measurement, expectation.modes, &mut problems);
-        check_shapes(&measurement, expectation, &mut problems);
-        check_covariates(&measurement, expectation.covariates, &mut problems);
-        check_settings(&measurement, expectation.space, &mut problems);
-        if let Some(measured_at) = measured_at {
-            checked.push(ModalMeasurement {
-                measured_at,
-                frequencies_hz,
-                std_hz: measurement.std_hz,
-                mode_shapes: measurement.mode_shapes,
-                covariates: measurement.covariates,
-                settings: measurement.settings,
-            });
-        }
-    }
+    let checked = raw.into_iter().filter_map(|raw| check_one(raw, expectation, &mut times, &mut problems)).collect();
     problems.into_result(checked)
 }
 
-fn check_time(raw: &RawMeasurement, now: Timestamp, problems: &mut Problems) -> Option<Timestamp> {
+/// Checks measurements one by one: each of them, or its first mistake.
+pub fn check_each(raw: Vec<RawMeasurement>, expectation: &Expectation<'_>) -> Vec<Result<ModalMeasurement, Problem>> {
+    let mut times = BTreeSet::new();
+    let mut check = |raw: RawMeasurement| {
+        let mut problems = Problems { found: Vec::new(), more: 0 };
+        let checked = check_one(raw, expectation, &mut times, &mut problems);
+        match problems.found.into_iter().next() {
+            Some(problem) => Err(problem),
+            None => Ok(checked.expect("a measurement without problems has a time")),
+        }
+    };
+    raw.into_iter().map(&mut check).collect()
+}
+
+/// Checks one measurement; `times` are those of the measurements before it. `None` if its time is not valid.
+fn check_one(
+    raw: RawMeasurement,
+    expectation: &Expectation<'_>,
+    times: &mut BTreeSet<Timestamp>,
+    problems: &mut Problems,
+) -> Option<ModalMeasurement> {
+    let measured_at = check_time(&raw, expectation, problems);
+    if measured_at.is_some_and(|time| !times.insert(time)) {
+        let message = "another measurement of this batch has the same time: a measurement is identified by its time";
+        problems.add(raw.path.of(&Field::Time), message);
+    }
+    let frequencies_hz = check_frequencies(&raw, expectation, problems);
+    check_std(&raw, expectation.modes, problems);
+    check_shapes(&raw, expectation, problems);
+    check_covariates(&raw, expectation.covariates, problems);
+    check_settings(&raw, expectation, problems);
+    Some(ModalMeasurement {
+        measured_at: measured_at?,
+        frequencies_hz,
+        std_hz: raw.std_hz,
+        mode_shapes: raw.mode_shapes,
+        covariates: raw.covariates,
+        settings: raw.settings,
+    })
+}
+
+fn check_time(raw: &RawMeasurement, expectation: &Expectation<'_>, problems: &mut Problems) -> Option<Timestamp> {
+    let Expectation { purpose, now, .. } = *expectation;
     let pointer = || raw.path.of(&Field::Time);
     let Some(text) = &raw.measured_at else {
         problems.add(pointer(), "measured_at is missing: RFC 3339 with an offset, such as 2026-03-01T12:00:00Z");
@@ -222,7 +268,9 @@ fn check_time(raw: &RawMeasurement, now: Timestamp, problems: &mut Problems) -> 
     };
     match Timestamp::parse(text) {
         Err(error) => problems.add(pointer(), error.to_string()),
-        Ok(time) if time.micros() < 0 => problems.add(pointer(), format!("{time} is before 1970: it must be later")),
+        Ok(time) if purpose == Purpose::Assessment && time.micros() < 0 => {
+            problems.add(pointer(), format!("{time} is before 1970: it must be later"))
+        }
         Ok(time) if time.micros() > now.micros() + CLOCK_SKEW_MICROS => {
             problems.add(pointer(), format!("{time} is in the future: the clock of the service shows {now}"));
         }
@@ -333,11 +381,12 @@ fn check_covariates(raw: &RawMeasurement, declared: &[Covariate], problems: &mut
     }
 }
 
-fn check_settings(raw: &RawMeasurement, space: &ParameterSpace, problems: &mut Problems) {
+fn check_settings(raw: &RawMeasurement, expectation: &Expectation<'_>, problems: &mut Problems) {
     for (name, value) in &raw.settings {
-        let message = match space.iter().find(|p| p.name == *name) {
+        let message = match expectation.space.iter().find(|p| p.name == *name) {
             None => format!("{} is not a parameter of this structure", shown(name)),
-            Some(p) if !(p.lower..=p.upper).contains(value) => {
+            Some(_) if !value.is_finite() => format!("{value} is not finite: omit a setting that is not known"),
+            Some(p) if expectation.purpose == Purpose::Assessment && !(p.lower..=p.upper).contains(value) => {
                 format!("{value} {} is outside the prior of {name}, {} to {}", p.unit, p.lower, p.upper)
             }
             Some(_) => continue,

@@ -1,7 +1,8 @@
 //! Measurements as CSV tables.
 //!
 //! The columns are `measured_at`, `f1_hz` …, and optionally `std_f1_hz` …, the declared covariates by name, and
-//! `set_<parameter>`. An empty cell is a missing value. The separator is `,`, `;` or tab; it is detected from the header or read
+//! `set_<parameter>`. An empty cell is a missing value. [`read`] refuses a table with a mistake; [`read_rows`] gives the rows one
+//! by one, so that those with a mistake can be left out. The separator is `,`, `;` or tab; it is detected from the header or read
 //! from a first line `sep=;`. With `;` or tab, decimal commas are accepted. Additions by spreadsheets are accepted: a byte order
 //! mark, CRLF, blanks around cells, empty lines, and columns with neither a name nor values.
 
@@ -12,17 +13,20 @@ use super::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use crate::quantity::{shown, Hertz, Timestamp};
 
 /// How the times of measurements are found.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Times {
     /// The column `measured_at` is required.
+    #[default]
     Required,
+    /// Without a column `measured_at`, the rows have no times.
+    Optional,
     /// Without a column `measured_at`, row i (from 0) gets the time 1970-01-01T00:00:00Z plus i seconds. This is for files whose
     /// times do not matter.
     RowNumber,
 }
 
 /// How a table is read.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct CsvOptions {
     /// How times are found.
     pub times: Times,
@@ -30,6 +34,28 @@ pub struct CsvOptions {
     pub ignore: Vec<String>,
     /// Name of the time column, if it is not `measured_at`.
     pub time_column: Option<String>,
+    /// Columns of settings that are not named `set_<parameter>`.
+    pub settings: Vec<SettingColumn>,
+}
+
+/// A column that holds the values of a setting.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SettingColumn {
+    /// The parameter.
+    pub parameter: String,
+    /// Name of the column.
+    pub column: String,
+}
+
+/// A table whose header is valid.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    /// Whether it has a column of times.
+    pub timed: bool,
+    /// The parameters of its columns of settings.
+    pub settings: Vec<String>,
+    /// Its rows; of a row that cannot be read, its first mistake.
+    pub rows: Vec<Result<RawMeasurement, Problem>>,
 }
 
 /// A column that the structure does not declare, and its probable meaning.
@@ -37,6 +63,12 @@ pub struct CsvOptions {
 pub enum Offered {
     /// A covariate of this kind.
     Covariate(Covariate),
+    /// A column with values and without a name, such as the numbers of the rows in tables written by data frames. The name `""` in
+    /// [`CsvOptions::ignore`] ignores it.
+    Unnamed {
+        /// Number of the column, from 1.
+        number: usize,
+    },
     /// Text with too many different values for a category.
     Ignored {
         /// Name of the column.
@@ -66,8 +98,8 @@ pub fn offered(
     let mut records = reader(text, separator).into_records().skip(usize::from(named_separator(text).is_some()));
     let Some(header) = records.next() else { return Ok(Vec::new()) };
     let header = header.map_err(|e| problem(&e))?;
-    let unknown: Vec<usize> =
-        (0..header.len()).filter(|i| column(&header[*i], covariates, options).is_none()).collect();
+    let is_unknown = |name: &str| matches!(column(name, covariates, options), None | Some(Column::Unnamed));
+    let unknown: Vec<usize> = (0..header.len()).filter(|i| is_unknown(&header[*i])).collect();
     let mut cells: Vec<std::collections::BTreeSet<String>> = vec![std::collections::BTreeSet::new(); unknown.len()];
     let (mut numbers, mut others) = (vec![0; unknown.len()], vec![0; unknown.len()]);
     for record in records {
@@ -83,16 +115,19 @@ pub fn offered(
     }
     let offer = |(position, index): (usize, &usize)| {
         let (name, values) = (header[*index].to_owned(), cells[position].len());
+        if name.is_empty() {
+            return (values > 0).then_some(Offered::Unnamed { number: index + 1 });
+        }
         // A few cells that are not numbers do not make the column text: `read` then reports them with their lines.
-        if numbers[position] >= 9 * others[position] {
+        Some(if numbers[position] >= 9 * others[position] {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Number })
         } else if values <= most_categories {
             Offered::Covariate(Covariate { name, kind: CovariateKind::Category })
         } else {
             Offered::Ignored { name, values }
-        }
+        })
     };
-    Ok(unknown.iter().enumerate().map(offer).collect())
+    Ok(unknown.iter().enumerate().filter_map(offer).collect())
 }
 
 fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
@@ -151,6 +186,20 @@ pub fn read(
     covariates: &[Covariate],
     options: &CsvOptions,
 ) -> Result<Vec<RawMeasurement>, Vec<Problem>> {
+    let table = read_rows(bytes, modes, covariates, options)?;
+    table.rows.into_iter().collect::<Result<_, _>>().map_err(|problem| vec![problem])
+}
+
+/// Reads a table of a structure with `modes` modes, each row by itself.
+///
+/// # Errors
+/// The mistakes of the header, with its line; text that is not a table.
+pub fn read_rows(
+    bytes: &[u8],
+    modes: usize,
+    covariates: &[Covariate],
+    options: &CsvOptions,
+) -> Result<Table, Vec<Problem>> {
     let text = text(bytes)?;
     let separator = separator(text);
     let mut reader = reader(text, separator);
@@ -167,15 +216,20 @@ pub fn read(
         return Err(vec![Problem::new("line 1", "the table is empty: its first line must name the columns")]);
     };
     let columns = columns(&header, line_of(text, &header), modes, covariates, options)?;
-    let mut measurements = Vec::new();
+    let mut rows = Vec::new();
     while let Some(record) = next()? {
         let line = line_of(text, &record);
         if record.iter().all(str::is_empty) {
             continue;
         }
-        measurements.push(row(&record, line, &columns, modes, separator != b',', measurements.len(), options.times)?);
+        rows.push(row(&record, line, &columns, modes, separator != b',', rows.len(), options.times));
     }
-    Ok(measurements)
+    let parameter = |column: &Column| match column {
+        Column::Setting(parameter) => Some(parameter.clone()),
+        _ => None,
+    };
+    let settings = columns.iter().filter_map(parameter).collect();
+    Ok(Table { timed: columns.contains(&Column::Time), settings, rows })
 }
 
 /// The separator that the table specifies, or else the most frequent one in its header.
@@ -230,6 +284,11 @@ fn columns(
     if options.times == Times::Required && !columns.contains(&Column::Time) {
         add("missing column measured_at: RFC 3339 with an offset, such as 2026-03-01T12:00:00Z".to_owned());
     }
+    for SettingColumn { parameter, column } in &options.settings {
+        if !header.iter().any(|name| name.eq_ignore_ascii_case(column)) {
+            add(format!("missing column {}, which holds the settings of {parameter}", shown(column)));
+        }
+    }
     if problems.is_empty() {
         Ok(columns)
     } else {
@@ -239,15 +298,18 @@ fn columns(
 
 fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<Column> {
     let lower = name.to_ascii_lowercase();
-    if name.is_empty() {
-        return Some(Column::Unnamed);
-    }
     let mode = |text: &str| {
         let number: usize = text.strip_prefix('f')?.strip_suffix("_hz")?.parse().ok()?;
         number.checked_sub(1)
     };
     if options.ignore.iter().any(|ignored| ignored.eq_ignore_ascii_case(name)) {
         return Some(Column::Ignored);
+    }
+    if name.is_empty() {
+        return Some(Column::Unnamed);
+    }
+    if let Some(setting) = options.settings.iter().find(|setting| setting.column.eq_ignore_ascii_case(name)) {
+        return Some(Column::Setting(setting.parameter.clone()));
     }
     if options.time_column.as_ref().map_or(lower == "measured_at", |column| column.eq_ignore_ascii_case(name)) {
         return Some(Column::Time);
@@ -273,10 +335,10 @@ fn row(
     decimal_comma: bool,
     index: usize,
     times: Times,
-) -> Result<RawMeasurement, Vec<Problem>> {
+) -> Result<RawMeasurement, Problem> {
     if record.len() != columns.len() {
         let message = format!("{} cells, but the header has {}", record.len(), columns.len());
-        return Err(vec![Problem::new(format!("line {line}"), message)]);
+        return Err(Problem::new(format!("line {line}"), message));
     }
     let mut raw = RawMeasurement {
         path: FieldPath::Csv { line },
@@ -289,17 +351,19 @@ fn row(
     };
     for (column, cell) in columns.iter().zip(record).filter(|(_, cell)| !cell.is_empty()) {
         let number = |name: String| {
-            number(cell, decimal_comma)
-                .map_err(|message| vec![Problem::new(format!("line {line}, column {name}"), message)])
+            number(cell, decimal_comma).map_err(|message| Problem::new(format!("line {line}, column {name}"), message))
         };
         match column {
             Column::Ignored => {}
             Column::Unnamed => {
                 let message =
                     format!("{} is in a column without a name: name the column in the first line", shown(cell));
-                return Err(vec![Problem::new(format!("line {line}"), message)]);
+                return Err(Problem::new(format!("line {line}"), message));
             }
-            Column::Time => raw.measured_at = Some(cell.to_owned()),
+            Column::Time => {
+                let is_number = decimal_comma && self::number(cell, decimal_comma).is_ok();
+                raw.measured_at = Some(if is_number { cell.replace(',', ".") } else { cell.to_owned() });
+            }
             Column::Frequency(mode) => raw.frequencies_hz[*mode] = Some(number(format!("f{}_hz", mode + 1))?),
             Column::Std(mode) => {
                 let value = number(format!("std_f{}_hz", mode + 1))?;

@@ -1,12 +1,15 @@
 //! Measured natural frequencies. Values of these types have been checked.
 //!
-//! [`body`] reads raw measurements from JSON, [`csv`] reads and writes them as tables, and [`check`] checks them.
+//! [`body`] reads raw measurements from JSON, [`csv`] reads and writes them as tables, and [`check`] checks them. [`times`] are
+//! those that a table gives as numbers, and [`order`] is that of the modes.
 
 pub mod body;
 pub mod check;
 pub mod csv;
 pub mod json;
+pub mod order;
 pub mod shape;
+pub mod times;
 
 use std::collections::BTreeMap;
 

@@ -1,5 +1,7 @@
 //! The errors of the operations of the monitor.
 
+use serde::Serialize;
+
 use super::compute::QueueFull;
 use crate::assessment;
 use crate::damage;
@@ -97,15 +99,54 @@ pub enum IngestError {
     Monitor(#[from] Error),
 }
 
+/// A batch that cannot be part of the undamaged reference.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[schema(as = LeftOutBatch)]
+pub struct LeftOutBatch {
+    /// Its id.
+    pub batch: String,
+    /// Why it cannot be part of the reference.
+    pub reason: String,
+}
+
+/// Largest number of batches that are named in a sentence.
+const MOST_NAMED: usize = 3;
+
+/// The first batches with their reasons, and the number of the others.
+fn named(left_out: &[LeftOutBatch]) -> String {
+    let mut named: Vec<String> = left_out
+        .iter()
+        .take(MOST_NAMED)
+        .map(|LeftOutBatch { batch, reason }| format!("batch {batch}: {reason}"))
+        .collect();
+    if left_out.len() > MOST_NAMED {
+        named.push(format!("and {} more", left_out.len() - MOST_NAMED));
+    }
+    named.join("; ")
+}
+
 /// Why batches were not declared as the undamaged reference.
 #[derive(Debug, thiserror::Error)]
 pub enum DeclareError {
     /// A batch is listed twice.
     #[error("batch {0} is listed twice")]
     RepeatedBatch(String),
-    /// No undamaged reference can be computed from the batches.
-    #[error(transparent)]
-    Reference(#[from] damage::Error),
+    /// No batch was measured in the period.
+    #[error("no batch was measured from {from} to {to}")]
+    EmptyPeriod {
+        /// Begin of the period.
+        from: Timestamp,
+        /// End of the period.
+        to: Timestamp,
+    },
+    /// No undamaged reference can be computed from the batches that can be trusted.
+    #[error("{source}{}", if left_out.is_empty() { String::new() } else { format!("; left out: {}", named(left_out)) })]
+    Reference {
+        /// The cause.
+        source: damage::Error,
+        /// The batches that were left out before.
+        left_out: Vec<LeftOutBatch>,
+    },
     /// The assessment of a batch failed.
     #[error("batch {batch} could not be used: {source}")]
     Assess {
@@ -114,17 +155,32 @@ pub enum DeclareError {
         /// The cause.
         source: assessment::Error,
     },
-    /// A batch that cannot be trusted cannot be part of the undamaged reference.
-    #[error("batch {batch} cannot be part of the undamaged reference: {reason}")]
-    Untrusted {
-        /// The batch.
-        batch: String,
-        /// What was found in it.
-        reason: String,
+    /// Batches that cannot be trusted cannot be part of the undamaged reference.
+    #[error(
+        "{} of {batches} batches cannot be part of the undamaged reference: omit them, or let \"leave_out_doubtful\": true leave \
+         them out; {}",
+        doubtful.len(), named(doubtful)
+    )]
+    Doubtful {
+        /// Number of batches that were declared.
+        batches: usize,
+        /// Those that cannot be trusted.
+        doubtful: Vec<LeftOutBatch>,
     },
     /// Any other error.
     #[error(transparent)]
     Monitor(#[from] Error),
+}
+
+impl DeclareError {
+    /// The batches that cannot be part of the reference, if there are any.
+    pub fn left_out(&self) -> &[LeftOutBatch] {
+        match self {
+            Self::Reference { left_out, .. } => left_out,
+            Self::Doubtful { doubtful, .. } => doubtful,
+            _ => &[],
+        }
+    }
 }
 
 /// Why a diagnosis or an extension was not started.

@@ -6,10 +6,44 @@ use tracing::{info, warn};
 
 use super::assessor::Assessor;
 use super::compute::Place;
-use super::error::{DeclareError, Error};
-use crate::assessment::{undamaged_reference, Draws, ReferenceError};
+use super::error::{DeclareError, Error, LeftOutBatch};
+use crate::assessment::{BatchState, DoubtfulBatch, Draws, ReferenceBatches, ReferenceError};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::ReferenceRecord;
+use crate::store::{MeasuredBatch, ReferenceRecord};
+
+/// The batches of an undamaged reference.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ReferenceChoice {
+    /// Batches by id.
+    Batches(Vec<String>),
+    /// The batches whose measurements were all made in a period.
+    Period {
+        /// Its begin.
+        from: Timestamp,
+        /// Its end, which is not part of it.
+        to: Timestamp,
+    },
+}
+
+/// A declaration of the undamaged reference.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReferenceRequest {
+    /// The batches.
+    pub choice: ReferenceChoice,
+    /// Whether batches that cannot be trusted are left out; otherwise the declaration is refused and all of them are named.
+    pub leave_out_doubtful: bool,
+    /// Probability that the undamaged structure is below the damage threshold.
+    pub threshold_probability: f64,
+}
+
+/// An undamaged reference that was declared.
+#[derive(Debug, Clone)]
+pub struct DeclaredReference {
+    /// The reference as it was stored.
+    pub record: Arc<ReferenceRecord>,
+    /// The batches that were left out.
+    pub left_out: Vec<LeftOutBatch>,
+}
 
 /// Makes undamaged references.
 pub(super) struct References {
@@ -45,38 +79,35 @@ impl References {
             warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
         };
         let newest = self.assessor.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
-        let (mut batches, threshold) = (newest.batches.clone(), newest.state.threshold_probability);
-        loop {
-            let place = self.assessor.compute.wait().await;
-            match self.declare(structure, batches.clone(), threshold, place).await {
-                Ok(record) => return Some(record.state.version),
-                Err(DeclareError::Untrusted { batch, reason }) if batches.len() > 1 => {
-                    warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged reference of {structure}: {reason}");
-                    batches.retain(|id| *id != batch);
-                }
-                Err(error) => {
-                    failed(&error);
-                    return None;
-                }
-            }
+        let request = ReferenceRequest {
+            choice: ReferenceChoice::Batches(newest.batches.clone()),
+            leave_out_doubtful: true,
+            threshold_probability: newest.state.threshold_probability,
+        };
+        let place = self.assessor.compute.wait().await;
+        let declared = self.declare(structure, request, place).await.map_err(|e| failed(&e)).ok()?;
+        for LeftOutBatch { batch, reason } in &declared.left_out {
+            warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged reference of {structure}: {reason}");
         }
+        Some(declared.record.state.version)
     }
 
     /// Makes a reference from stored batches, and stores it. Other batches are compared with it when they are assessed again.
     pub(super) async fn declare(
         &self,
         structure: &StructureId,
-        batch_ids: Vec<String>,
-        threshold_probability: f64,
+        request: ReferenceRequest,
         place: Place,
-    ) -> Result<Arc<ReferenceRecord>, DeclareError> {
+    ) -> Result<DeclaredReference, DeclareError> {
         let Assessor { store, structures, events, alarms, .. } = &*self.assessor;
         let baseline = structures.get(structure)?.trained_baseline()?;
+        let (mut batch_ids, mut left_out) = self.chosen(structure, &request.choice).await?;
+        if !request.leave_out_doubtful && !left_out.is_empty() {
+            let batches = batch_ids.len() + left_out.len();
+            return Err(DeclareError::Doubtful { batches, doubtful: left_out });
+        }
         let mut records = Vec::new();
-        for (index, id) in batch_ids.iter().enumerate() {
-            if batch_ids[..index].contains(id) {
-                return Err(DeclareError::RepeatedBatch(id.clone()));
-            }
+        for id in &batch_ids {
             records.push(self.assessor.stored(structure, id).await?);
         }
         let drawn: Vec<Draws> = records.iter().map(|record| self.assessor.draws(&baseline, record)).collect();
@@ -86,27 +117,96 @@ impl References {
             .run(move || {
                 let batches: Vec<_> =
                     records.iter().zip(&drawn).map(|(r, d)| (r.batch.measurements.as_slice(), *d)).collect();
-                let state = undamaged_reference(&baseline, &batches, threshold_probability)?;
-                known_limits.prepare(&baseline, &state, &settings);
-                Ok(state)
+                let examined = match ReferenceBatches::examine(&baseline, &batches) {
+                    Ok(examined) => examined,
+                    Err(error) => return (Vec::new(), Err(error)),
+                };
+                let doubtful = examined.doubtful().to_vec();
+                if !request.leave_out_doubtful && !doubtful.is_empty() {
+                    return (Vec::new(), Err(ReferenceError::Doubtful(doubtful)));
+                }
+                let state = examined.reference(request.threshold_probability);
+                if let Ok(state) = &state {
+                    known_limits.prepare(&baseline, state, &settings);
+                }
+                (doubtful, state)
             })
             .await;
-        let state = made.map_err(|_| Error::Panicked)?.map_err(|error| match error {
+        let (doubtful, state) = made.map_err(|_| Error::Panicked)?;
+        let with_id =
+            |DoubtfulBatch { batch, reason }: DoubtfulBatch| LeftOutBatch { batch: batch_ids[batch].clone(), reason };
+        let doubtful: Vec<LeftOutBatch> = doubtful.into_iter().map(with_id).collect();
+        let batches = batch_ids.len();
+        let state = state.map_err(|error| match error {
             ReferenceError::Assess { batch, source } => {
                 DeclareError::Assess { batch: batch_ids[batch].clone(), source }
             }
-            ReferenceError::Untrusted { batch, reason } => {
-                DeclareError::Untrusted { batch: batch_ids[batch].clone(), reason }
+            ReferenceError::Doubtful(doubtful) => {
+                DeclareError::Doubtful { batches, doubtful: doubtful.into_iter().map(with_id).collect() }
             }
-            ReferenceError::State(error) => DeclareError::Reference(error),
+            ReferenceError::State(source) => {
+                DeclareError::Reference { source, left_out: [left_out.clone(), doubtful.clone()].concat() }
+            }
         })?;
+        batch_ids.retain(|id| doubtful.iter().all(|left_out| left_out.batch != *id));
+        left_out.extend(doubtful);
         let version =
             store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
-        let batches = batch_ids.len();
-        info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches");
+        let (batches, without) = (batch_ids.len(), left_out.len());
+        info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");
         alarms.publish_changes(structure).await;
         events.structure_changed(structure);
         let stored = store.reference().undamaged(structure).await?;
-        Ok(stored.expect("it was stored a moment ago and is never deleted"))
+        Ok(DeclaredReference { record: stored.expect("it was stored a moment ago and is never deleted"), left_out })
+    }
+
+    /// The ids of the chosen batches, and those that cannot be used whatever they contain.
+    async fn chosen(
+        &self,
+        structure: &StructureId,
+        choice: &ReferenceChoice,
+    ) -> Result<(Vec<String>, Vec<LeftOutBatch>), DeclareError> {
+        let (from, to) = match choice {
+            ReferenceChoice::Batches(ids) => {
+                let repeated = ids.iter().enumerate().find(|(index, id)| ids[..*index].contains(id));
+                return match repeated {
+                    Some((_, id)) => Err(DeclareError::RepeatedBatch(id.clone())),
+                    None => Ok((ids.clone(), Vec::new())),
+                };
+            }
+            ReferenceChoice::Period { from, to } => (*from, *to),
+        };
+        let found = self.assessor.store.reference().batches_in(structure, from, to).await?;
+        if found.is_empty() {
+            return Err(DeclareError::EmptyPeriod { from, to });
+        }
+        let (mut ids, mut left_out) = (Vec::new(), Vec::new());
+        for batch in found {
+            match unsuitable(&batch, from, to) {
+                Some(reason) => left_out.push(LeftOutBatch { batch: batch.batch_id, reason }),
+                None => ids.push(batch.batch_id),
+            }
+        }
+        Ok((ids, left_out))
+    }
+}
+
+/// Why a batch cannot be part of the undamaged reference of a period, if this is known before its measurements are examined.
+fn unsuitable(batch: &MeasuredBatch, from: Timestamp, to: Timestamp) -> Option<String> {
+    if batch.measured_from < from || batch.measured_to >= to {
+        return Some(format!(
+            "it was measured from {} to {}, which is only in part in the period",
+            batch.measured_from, batch.measured_to
+        ));
+    }
+    if let Some(reason) = &batch.maintenance {
+        return Some(format!("it was measured during maintenance: {reason}"));
+    }
+    match (batch.state, batch.assessed) {
+        (BatchState::Failed, _) => {
+            Some(format!("its assessment failed: {}", batch.failure.as_deref().unwrap_or("the reason is not known")))
+        }
+        (_, false) => Some("it has no assessment yet".to_owned()),
+        (_, true) => None,
     }
 }

@@ -16,10 +16,10 @@ use tracing::{error, warn};
 use super::assessor::{Assessor, Computed, Finished, Settled};
 use super::error::{DeclareError, Error};
 use super::own_task::in_own_task;
-use super::references::References;
+use super::references::{DeclaredReference, ReferenceRequest, References};
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
-use crate::store::{self, ReferenceRecord};
+use crate::store;
 
 /// Pause between two attempts to store results that could not be stored, for example on a full disk.
 const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
@@ -67,13 +67,12 @@ impl Replay {
     pub async fn declare_reference(
         &self,
         structure: &StructureId,
-        batch_ids: Vec<String>,
-        threshold_probability: f64,
-    ) -> Result<Arc<ReferenceRecord>, DeclareError> {
+        request: ReferenceRequest,
+    ) -> Result<DeclaredReference, DeclareError> {
         let (replay, structure) = (self.clone(), structure.clone());
         let place = self.assessor.compute.reserve().map_err(Error::from)?;
         in_own_task(async move {
-            let declared = replay.references.declare(&structure, batch_ids, threshold_probability, place).await?;
+            let declared = replay.references.declare(&structure, request, place).await?;
             replay.resume_later(structure);
             Ok(declared)
         })

@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 
 use super::compute::ComputeSettings;
 use super::events::News;
-use super::{Error, IngestError, Ingested, Monitor, MonitorSettings};
+use super::{Error, IngestError, Ingested, Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
@@ -48,6 +48,12 @@ fn batch(number: usize) -> MeasurementBatch {
         idempotency_key: Some(format!("key-{number}")),
         measurements: (0..MEASUREMENTS).map(one).collect(),
     }
+}
+
+/// The declaration of these batches as the undamaged reference.
+fn reference(ids: &[String]) -> ReferenceRequest {
+    let choice = ReferenceChoice::Batches(ids.to_vec());
+    ReferenceRequest { choice, leave_out_doubtful: false, threshold_probability: 0.05 }
 }
 
 async fn open(folder: &Path) -> Monitor {
@@ -190,7 +196,7 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
     }
     // A year back.
     faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
-    monitor.replay().declare_reference(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
+    monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
     for _ in 0..100 {
         let view = monitor.records().batch(&structure(), &ids[5]).await.unwrap();
         if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
@@ -214,7 +220,7 @@ async fn replayed(threads: usize) -> Vec<String> {
         ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
     }
     let mut news = monitor.events().watch().unwrap();
-    monitor.replay().declare_reference(&structure(), ids[..5].to_vec(), 0.05).await.unwrap();
+    monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
     let mut assessed = Vec::new();
     while assessed.len() < REPLAYED - 5 {
         if let News::Batch { batch, state, .. } = news.recv().await.unwrap() {

@@ -33,8 +33,32 @@ pub enum Target {
     SettingOffset(usize),
     /// A parameter that the experimenter sets, p → p(1 + g).
     SettingScale(usize),
+    /// A parameter that the experimenter sets was given in another unit, p → factor·p where g = 1; unchanged where g = 0.
+    SettingUnit {
+        /// Column of the parameter.
+        column: usize,
+        /// Unit in which it was given, in units of the parameter; −1 for the opposite sign.
+        factor: f64,
+    },
+    /// A parameter that the experimenter sets was measured from the other end, p → g₂ − p where g₁ = 1; unchanged where g₁ = 0.
+    SettingMirror(usize),
+    /// Two parameters that the experimenter sets were exchanged where g = 1.
+    SettingExchange(usize, usize),
     /// Any parameter, p → p(1 + g). An emulator, which has no springs, uses this target.
     ParameterScale(usize),
+    /// Any parameter, p → p + g in the unit of the parameter.
+    ParameterOffset(usize),
+    /// A target on a setting that acts on the frequency of one mode only.
+    InMode(usize, Box<Target>),
+    /// The response of one mode to a parameter: ln f(p) → ln f(r) + (1 + g₁)(ln f(p) − ln f(r)) + g₂, with r the reference.
+    ModeGain {
+        /// The mode.
+        mode: usize,
+        /// Column of the parameter.
+        column: usize,
+        /// Value r of the parameter at which the gain changes nothing, in its unit.
+        reference: f64,
+    },
     /// An additional spring of stiffness g, N/m, between two nodes.
     AddedSpring(Node, Node),
     /// An additional body of g₁ kg on a spring tuned to g₂ Hz, attached to a degree of freedom.
@@ -44,12 +68,41 @@ pub enum Target {
 }
 
 impl Target {
-    /// Number of sizes: 2 for an oscillator, 0 for an order of modes, otherwise 1.
+    /// Number of sizes: 2 for an oscillator, a mirrored setting and the gain of a mode, 0 for an order of modes, otherwise 1.
     pub fn sizes(&self) -> usize {
         match self {
-            Self::Oscillator(_) => 2,
+            Self::Oscillator(_) | Self::SettingMirror(_) | Self::ModeGain { .. } => 2,
             Self::ModeOrder(_) => 0,
+            Self::InMode(_, target) => target.sizes(),
             _ => 1,
+        }
+    }
+
+    /// Whether the first size is a switch: 1 in the rows in which the target acts, 0 in the others.
+    pub fn is_switch(&self) -> bool {
+        match self {
+            Self::SettingUnit { .. } | Self::SettingMirror(_) | Self::SettingExchange(..) => true,
+            Self::InMode(_, target) => target.is_switch(),
+            _ => false,
+        }
+    }
+
+    /// Whether the target changes parameters, or the response to them, instead of the structure or the instrument.
+    pub fn acts_on_parameters(&self) -> bool {
+        let others = matches!(self, Self::ParameterScale(_) | Self::ParameterOffset(_) | Self::ModeGain { .. });
+        others || !self.settings().is_empty()
+    }
+
+    /// Columns of the settings that the target corrects; empty for other targets.
+    pub fn settings(&self) -> Vec<usize> {
+        match self {
+            Self::SettingOffset(column)
+            | Self::SettingScale(column)
+            | Self::SettingUnit { column, .. }
+            | Self::SettingMirror(column) => vec![*column],
+            Self::SettingExchange(one, other) => vec![*one, *other],
+            Self::InMode(_, target) => target.settings(),
+            _ => Vec::new(),
         }
     }
 }
@@ -150,7 +203,8 @@ impl Changed {
                 Target::FrequencyScale(_) | Target::SettingScale(_) | Target::ParameterScale(_) => {
                     factor()?;
                 }
-                Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
+                // The simulator applies these to the parameters, or to the frequencies of single modes.
+                _ => {}
             }
         }
         // Springs and masses that targets added follow those of the structure and have no factor. The sizes were checked above,
@@ -270,8 +324,10 @@ pub fn measured(
                     return Err(Error::Effect { number, size });
                 }
             }
-            Target::FrequencyOffset(_) | Target::SettingOffset(_) => {}
-            _ => return Err(Error::Effect { number, size }),
+            Target::Springs(_) | Target::Masses(_) | Target::AddedSpring(..) | Target::Oscillator(_) => {
+                return Err(Error::Effect { number, size });
+            }
+            _ => {}
         }
     }
     let needed = order.iter().max().map_or(count, |highest| highest + 1);

@@ -112,6 +112,8 @@ pub enum TargetDefinition {
     Masses(Vec<String>),
     /// This parameter: p(1 + g).
     Parameter(String),
+    /// This parameter: p + g, in its unit.
+    ParameterOffset(String),
     /// Scale of the measured frequency of this mode, counted from 1, or of all modes for 0: f(1 + g).
     FrequencyScale(usize),
     /// Offset of the measured frequency of this mode, counted from 1, or of all modes for 0: f + g, Hz.

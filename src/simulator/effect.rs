@@ -240,6 +240,9 @@ fn check_one(
         );
         return Err(("law", message));
     }
+    if effect.law == LawKind::Product {
+        return Err(("law", "the law product needs two covariates, and an effect has one: use another law".to_owned()));
+    }
     if !constant && matches!(target, Target::Oscillator(_) | Target::ModeOrder(_)) {
         return Err(("law", "the targets oscillator and mode_order need the law constant".to_owned()));
     }
@@ -359,14 +362,16 @@ fn check_target(
         mode if mode <= modes => Ok(Some(mode - 1)),
         _ => Err(wrong(format!("mode {mode}: the structure has {modes} modes; 0 means all of them"))),
     };
+    let parameter = |name: &String| {
+        let column = definition.parameters.iter().position(|p| p.name == *name);
+        column.ok_or_else(|| wrong(format!("there is no parameter {}", shown(name))))
+    };
     let available = model.available_modes();
     match target {
         TargetDefinition::FrequencyScale(mode) => Ok(Target::FrequencyScale(one_mode(*mode)?)),
         TargetDefinition::FrequencyOffset(mode) => Ok(Target::FrequencyOffset(one_mode(*mode)?)),
-        TargetDefinition::Parameter(name) => {
-            let column = definition.parameters.iter().position(|p| p.name == *name);
-            column.map(Target::ParameterScale).ok_or_else(|| wrong(format!("there is no parameter {}", shown(name))))
-        }
+        TargetDefinition::Parameter(name) => parameter(name).map(Target::ParameterScale),
+        TargetDefinition::ParameterOffset(name) => parameter(name).map(Target::ParameterOffset),
         TargetDefinition::ModeOrder(order) => {
             let mut sorted = order.clone();
             sorted.sort_unstable();
@@ -422,13 +427,15 @@ fn check_part(target: &TargetDefinition, structure: &Structure) -> Result<Target
         TargetDefinition::FrequencyScale(_)
         | TargetDefinition::FrequencyOffset(_)
         | TargetDefinition::Parameter(_)
+        | TargetDefinition::ParameterOffset(_)
         | TargetDefinition::ModeOrder(_) => {
             unreachable!("check_target handles targets that are not parts of a structure")
         }
     }
 }
 
-/// A target as it is written in a structure file. `None` for a setting, which is not part of the structure.
+/// A target as it is written in a structure file. `None` for a setting, which is not part of the structure, and for the gain of
+/// a mode, which concerns settings only.
 ///
 /// # Panics
 /// If the target acts on a spring or mass and `structure` is `None`, as for a table: a programming error in the caller.
@@ -452,6 +459,7 @@ pub fn target_definition(
         Target::Oscillator(host) => Some(TargetDefinition::Oscillator(node(Node::Dof(*host)))),
         Target::ModeOrder(order) => Some(TargetDefinition::ModeOrder(order.iter().map(|m| m + 1).collect())),
         Target::ParameterScale(column) => Some(TargetDefinition::Parameter(parameter(*column))),
-        Target::SettingOffset(_) | Target::SettingScale(_) => None,
+        Target::ParameterOffset(column) => Some(TargetDefinition::ParameterOffset(parameter(*column))),
+        _ => None,
     }
 }

@@ -25,6 +25,8 @@ pub enum LawKind {
     Step,
     /// g = level + slope·(c̃ − reference), where c̃ is the covariate after a first-order lag: dc̃/dt = (c − c̃)/lag.
     Lagged,
+    /// g = level + slope·u + second_slope·v + product·u·v, where u and v are two covariates minus their means.
+    Product,
 }
 
 /// A law with everything except its coefficients ψ.
@@ -51,6 +53,8 @@ pub enum Input {
     Lagged(f64, f64),
     /// Index of a category in [`Law::levels`]; `None` for a category without a coefficient.
     Level(Option<usize>),
+    /// Two numbers, each minus its mean, for [`LawKind::Product`].
+    Pair(f64, f64),
     /// Unknown: the effect then consists of its level alone.
     Missing,
 }
@@ -67,6 +71,7 @@ impl LawKind {
             Self::Category => "category",
             Self::Step => "step",
             Self::Lagged => "lagged",
+            Self::Product => "product",
         }
     }
 
@@ -81,6 +86,7 @@ impl LawKind {
             Self::Exponential => &["level", "slope_per_unit", "rate_per_unit"],
             Self::Category => &[],
             Self::Lagged => &["level", "slope_per_unit", "lag_days"],
+            Self::Product => &["level", "slope_per_unit", "second_slope_per_unit", "product_per_unit2"],
         }
     }
 
@@ -91,6 +97,12 @@ impl LawKind {
 }
 
 impl Law {
+    /// The law of a product of two covariates, without level; `name`: name of the product.
+    pub fn of_product(name: &str) -> Self {
+        let covariate = Some(name.to_owned());
+        Self { kind: LawKind::Product, covariate, reference: 0.0, with_level: false, levels: Vec::new() }
+    }
+
     /// Names of the coefficients ψ, in order.
     pub fn numbers(&self) -> Vec<String> {
         if self.kind == LawKind::Category {
@@ -120,6 +132,7 @@ impl Law {
                 slopes[level] = 1.0;
                 return psi[level];
             }
+            Input::Pair(u, _) => u + self.reference,
             Input::Number(c) | Input::Lagged(c, _) => c,
         };
         let first = usize::from(self.kind.has_level() && self.with_level);
@@ -175,8 +188,23 @@ impl Law {
                     slopes[1] = if let Input::Lagged(_, by_lag) = input { psi[0] * by_lag } else { 0.0 };
                     psi[0] * u
                 }
+                LawKind::Product => {
+                    let v = if let Input::Pair(_, v) = input { v } else { 0.0 };
+                    slopes[..3].copy_from_slice(&[u, v, u * v]);
+                    psi[0] * u + psi[1] * v + psi[2] * u * v
+                }
                 LawKind::Category => 0.0,
             }
+    }
+
+    /// Whether a target that is switched on and off acts at an input: always under a constant law, in the categories that are
+    /// listed, and from the time of a step on.
+    pub fn acts(&self, input: Input) -> bool {
+        match (self.kind, input) {
+            (LawKind::Constant, _) | (LawKind::Category, Input::Level(Some(_))) => true,
+            (LawKind::Step, Input::Number(time)) => time >= self.reference,
+            _ => false,
+        }
     }
 }
 
@@ -225,10 +253,15 @@ mod tests {
             (LawKind::Exponential, vec![0.1, -0.2, 1e-6]),
             (LawKind::Step, vec![0.2]),
             (LawKind::Category, vec![0.2, -0.1]),
+            (LawKind::Product, vec![0.1, 0.2, -0.3, 0.4]),
         ];
         for (kind, psi) in kinds {
             for c in [-2.0, 0.71, 3.0] {
-                let input = if kind == LawKind::Category { Input::Level(Some(1)) } else { Input::Number(c) };
+                let input = match kind {
+                    LawKind::Category => Input::Level(Some(1)),
+                    LawKind::Product => Input::Pair(c, 0.4 * c + 1.0),
+                    _ => Input::Number(c),
+                };
                 let law = law(kind, true);
                 let mut slopes = vec![0.0; psi.len()];
                 law.size(input, &psi, &mut slopes);

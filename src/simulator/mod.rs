@@ -42,12 +42,15 @@ mod layout;
 mod model;
 mod parse;
 pub mod population;
+mod respond;
+pub mod settings;
 mod shapes;
 mod simulate;
 pub mod table;
 mod training;
 
 pub use model::{Binding, SimulationModel};
+pub use respond::Response;
 pub use shapes::Linearised;
-pub use simulate::{DerivedStiffness, Error, Response, Simulator};
+pub use simulate::{DerivedStiffness, Error, Simulator};
 pub use training::TrainingSet;

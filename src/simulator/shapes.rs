@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::model::{chained, structure_at, Binding, SimulationModel};
+use super::settings::CorrectedParameters;
 use super::simulate::Simulator;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
@@ -46,7 +47,11 @@ impl Simulator {
     pub fn frequencies_and_shapes(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) => {
-                let shaped = self.shaped(structure, bindings, theta, self.modes(), (&instrumented.dofs, &[]))?;
+                let corrected = self.corrected(theta).theta;
+                let shaped = self.shaped(structure, bindings, &corrected, self.modes(), (&instrumented.dofs, &[]))?;
+                if self.has_effects_in_single_modes() {
+                    return Ok((self.frequencies_hz(theta)?, shaped.shapes));
+                }
                 Ok((shaped.response.frequencies_hz, shaped.shapes))
             }
             _ => Ok((self.frequencies_hz(theta)?, DMatrix::zeros(0, 0))),
@@ -63,23 +68,27 @@ impl Simulator {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) if with_shapes => {
                 let springs: Vec<usize> = bindings.iter().map(|b| b.spring).collect();
+                let corrected = self.corrected(theta);
                 let Shaped { response, shapes, shape_slopes } =
-                    self.shaped(structure, bindings, theta, count, (&instrumented.dofs, &springs))?;
-                let (moved, factors) = self.moved_by_effects(theta);
-                let mut frequency_slopes = chained(&response.by_spring, bindings, &moved);
-                for (mut slopes, factor) in frequency_slopes.column_iter_mut().zip(&factors) {
-                    slopes *= *factor;
+                    self.shaped(structure, bindings, &corrected.theta, count, (&instrumented.dofs, &springs))?;
+                let mut frequencies_hz = response.frequencies_hz;
+                let mut frequency_slopes =
+                    chained(&response.by_spring, bindings, &corrected.theta) * &corrected.by_theta;
+                if self.has_effects_in_single_modes() {
+                    let measured = self.respond(theta, self.modes(), &[], &[])?;
+                    frequencies_hz[..self.modes()].copy_from_slice(&measured.frequencies_hz);
+                    frequency_slopes.rows_mut(0, self.modes()).copy_from(&measured.by_parameter);
                 }
                 let by_parameter = |of_mode: DMatrix<f64>| {
                     let mut slopes = DMatrix::zeros(of_mode.nrows(), theta.len());
                     for (binding, column) in bindings.iter().zip(of_mode.column_iter()) {
-                        let slope = binding.slope(moved[binding.parameter]) * factors[binding.parameter];
+                        let slope = binding.slope(corrected.theta[binding.parameter]);
                         slopes.column_mut(binding.parameter).axpy(slope, &column, 1.0);
                     }
-                    slopes
+                    slopes * &corrected.by_theta
                 };
                 let shape_slopes = shape_slopes.into_iter().map(by_parameter).collect();
-                Ok(Linearised { frequencies_hz: response.frequencies_hz, frequency_slopes, shapes, shape_slopes })
+                Ok(Linearised { frequencies_hz, frequency_slopes, shapes, shape_slopes })
             }
             _ => {
                 let (frequencies_hz, frequency_slopes) = self.frequencies_and_jacobian(theta)?;
@@ -89,19 +98,33 @@ impl Simulator {
         }
     }
 
-    /// The lowest `count` modes of the structure under the effects, with their shapes at the degrees of freedom `points`, and their
-    /// derivatives with respect to the stiffness of `springs`.
+    /// Parameters `theta` (`[d]`) as the effects change them in all modes.
+    fn corrected(&self, theta: &[f64]) -> CorrectedParameters {
+        // No mode has this number, so that the effects on the frequency of a single mode are left out.
+        CorrectedParameters::new(theta, &self.targets(), self.sizes(), usize::MAX)
+    }
+
+    fn targets(&self) -> Vec<Target> {
+        self.effects().iter().map(|effect| effect.target.clone()).collect()
+    }
+
+    /// Whether an effect changes the parameters, or the response to them, for the frequency of a single mode only.
+    fn has_effects_in_single_modes(&self) -> bool {
+        self.effects().iter().any(|effect| matches!(effect.target, Target::InMode(..) | Target::ModeGain { .. }))
+    }
+
+    /// The lowest `count` modes of the structure under the effects at `corrected` parameters (`[d]`), with their shapes at the degrees
+    /// of freedom `points`, and their derivatives with respect to the stiffness of `springs`.
     fn shaped(
         &self,
         structure: &Structure,
         bindings: &[Binding],
-        theta: &[f64],
+        corrected: &[f64],
         count: usize,
         (points, springs): (&[usize], &[usize]),
     ) -> Result<Shaped, physics::Error> {
-        let targets: Vec<Target> = self.effects().iter().map(|effect| effect.target.clone()).collect();
-        let structure = structure_at(structure, bindings, &self.moved_by_effects(theta).0)?;
-        respond_shaped(&structure, count, (&targets, self.sizes()), points, springs)
+        let structure = structure_at(structure, bindings, corrected)?;
+        respond_shaped(&structure, count, (&self.targets(), self.sizes()), points, springs)
     }
 
     /// Number of simulated modes to pair with the measured ones: the measured modes and a few above, which can swap with them.

@@ -12,10 +12,11 @@ use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinit
 use super::effect::{self, SimulationEffect};
 use super::instrumented::Instrumented;
 use super::model::{chained, changes, structure_at, Binding, SimulationModel};
+use super::settings::CorrectedParameters;
 use super::table::Table;
 use crate::measurement::{Covariate, CovariateValue};
 use crate::parameter::{Parameter, ParameterSpace};
-use crate::physics::effect::{measured, respond, Target};
+use crate::physics::effect::Target;
 use crate::physics::{self, frequency_sensitivity, modes, natural_frequencies_with, Structure};
 use crate::quantity::{Digest, StructureId};
 
@@ -61,17 +62,6 @@ struct Parts {
     checked: check::Checked,
     /// Prepared when it is first needed; `None` for a simulation that cannot be batched.
     batched: OnceLock<Option<BatchedRuns>>,
-}
-
-/// Frequencies under effects and their derivatives.
-#[derive(Debug, Clone)]
-pub struct Response {
-    /// Frequencies as the instrument reports them, Hz, `[m]`.
-    pub frequencies_hz: Vec<f64>,
-    /// Derivatives with respect to the parameters, Hz per parameter unit, `[m, d]`.
-    pub by_parameter: DMatrix<f64>,
-    /// Derivatives with respect to the sizes of the further effects, Hz per unit of the size, `[m, sizes]`.
-    pub by_size: DMatrix<f64>,
 }
 
 /// The stiffness of a spring that a parameter sets through a law.
@@ -143,6 +133,11 @@ impl Simulator {
         effect::sizes(self.effects(), covariates)
     }
 
+    /// Sizes of the effects of the structure file, `[sizes]`, in the units of their targets.
+    pub(super) fn sizes(&self) -> &[f64] {
+        &self.sizes
+    }
+
     /// Id of the structure.
     pub fn id(&self) -> &StructureId {
         &self.parts.checked.id
@@ -193,25 +188,8 @@ impl Simulator {
     /// table has no runs near them.
     pub fn is_extrapolated(&self, theta: &[f64]) -> bool {
         let Some(table) = self.table() else { return false };
-        table.is_outside(&self.moved_by_effects(theta).0)
-    }
-
-    /// Parameters `theta` (`[d]`) as the effects change them, and the factor on each, `[d]`.
-    pub(super) fn moved_by_effects(&self, theta: &[f64]) -> (Vec<f64>, Vec<f64>) {
-        let mut factors = vec![1.0; theta.len()];
-        let mut first = 0;
-        for effect in self.effects() {
-            if let Target::ParameterScale(column) = effect.target {
-                factors[column] *= 1.0 + self.sizes[first];
-            }
-            first += effect.target.sizes();
-        }
-        (theta.iter().zip(&factors).map(|(value, factor)| value * factor).collect(), factors)
-    }
-
-    /// Sizes of the effects, in the order of the effects and in the units of their targets, `[sizes]`.
-    pub(super) fn sizes(&self) -> &[f64] {
-        &self.sizes
+        let targets: Vec<Target> = self.effects().iter().map(|e| e.target.clone()).collect();
+        table.is_outside(&CorrectedParameters::new(theta, &targets, &self.sizes, 0).theta)
     }
 
     /// The stiffnesses that parameters set; empty for a table.
@@ -352,69 +330,6 @@ impl Simulator {
                 Ok((frequencies, jacobian.rows(0, self.modes()).into_owned()))
             }
         }
-    }
-
-    /// The lowest `modes` frequencies at parameters `theta` (`[d]`, parameter units) under the effects of the structure file
-    /// and the further effects `targets`, and their derivatives with respect to the parameters and to the sizes of the further
-    /// effects, `sizes` (`[sizes]`, in the units of the targets).
-    ///
-    /// # Errors
-    /// As [`Self::frequencies_hz`] and [`respond`].
-    pub fn respond(
-        &self,
-        theta: &[f64],
-        modes: usize,
-        targets: &[Target],
-        sizes: &[f64],
-    ) -> Result<Response, physics::Error> {
-        let own: usize = self.sizes.len();
-        let targets: Vec<Target> = self.effects().iter().map(|e| &e.target).chain(targets).cloned().collect();
-        let sizes: Vec<f64> = self.sizes.iter().chain(sizes).copied().collect();
-        let (targets, sizes) = (targets.as_slice(), sizes.as_slice());
-        let mut theta = theta.to_vec();
-        let mut set_scale = vec![1.0; theta.len()];
-        let mut first = 0;
-        for target in targets {
-            match target {
-                Target::SettingOffset(column) => theta[*column] += sizes[first],
-                Target::SettingScale(column) | Target::ParameterScale(column) => {
-                    theta[*column] *= 1.0 + sizes[first];
-                    set_scale[*column] *= 1.0 + sizes[first];
-                }
-                _ => {}
-            }
-            first += target.sizes();
-        }
-        let (frequencies_hz, mut by_parameter, mut by_size) = match self.model() {
-            SimulationModel::Matrices { structure, bindings } => {
-                let response = respond(&structure_at(structure, bindings, &theta)?, modes, targets, sizes)?;
-                let by_parameter = chained(&response.by_spring, bindings, &theta);
-                (response.frequencies_hz, by_parameter, response.by_size)
-            }
-            SimulationModel::Table(table) => {
-                let (frequencies, jacobian) = table.frequencies_and_jacobian(&theta);
-                let measured = measured(&frequencies, &jacobian, modes, targets, sizes)?;
-                (measured.frequencies_hz, measured.by_parameter, measured.by_size)
-            }
-        };
-        first = 0;
-        for target in targets {
-            for mode in 0..modes {
-                match target {
-                    Target::SettingOffset(column) => by_size[(mode, first)] = by_parameter[(mode, *column)],
-                    Target::SettingScale(column) | Target::ParameterScale(column) => {
-                        by_size[(mode, first)] = by_parameter[(mode, *column)] * theta[*column] / (1.0 + sizes[first]);
-                    }
-                    _ => {}
-                }
-            }
-            first += target.sizes();
-        }
-        for (column, scale) in set_scale.iter().enumerate() {
-            by_parameter.column_mut(column).scale_mut(*scale);
-        }
-        let by_size = by_size.columns(own, sizes.len() - own).into_owned();
-        Ok(Response { frequencies_hz, by_parameter, by_size })
     }
 
     /// Natural frequencies at the nominal stiffnesses, or in the middle of the prior of a table, Hz, `[m]`.

@@ -74,7 +74,7 @@ pub use retention::{Deleted, Expired, Retention};
 pub use series::{ChartMark, ChartSeries, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};
 pub use token::Tokens;
-pub use undamaged::{ReferenceRecord, References};
+pub use undamaged::{MeasuredBatch, ReferenceRecord, References};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
 

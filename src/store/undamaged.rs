@@ -7,10 +7,12 @@ use serde::Serialize;
 use sqlx::FromRow;
 
 use super::assessment::CURRENT_FIRST;
+use super::batch::batch_state;
 use super::column::{bad_row, from_blob, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
 use super::transaction::Transaction;
+use crate::assessment::BatchState;
 use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -25,6 +27,36 @@ pub struct ReferenceRecord {
     pub created_at: Timestamp,
     /// Ids of its batches.
     pub batches: Vec<String>,
+}
+
+/// A batch with measurements in a period.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MeasuredBatch {
+    /// Its id.
+    pub batch_id: String,
+    /// Time of its first measurement.
+    pub measured_from: Timestamp,
+    /// Time of its last measurement.
+    pub measured_to: Timestamp,
+    /// Its state.
+    pub state: BatchState,
+    /// Why its assessment failed.
+    pub failure: Option<String>,
+    /// Whether it was assessed at any time.
+    pub assessed: bool,
+    /// Reason of a maintenance window in which a part of it was measured.
+    pub maintenance: Option<String>,
+}
+
+#[derive(FromRow)]
+struct MeasuredRow {
+    batch_id: String,
+    measured_from_us: i64,
+    measured_to_us: i64,
+    state: String,
+    failure: Option<String>,
+    assessed: bool,
+    maintenance: Option<String>,
 }
 
 /// The newest undamaged references that were read, by structure.
@@ -82,6 +114,45 @@ impl References<'_> {
         // The next call of `undamaged_as_read` reads the new reference.
         self.newest.lock().expect("no holder of this lock panics").remove(structure);
         Ok(version)
+    }
+
+    /// The batches with measurements from `from` on and before `to`, by their first measurement.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn batches_in(
+        self,
+        structure: &StructureId,
+        from: Timestamp,
+        to: Timestamp,
+    ) -> Result<Vec<MeasuredBatch>, Error> {
+        let rows: Vec<MeasuredRow> = sqlx::query_as(
+            "select batch_id, measured_from_us, measured_to_us, state, failure,
+                    exists (select 1 from assessment a where a.structure_id = b.structure_id and a.batch_id = b.batch_id) as assessed,
+                    (select reason from maintenance_window w where w.structure_id = b.structure_id
+                        and w.from_us <= b.measured_to_us and w.to_us > b.measured_from_us
+                        order by w.from_us limit 1) as maintenance
+             from measurement_batch b
+             where b.structure_id = $1 and b.measured_from_us < $3 and b.measured_to_us >= $2
+             order by b.measured_from_us, b.batch_id",
+        )
+        .bind(structure.as_str())
+        .bind(from.micros())
+        .bind(to.micros())
+        .fetch_all(&self.database.reader)
+        .await?;
+        let batch = |row: MeasuredRow| {
+            Ok(MeasuredBatch {
+                batch_id: row.batch_id,
+                measured_from: timestamp("batch", row.measured_from_us)?,
+                measured_to: timestamp("batch", row.measured_to_us)?,
+                state: batch_state(&row.state)?,
+                failure: row.failure,
+                assessed: row.assessed,
+                maintenance: row.maintenance,
+            })
+        };
+        rows.into_iter().map(batch).collect()
     }
 
     /// The newest undamaged reference of a structure. Each version is read only once, because it never changes.

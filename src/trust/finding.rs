@@ -24,6 +24,8 @@ pub enum FindingCode {
     FitNotTestable,
     /// The values are in another unit than Hz.
     UnitSuspected,
+    /// Two modes have the same frequency.
+    ModesCoincide,
     /// Modes are in the wrong order.
     ModesSwapped,
     /// A mode was missed, and those above it were numbered one too low.

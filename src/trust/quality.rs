@@ -1,6 +1,8 @@
-//! Plausibility checks of the measurements that need no simulation: order of the modes, repeated values, resolution, outliers.
+//! Plausibility checks of the measurements that need no simulation: equal modes, order of the modes, repeated values, resolution,
+//! outliers.
 
 use super::finding::{too_many, Finding, FindingCode, FindingEffect};
+use crate::measurement::order::Disorder;
 use crate::measurement::ModalMeasurement;
 use crate::quantity::Hertz;
 use crate::stats;
@@ -27,6 +29,7 @@ pub struct Inspection {
 pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hertz>]>) -> Inspection {
     let mut findings = Vec::new();
     let mut kept: Vec<(usize, ModalMeasurement)> = measurements.iter().cloned().enumerate().collect();
+    drop_coinciding(&mut kept, &mut findings);
     sort_modes(&mut kept, &mut findings);
     let coarse = quantised(&kept, &mut findings);
     // Values rounded to coarse steps coincide by chance.
@@ -35,6 +38,25 @@ pub fn inspect(measurements: &[ModalMeasurement], previous: Option<&[Option<Hert
     }
     drop_outliers(&mut kept, &mut findings);
     Inspection { kept, findings }
+}
+
+/// Leaves out measurements with two equal frequencies: one peak was taken for two modes, which says nothing about the other
+/// measurements. The batch is rejected if they are more than half of it.
+fn drop_coinciding(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Finding>) {
+    let equal = |m: &ModalMeasurement| Disorder::of(&m.frequencies_hz).filter(Disorder::is_equal);
+    let found: Vec<(usize, Disorder)> = kept.iter().filter_map(|(index, m)| Some((*index, equal(m)?))).collect();
+    let Some((_, example)) = found.first() else { return };
+    let (bad, all) = (found.len(), kept.len());
+    let many = 2 * bad > all;
+    let rest = if many { "" } else { ", and are left out" };
+    let message =
+        format!("{bad} of {all} measurements have two modes with the same frequency{rest} (in the first, {example})");
+    let effect = if many { FindingEffect::Reject } else { FindingEffect::Note };
+    let indices: Vec<usize> = found.iter().map(|(index, _)| *index).collect();
+    findings.push(Finding::new(FindingCode::ModesCoincide, effect, message).of(indices.clone()));
+    if !many {
+        kept.retain(|(index, _)| !indices.contains(index));
+    }
 }
 
 /// Reports measurements whose modes are out of order. A few are left out. When there are many, the batch is rejected, and the modes
@@ -46,7 +68,7 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
         let present: Vec<usize> =
             (0..measurement.frequencies_hz.len()).filter(|&i| measurement.frequencies_hz[i].is_some()).collect();
         let value = |m: &ModalMeasurement, mode: usize| m.frequencies_hz[mode].map_or(0.0, Hertz::get);
-        let Some(pair) = present.windows(2).find(|pair| value(measurement, pair[1]) <= value(measurement, pair[0]))
+        let Some(pair) = present.windows(2).find(|pair| value(measurement, pair[1]) < value(measurement, pair[0]))
         else {
             continue;
         };

@@ -16,6 +16,8 @@ mod hostile;
 mod needs;
 mod openapi;
 mod operations;
+mod reference;
 mod restart;
 mod ruler_frame;
+mod tables;
 mod views;

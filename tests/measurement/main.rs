@@ -4,8 +4,10 @@
 
 use std::collections::BTreeMap;
 
-use modalwatch::measurement::check::{check_measurements, Expectation};
-use modalwatch::measurement::csv::{read, write, CsvOptions, Times};
+use modalwatch::measurement::body::RawBatch;
+use modalwatch::measurement::check::{check_each, check_measurements, Expectation, Purpose};
+use modalwatch::measurement::csv::{read, write, CsvOptions};
+use modalwatch::measurement::shape::InstrumentedPoints;
 use modalwatch::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
 use modalwatch::quantity::{Hertz, Timestamp};
@@ -30,7 +32,7 @@ fn space() -> ParameterSpace {
 }
 
 fn options() -> CsvOptions {
-    CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: None }
+    CsvOptions::default()
 }
 
 prop_compose! {
@@ -70,6 +72,7 @@ proptest! {
         rows.dedup_by_key(|m| m.measured_at);
         let (covariates, space) = (covariates(), space());
         let expectation = Expectation {
+            purpose: Purpose::Assessment,
             modes: 3,
             frequency_limits_hz: (0.01, 100.0),
             covariates: &covariates,
@@ -98,6 +101,7 @@ proptest! {
 fn the_ways_a_table_is_written_are_read_alike() {
     let (covariates, space) = (covariates(), space());
     let expectation = Expectation {
+        purpose: Purpose::Assessment,
         modes: 3,
         frequency_limits_hz: (0.01, 100.0),
         covariates: &covariates,
@@ -140,6 +144,62 @@ fn the_ways_a_table_is_written_are_read_alike() {
     ];
     for (name, text) in cases {
         assert_eq!(of(&text), Ok(expected.clone()), "{name}:\n{text}");
+    }
+}
+
+/// Mode shapes come in JSON only: each measurement is judged by itself, and named.
+#[test]
+fn measurements_are_judged_one_by_one() {
+    let text = r#"{"measurements": [
+        {"measured_at": "2026-01-01T00:00:00Z", "frequencies_hz": [1, 2], "mode_shapes": [[1, 0.5], null]},
+        {"measured_at": "2026-01-01T00:01:00Z", "frequencies_hz": [1, 2], "mode_shapes": [[1, 0.5, 2], null]},
+        {"measured_at": "2026-01-01T00:02:00Z", "frequencies_hz": [1, 2, 3]},
+        {"measured_at": "2026-01-01T00:03:00Z", "frequencies_hz": [1, null], "settings": {"k1": 90}},
+        {"measured_at": "2026-01-01T00:03:00Z", "frequencies_hz": [1, 2]},
+        {"measured_at": "1969-01-01T00:00:00Z", "frequencies_hz": [1, -2]}
+    ]}"#;
+    let points = InstrumentedPoints {
+        names: vec!["roof".to_owned(), "floor".to_owned()],
+        nominal: vec![vec![0.9, 0.45], vec![-0.45, 0.9]],
+    };
+    let space = space();
+    let expectation = |purpose| Expectation {
+        purpose,
+        modes: 2,
+        frequency_limits_hz: (0.01, 100.0),
+        covariates: &[],
+        instrumented: Some(&points),
+        space: &space,
+        now: Timestamp::now(),
+        max_measurements: 100,
+    };
+    let of = |purpose| {
+        let raw = RawBatch::of_post(text.as_bytes(), None).unwrap().measurements;
+        let each = check_each(raw, &expectation(purpose)).into_iter();
+        each.map(|checked| checked.err().map_or_else(String::new, |p| format!("{}: {}", p.pointer, p.message)))
+            .collect()
+    };
+    let reasons = [
+        ["", ""],
+        ["/measurements/1/mode_shapes/0: 3 numbers, expected 2"; 2],
+        ["/measurements/2/frequencies_hz: 3 frequencies, expected 2"; 2],
+        ["/measurements/3/settings/k1: 90 N/m is outside the prior of k1", ""],
+        ["/measurements/4/measured_at: another measurement of this batch has the same time"; 2],
+        [
+            "/measurements/5/measured_at: 1969-01-01T00:00:00Z is before 1970",
+            "/measurements/5/frequencies_hz/1: natural frequency",
+        ],
+    ];
+    for (purpose, column) in [(Purpose::Assessment, 0), (Purpose::Diagnosis, 1)] {
+        let found: Vec<String> = of(purpose);
+        assert_eq!(found.len(), reasons.len());
+        for (found, expected) in found.iter().zip(reasons) {
+            let expected = expected[column];
+            assert!(
+                found.starts_with(expected) && found.is_empty() == expected.is_empty(),
+                "{found} instead of {expected}"
+            );
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::figures::{digits, plus, signed};
 use crate::discrepancy::describe::rounded;
-use crate::discrepancy::gain::{Change, Gain};
+use crate::discrepancy::gain::{Change, Gain, GainMethod};
 use crate::plot::{escaped, table_of_html};
 
 /// The table of the gain: each figure without and with the causes, its change and its meaning.
@@ -50,11 +50,15 @@ pub(super) fn gain(g: &Gain) -> String {
     }
     let alarms = "Batches of ten rows that exceed a limit set for 1 false alarm in 1000, assuming that the structure is undamaged in \
                   these rows.";
-    simple("false alarms per 1000 batches".to_owned(), &g.false_alarms_per_1000, alarms);
+    if let Some(change) = &g.false_alarms_per_1000 {
+        simple("false alarms per 1000 batches".to_owned(), change, alarms);
+    }
     let loss =
         "Smallest loss of the parameter that is identified worst which one batch of ten rows detects with a probability of \
          90 %. Smaller is better.";
-    simple("smallest detectable loss, %".to_owned(), &g.smallest_detectable_loss_percent, loss);
+    if let Some(change) = &g.smallest_detectable_loss_percent {
+        simple("smallest detectable loss, %".to_owned(), change, loss);
+    }
     let header = [
         ("figure", true),
         ("without the causes", false),
@@ -62,9 +66,15 @@ pub(super) fn gain(g: &Gain) -> String {
         ("change", false),
         ("meaning", true),
     ];
-    let caption = format!(
-        "Measured on the {} rows held out, which were used neither to find nor to fit the causes",
-        g.holdout_rows
-    );
+    let caption = match g.method {
+        GainMethod::HeldOut => {
+            format!("Measured on the {} rows held out, which were used neither to find nor to fit the causes", g.holdout_rows)
+        }
+        GainMethod::CrossValidation => format!(
+            "Measured by cross-validation: each of the {} rows is predicted by a fit without its block of rows. The causes were \
+             found with all rows, so that the gain is measured a little too large",
+            g.holdout_rows
+        ),
+    };
     table_of_html(&caption, &header, &rows)
 }

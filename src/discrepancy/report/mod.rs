@@ -34,7 +34,10 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
     if let Some(left) = &d.remainder {
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
     }
-    sections.push(("Gain on the rows held out".to_owned(), d.gain.as_ref().map_or_else(|| no_gain(d), gain::gain)));
+    sections.push((
+        "Gain on rows that were not used for the fit".to_owned(),
+        d.gain.as_ref().map_or_else(|| no_gain(d), gain::gain),
+    ));
     sections.push(("Notes".to_owned(), notes(d)));
     sections.push(("How to read this".to_owned(), GLOSSARY.to_owned()));
     Some(page(&format!("Diagnosis of the simulation of {}", d.structure), &sections))
@@ -45,6 +48,7 @@ fn in_short(d: &Diagnosis) -> String {
         DiagnosisVerdict::Cause => "one cause, with high probability",
         DiagnosisVerdict::Several => "several causes at the same time",
         DiagnosisVerdict::Ambiguous => "one cause out of a few that these data cannot distinguish",
+        DiagnosisVerdict::UnexplainedScatter => "more scatter than noise and spread explain",
         DiagnosisVerdict::NoneOfThese => "a deviation that no known cause explains",
         DiagnosisVerdict::NothingFound => "no cause found",
     };

@@ -10,8 +10,12 @@ use crate::baseline::Baseline;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend;
 use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
+use crate::measurement::order::{Disorder, Ordered};
 use crate::measurement::ModalMeasurement;
 use crate::simulator::Simulator;
+
+/// Largest number of measurements that a note names.
+const MOST_NAMED: usize = 5;
 
 /// The measurements of a diagnosis, and how they are used.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -89,9 +93,26 @@ impl Study {
     }
 
     fn outcome(&self) -> Result<(Data, Outcome), String> {
-        let data = Data::new(&self.simulator, &self.measurements);
+        let ordered = Ordered::of(&self.measurements);
+        let used: Vec<ModalMeasurement> = ordered.kept.iter().map(|index| self.measurements[*index].clone()).collect();
+        let data = Data::new(&self.simulator, &used);
         let progress = |step: Step| self.progress.report(&self.id, step.to_string());
         let outcome = diagnose(&self.simulator, &data, &self.request.holdout, self.request.seed, &progress);
-        Ok((data, outcome.map_err(|e| e.to_string())?))
+        let mut outcome = outcome.map_err(|e| e.to_string())?;
+        outcome.diagnosis.notes.splice(0..0, self.left_out(&ordered).into_iter().chain(ordered.notes));
+        Ok((data, outcome))
+    }
+
+    /// A sentence about the measurements that are left out, if there are any.
+    fn left_out(&self, ordered: &Ordered) -> Option<String> {
+        let named =
+            |(index, disorder): &(usize, Disorder)| format!("{}: {disorder}", self.measurements[*index].measured_at);
+        let mut some: Vec<String> = ordered.left_out.iter().take(MOST_NAMED).map(named).collect();
+        let (count, all) = (ordered.left_out.len(), self.measurements.len());
+        if count > MOST_NAMED {
+            some.push(format!("and {} more", count - MOST_NAMED));
+        }
+        (count > 0)
+            .then(|| format!("{count} of {all} measurements cannot be used and are left out: {}", some.join("; ")))
     }
 }

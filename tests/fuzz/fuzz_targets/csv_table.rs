@@ -5,7 +5,7 @@
 use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
-use modalwatch::measurement::check::{check_measurements, Expectation};
+use modalwatch::measurement::check::{check_measurements, Expectation, Purpose};
 use modalwatch::measurement::csv::{offered, read, write, CsvOptions, Times};
 use modalwatch::measurement::{Covariate, CovariateKind, ModalMeasurement};
 use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
@@ -28,7 +28,7 @@ fn covariates() -> [Covariate; 2] {
 
 fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
     let covariates = covariates();
-    let options = CsvOptions { times, ignore: vec!["lab".to_owned()], time_column: None };
+    let options = CsvOptions { times, ignore: vec!["lab".to_owned()], ..CsvOptions::default() };
     let raw = match read(bytes, 3, &covariates, &options) {
         Ok(raw) => raw,
         Err(problems) => {
@@ -37,6 +37,7 @@ fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
         }
     };
     let expectation = Expectation {
+        purpose: Purpose::Assessment,
         modes: 3,
         frequency_limits_hz: (0.001, 1_000.0),
         covariates: &covariates,
@@ -49,7 +50,7 @@ fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
 }
 
 fuzz_target!(|bytes: &[u8]| {
-    let options = CsvOptions { times: Times::Required, ignore: Vec::new(), time_column: Some("Zeit".to_owned()) };
+    let options = CsvOptions { time_column: Some("Zeit".to_owned()), ..CsvOptions::default() };
     let _ = offered(bytes, &covariates(), &options, 5);
     let _ = read(bytes, 3, &covariates(), &options);
     let _ = checked(bytes, Times::RowNumber);

@@ -2,7 +2,7 @@
 
 import { at, read, send } from "../api.js";
 import { ask, cell, fill, h, icon, notify } from "../dom.js";
-import { count, digest, local, number, percent } from "../format.js";
+import { count, digest, local, number, percent, zone } from "../format.js";
 
 export function model(structure, changed) {
   const content = h("div", null);
@@ -262,21 +262,40 @@ async function declare(structure, changed) {
       h(
         "p",
         null,
-        "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available. All batches are compared again with the new reference, and alarms based on the old one are withdrawn.",
+        "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available, or the period in which it was. All batches are compared again with the new reference, and alarms based on the old one are withdrawn.",
       ),
       list,
     ],
-    fields: [{ name: "p", label: "Limit of the probability of damage (%)", type: "text", required: true, value: "5" }],
+    fields: [
+      {
+        name: "from",
+        label: `Instead of batches, a period: from (${zone()})`,
+        type: "datetime-local",
+        hint: "All batches of the period are used. Doubtful ones are left out and named.",
+      },
+      { name: "to", label: `to (${zone()})`, type: "datetime-local" },
+      { name: "p", label: "Limit of the probability of damage (%)", type: "text", required: true, value: "5" },
+    ],
     confirm: "Declare",
-    submit: ({ p }) => {
+    submit: ({ from, to, p }) => {
       const batches = [...list.querySelectorAll("input:checked")].map((box) => box.value);
-      if (batches.length === 0)
-        throw Object.assign(new Error("Choose at least one batch."), { title: "No batch chosen" });
-      return send(at(structure, "/reference"), { batches, threshold_probability: Number(p.replace(",", ".")) / 100 });
+      const refuse = (title, message) => {
+        throw Object.assign(new Error(message), { title });
+      };
+      if ((from === "") !== (to === "")) refuse("Incomplete period", "Give both the begin and the end of the period.");
+      const period = from === "" ? null : { from: new Date(from).toISOString(), to: new Date(to).toISOString() };
+      if (period && batches.length > 0) refuse("Batches and period", "Choose either batches or a period.");
+      if (!period && batches.length === 0) refuse("No batch chosen", "Choose at least one batch, or a period.");
+      const threshold_probability = Number(p.replace(",", ".")) / 100;
+      return send(at(structure, "/reference"), { ...(period ?? { batches }), threshold_probability });
     },
   });
   if (done) {
-    notify(`Version ${done.version} of the undamaged reference of ${structure} has been declared.`);
+    const left = done.left_out;
+    const without = left.length > 0 ? ` ${count(left.length, "batch", "batches")} left out; the first: ${left[0].reason}.` : "";
+    notify(
+      `Version ${done.version} of the undamaged reference of ${structure} has been declared from ${count(done.batches.length, "batch", "batches")}.${without}`,
+    );
     changed();
   }
 }
