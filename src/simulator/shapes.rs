@@ -69,11 +69,12 @@ impl Simulator {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) if with_shapes => {
                 let springs: Vec<usize> = bindings.iter().map(|b| b.spring).collect();
                 let corrected = self.corrected(theta);
+                let moved = self.effects().iter().any(|effect| effect.target.acts_on_parameters());
+                let chain = |slopes: DMatrix<f64>| if moved { slopes * &corrected.by_theta } else { slopes };
                 let Shaped { response, shapes, shape_slopes } =
                     self.shaped(structure, bindings, &corrected.theta, count, (&instrumented.dofs, &springs))?;
                 let mut frequencies_hz = response.frequencies_hz;
-                let mut frequency_slopes =
-                    chained(&response.by_spring, bindings, &corrected.theta) * &corrected.by_theta;
+                let mut frequency_slopes = chain(chained(&response.by_spring, bindings, &corrected.theta));
                 if self.has_effects_in_single_modes() {
                     let measured = self.respond(theta, self.modes(), &[], &[])?;
                     frequencies_hz[..self.modes()].copy_from_slice(&measured.frequencies_hz);
@@ -85,7 +86,7 @@ impl Simulator {
                         let slope = binding.slope(corrected.theta[binding.parameter]);
                         slopes.column_mut(binding.parameter).axpy(slope, &column, 1.0);
                     }
-                    slopes * &corrected.by_theta
+                    chain(slopes)
                 };
                 let shape_slopes = shape_slopes.into_iter().map(by_parameter).collect();
                 Ok(Linearised { frequencies_hz, frequency_slopes, shapes, shape_slopes })
