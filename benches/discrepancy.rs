@@ -8,6 +8,8 @@ use criterion::{criterion_group, criterion_main, BenchmarkId, Criterion};
 use modalwatch::discrepancy::data::Data;
 use modalwatch::discrepancy::{diagnose, Holdout};
 use modalwatch::measurement::{CovariateValue, ModalMeasurement};
+use modalwatch::physics::modes;
+use modalwatch::physics::shapes::shapes_at;
 use modalwatch::quantity::{Hertz, Timestamp};
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
@@ -15,8 +17,8 @@ use modalwatch::stats;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 
-/// A chain with ties to the ground; the first two springs are unknown.
-fn simulator(masses: usize) -> Simulator {
+/// A chain with ties to the ground; the first two springs are unknown. With `shapes`, they are measured at every second mass.
+fn simulator(masses: usize, shapes: bool) -> Simulator {
     let mass = |i: usize| format!("{{ name = \"m{i}\", kg = {} }}", 1.0 + 0.1 * i as f64);
     let tie = |i: usize| format!("{{ name = \"g{i}\", from = \"ground\", to = \"m{i}\", n_per_m = {} }}", 300 + 70 * i);
     let link =
@@ -24,8 +26,11 @@ fn simulator(masses: usize) -> Simulator {
     let unknown = |name: &str, low: f64, high: f64| {
         format!("{{ name = \"{name}\", prior = {{ uniform = [{low}, {high}] }}, sets = {{ spring = \"{name}\" }} }}")
     };
+    let points = points(masses).map(|i| format!("\"m{i}\"")).collect::<Vec<_>>().join(", ");
+    let declared =
+        if shapes { format!("mode_shapes = {{ points = [{points}], noise = 0.02 }}\n") } else { String::new() };
     let text = format!(
-        "id = \"bench\"\nmodes = {masses}\nmeasurement_noise = {{ relative = 0.002 }}\nmass = [{}]\nspring = [{}, {}]\nparameter = [{}, {}]\n",
+        "id = \"bench\"\nmodes = {masses}\nmeasurement_noise = {{ relative = 0.002 }}\n{declared}mass = [{}]\nspring = [{}, {}]\nparameter = [{}, {}]\n",
         (0..masses).map(mass).collect::<Vec<_>>().join(", "),
         (0..masses).map(tie).collect::<Vec<_>>().join(", "),
         (0..masses - 1).map(link).collect::<Vec<_>>().join(", "),
@@ -33,6 +38,29 @@ fn simulator(masses: usize) -> Simulator {
         unknown("c0", 450.0, 1350.0),
     );
     Simulator::new(StructureDefinition::parse_toml(&text).expect("a structure")).expect("a structure")
+}
+
+/// The masses at which shapes are measured.
+fn points(masses: usize) -> impl Iterator<Item = usize> {
+    (0..masses).step_by(2)
+}
+
+/// Shapes with noise at the points of a structure whose last tie has changed by a share `change`, `[modes][points]`.
+fn shapes(
+    simulator: &Simulator,
+    theta: [f64; 2],
+    change: f64,
+    normal: &mut impl FnMut() -> f64,
+) -> Vec<Option<Vec<f64>>> {
+    let nominal = simulator.structure().expect("a structure of masses and springs");
+    let masses = nominal.masses().len();
+    let last = nominal.springs()[masses - 1].n_per_m * (1.0 + change);
+    let changes = [(0, theta[0]), (masses, theta[1]), (masses - 1, last)];
+    let changed = nominal.with_stiffness(&changes).expect("positive stiffnesses");
+    let points: Vec<usize> = points(masses).collect();
+    let exact = shapes_at(&modes(&changed, simulator.modes()).expect("modes"), &points);
+    let noisy = |x: &f64| x + simulator.shape_std() * normal();
+    exact.column_iter().map(|shape| Some(shape.iter().map(noisy).collect())).collect()
 }
 
 /// Rows of one year in which the last tie softens with temperature.
@@ -47,12 +75,14 @@ fn data(simulator: &Simulator, rows: usize) -> Data {
         let target = modalwatch::physics::effect::Target::Springs(vec![last]);
         let exact = simulator.respond(&theta, last + 1, &[target], &[-0.004 * (celsius - 10.0)]).expect("frequencies");
         let hertz = |f: &f64| Hertz::new(f * (1.0 + 0.002 * normal())).ok();
+        let frequencies_hz = exact.frequencies_hz.iter().map(hertz).collect();
         let operator = ["A", "B", "C"][row % 3].to_owned();
         ModalMeasurement {
-            frequencies_hz: exact.frequencies_hz.iter().map(hertz).collect(),
+            frequencies_hz,
             measured_at: Timestamp::from_micros((day * 86_400e6) as i64).expect("a time"),
             std_hz: None,
-            mode_shapes: None,
+            mode_shapes: (simulator.shape_points() > 0)
+                .then(|| shapes(simulator, theta, -0.004 * (celsius - 10.0), &mut normal)),
             covariates: [
                 ("temperature_c".to_owned(), CovariateValue::Number(celsius)),
                 ("humidity_percent".to_owned(), CovariateValue::Number(60.0 - celsius + 5.0 * normal())),
@@ -68,12 +98,15 @@ fn data(simulator: &Simulator, rows: usize) -> Data {
 fn diagnosis(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("diagnose, rows x modes");
     group.sample_size(10);
-    for (rows, modes) in [(100, 4), (400, 4), (1_600, 4), (400, 8), (10_000, 5)] {
-        let simulator = simulator(modes);
+    let cases =
+        [(100, 4, false), (400, 4, false), (400, 4, true), (1_600, 4, false), (400, 8, false), (10_000, 5, false)];
+    for (rows, modes, shapes) in cases {
+        let simulator = simulator(modes, shapes);
         let data = data(&simulator, rows);
         let run = || diagnose(&simulator, &data, &Holdout::Last(0.25), 1, &|_| {}).expect("a diagnosis");
-        println!("{rows} x {modes}: {} candidates", run().diagnosis.candidates);
-        group.bench_function(BenchmarkId::from_parameter(format!("{rows} x {modes}")), |bencher| {
+        let name = format!("{rows} x {modes}{}", if shapes { " with shapes" } else { "" });
+        println!("{name}: {} candidates", run().diagnosis.candidates);
+        group.bench_function(BenchmarkId::from_parameter(name), |bencher| {
             bencher.iter(|| black_box(run()));
         });
     }

@@ -20,7 +20,8 @@ pub fn read_measurements(
     ignore: &[String],
 ) -> anyhow::Result<Vec<ModalMeasurement>> {
     let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let options = CsvOptions { times: Times::RowNumber, ignore: ignore.to_vec(), ..CsvOptions::default() };
+    let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
+    let options = CsvOptions { times: Times::RowNumber, ignore: ignore.to_vec(), points, ..CsvOptions::default() };
     let expectation = simulator.expectation(Timestamp::now(), usize::MAX);
     csv::read(&bytes, simulator.modes(), simulator.covariates(), &options)
         .and_then(|raw| check_measurements(raw, &expectation))

@@ -87,6 +87,7 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         ignore: how.ignore.to_vec(),
         time_column: how.time.map(str::to_owned),
         settings: setting_columns(simulator, how.settings)?,
+        points: simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone()),
     };
     let mut covariates = simulator.covariates().to_vec();
     let mut rows = Rows::default();

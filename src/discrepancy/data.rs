@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::shapes::MeasuredShapes;
 use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::quantity::{Digest, Hertz};
 use crate::simulator::law::{lagged, Input, Law, LawKind};
@@ -72,6 +73,8 @@ pub struct Data {
     pub noise: Vec<Vec<f64>>,
     /// Values of the parameters that the experimenter set, `[n][d]`, in their own units.
     pub settings: Vec<Vec<Option<f64>>>,
+    /// Mode shapes; `None` if none was measured.
+    pub shapes: Option<MeasuredShapes>,
     /// Covariates, settings that vary, their products by pairs, and time, in this order.
     pub columns: Vec<Column>,
     /// Digest of the measurements.
@@ -80,7 +83,7 @@ pub struct Data {
 
 impl Data {
     /// Sorts n measurements by time and converts them to rows. Frequencies become logarithms, and a noise that a measurement
-    /// does not state is that of the structure.
+    /// does not state is that of the structure. In rows with mode shapes, the modes are put in the order that their shapes show.
     pub fn new(simulator: &Simulator, measurements: &[ModalMeasurement]) -> Self {
         let mut sorted: Vec<&ModalMeasurement> = measurements.iter().collect();
         sorted.sort_by_key(|m| m.measured_at);
@@ -97,7 +100,14 @@ impl Data {
             };
             m.frequencies_hz.iter().enumerate().map(cell).unzip()
         };
-        let (log_frequencies, noise) = sorted.iter().map(row).unzip();
+        let (mut log_frequencies, mut noise): (Vec<Vec<f64>>, Vec<Vec<f64>>) = sorted.iter().map(row).unzip();
+        let shapes = MeasuredShapes::new(simulator, &sorted).map(|(shapes, orders)| {
+            for ((log_frequencies, noise), order) in log_frequencies.iter_mut().zip(&mut noise).zip(&orders) {
+                *log_frequencies = order.iter().map(|listed| log_frequencies[*listed]).collect();
+                *noise = order.iter().map(|listed| noise[*listed]).collect();
+            }
+            shapes
+        });
         let setting = |m: &&ModalMeasurement| {
             simulator.space().iter().map(|p| m.settings.get(&p.name).copied()).collect::<Vec<_>>()
         };
@@ -123,6 +133,7 @@ impl Data {
             time_unit: "day",
             log_frequencies,
             noise,
+            shapes,
             columns,
         }
     }

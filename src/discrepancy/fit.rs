@@ -14,8 +14,10 @@ pub struct Fit {
     pub mean: Vec<f64>,
     /// Standard deviation σ of each parameter between rows, `[d]`; 0 for one that is set in every row.
     pub spread: Vec<f64>,
-    /// Factor s on the stated noise of each mode, `[m]`.
+    /// Factor s on the stated noise of the frequency of each mode, `[m]`.
     pub noise_factor: Vec<f64>,
+    /// Factor on the stated noise of the shape of each mode, `[m]`; empty if no shapes were measured.
+    pub shape_noise_factor: Vec<f64>,
     /// Numbers ψ of each effect.
     pub psi: Vec<Vec<f64>>,
     /// Degrees of freedom ν of the t distribution; infinite for a normal distribution.

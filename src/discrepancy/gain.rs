@@ -69,7 +69,7 @@ pub struct Gain {
     pub rms_error_percent: Change<Vec<f64>>,
     /// 90 % interval of the change of that error for each mode, by bootstrap over blocks.
     pub rms_difference_interval90: Vec<[f64; 2]>,
-    /// Log predictive density of the logarithms of the frequencies.
+    /// Log predictive density of the logarithms of the frequencies and of the coordinates of mode shapes.
     pub log_density_per_row: DensityChange,
     /// Share of the frequencies inside their predicted 90 % interval.
     pub coverage90: Change<f64>,
@@ -177,7 +177,7 @@ fn figures_of(study: &Study<'_>, training: &[usize], views: &[RowView], fit: &Fi
     let modes = study.simulator.modes();
     let error = |view: &RowView| {
         let mut errors = vec![f64::NAN; modes];
-        for (place, mode) in view.present.iter().enumerate() {
+        for (place, mode) in view.present[..view.frequencies].iter().enumerate() {
             errors[*mode] = view.residual[place];
         }
         errors
@@ -194,9 +194,9 @@ fn figures_of(study: &Study<'_>, training: &[usize], views: &[RowView], fit: &Fi
     };
     let inside = |view: &RowView| {
         let within = |place: usize| view.residual[place].abs() <= edge * view.covariance[(place, place)].sqrt();
-        (0..view.present.len()).filter(|p| within(*p)).count()
+        (0..view.frequencies).filter(|p| within(*p)).count()
     };
-    let cells: usize = views.iter().map(|v| v.present.len()).sum();
+    let cells: usize = views.iter().map(|v| v.frequencies).sum();
     let coverage = views.iter().map(inside).sum::<usize>() as f64 / cells.max(1) as f64;
 
     let space = study.simulator.space().as_slice();

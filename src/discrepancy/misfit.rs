@@ -199,7 +199,7 @@ fn lag_one(values: &[f64]) -> f64 {
 /// The most significant dependence of the residuals of a fit on a function of the covariates, including functions that no
 /// candidate has. The inner `None` means that there are no functions, the outer one that the frequencies cannot be computed.
 ///
-/// Each function is tested with an arbitrary response of each mode, and along the target of each cause found, since a cause with
+/// Each function is tested with an arbitrary response of each frequency and each coordinate of a mode shape, and along the target of each cause found, since a cause with
 /// the wrong law leaves a residual there. Twice the estimated gain of the score test, times the share of independent rows, is
 /// compared with a χ² distribution.
 ///
@@ -212,18 +212,18 @@ pub fn remainder(study: &Study<'_>, rows: &[usize], fit: &Fit, independent_share
     let mut targets: Vec<Target> = fit.effects.iter().map(|e| e.target.clone()).collect();
     targets.retain(|t| t.sizes() == 1);
     let directions = study.directions(rows, fit, &targets)?;
-    let sums = |column: usize| whitened.sums(|place, mode| directions[place][(mode, column)]);
+    let sums = |column: usize| whitened.sums(|place, output| directions[place][(output, column)]);
     let along: Vec<_> = (0..targets.len()).map(sums).collect();
-    let of_modes = whitened.mode_sums(modes);
+    let of_outputs = whitened.output_sums(study.outputs());
     let functions = functions(study.data, rows);
     let tests = (functions.len() * (1 + targets.len())) as f64;
     let mut best: Option<(Remainder, f64)> = None;
     for (function, covariates, values) in functions {
         let range = stats::quantile(&values, 0.95) - stats::quantile(&values, 0.05);
         let values = DVector::from_vec(values);
-        let free = whitened.free_score(&of_modes, &values);
-        let mut scores: Vec<(f64, usize, Vec<f64>)> =
-            vec![(free.nats, free.numbers, free.psi.iter().map(|s| 100.0 * s * range).collect())];
+        let free = whitened.free_score(&of_outputs, &values);
+        let of_frequencies = free.psi[..modes].iter().map(|s| 100.0 * s * range).collect();
+        let mut scores: Vec<(f64, usize, Vec<f64>)> = vec![(free.nats, free.numbers, of_frequencies)];
         for (column, sums) in along.iter().enumerate() {
             let score = whitened.score(sums, &[&values]);
             let mean =

@@ -3,7 +3,7 @@
 //! [`diagnose`] fits the simulation to measurements, ranks every combination of target, law and covariate as a possible cause of
 //! the deviations, and measures on rows held out what the causes gain.
 //!
-//! - [`data`]: measurements, covariates and settings by row; [`holdout`]: the rows held out;
+//! - [`data`]: measurements, covariates and settings by row; [`shapes`]: their mode shapes; [`holdout`]: the rows held out;
 //! - [`grammar`]: the candidates; [`effect`]: an effect whose numbers are fitted;
 //! - [`model`]: the likelihood and its maximum, computed by `problem`, `row` and [`response`]; [`study`] and [`fit`]: its input
 //!   and its result;
@@ -20,6 +20,7 @@
 //! |---|---|
 //! | row | one measurement: its frequencies, covariates and settings |
 //! | modes present | the modes that were measured in a row |
+//! | outputs | what the simulation predicts for a row: ln f of each mode and, if shapes were measured, their coordinates |
 //! | setting | value of a parameter that the experimenter set; a parameter that is not set in every row is free |
 //! | cause | an effect that the simulation lacks; a candidate is a possible cause |
 //! | numbers ψ | the coefficients of the law of an effect, and the tuning frequency of an oscillator |
@@ -58,6 +59,7 @@ pub mod screen;
 pub mod select;
 mod setting_candidates;
 mod setting_starts;
+pub mod shapes;
 pub mod study;
 pub mod target_name;
 

@@ -10,6 +10,13 @@
 //! unknowns but ν have normal priors (σ and s in their logarithms). Fisher scoring maximises the log posterior; it neglects
 //! the derivative of J in the step, not in the value.
 //!
+//! Mode shapes that were measured in a row are further components of ln y_j and M: a shape at P points, whose norm and sign mean
+//! nothing, has P − 1 coordinates in the tangent space at the mean measured shape of its mode
+//! ([`TangentSpace`](crate::physics::tangent::TangentSpace)). Their stated noise r is that of a component of a shape of unit norm,
+//! and the shape of each mode has a noise factor of its own. A spread of the parameters moves frequencies and shapes together, as
+//! J states. Simulated modes are paired with the mean measured modes by the modal assurance criterion and the frequency
+//! ([`pair_modes`](crate::physics::shapes::pair_modes)) wherever the eigenproblem is solved, as in the fit of a measurement.
+//!
 //! Source: Lange, Little and Taylor (1989), JASA 84, for the t distribution; Kass and Raftery (1995), JASA 90, for Laplace's
 //! approximation of the evidence.
 
@@ -20,7 +27,7 @@ use super::fit::{Fit, Start};
 use super::problem::{Point, Problem};
 use super::response::Responses;
 use super::row::{best_tails, weight, Density, FIRST_TAILS};
-use super::study::Study;
+use super::study::{Present, Study};
 use crate::physics::effect::Target;
 
 /// Greatest number of steps of a fit.
@@ -34,13 +41,15 @@ const FEW_ROWS: usize = 400;
 /// A fit ends when the expected gain in log posterior of a step is below this, nats.
 const ENOUGH_NATS: f64 = 5e-3;
 
-/// One row under a fit; shapes are `[present modes]` unless said otherwise.
+/// One row under a fit; shapes are `[present]`, the outputs measured in the row, unless said otherwise.
 pub struct RowView {
     /// Index of the row.
     pub row: usize,
-    /// Modes present.
+    /// Outputs measured: below m, ln f of a mode; from m on, coordinates of mode shapes. Ascending.
     pub present: Vec<usize>,
-    /// Residual ln y − M.
+    /// Number of frequencies among them, which come first.
+    pub frequencies: usize,
+    /// Residual ln y − M, and for shapes the difference of their coordinates, rad.
     pub residual: DVector<f64>,
     /// Covariance V of the residual, `[present, present]`.
     pub covariance: DMatrix<f64>,
@@ -124,13 +133,13 @@ impl Study<'_> {
     pub fn view(&self, rows: &[usize], fit: &Fit) -> Option<Vec<RowView>> {
         let problem = Problem::new(self, rows, &fit.effects);
         let responses = problem.responses(&fit.mean, &problem.sizes(&fit.psi).values, &[])?;
-        let density = Density::new(fit.tails, responses.modes());
+        let density = Density::new(fit.tails, responses.outputs());
         let view = |(place, row): (usize, &usize)| self.row_view(*row, fit, &density, &responses, place);
         Some(rows.iter().enumerate().map(view).collect())
     }
 
-    /// Derivatives of ln f by the sizes of further `targets`, at size 0 and with the effects of the fit in place:
-    /// `[m, sizes]` for each of `rows`.
+    /// Derivatives of the outputs by the sizes of further `targets`, at size 0 and with the effects of the fit in place:
+    /// `[outputs, sizes]` for each of `rows`.
     pub fn directions(&self, rows: &[usize], fit: &Fit, targets: &[Target]) -> Option<Vec<DMatrix<f64>>> {
         let problem = Problem::new(self, rows, &fit.effects);
         let further: usize = targets.iter().map(Target::sizes).sum();
@@ -139,12 +148,14 @@ impl Study<'_> {
         let sizes = sizes.resize_vertically(first + further, 0.0);
         let responses = problem.responses(&fit.mean, &sizes, targets)?;
         let slopes = |place: usize| {
-            DMatrix::from_fn(responses.modes(), further, |mode, column| responses.by_size(place, mode)[first + column])
+            DMatrix::from_fn(responses.outputs(), further, |output, column| {
+                responses.by_size(place, output)[first + column]
+            })
         };
         Some((0..rows.len()).map(slopes).collect())
     }
 
-    /// Derivatives of M by the free means and all ψ, `[m, free + ψ]` for each of `rows`, per unit of each number.
+    /// Derivatives of M by the free means and all ψ, `[outputs, free + ψ]` for each of `rows`, per unit of each number.
     pub fn nuisance(&self, rows: &[usize], fit: &Fit) -> Option<Vec<DMatrix<f64>>> {
         let problem = Problem::new(self, rows, &fit.effects);
         let sizes = problem.sizes(&fit.psi);
@@ -152,16 +163,16 @@ impl Study<'_> {
         let free = self.free.len();
         let columns = free + fit.psi.iter().map(Vec::len).sum::<usize>();
         let by = |(place, row): (usize, &usize)| {
-            let mut by = DMatrix::zeros(responses.modes(), columns);
-            for mode in 0..responses.modes() {
+            let mut by = DMatrix::zeros(responses.outputs(), columns);
+            for output in 0..responses.outputs() {
                 for (column, k) in self.free.iter().enumerate() {
                     if self.data.settings[*row][*k].is_none() {
-                        by[(mode, column)] = responses.by_parameter(place, mode)[*k];
+                        by[(output, column)] = responses.by_parameter(place, output)[*k];
                     }
                 }
-                let by_size = responses.by_size(place, mode);
+                let by_size = responses.by_size(place, output);
                 for (number, (moved, slope)) in sizes.moved.iter().zip(sizes.slopes.column(place).iter()).enumerate() {
-                    by[(mode, free + number)] = by_size[*moved] * slope;
+                    by[(output, free + number)] = by_size[*moved] * slope;
                 }
             }
             by
@@ -181,13 +192,20 @@ impl Study<'_> {
 
     /// [`Self::view`] of one row, which has the index `place` in `responses`.
     fn row_view(&self, row: usize, fit: &Fit, density: &Density, responses: &Responses, place: usize) -> RowView {
-        let y = &self.data.log_frequencies[row];
-        let present = self.present[row].0.clone();
+        let Present { outputs: present, groups, .. } = &self.present[row];
+        let noise_factor = |group: usize| {
+            let modes = fit.noise_factor.len();
+            if group < modes {
+                fit.noise_factor[group]
+            } else {
+                fit.shape_noise_factor[group - modes]
+            }
+        };
         let d = fit.mean.len();
         let spread = |k: usize| if self.data.settings[row][k].is_some() { 0.0 } else { fit.spread[k] };
         let residual = DVector::from_iterator(
             present.len(),
-            present.iter().map(|mode| y[*mode] - responses.log_frequency(place, *mode)),
+            present.iter().map(|output| self.observed(row, *output) - responses.value(place, *output)),
         );
         let by_parameter = DMatrix::from_fn(present.len(), d, |i, k| responses.by_parameter(place, present[i])[k]);
         let mut covariance = DMatrix::zeros(present.len(), present.len());
@@ -197,7 +215,7 @@ impl Study<'_> {
                 covariance[(i, j)] = sum;
                 covariance[(j, i)] = sum;
             }
-            covariance[(i, i)] += (fit.noise_factor[present[i]] * self.data.noise[row][present[i]]).powi(2);
+            covariance[(i, i)] += (noise_factor(groups[i]) * self.noise(row, present[i])).powi(2);
         }
         let factor = covariance.clone().cholesky().expect("the noise of a row is never 0");
         let solved = factor.solve(&residual);
@@ -208,7 +226,8 @@ impl Study<'_> {
             row,
             log_density: density.log(distance, present.len(), half_log_det),
             weight: weight(distance, present.len(), fit.tails),
-            present,
+            frequencies: present.iter().filter(|output| **output < responses.modes()).count(),
+            present: present.clone(),
             residual,
             covariance,
             deviation,

@@ -11,7 +11,7 @@ use crate::simulator::Simulator;
 
 /// An answer that is not sure names candidates until their probabilities sum to this, at most so many.
 const COVERED: f64 = 0.985;
-const MOST_NAMED: usize = 3;
+const MOST_NAMED: usize = 8;
 
 /// Alternatives that are reported in any case.
 const MOST_ALTERNATIVES: usize = 5;

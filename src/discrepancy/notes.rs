@@ -9,6 +9,9 @@ use crate::stats;
 /// Two covariates whose correlation exceeds this cannot be distinguished.
 const COLLINEAR: f64 = 0.98;
 
+/// Noise factor above which a shape scatters more than stated.
+const NOISY: f64 = 2.0;
+
 /// Share of independent rows below which the correlation in time is reported.
 const CORRELATED: f64 = 0.9;
 
@@ -46,6 +49,7 @@ pub(super) fn notes(
         }
     }
     notes.extend(outside_priors(simulator, fit));
+    notes.extend(of_shapes(simulator, data, rows, fit));
     if independent_share < CORRELATED {
         notes.push(format!(
             "residuals of successive rows are correlated: the rows carry as much information as {:.0} % of their number would if \
@@ -55,6 +59,32 @@ pub(super) fn notes(
     }
     if rows.len() < FEW_ROWS {
         notes.push(format!("{} rows are few: small effects cannot be detected", rows.len()));
+    }
+    notes
+}
+
+/// Notes on mode shapes: in how many rows they were measured, their order and their noise.
+fn of_shapes(simulator: &Simulator, data: &Data, rows: &[usize], fit: &Fit) -> Vec<String> {
+    let Some(shapes) = &data.shapes else { return Vec::new() };
+    let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
+    let measured = shapes.rows_with_shapes(rows);
+    let mut notes =
+        vec![format!("mode shapes at {} are compared in {measured} of {} rows", points.join(", "), rows.len())];
+    if shapes.reordered > 0 {
+        notes.push(format!(
+            "in {} rows the modes were listed in another order than in the others, as their shapes show: they were put in the same \
+             order",
+            shapes.reordered
+        ));
+    }
+    for (mode, factor) in fit.shape_noise_factor.iter().enumerate() {
+        if *factor > NOISY {
+            notes.push(format!(
+                "the shape of mode {} scatters {factor:.1} times as much as the noise of the structure file states, beyond the \
+                 scatter that the spread of the parameters explains",
+                mode + 1
+            ));
+        }
     }
     notes
 }

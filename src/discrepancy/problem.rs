@@ -9,7 +9,7 @@ use super::fit::{Fit, Start};
 use super::outside::{corrected_settings, outside};
 use super::response::Responses;
 use super::row::{Density, RowSums};
-use super::study::Study;
+use super::study::{Present, Study};
 use crate::physics::effect::Target;
 use crate::simulator::law::Input;
 
@@ -30,7 +30,7 @@ const NOISE_LN_STD: f64 = 0.7;
 /// A fit of effects to rows.
 ///
 /// The unknowns η are standardised by their priors, in this order: free means, all ψ, ln spreads of the free parameters, ln
-/// noise factors of the modes.
+/// noise factors of the frequencies of the modes and, if shapes were measured, of their shapes.
 pub(super) struct Problem<'a> {
     study: &'a Study<'a>,
     pub(super) rows: &'a [usize],
@@ -57,7 +57,7 @@ pub(super) struct Point {
     pub(super) log_posterior: f64,
     gradient: DVector<f64>,
     information: DMatrix<f64>,
-    /// Squared Mahalanobis distance, number of modes and ½ ln|V| of each row.
+    /// Squared Mahalanobis distance, number of outputs and ½ ln|V| of each row.
     pub(super) distances: Vec<(f64, usize, f64)>,
 }
 
@@ -78,10 +78,6 @@ impl<'a> Problem<'a> {
         Self { study, rows, effects, inputs: effects.iter().map(inputs).collect() }
     }
 
-    fn modes(&self) -> usize {
-        self.study.simulator.modes()
-    }
-
     fn numbers(&self) -> impl Iterator<Item = &Number> {
         self.effects.iter().flat_map(|e| &e.numbers)
     }
@@ -92,7 +88,7 @@ impl<'a> Problem<'a> {
     }
 
     fn unknowns(&self) -> usize {
-        self.means() + self.study.free.len() + self.modes()
+        self.means() + self.study.free.len() + self.study.groups()
     }
 
     /// The prior means of all unknowns, `[unknowns]`.
@@ -114,8 +110,9 @@ impl<'a> Problem<'a> {
             eta[column] = (start.fit.mean[*k] - middle) / scale;
             eta[self.means() + column] = (start.fit.spread[*k] / (2.0 * scale * SPREAD_SHARE)).ln() / SPREAD_LN_STD;
         }
-        for mode in 0..self.modes() {
-            eta[self.means() + free.len() + mode] = start.fit.noise_factor[mode].ln() / NOISE_LN_STD;
+        let noise = start.fit.noise_factor.iter().chain(&start.fit.shape_noise_factor);
+        for (group, factor) in noise.enumerate() {
+            eta[self.means() + free.len() + group] = factor.ln() / NOISE_LN_STD;
         }
         let mut column = free.len();
         for (effect, psi) in self.effects.iter().zip(&start.psi) {
@@ -169,7 +166,7 @@ impl<'a> Problem<'a> {
         (0..self.unknowns()).filter(beyond).collect()
     }
 
-    /// Means `[d]`, spreads `[d]`, noise factors `[m]` and the ψ of each effect at a point.
+    /// Means `[d]`, spreads `[d]`, noise factors `[groups]` and the ψ of each effect at a point.
     fn unpack(&self, eta: &DVector<f64>) -> (Vec<f64>, Vec<f64>, Vec<f64>, Vec<Vec<f64>>) {
         let d = self.study.simulator.space().len();
         let mut mean: Vec<f64> = (0..d).map(|k| self.scale(k).0).collect();
@@ -180,7 +177,7 @@ impl<'a> Problem<'a> {
             spread[*k] = 2.0 * scale * SPREAD_SHARE * (SPREAD_LN_STD * eta[self.means() + column]).exp();
         }
         let first = self.means() + self.study.free.len();
-        let noise = (0..self.modes()).map(|mode| (NOISE_LN_STD * eta[first + mode]).exp()).collect();
+        let noise = (0..self.study.groups()).map(|group| (NOISE_LN_STD * eta[first + group]).exp()).collect();
         let mut column = self.study.free.len();
         let psi = self.effects.iter().map(|effect| {
             let value = |(place, n): (usize, &Number)| n.prior_mean + n.prior_std * eta[column + place];
@@ -233,7 +230,8 @@ impl<'a> Problem<'a> {
         let settings = &self.study.data.settings;
         let set = |k: usize, place: usize| settings[self.rows[place]][k].unwrap_or(mean[k]);
         let theta = DMatrix::from_fn(mean.len(), self.rows.len(), set);
-        corrected_responses(self.study.simulator, &targets, &theta, sizes, &self.study.limits)
+        let reference = self.study.data.shapes.as_ref().map(|shapes| shapes.reference.as_slice());
+        corrected_responses(self.study.simulator, reference, &targets, (&theta, sizes), &self.study.limits)
     }
 
     /// Value, gradient and information at a point; `None` if the frequencies cannot be computed in some row.
@@ -251,30 +249,30 @@ impl<'a> Problem<'a> {
         let mut information = DMatrix::<f64>::zeros(unknowns, unknowns);
         let mut distances = Vec::with_capacity(self.rows.len());
         let log_factors: Vec<f64> = noise.iter().map(|factor| factor.ln()).collect();
-        let mut of_row = RowSums::new(means, free.len(), self.modes());
+        let mut of_row = RowSums::new(means, free.len(), self.study.outputs());
         for (place, &row) in self.rows.iter().enumerate() {
-            let (present, log_noise) = &self.study.present[row];
-            for (i, &mode) in present.iter().enumerate() {
-                let inverse = 1.0 / (noise[mode] * data.noise[row][mode]);
-                of_row.residual[i] = inverse * (data.log_frequencies[row][mode] - responses.log_frequency(place, mode));
-                let by_parameter = responses.by_parameter(place, mode);
+            let Present { outputs, groups, log_noise } = &self.study.present[row];
+            for (i, (&output, &group)) in outputs.iter().zip(groups).enumerate() {
+                let inverse = 1.0 / (noise[group] * self.study.noise(row, output));
+                of_row.residual[i] = inverse * (self.study.observed(row, output) - responses.value(place, output));
+                let by_parameter = responses.by_parameter(place, output);
                 for (column, k) in free.iter().enumerate() {
                     let slope = if data.settings[row][*k].is_none() { inverse * by_parameter[*k] } else { 0.0 };
                     of_row.slopes[i * means + column] = slope * scales[column];
                     of_row.spreads[i * free.len() + column] = slope * spread[*k];
                 }
-                let by_size = responses.by_size(place, mode);
+                let by_size = responses.by_size(place, output);
                 for (number, (moved, slope)) in sizes.moved.iter().zip(sizes.slopes.column(place).iter()).enumerate() {
                     let column = free.len() + number;
                     of_row.slopes[i * means + column] = inverse * by_size[*moved] * slope * scales[column];
                 }
             }
-            let (distance, half_log_det_scaled) = of_row.solve(present.len());
-            let log_noise = log_noise + present.iter().map(|mode| log_factors[*mode]).sum::<f64>();
-            distances.push((distance, present.len(), log_noise + half_log_det_scaled));
-            of_row.add(present, distance, tails, &mut gradient, &mut information);
+            let (distance, half_log_det_scaled) = of_row.solve(outputs.len());
+            let log_noise = log_noise + groups.iter().map(|group| log_factors[*group]).sum::<f64>();
+            distances.push((distance, outputs.len(), log_noise + half_log_det_scaled));
+            of_row.add(groups, distance, tails, &mut gradient, &mut information);
         }
-        let log_likelihood = Density::new(tails, self.modes()).total(&distances);
+        let log_likelihood = Density::new(tails, self.study.outputs()).total(&distances);
         self.add_prior(eta, &mut gradient, &mut information);
         let log_posterior = log_likelihood - 0.5 * eta.norm_squared();
         log_posterior.is_finite().then_some(Point {
@@ -290,7 +288,7 @@ impl<'a> Problem<'a> {
     /// Turns the derivatives by ln σ and ln s into prior units, and adds those of the standard normal prior.
     fn add_prior(&self, eta: &DVector<f64>, gradient: &mut DVector<f64>, information: &mut DMatrix<f64>) {
         let (means, free) = (self.means(), self.study.free.len());
-        for u in 0..free + self.modes() {
+        for u in 0..free + self.study.groups() {
             let unit = if u < free { SPREAD_LN_STD } else { NOISE_LN_STD };
             gradient[means + u] *= unit;
             for v in 0..=u {
@@ -351,7 +349,8 @@ impl<'a> Problem<'a> {
 
     /// The fit at a point, with Laplace's approximation of the evidence; `None` if the information is singular.
     pub(super) fn fit_at(&self, point: &Point, tails: f64) -> Option<Fit> {
-        let (mean, spread, noise_factor, psi) = self.unpack(&point.eta);
+        let (mean, spread, mut noise_factor, psi) = self.unpack(&point.eta);
+        let shape_noise_factor = noise_factor.split_off(self.study.simulator.modes());
         let factor = self.information(point, tails)?.cholesky()?;
         // The priors are standard normal in these units, so that their factors of 2π cancel those of Laplace's integral.
         let half_log_det: f64 = factor.l_dirty().diagonal().iter().map(|l| l.ln()).sum();
@@ -368,11 +367,12 @@ impl<'a> Problem<'a> {
             mean,
             spread,
             noise_factor,
+            shape_noise_factor,
             psi,
             tails,
             covariance,
             free: self.study.free.clone(),
-            noise_factor_ln_std: (0..self.modes()).map(ln_std).collect(),
+            noise_factor_ln_std: (0..self.study.simulator.modes()).map(ln_std).collect(),
             outside: outside(self.study.simulator, self.study.data, self.rows, &corrected),
             log_likelihood: point.log_likelihood,
             log_evidence: point.log_posterior - half_log_det,

@@ -22,7 +22,12 @@ const REFINED: usize = 5;
 /// Evidence that a covariate must add to a constant effect on the same target, nats.
 const COVARIATE_NATS: f64 = 3.0;
 
-/// If an arbitrary constant for each mode has an estimated gain below this, no constant effect can be accepted, nats.
+/// Constant effects that are fitted if an arbitrary constant is significant: all in structures of up to about ten bodies. They are not
+/// chosen by the score test alone, because it is a linear estimate at size 0, and constant effects are often large: parameters
+/// have adapted to them, and the estimate of the true one can lie far below that of others.
+const CONSTANTS: usize = 80;
+
+/// If an arbitrary constant for each output has an estimated gain below this, no constant effect can be accepted, nats.
 const CONSTANT_NATS: f64 = 6.0;
 
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
@@ -106,10 +111,14 @@ pub fn rank(
 
     let fitted = |promise: &&Promise| Trial::new(study, rows, fit, &candidates[promise.candidate], promise);
     let mut tried: Vec<Trial> = most_promising(&promised, candidates).par_iter().filter_map(fitted).collect();
-    // No constant effect can gain more than an arbitrary constant for each mode.
+    // No constant effect can gain more than an arbitrary constant for each output.
     let ones = DVector::from_element(rows.len(), 1.0);
-    let constant = whitened.free_score(&whitened.mode_sums(study.simulator.modes()), &ones);
+    let constant = whitened.free_score(&whitened.output_sums(study.outputs()), &ones);
     if constant.nats > CONSTANT_NATS {
+        let left = promised.iter().filter(|p| candidates[p.candidate].covariate.is_none());
+        let left = left.filter(|p| !tried.iter().any(|t| t.candidate == p.candidate)).take(CONSTANTS);
+        let constants: Vec<Trial> = left.collect::<Vec<_>>().par_iter().filter_map(fitted).collect();
+        tried.extend(constants);
         tried.extend(unscreened(study, rows, fit, candidates));
     }
     tried.extend(corrections(study, rows, fit, candidates));
@@ -281,12 +290,12 @@ fn corrections(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candi
 /// residuals; 1 if ρ is within three standard errors of 0. `None` if the frequencies cannot be computed in some row.
 fn independent_share(study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<f64> {
     let views = study.view(rows, fit)?;
-    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.simulator.modes()];
+    let mut series: Vec<Vec<f64>> = vec![Vec::new(); study.outputs()];
     for view in &views {
         let factor = view.covariance.clone().cholesky()?.l();
         let white = factor.solve_lower_triangular(&view.residual)?;
-        for (place, mode) in view.present.iter().enumerate() {
-            series[*mode].push(white[place] * view.weight.sqrt());
+        for (place, output) in view.present.iter().enumerate() {
+            series[*output].push(white[place] * view.weight.sqrt());
         }
     }
     let (mut products, mut squares, mut pairs) = (0.0, 0.0, 0.0);

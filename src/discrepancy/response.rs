@@ -1,6 +1,6 @@
-//! Frequencies and their derivatives for many rows that differ in a few numbers.
+//! Frequencies and mode shapes, and their derivatives, for many rows that differ in a few numbers.
 //!
-//! Rows differ in the sizes of effects and in settings, and the frequencies are smooth functions of both. The eigenproblem is
+//! Rows differ in the sizes of effects and in settings, and the frequencies and the coordinates of shapes are smooth functions of both. The eigenproblem is
 //! therefore solved only at Chebyshev nodes of these numbers, between which the results are interpolated. Numbers with few
 //! different values (categories, steps) are used exactly. Effects that multiply all frequencies by one factor, and effects of the
 //! instrument, need no eigenproblem and are applied afterwards. If interpolation saves nothing, every different row is solved.
@@ -10,6 +10,7 @@ use std::collections::HashMap;
 use nalgebra::DMatrix;
 
 use crate::physics::effect::Target;
+use crate::physics::tracked::ReferenceMode;
 use crate::simulator::Simulator;
 
 /// Numbers with at most this many different values are not interpolated.
@@ -24,13 +25,16 @@ const MOST_NODES: usize = 10;
 /// Greatest number of dimensions of the interpolation.
 const MOST_DIMENSIONS: usize = 3;
 
-/// Responses of rows: ln f, ∂ln f/∂x and ∂ln f/∂size of each mode.
+/// Responses of rows: the outputs, which are ln f of each mode and the coordinates of mode shapes, and their derivatives by the
+/// parameters and by the sizes.
 pub struct Responses {
     modes: usize,
+    /// Number of outputs: modes, then coordinates of shapes.
+    outputs: usize,
     parameters: usize,
-    /// Values of a mode: 1 + parameters + sizes.
+    /// Values of an output: 1 + parameters + sizes.
     width: usize,
-    /// Blocks of `[modes][width]`.
+    /// Blocks of `[outputs][width]`.
     values: Vec<f64>,
     /// Index of the first value of each row's block, `[rows]`.
     places: Vec<usize>,
@@ -38,19 +42,24 @@ pub struct Responses {
 
 impl Responses {
     /// ln f of a mode in a row, f in Hz.
-    pub fn log_frequency(&self, row: usize, mode: usize) -> f64 {
-        self.values[self.places[row] + mode * self.width]
+    fn log_frequency(&self, row: usize, mode: usize) -> f64 {
+        self.value(row, mode)
     }
 
-    /// ∂ln f/∂x of a mode in a row, `[parameters]`, per unit of each parameter.
-    pub fn by_parameter(&self, row: usize, mode: usize) -> &[f64] {
-        let first = self.places[row] + mode * self.width + 1;
+    /// An output in a row: ln f of a mode, f in Hz, or a coordinate of a shape, rad.
+    pub fn value(&self, row: usize, output: usize) -> f64 {
+        self.values[self.places[row] + output * self.width]
+    }
+
+    /// Derivatives of an output in a row by the parameters, `[parameters]`, per unit of each parameter.
+    pub fn by_parameter(&self, row: usize, output: usize) -> &[f64] {
+        let first = self.places[row] + output * self.width + 1;
         &self.values[first..first + self.parameters]
     }
 
-    /// ∂ln f/∂size of a mode in a row, `[sizes]`, per unit of each size.
-    pub fn by_size(&self, row: usize, mode: usize) -> &[f64] {
-        let first = self.places[row] + mode * self.width;
+    /// Derivatives of an output in a row by the sizes, `[sizes]`, per unit of each size.
+    pub fn by_size(&self, row: usize, output: usize) -> &[f64] {
+        let first = self.places[row] + output * self.width;
         &self.values[first + 1 + self.parameters..first + self.width]
     }
 
@@ -59,30 +68,55 @@ impl Responses {
         self.modes
     }
 
+    /// Number of outputs: the modes, and the coordinates of shapes if they are simulated.
+    pub fn outputs(&self) -> usize {
+        self.outputs
+    }
+
     /// The responses for parameters `theta`, `[d, rows]`, and sizes of all targets in turn, `[sizes, rows]`; `None` if the
-    /// frequencies cannot be computed in some row.
-    pub fn new(simulator: &Simulator, targets: &[Target], theta: &DMatrix<f64>, sizes: &DMatrix<f64>) -> Option<Self> {
+    /// frequencies cannot be computed in some row. With `reference` modes, `[m]`, the modes are paired with them, and the outputs
+    /// include the coordinates of the shapes.
+    pub fn new(
+        simulator: &Simulator,
+        reference: Option<&[ReferenceMode]>,
+        targets: &[Target],
+        theta: &DMatrix<f64>,
+        sizes: &DMatrix<f64>,
+    ) -> Option<Self> {
         let after = Afterwards::new(simulator, targets);
         if after.steps.is_empty() {
-            return Self::structural(simulator, targets, theta, sizes);
+            return Self::structural(simulator, reference, targets, theta, sizes);
         }
         let left: Vec<Target> = after.structural.iter().map(|(target, _)| targets[*target].clone()).collect();
         let own = |(target, first): &(usize, usize)| *first..first + targets[*target].sizes();
         let picked: Vec<usize> = after.structural.iter().flat_map(own).collect();
-        let inner = Self::structural(simulator, &left, theta, &sizes.select_rows(&picked))?;
+        let inner = Self::structural(simulator, reference, &left, theta, &sizes.select_rows(&picked))?;
         after.apply(&inner, targets, sizes)
     }
 
-    /// Responses of consecutive rows from their values, `[rows][modes][1 + parameters + sizes]`.
-    pub(super) fn from_values(modes: usize, parameters: usize, sizes: usize, values: Vec<f64>) -> Self {
+    /// Responses of consecutive rows from their values, `[rows][outputs][1 + parameters + sizes]`.
+    pub(super) fn from_values(
+        (modes, outputs): (usize, usize),
+        parameters: usize,
+        sizes: usize,
+        values: Vec<f64>,
+    ) -> Self {
         let width = 1 + parameters + sizes;
-        let block = modes * width;
-        Self { modes, parameters, width, places: (0..values.len() / block).map(|row| row * block).collect(), values }
+        let block = outputs * width;
+        Self {
+            modes,
+            outputs,
+            parameters,
+            width,
+            places: (0..values.len() / block).map(|row| row * block).collect(),
+            values,
+        }
     }
 
     /// As [`Self::new`], but solves the eigenproblem for all targets.
     fn structural(
         simulator: &Simulator,
+        reference: Option<&[ReferenceMode]>,
         targets: &[Target],
         theta: &DMatrix<f64>,
         sizes: &DMatrix<f64>,
@@ -90,7 +124,10 @@ impl Responses {
         let (modes, parameters) = (simulator.modes(), simulator.space().len());
         let (count, rows) = sizes.shape();
         let width = 1 + parameters + count;
-        let mut found = Self { modes, parameters, width, values: Vec::new(), places: Vec::with_capacity(rows) };
+        let coordinates = reference.map_or(0, |reference| reference.len() * (simulator.shape_points() - 1));
+        let outputs = modes + coordinates;
+        let places = Vec::with_capacity(rows);
+        let mut found = Self { modes, outputs, parameters, width, values: Vec::new(), places };
         let at = |row: usize, dimension: usize| {
             if dimension < parameters {
                 theta[(dimension, row)]
@@ -117,7 +154,7 @@ impl Responses {
             point.clear();
             point.extend(theta.column(row).iter().chain(sizes.column(row).iter()));
             if !interpolated {
-                let place = found.solved(simulator, targets, &mut known, &point)?;
+                let place = found.solved(simulator, reference, targets, &mut known, &point)?;
                 found.places.push(place);
                 continue;
             }
@@ -139,15 +176,15 @@ impl Responses {
                         point[dimension.index] = dimension.nodes[rest % dimension.nodes.len()];
                         rest /= dimension.nodes.len();
                     }
-                    sources.push(found.solved(simulator, targets, &mut known, &point)?);
+                    sources.push(found.solved(simulator, reference, targets, &mut known, &point)?);
                 }
                 shared.insert(key.clone(), sources);
             }
             let first = found.values.len();
-            found.values.resize(first + modes * width, 0.0);
+            found.values.resize(first + outputs * width, 0.0);
             let (before, own) = found.values.split_at_mut(first);
             for (weight, source) in weights.iter().zip(&shared[key.as_slice()]) {
-                for (value, node) in own.iter_mut().zip(&before[*source..*source + modes * width]) {
+                for (value, node) in own.iter_mut().zip(&before[*source..*source + outputs * width]) {
                     *value += weight * node;
                 }
             }
@@ -157,14 +194,24 @@ impl Responses {
     }
 
     /// Index of the response at a point, which is solved if it is new.
-    fn solved(&mut self, simulator: &Simulator, targets: &[Target], known: &mut Known, point: &[f64]) -> Option<usize> {
+    fn solved(
+        &mut self,
+        simulator: &Simulator,
+        reference: Option<&[ReferenceMode]>,
+        targets: &[Target],
+        known: &mut Known,
+        point: &[f64],
+    ) -> Option<usize> {
         known.key.clear();
         known.key.extend(point.iter().map(|v| v.to_bits()));
         if let Some(place) = known.places.get(known.key.as_slice()) {
             return Some(*place);
         }
         let (theta, sizes) = point.split_at(self.parameters);
-        let response = simulator.respond(theta, self.modes, targets, sizes).ok()?;
+        let (response, shapes) = match reference {
+            Some(reference) => simulator.respond_tracked(theta, reference, targets, sizes).ok()?,
+            None => (simulator.respond(theta, self.modes, targets, sizes).ok()?, None),
+        };
         let place = self.values.len();
         for (mode, f) in response.frequencies_hz.iter().enumerate() {
             if !(f.is_finite() && *f > 0.0) {
@@ -173,6 +220,13 @@ impl Responses {
             self.values.push(f.ln());
             self.values.extend((0..self.parameters).map(|k| response.by_parameter[(mode, k)] / f));
             self.values.extend((0..sizes.len()).map(|s| response.by_size[(mode, s)] / f));
+        }
+        if let Some(shapes) = shapes {
+            for (row, coordinate) in shapes.coordinates.iter().enumerate() {
+                self.values.push(*coordinate);
+                self.values.extend(shapes.by_parameter.row(row).iter());
+                self.values.extend(shapes.by_size.row(row).iter());
+            }
         }
         known.places.insert(known.key.clone(), place);
         Some(place)
@@ -226,13 +280,13 @@ impl Afterwards {
     ///  ∂ln f'/∂· = (f·Π s/f') ∂ln f/∂·,   ∂ln f'/∂g = (f·Π s/f') ∂ln s/∂g,   ∂ln f'/∂o = 1/f'
     /// ```
     fn apply(&self, inner: &Responses, targets: &[Target], sizes: &DMatrix<f64>) -> Option<Responses> {
-        let (modes, parameters) = (inner.modes, inner.parameters);
+        let (modes, outputs, parameters) = (inner.modes, inner.outputs, inner.parameters);
         let (count, rows) = sizes.shape();
         let width = 1 + parameters + count;
-        let mut values = vec![0.0; rows * modes * width];
+        let mut values = vec![0.0; rows * outputs * width];
         for (row, sizes) in sizes.column_iter().enumerate() {
             for mode in 0..modes {
-                let line = &mut values[(row * modes + mode) * width..(row * modes + mode + 1) * width];
+                let line = &mut values[(row * outputs + mode) * width..(row * outputs + mode + 1) * width];
                 let mut scaled_hz = inner.log_frequency(row, mode).exp();
                 let mut offset_hz = 0.0;
                 for (target, column) in &self.steps {
@@ -279,9 +333,30 @@ impl Afterwards {
                     }
                 }
             }
+            for output in modes..outputs {
+                let line = &mut values[(row * outputs + output) * width..(row * outputs + output + 1) * width];
+                self.copy_shape(inner, targets, (row, output), line);
+            }
         }
-        let places = (0..rows).map(|row| row * modes * width).collect();
-        Some(Responses { modes, parameters, width, values, places })
+        let places = (0..rows).map(|row| row * outputs * width).collect();
+        Some(Responses { modes, outputs, parameters, width, values, places })
+    }
+}
+
+impl Afterwards {
+    /// Copies a coordinate of a shape in a row with its derivatives to `line`: a factor on all frequencies, or an error of the
+    /// instrument, does not change shapes.
+    fn copy_shape(&self, inner: &Responses, targets: &[Target], (row, output): (usize, usize), line: &mut [f64]) {
+        let parameters = inner.parameters;
+        line[0] = inner.value(row, output);
+        line[1..=parameters].copy_from_slice(inner.by_parameter(row, output));
+        let mut by_size = inner.by_size(row, output).iter();
+        for (target, first) in &self.structural {
+            let own = 1 + parameters + first;
+            for (slope, by) in line[own..own + targets[*target].sizes()].iter_mut().zip(&mut by_size) {
+                *slope = *by;
+            }
+        }
     }
 }
 
@@ -397,7 +472,7 @@ mod tests {
             let rows: Vec<Vec<f64>> = (0..400).map(row).collect();
             let theta = DMatrix::from_fn(3, rows.len(), |k, _| 4.0 + k as f64);
             let sizes = DMatrix::from_fn(3, rows.len(), |k, row| rows[row][k]);
-            let many = Responses::new(&simulator, &targets, &theta, &sizes).unwrap();
+            let many = Responses::new(&simulator, None, &targets, &theta, &sizes).unwrap();
             for (place, sizes) in rows.iter().enumerate().step_by(7) {
                 let one = simulator.respond(&[4.0, 5.0, 6.0], 3, &targets, sizes).unwrap();
                 for (mode, f) in one.frequencies_hz.iter().enumerate() {

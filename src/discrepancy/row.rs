@@ -13,7 +13,7 @@ pub(super) const FIRST_TAILS: f64 = TAILS[2];
 
 /// Workspace for one row: solves with its covariance and adds its part of the gradient and information.
 ///
-/// All quantities are divided by the noise of their mode, so that V = 1 + U Uᵀ, where U holds the derivatives by the parameters
+/// All quantities are divided by the noise of their output, so that V = 1 + U Uᵀ, where U holds the derivatives by the parameters
 /// times their spreads, `[p, free]`. e: residual, `[p]`.
 ///
 /// ```text
@@ -47,28 +47,28 @@ pub(super) struct RowSums {
 }
 
 impl RowSums {
-    /// A workspace for rows of at most `modes` modes.
-    pub(super) fn new(means: usize, free: usize, modes: usize) -> Self {
-        let (of_free, of_modes) = (vec![0.0; free * free], vec![0.0; modes * free]);
-        let variances = free + modes;
+    /// A workspace for rows of at most `outputs` outputs.
+    pub(super) fn new(means: usize, free: usize, outputs: usize) -> Self {
+        let (of_free, of_outputs) = (vec![0.0; free * free], vec![0.0; outputs * free]);
+        let variances = free + outputs;
         Self {
             means,
             free,
-            residual: vec![0.0; modes],
-            slopes: vec![0.0; modes * means],
-            spreads: of_modes.clone(),
+            residual: vec![0.0; outputs],
+            slopes: vec![0.0; outputs * means],
+            spreads: of_outputs.clone(),
             factor: of_free.clone(),
             inverse: of_free,
-            absorbed: of_modes,
+            absorbed: of_outputs,
             along: vec![0.0; free],
-            solved: vec![0.0; modes],
+            solved: vec![0.0; outputs],
             slopes_absorbed: vec![0.0; free * means],
             score: vec![0.0; variances],
             products: vec![0.0; variances * variances],
         }
     }
 
-    /// Factors V and solves for the residual of `p` modes. Returns eᵀV⁻¹e and ½ ln|V|.
+    /// Factors V and solves for the residual of `p` outputs. Returns eᵀV⁻¹e and ½ ln|V|.
     pub(super) fn solve(&mut self, p: usize) -> (f64, f64) {
         let f = self.free;
         let mut volume = 1.0;
@@ -117,16 +117,17 @@ impl RowSums {
     ///  w = (ν + p)/(ν + eᵀ V⁻¹ e),   a = (ν + p)/(ν + p + 2),   b = 2/(ν + p + 2)
     /// ```
     ///
-    /// D: derivatives of the mean; G = (U, 1); the ln scales are those of the columns of G: spreads, then noise factors.
+    /// D: derivatives of the mean; G = (U, 1); the ln scales are those of the columns of G: spreads, then noise factors. Outputs of
+    /// one group have one noise factor, whose score is the sum of theirs. `groups`: the group of each output, ascending.
     pub(super) fn add(
         &mut self,
-        present: &[usize],
+        groups: &[usize],
         distance: f64,
         tails: f64,
         gradient: &mut DVector<f64>,
         information: &mut DMatrix<f64>,
     ) {
-        let (p, f, means) = (present.len(), self.free, self.means);
+        let (p, f, means) = (groups.len(), self.free, self.means);
         let weight = weight(distance, p, tails);
         let (factor_a, factor_b) = information_factors(p, tails);
         self.slopes_absorbed.fill(0.0);
@@ -176,25 +177,28 @@ impl RowSums {
                 *product = f64::from(u8::from(i == j)) - sum;
             }
         }
-        let place = |u: usize| means + if u < f { u } else { f + present[u - f] };
+        let place = |u: usize| means + if u < f { u } else { f + groups[u - f] };
         for u in 0..count {
             let own = self.products[u * count + u];
             gradient[place(u)] += weight * self.score[u] * self.score[u] - own;
-            // The indices of the modes present ascend, so that the lower triangle for this row maps into the lower triangle of
+            // The groups of the outputs ascend, so that the lower triangle for this row maps into the lower triangle of
             // `information`.
             let (twice_a, b_own) = (2.0 * factor_a, factor_b * own);
             for v in 0..=u {
                 let shared = self.products[u * count + v];
-                information[(place(u), place(v))] += twice_a * shared * shared - b_own * self.products[v * count + v];
+                let both = twice_a * shared * shared - b_own * self.products[v * count + v];
+                // Two outputs of a group meet in both orders.
+                let times = if u != v && place(u) == place(v) { 2.0 } else { 1.0 };
+                information[(place(u), place(v))] += times * both;
             }
         }
     }
 }
 
 /// Weight w of a row with squared Mahalanobis distance `distance`, relative to a normal distribution: (ν + p)/(ν + distance).
-pub(super) fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
+pub(super) fn weight(distance: f64, outputs: usize, tails: f64) -> f64 {
     if tails.is_finite() {
-        (tails + modes as f64) / (tails + distance)
+        (tails + outputs as f64) / (tails + distance)
     } else {
         1.0
     }
@@ -202,9 +206,9 @@ pub(super) fn weight(distance: f64, modes: usize, tails: f64) -> f64 {
 
 /// Factors of the expected information of a t distribution: a = (ν + p)/(ν + p + 2) and b = 2/(ν + p + 2); 1 and 0 for a normal
 /// distribution.
-fn information_factors(modes: usize, tails: f64) -> (f64, f64) {
+fn information_factors(outputs: usize, tails: f64) -> (f64, f64) {
     if tails.is_finite() {
-        let total = tails + modes as f64;
+        let total = tails + outputs as f64;
         (total / (total + 2.0), 2.0 / (total + 2.0))
     } else {
         (1.0, 0.0)
@@ -218,15 +222,15 @@ fn information_factors(modes: usize, tails: f64) -> (f64, f64) {
 /// ```
 pub(super) struct Density {
     tails: f64,
-    /// The terms that depend only on the number of modes p, `[modes + 1]`.
+    /// The terms that depend only on the number of outputs p, `[outputs + 1]`.
     constants: Vec<f64>,
 }
 
 impl Density {
-    /// The density of rows with at most `most` modes.
+    /// The density of rows with at most `most` outputs.
     pub(super) fn new(tails: f64, most: usize) -> Self {
-        let constant = |modes: usize| {
-            let m = modes as f64;
+        let constant = |outputs: usize| {
+            let m = outputs as f64;
             if tails.is_finite() {
                 ln_gamma(0.5 * (tails + m)) - ln_gamma(0.5 * tails) - 0.5 * m * (tails * std::f64::consts::PI).ln()
             } else {
@@ -237,34 +241,34 @@ impl Density {
     }
 
     /// Log density of one row, nats; `distance` is q, `half_log_det` is ½ ln|V|.
-    pub(super) fn log(&self, distance: f64, modes: usize, half_log_det: f64) -> f64 {
+    pub(super) fn log(&self, distance: f64, outputs: usize, half_log_det: f64) -> f64 {
         let of_distance = if self.tails.is_finite() {
-            0.5 * (self.tails + modes as f64) * (distance / self.tails).ln_1p()
+            0.5 * (self.tails + outputs as f64) * (distance / self.tails).ln_1p()
         } else {
             0.5 * distance
         };
-        self.constants[modes] - half_log_det - of_distance
+        self.constants[outputs] - half_log_det - of_distance
     }
 
-    /// Sum of the log densities of rows, given as q, number of modes and ½ ln|V|.
+    /// Sum of the log densities of rows, given as q, number of outputs and ½ ln|V|.
     pub(super) fn total(&self, rows: &[(f64, usize, f64)]) -> f64 {
-        // Logarithms are slow: for each number of modes, their arguments are multiplied first.
+        // Logarithms are slow: for each number of outputs, their arguments are multiplied first.
         let mut products = vec![1.0; self.constants.len()];
         let mut sum = 0.0;
-        for (distance, modes, half_log_det) in rows {
-            sum += self.constants[*modes] - half_log_det;
+        for (distance, outputs, half_log_det) in rows {
+            sum += self.constants[*outputs] - half_log_det;
             if self.tails.is_finite() {
-                let product = &mut products[*modes];
+                let product = &mut products[*outputs];
                 *product *= 1.0 + distance / self.tails;
                 if *product > 1e150 {
-                    sum -= 0.5 * (self.tails + *modes as f64) * product.ln();
+                    sum -= 0.5 * (self.tails + *outputs as f64) * product.ln();
                     *product = 1.0;
                 }
             } else {
                 sum -= 0.5 * distance;
             }
         }
-        let left = |(modes, product): (usize, &f64)| 0.5 * (self.tails + modes as f64) * product.ln();
+        let left = |(outputs, product): (usize, &f64)| 0.5 * (self.tails + outputs as f64) * product.ln();
         if self.tails.is_finite() {
             sum -= products.iter().enumerate().map(left).sum::<f64>();
         }
@@ -272,9 +276,9 @@ impl Density {
     }
 }
 
-/// The degrees of freedom with the largest likelihood, for rows given as q, number of modes and ½ ln|V|.
+/// The degrees of freedom with the largest likelihood, for rows given as q, number of outputs and ½ ln|V|.
 pub(super) fn best_tails(distances: &[(f64, usize, f64)]) -> f64 {
-    let most = distances.iter().map(|(_, modes, _)| *modes).max().unwrap_or(0);
+    let most = distances.iter().map(|(_, outputs, _)| *outputs).max().unwrap_or(0);
     let total = |tails: f64| Density::new(tails, most).total(distances);
     TAILS.into_iter().map(|t| (total(t), t)).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(f64::INFINITY, |best| best.1)
 }
@@ -289,13 +293,20 @@ mod tests {
     /// Compares distance, ½ ln|V|, score and information of a row with dense matrices.
     #[test]
     fn score_and_information_equal_those_of_dense_matrices() {
-        for (p, f, means, tails) in [(4, 2, 3, 5.0), (3, 3, 5, f64::INFINITY), (2, 4, 4, 3.0), (3, 0, 2, 10.0)] {
+        let cases = [
+            (4, 2, 3, 5.0, vec![0, 2, 3, 4]),
+            (3, 3, 5, f64::INFINITY, vec![0, 2, 3]),
+            (2, 4, 4, 3.0, vec![0, 2]),
+            (3, 0, 2, 10.0, vec![0, 2, 3]),
+            // Outputs that share a noise factor.
+            (6, 2, 3, 5.0, vec![0, 1, 3, 3, 3, 5]),
+            (4, 1, 2, f64::INFINITY, vec![2, 2, 4, 4]),
+        ];
+        for (p, f, means, tails, groups) in cases {
             let mut stream = stats::stream(p as u64, "a row");
             let mut random =
                 |rows: usize, columns: usize| DMatrix::from_fn(rows, columns, |_, _| stream.random_range(-1.0..1.0));
             let (e, d, u) = (random(p, 1), random(p, means), random(p, f));
-            // The modes present, out of six.
-            let present: Vec<usize> = (0..p).map(|i| i + usize::from(i > 0)).collect();
             let mut row = RowSums::new(means, f, 6);
             row.residual[..p].copy_from_slice(e.as_slice());
             row.slopes[..p * means].copy_from_slice(d.transpose().as_slice());
@@ -303,7 +314,7 @@ mod tests {
             let (distance, half_log_det) = row.solve(p);
             let unknowns = means + f + 6;
             let (mut gradient, mut information) = (DVector::zeros(unknowns), DMatrix::zeros(unknowns, unknowns));
-            row.add(&present, distance, tails, &mut gradient, &mut information);
+            row.add(&groups, distance, tails, &mut gradient, &mut information);
 
             let v = DMatrix::identity(p, p) + &u * u.transpose();
             let inverse = v.clone().try_inverse().unwrap();
@@ -317,23 +328,24 @@ mod tests {
             let (h, b) = (g.transpose() * &inverse * &e, g.transpose() * &inverse * &g);
             let mut expected = DVector::zeros(unknowns);
             let mut expected_information = DMatrix::zeros(unknowns, unknowns);
-            let place = |k: usize| means + if k < f { k } else { f + present[k - f] };
             for k in 0..means {
                 expected[k] = of_means[(k, 0)];
                 for l in 0..=k {
                     expected_information[(k, l)] = between[(k, l)];
                 }
             }
+            // The score of a noise factor is the sum of those of its outputs, and so is its information.
+            let place = |k: usize| means + if k < f { k } else { f + groups[k - f] };
             for k in 0..f + p {
-                expected[place(k)] = weight * h[(k, 0)] * h[(k, 0)] - b[(k, k)];
-                for l in 0..=k {
+                expected[place(k)] += weight * h[(k, 0)] * h[(k, 0)] - b[(k, k)];
+                for l in (0..f + p).filter(|l| place(*l) <= place(k)) {
                     let shared = b[(k, l)];
-                    expected_information[(place(k), place(l))] =
+                    expected_information[(place(k), place(l))] +=
                         factor_a * 2.0 * shared * shared - factor_b * b[(k, k)] * b[(l, l)];
                 }
             }
-            assert!((gradient - expected).amax() < 1e-12, "{p} modes, {f} parameters");
-            assert!((information - expected_information).amax() < 1e-12, "{p} modes, {f} parameters");
+            assert!((gradient - expected).amax() < 1e-12, "{p} outputs, {f} parameters");
+            assert!((information - expected_information).amax() < 1e-12, "{p} outputs, {f} parameters");
         }
     }
 

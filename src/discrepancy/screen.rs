@@ -54,11 +54,11 @@ pub struct Whitened {
     pub nuisance: Vec<DMatrix<f64>>,
     /// Inverse of ⟨N, N⟩ plus the prior information, `[N, N]`.
     inverse: DMatrix<f64>,
-    /// L⁻¹, the modes present and √w of each row.
+    /// L⁻¹, the outputs present and √w of each row.
     factors: Vec<(DMatrix<f64>, Vec<usize>, f64)>,
 }
 
-/// Products of one direction T in the space of frequencies with residual and derivatives, for each row: w TᵀV⁻¹e, `[rows]`;
+/// Products of one direction T in the space of outputs with residual and derivatives, for each row: w TᵀV⁻¹e, `[rows]`;
 /// w TᵀV⁻¹T, `[rows]`; w TᵀV⁻¹N, `[rows, N]`.
 pub struct Sums {
     along: DVector<f64>,
@@ -67,13 +67,13 @@ pub struct Sums {
     nuisance: DMatrix<f64>,
 }
 
-/// The same products for the unit direction of each mode.
-pub struct ModeSums {
-    /// `[rows, modes]`
+/// The same products for the unit direction of each of the first outputs.
+pub struct OutputSums {
+    /// `[rows, outputs]`
     along: DMatrix<f64>,
-    /// `[rows, modes·modes]`
+    /// `[rows, outputs·outputs]`
     square: DMatrix<f64>,
-    /// `[rows, N·modes]`
+    /// `[rows, N·outputs]`
     nuisance: DMatrix<f64>,
 }
 
@@ -123,7 +123,8 @@ impl Whitened {
         Some(Self { residual, nuisance, inverse, factors })
     }
 
-    /// Products of the direction whose component is `direction(index of the row, mode)`, in ln f per unit of the number.
+    /// Products of the direction whose component is `direction(index of the row, output)`, in the unit of the output (ln f, or rad
+    /// for a shape) per unit of the number.
     pub fn sums(&self, direction: impl Fn(usize, usize) -> f64) -> Sums {
         let rows = self.factors.len();
         let mut sums = Sums {
@@ -169,38 +170,39 @@ impl Whitened {
         self.solve(&score, &information, &cross)
     }
 
-    /// Products of the unit direction of each mode.
-    pub fn mode_sums(&self, modes: usize) -> ModeSums {
+    /// Products of the unit direction of each of the first `outputs` outputs.
+    pub fn output_sums(&self, outputs: usize) -> OutputSums {
         let (rows, columns) = (self.factors.len(), self.inverse.nrows());
-        let mut sums = ModeSums {
-            along: DMatrix::zeros(rows, modes),
-            square: DMatrix::zeros(rows, modes * modes),
-            nuisance: DMatrix::zeros(rows, modes * columns),
+        let mut sums = OutputSums {
+            along: DMatrix::zeros(rows, outputs),
+            square: DMatrix::zeros(rows, outputs * outputs),
+            nuisance: DMatrix::zeros(rows, outputs * columns),
         };
         for (place, (inverse, present, root)) in self.factors.iter().enumerate() {
             let along = inverse.tr_mul(&self.residual[place]) * *root;
             let square = inverse.tr_mul(inverse) * (root * root);
             let with = inverse.tr_mul(&self.nuisance[place]) * *root;
-            for (i, a) in present.iter().enumerate() {
+            for (i, a) in present.iter().enumerate().take_while(|(_, a)| **a < outputs) {
                 sums.along[(place, *a)] = along[i];
-                for (j, b) in present.iter().enumerate() {
-                    sums.square[(place, b * modes + a)] = square[(i, j)];
+                for (j, b) in present.iter().enumerate().take_while(|(_, b)| **b < outputs) {
+                    sums.square[(place, b * outputs + a)] = square[(i, j)];
                 }
                 for column in 0..columns {
-                    sums.nuisance[(place, column * modes + a)] = with[(i, column)];
+                    sums.nuisance[(place, column * outputs + a)] = with[(i, column)];
                 }
             }
         }
         sums
     }
 
-    /// The score test of an arbitrary response of each mode to one function of the row, `[rows]`.
-    pub fn free_score(&self, sums: &ModeSums, function: &DVector<f64>) -> Score {
-        let modes = sums.along.ncols();
+    /// The score test of an arbitrary response of each output to one function of the row, `[rows]`.
+    pub fn free_score(&self, sums: &OutputSums, function: &DVector<f64>) -> Score {
+        let outputs = sums.along.ncols();
         let score = sums.along.tr_mul(function);
-        let information = sums.square.tr_mul(&function.component_mul(function)).reshape_generic(Dyn(modes), Dyn(modes));
+        let information =
+            sums.square.tr_mul(&function.component_mul(function)).reshape_generic(Dyn(outputs), Dyn(outputs));
         let columns = self.inverse.nrows();
-        let cross = sums.nuisance.tr_mul(function).reshape_generic(Dyn(modes), Dyn(columns));
+        let cross = sums.nuisance.tr_mul(function).reshape_generic(Dyn(outputs), Dyn(columns));
         self.solve(&score, &information, &cross)
     }
 

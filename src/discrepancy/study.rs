@@ -1,6 +1,7 @@
 //! The simulation and the measurements that a diagnosis compares.
 
 use super::data::Data;
+use super::shapes::MeasuredShapes;
 use crate::physics::effect::Target;
 use crate::simulator::Simulator;
 
@@ -22,8 +23,22 @@ pub struct Study<'a> {
     /// Range to which each parameter is limited, `[d]`, in its unit: its prior, extended by half its width on both sides.
     /// `None` for a parameter that is set in no row.
     pub(super) limits: Vec<Option<[f64; 2]>>,
-    /// For each row, the modes present and the sum of the logarithms of their stated noise.
-    pub(super) present: Vec<(Vec<usize>, f64)>,
+    /// What was measured in each row.
+    pub(super) present: Vec<Present>,
+}
+
+/// What was measured in one row.
+///
+/// Outputs are the quantities that the simulation predicts: ln f of each mode, then, if mode shapes were measured, their
+/// coordinates (see [`super::shapes`]), mode by mode. One unknown factor multiplies the stated noise of all outputs of a group:
+/// group j is the frequency of mode j, group m + j the shape of mode j.
+pub(super) struct Present {
+    /// The outputs measured, ascending; the frequencies come first.
+    pub(super) outputs: Vec<usize>,
+    /// The group of each of them, ascending.
+    pub(super) groups: Vec<usize>,
+    /// Sum of the logarithms of their stated noise.
+    pub(super) log_noise: f64,
 }
 
 impl<'a> Study<'a> {
@@ -39,13 +54,53 @@ impl<'a> Study<'a> {
             data.settings.iter().any(|row| row[k].is_some()).then_some([low, p.upper + beyond])
         };
         let limits = (0..simulator.space().len()).map(limit).collect();
-        let present = |(y, noise): (&Vec<f64>, &Vec<f64>)| {
-            let present: Vec<usize> = (0..y.len()).filter(|mode| y[*mode].is_finite()).collect();
-            let log_noise = present.iter().map(|mode| noise[*mode].ln()).sum();
-            (present, log_noise)
+        let mut study = Self { simulator, data, free, limits, present: Vec::new() };
+        let present = |row: usize| {
+            let outputs: Vec<usize> =
+                (0..study.outputs()).filter(|output| study.observed(row, *output).is_finite()).collect();
+            let groups = outputs.iter().map(|output| study.group(*output)).collect();
+            let log_noise = outputs.iter().map(|output| study.noise(row, *output).ln()).sum();
+            Present { outputs, groups, log_noise }
         };
-        let present = data.log_frequencies.iter().zip(&data.noise).map(present).collect();
-        Self { simulator, data, free, limits, present }
+        study.present = (0..data.rows()).map(present).collect();
+        study
+    }
+
+    /// Number of outputs: ln f of each mode and the coordinates of mode shapes.
+    pub fn outputs(&self) -> usize {
+        self.simulator.modes() + self.data.shapes.as_ref().map_or(0, MeasuredShapes::count)
+    }
+
+    /// Number of groups of outputs with a common noise factor.
+    pub(super) fn groups(&self) -> usize {
+        self.simulator.modes() * if self.data.shapes.is_some() { 2 } else { 1 }
+    }
+
+    /// The group of an output.
+    pub(super) fn group(&self, output: usize) -> usize {
+        let modes = self.simulator.modes();
+        match &self.data.shapes {
+            Some(shapes) if output >= modes => modes + shapes.mode(output - modes),
+            _ => output,
+        }
+    }
+
+    /// The measured value of an output in a row: ln f, f in Hz, or the coordinate of a shape, rad; NaN if missing.
+    pub(super) fn observed(&self, row: usize, output: usize) -> f64 {
+        let frequencies = &self.data.log_frequencies[row];
+        match &self.data.shapes {
+            Some(shapes) if output >= frequencies.len() => shapes.coordinates[row][output - frequencies.len()],
+            _ => frequencies[output],
+        }
+    }
+
+    /// Stated standard deviation of an output in a row.
+    pub(super) fn noise(&self, row: usize, output: usize) -> f64 {
+        let noise = &self.data.noise[row];
+        match &self.data.shapes {
+            Some(shapes) if output >= noise.len() => shapes.std,
+            _ => noise[output],
+        }
     }
 
     /// Columns of the free parameters, which are not set in every row, `[free]`.

@@ -172,8 +172,9 @@ fn parse_batch(
         Some("text/csv") => {
             let ignore = query.ignore.as_deref().unwrap_or_default().split(',').map(|c| c.trim().to_owned());
             let ignore = ignore.filter(|column| !column.is_empty()).collect();
-            let options = CsvOptions { times: Times::Required, ignore, ..CsvOptions::default() };
             let simulator = &active.simulator;
+            let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
+            let options = CsvOptions { times: Times::Required, ignore, points, ..CsvOptions::default() };
             let read = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
             let mut measurements = read.map_err(ApiError::invalid_input)?;
             if let Some(unit) = query.time_unit {

@@ -1,8 +1,9 @@
 //! Measurements as CSV tables.
 //!
-//! The columns are `measured_at`, `f1_hz` …, and optionally `std_f1_hz` …, the declared covariates by name, and
-//! `set_<parameter>`. An empty cell is a missing value. [`read`] refuses a table with a mistake; [`read_rows`] gives the rows one
-//! by one, so that those with a mistake can be left out. The separator is `,`, `;` or tab; it is detected from the header or read
+//! The columns are `measured_at`, `f1_hz` …, and optionally `std_f1_hz` …, the declared covariates by name, `set_<parameter>`, and
+//! `phi<mode>_<point>` for the component of a mode's shape at an instrumented point. An empty cell is a missing value; of a shape,
+//! all components are missing or none. [`read`] refuses a table with a mistake; [`read_rows`] gives the rows one by one, so that
+//! those with a mistake can be left out. The separator is `,`, `;` or tab; it is detected from the header or read
 //! from a first line `sep=;`. With `;` or tab, decimal commas are accepted. Additions by spreadsheets are accepted: a byte order
 //! mark, CRLF, blanks around cells, empty lines, and columns with neither a name nor values.
 
@@ -36,6 +37,8 @@ pub struct CsvOptions {
     pub time_column: Option<String>,
     /// Columns of settings that are not named `set_<parameter>`.
     pub settings: Vec<SettingColumn>,
+    /// Names of the instrumented points, at which mode shapes are measured; empty if the structure has none.
+    pub points: Vec<String>,
 }
 
 /// A column that holds the values of a setting.
@@ -174,6 +177,10 @@ enum Column {
     Std(usize),
     Covariate(String, CovariateKind),
     Setting(String),
+    /// Component of the shape of a mode at a point, by their indices.
+    Shape(usize, usize),
+    /// A component at a point that is not instrumented.
+    ShapeElsewhere(String),
 }
 
 /// Reads a table of a structure with `modes` modes.
@@ -258,14 +265,23 @@ fn columns(
             None => {
                 let known: Vec<&str> = covariates.iter().map(|c| c.name.as_str()).collect();
                 let known = if known.is_empty() { String::new() } else { format!(", {}", known.join(", ")) };
+                let shapes = if options.points.is_empty() { "" } else { ", phi<mode>_<point>" };
                 add(format!(
                     "unknown column {}: the known columns are measured_at, f1_hz to f{modes}_hz, std_f1_hz to std_f{modes}_hz, \
-                     set_<parameter>{known}; declare a covariate in the structure file, or ignore the column",
+                     set_<parameter>{shapes}{known}; declare a covariate in the structure file, or ignore the column",
                     shown(name)
                 ));
             }
-            Some(Column::Frequency(mode) | Column::Std(mode)) if *mode >= modes => {
+            Some(Column::Frequency(mode) | Column::Std(mode) | Column::Shape(mode, _)) if *mode >= modes => {
                 add(format!("column {}: the structure has {modes} modes", shown(name)));
+            }
+            Some(Column::ShapeElsewhere(point)) => {
+                add(format!(
+                    "column {}: {} is not an instrumented point of the structure; mode_shapes.points lists {}",
+                    shown(name),
+                    shown(point),
+                    options.points.join(", ")
+                ));
             }
             Some(other) if ![Column::Ignored, Column::Unnamed].contains(other) && columns.contains(other) => {
                 add(format!("column {} appears twice: remove one", shown(name)));
@@ -280,6 +296,15 @@ fn columns(
         .collect();
     if !missing.is_empty() {
         add(format!("missing column {}: the structure has {modes} modes", missing.join(", ")));
+    }
+    for mode in 0..modes {
+        let lacks = |point: &usize| !columns.contains(&Column::Shape(mode, *point));
+        let missing: Vec<usize> = (0..options.points.len()).filter(lacks).collect();
+        if !missing.is_empty() && missing.len() < options.points.len() {
+            let names: Vec<String> =
+                missing.iter().map(|point| format!("phi{}_{}", mode + 1, options.points[*point])).collect();
+            add(format!("missing column {}: a shape needs a component at each point", names.join(", ")));
+        }
     }
     if options.times == Times::Required && !columns.contains(&Column::Time) {
         add("missing column measured_at: RFC 3339 with an offset, such as 2026-03-01T12:00:00Z".to_owned());
@@ -323,8 +348,15 @@ fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<
     if let Some(mode) = lower.strip_prefix("std_").and_then(mode) {
         return Some(Column::Std(mode));
     }
-    // The names of parameters are case-sensitive.
-    lower.starts_with("set_").then(|| Column::Setting(name["set_".len()..].to_owned()))
+    // The names of parameters and points are case-sensitive.
+    if lower.starts_with("set_") {
+        return Some(Column::Setting(name["set_".len()..].to_owned()));
+    }
+    let number = lower.strip_prefix("phi").filter(|_| !options.points.is_empty())?.split('_').next()?;
+    let mode = number.parse::<usize>().ok()?.checked_sub(1)?;
+    let point = name.get("phi".len() + number.len() + 1..)?;
+    let place = options.points.iter().position(|known| known == point);
+    Some(place.map_or_else(|| Column::ShapeElsewhere(point.to_owned()), |place| Column::Shape(mode, place)))
 }
 
 fn row(
@@ -349,12 +381,13 @@ fn row(
         covariates: BTreeMap::new(),
         settings: BTreeMap::new(),
     };
+    let mut shapes: Vec<Vec<Option<f64>>> = Vec::new();
     for (column, cell) in columns.iter().zip(record).filter(|(_, cell)| !cell.is_empty()) {
         let number = |name: String| {
             number(cell, decimal_comma).map_err(|message| Problem::new(format!("line {line}, column {name}"), message))
         };
         match column {
-            Column::Ignored => {}
+            Column::Ignored | Column::ShapeElsewhere(_) => {}
             Column::Unnamed => {
                 let message =
                     format!("{} is in a column without a name: name the column in the first line", shown(cell));
@@ -378,8 +411,15 @@ fn row(
             Column::Setting(name) => {
                 raw.settings.insert(name.clone(), number(format!("set_{name}"))?);
             }
+            Column::Shape(mode, point) => {
+                if shapes.is_empty() {
+                    shapes = vec![vec![None; points(columns)]; modes];
+                }
+                shapes[*mode][*point] = Some(number(format!("phi{}, component {}", mode + 1, point + 1))?);
+            }
         }
     }
+    raw.mode_shapes = whole_shapes(shapes).map_err(|message| Problem::new(format!("line {line}"), message))?;
     // A row without any standard deviation gets `None`, as if the table had no such columns.
     raw.std_hz = raw.std_hz.filter(|stds| stds.iter().any(Option::is_some));
     if times == Times::RowNumber && !columns.contains(&Column::Time) {
@@ -388,6 +428,32 @@ fn row(
         raw.measured_at = Some(time.to_string());
     }
     Ok(raw)
+}
+
+/// Number of points at which the columns state shapes; the columns of a mode state all points or none.
+fn points(columns: &[Column]) -> usize {
+    let number = |column: &Column| if let Column::Shape(_, point) = column { point + 1 } else { 0 };
+    columns.iter().map(number).max().unwrap_or(0)
+}
+
+/// The shapes of a row; `None` if it has none.
+///
+/// # Errors
+/// The mode whose shape has only some of its components.
+fn whole_shapes(shapes: Vec<Vec<Option<f64>>>) -> Result<Option<Vec<Option<Vec<f64>>>>, String> {
+    let mut whole = Vec::with_capacity(shapes.len());
+    for (mode, components) in shapes.into_iter().enumerate() {
+        let (count, given) = (components.len(), components.iter().flatten().count());
+        let shape: Option<Vec<f64>> = components.into_iter().collect();
+        if given > 0 && given < count {
+            return Err(format!(
+                "the shape of mode {0} has {given} of {count} components: fill all columns phi{0}_…, or leave all of them empty",
+                mode + 1
+            ));
+        }
+        whole.push(shape.filter(|_| given > 0));
+    }
+    Ok(whole.iter().any(Option::is_some).then_some(whole))
 }
 
 fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {
@@ -402,7 +468,8 @@ fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {
     }
 }
 
-/// Writes measurements as a table from which [`read`] restores them.
+/// Writes measurements as a table from which [`read`] restores them. Mode shapes are left out, because the measurements do not
+/// contain the names of their points.
 ///
 /// # Panics
 /// Never, because all measurements have the same number of modes and writing to memory cannot fail.

@@ -33,6 +33,8 @@ pub mod modes;
 pub mod shaped;
 pub mod shapes;
 mod structure;
+pub mod tangent;
+pub mod tracked;
 
 pub use modes::{
     frequency_sensitivity, modes, natural_frequencies_hz, natural_frequencies_with, FrequencySensitivity, Modes,

@@ -40,30 +40,16 @@ pub fn shape_sensitivity(
     springs: &[usize],
 ) -> Vec<DMatrix<f64>> {
     let shapes = &modes.all_shapes;
-    let n = shapes.ncols();
-    let transposed = shapes.transpose();
-    let at_points = shapes.select_rows(points);
+    let receptances = Receptances::new(modes, points);
     let of_mode = |mode: usize| {
-        let eigenvalue = modes.eigenvalues[mode];
-        let weight = |other: usize| {
-            let gap = eigenvalue - modes.eigenvalues[other];
-            if gap.abs() > REPEATED * eigenvalue {
-                1.0 / gap
-            } else {
-                0.0
-            }
-        };
-        let weights: Vec<f64> = (0..n).map(weight).collect();
-        let weighted = DMatrix::from_fn(points.len(), n, |point, other| at_points[(point, other)] * weights[other]);
-        // Displacement of the points under a unit force at each degree of freedom, without the contribution of the mode itself.
-        let receptance = product(&weighted, &transposed);
+        let receptance = receptances.of_mode(modes, mode);
         let mut slopes = DMatrix::zeros(points.len(), springs.len());
         for (mut slope, &spring) in slopes.column_iter_mut().zip(springs) {
             structure.springs()[spring].form.entries(|row, column, value| {
                 slope.axpy(value * shapes[(column, mode)], &receptance.column(row), 1.0);
             });
         }
-        let here = at_points.column(mode);
+        let here = receptances.at_points.column(mode);
         let norm = here.norm();
         if norm <= 0.0 {
             return DMatrix::zeros(points.len(), springs.len());
@@ -77,6 +63,49 @@ pub fn shape_sensitivity(
         slopes
     };
     (0..modes.frequencies_hz.len()).map(of_mode).collect()
+}
+
+/// The displacements of points under forces, by modal expansion.
+pub(super) struct Receptances {
+    /// All mode shapes at the points, `[points, n]`, and at all degrees of freedom, transposed, `[n, n]`; kg^-½.
+    at_points: DMatrix<f64>,
+    transposed: DMatrix<f64>,
+}
+
+impl Receptances {
+    pub(super) fn new(modes: &Modes, points: &[usize]) -> Self {
+        Self { at_points: modes.all_shapes.select_rows(points), transposed: modes.all_shapes.transpose() }
+    }
+
+    /// Displacement of the points under a unit force at each degree of freedom, without the contribution of the mode itself and of
+    /// modes whose eigenvalue repeats its own, `[points, n]`.
+    ///
+    /// ```text
+    ///  Σ_{j≠i} φ_j φ_jᵀ/(λ_i − λ_j)
+    /// ```
+    pub(super) fn of_mode(&self, modes: &Modes, mode: usize) -> DMatrix<f64> {
+        let eigenvalue = modes.eigenvalues[mode];
+        let weight = |other: usize| {
+            let gap = eigenvalue - modes.eigenvalues[other];
+            if gap.abs() > REPEATED * eigenvalue {
+                1.0 / gap
+            } else {
+                0.0
+            }
+        };
+        let (points, n) = self.at_points.shape();
+        let weights: Vec<f64> = (0..n).map(weight).collect();
+        let weighted = DMatrix::from_fn(points, n, |point, other| self.at_points[(point, other)] * weights[other]);
+        product(&weighted, &self.transposed)
+    }
+}
+
+/// Number of simulated modes to pair with `measured` modes, of `available`: the measured modes and a few above, which can swap
+/// with them.
+pub fn modes_to_pair(measured: usize, available: usize) -> usize {
+    /// Modes above the measured ones.
+    const ABOVE: usize = 3;
+    (measured + ABOVE).min(available)
 }
 
 /// Pairs each measured mode with a different simulated mode: repeatedly takes the pair with the highest score.

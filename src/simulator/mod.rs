@@ -40,6 +40,7 @@ mod instrumented;
 pub mod law;
 mod layout;
 mod model;
+mod moved;
 mod parse;
 pub mod population;
 mod respond;
@@ -51,6 +52,6 @@ mod training;
 
 pub use model::{Binding, SimulationModel};
 pub use respond::Response;
-pub use shapes::Linearised;
+pub use shapes::{Linearised, ShapeResponse};
 pub use simulate::{DerivedStiffness, Error, Simulator};
 pub use training::TrainingSet;

@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::model::{chained, structure_at, SimulationModel};
+use super::moved::MovedParameters;
 use super::settings::{groups_of_modes, CorrectedParameters};
 use super::simulate::Simulator;
 use crate::physics;
@@ -62,6 +63,13 @@ impl Simulator {
         self.apply_gains(&mut found, theta, targets, sizes)?;
         let by_size = found.by_size.columns(own, sizes.len() - own).into_owned();
         Ok(Response { by_size, ..found })
+    }
+
+    /// The parameters `theta` (`[d]`) under the effects of the structure file and the further effects `targets` of the sizes
+    /// `sizes`.
+    pub(super) fn moved(&self, theta: &[f64], targets: &[Target], sizes: &[f64]) -> MovedParameters {
+        let own: Vec<Target> = self.effects().iter().map(|e| e.target.clone()).collect();
+        MovedParameters::new(theta, (own.as_slice(), self.sizes()), (targets, sizes))
     }
 
     /// The response at corrected parameters: targets on parameters are not applied, and the derivatives by their sizes are 0.

@@ -3,11 +3,14 @@
 use nalgebra::DMatrix;
 
 use super::model::{chained, structure_at, Binding, SimulationModel};
+use super::respond::Response;
 use super::settings::CorrectedParameters;
 use super::simulate::Simulator;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
 use crate::physics::shaped::{respond_shaped, Shaped};
+use crate::physics::shapes::modes_to_pair;
+use crate::physics::tracked::{respond_tracked, ReferenceMode};
 use crate::physics::{self, Structure};
 
 /// Frequencies and mode shapes at one set of parameters, and their derivatives.
@@ -21,6 +24,18 @@ pub struct Linearised {
     pub shapes: DMatrix<f64>,
     /// Derivatives of the shape of each mode, per parameter unit, `[points, d]`.
     pub shape_slopes: Vec<DMatrix<f64>>,
+}
+
+/// Mode shapes as coordinates about the shapes of reference modes, and their derivatives; see
+/// [`crate::physics::tracked::ShapeResponse`].
+#[derive(Debug, Clone)]
+pub struct ShapeResponse {
+    /// Coordinates, rad, `[m (P − 1)]` at P points.
+    pub coordinates: Vec<f64>,
+    /// Derivatives with respect to the parameters, rad per parameter unit, `[m (P − 1), d]`.
+    pub by_parameter: DMatrix<f64>,
+    /// Derivatives with respect to the sizes of the further effects, rad per unit of the size, `[m (P − 1), sizes]`.
+    pub by_size: DMatrix<f64>,
 }
 
 impl Simulator {
@@ -130,8 +145,34 @@ impl Simulator {
 
     /// Number of simulated modes to pair with the measured ones: the measured modes and a few above, which can swap with them.
     pub fn modes_to_pair(&self) -> usize {
-        /// Modes above the measured ones.
-        const ABOVE: usize = 3;
-        (self.modes() + ABOVE).min(self.structure().map_or(self.modes(), Structure::dofs))
+        modes_to_pair(self.modes(), self.structure().map_or(self.modes(), Structure::dofs))
+    }
+
+    /// As [`Self::respond`], but for the modes that resemble the `reference` modes, one for each, with their shapes at the
+    /// instrumented points ([`respond_tracked`]). `None` for the shapes if the structure has no instrumented points.
+    ///
+    /// # Errors
+    /// As [`Self::respond`].
+    pub fn respond_tracked(
+        &self,
+        theta: &[f64],
+        reference: &[ReferenceMode],
+        targets: &[Target],
+        sizes: &[f64],
+    ) -> Result<(Response, Option<ShapeResponse>), physics::Error> {
+        let (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) =
+            (self.model(), self.instrumented())
+        else {
+            return Ok((self.respond(theta, reference.len(), targets, sizes)?, None));
+        };
+        let moved = self.moved(theta, targets, sizes);
+        let changed = structure_at(structure, bindings, moved.theta())?;
+        let (response, shapes) =
+            respond_tracked(&changed, &moved.targets, &moved.sizes, &instrumented.dofs, reference)?;
+        let (by_parameter, by_size) =
+            moved.chain(&chained(&response.by_spring, bindings, moved.theta()), response.by_size);
+        let response = Response { frequencies_hz: response.frequencies_hz, by_parameter, by_size };
+        let (by_parameter, by_size) = moved.chain(&chained(&shapes.by_spring, bindings, moved.theta()), shapes.by_size);
+        Ok((response, Some(ShapeResponse { coordinates: shapes.coordinates, by_parameter, by_size })))
     }
 }

@@ -7,6 +7,7 @@ mod further;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
+mod places;
 mod settings;
 mod spectrum;
 mod tables;
@@ -28,6 +29,9 @@ use world::{Kind, Truth, World};
 
 /// Difference in log evidence, nats, below which two causes cannot be distinguished.
 const EQUIVALENT_NATS: f64 = 5.0;
+
+/// Greatest number of causes that an ambiguous answer names.
+const MOST_NAMED: usize = 8;
 
 /// Share of the gain of the true model on the rows held out that a diagnosis should reach.
 const GAIN: f64 = 0.8;
@@ -80,20 +84,28 @@ impl Order {
     }
 }
 
-/// Draws worlds, runs the program on each and judges the answers, in parallel on all cores; the results are in the order given.
-fn judged(orders: &[Order]) -> Vec<Judged> {
+/// Results of a computation for each item, computed in parallel on all cores, in the order of the items.
+fn in_parallel<T: Sync, R: Send>(items: &[T], compute: impl Fn(&T) -> R + Sync) -> Vec<R> {
     let next = AtomicUsize::new(0);
     let done = Mutex::new(BTreeMap::new());
     let work = || loop {
         let index = next.fetch_add(1, Ordering::Relaxed);
-        let Some(order) = orders.get(index) else { break };
-        let (kind, world) = order.draw();
-        let answer = answer(&world.structure_toml, &world.csv, &[]);
-        done.lock().unwrap().insert(index, Judged::new(kind, world, answer));
+        let Some(item) = items.get(index) else { break };
+        let result = compute(item);
+        done.lock().unwrap().insert(index, result);
     };
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     std::thread::scope(|scope| (0..threads).for_each(|_| drop(scope.spawn(work))));
     done.into_inner().unwrap().into_values().collect()
+}
+
+/// Draws worlds, runs the program on each and judges the answers; the results are in the order given.
+fn judged(orders: &[Order]) -> Vec<Judged> {
+    in_parallel(orders, |order| {
+        let (kind, world) = order.draw();
+        let answer = answer(&world.structure_toml, &world.csv, &[]);
+        Judged::new(kind, world, answer)
+    })
 }
 
 // ---- Judging ----
@@ -236,16 +248,16 @@ fn as_good(other: &Value, truth: &Truth) -> bool {
     names(other, truth) && other["log_evidence_difference"].as_f64().unwrap() > -EQUIVALENT_NATS
 }
 
-/// The cause that names the one hidden effect: the first, or one of the few of an ambiguous answer.
+/// The cause that names the one hidden effect: the first, or one of the first three of an ambiguous answer.
 fn named<'a>(answer: &'a Value, truth: &Truth) -> Option<&'a Value> {
     let causes = list(answer, "causes");
     match answer["verdict"].as_str()? {
         "cause" => causes.first().filter(|cause| names(cause, truth)),
         "ambiguous" => {
-            assert!(causes.len() <= 3, "{} causes are too many for an answer", causes.len());
+            assert!(causes.len() <= MOST_NAMED, "{} causes are too many for an answer", causes.len());
             let first = names(&causes[0], truth);
             let equivalent = first || list(answer, "alternatives").iter().any(|other| as_good(other, truth));
-            causes.iter().find(|cause| names(cause, truth)).filter(|_| equivalent)
+            causes.iter().take(3).find(|cause| names(cause, truth)).filter(|_| equivalent)
         }
         _ => None,
     }

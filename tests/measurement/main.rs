@@ -223,3 +223,45 @@ fn invalid_or_ambiguous_values_are_refused_with_their_line() {
         assert!(problem.message.contains(message), "{text}: {problem:?}");
     }
 }
+
+/// Reads a table of a structure with two modes and the instrumented points `m2` and `m4`.
+fn with_shapes(table: &str) -> Result<Vec<Option<Vec<Option<Vec<f64>>>>>, String> {
+    let options = CsvOptions { points: vec!["m2".to_owned(), "m4".to_owned()], ..options() };
+    let rows = read(table.as_bytes(), 2, &[], &options).map_err(|problems| problems[0].message.clone())?;
+    Ok(rows.into_iter().map(|row| row.mode_shapes).collect())
+}
+
+#[test]
+fn a_table_carries_mode_shapes_in_columns_of_modes_and_points() {
+    // The columns may come in any order, and those of a mode may be left out.
+    let header = "measured_at,f1_hz,f2_hz,phi2_m4,PHI2_m2";
+    let table = format!(
+        "{header}\n2026-03-01T12:00:00Z,1.0,2.0,-0.5,0.25\n2026-03-01T13:00:00Z,1.0,2.0,,\n2026-03-01T14:00:00Z,1.0,2.0,4,3\n"
+    );
+    let shape = |m2: f64, m4: f64| Some(vec![None, Some(vec![m2, m4])]);
+    assert_eq!(with_shapes(&table).unwrap(), [shape(0.25, -0.5), None, shape(3.0, 4.0)]);
+}
+
+#[test]
+fn incomplete_shapes_in_a_table_are_refused_with_what_is_missing() {
+    let row = "2026-03-01T12:00:00Z,1.0,2.0";
+    let cases = [
+        ("phi1_m2", "0.1", "missing column phi1_m4"),
+        (
+            "phi1_m2,phi1_m3",
+            "0.1,0.2",
+            "m3\" is not an instrumented point of the structure; mode_shapes.points lists m2, m4",
+        ),
+        ("phi3_m2,phi3_m4", "0.1,0.2", "the structure has 2 modes"),
+        ("phi1_m2,phi1_m4", "0.1,", "the shape of mode 1 has 1 of 2 components"),
+        ("phi1_m2,phi1_m4", "0.1,x", "\"x\" is not a number"),
+        ("phi1_m2,phi1_m4,phi1_m2", "0.1,0.2,0.3", "appears twice"),
+    ];
+    for (columns, cells, expected) in cases {
+        let message = with_shapes(&format!("measured_at,f1_hz,f2_hz,{columns}\n{row},{cells}\n")).unwrap_err();
+        assert!(message.contains(expected), "{columns}: {message}");
+    }
+    // Without instrumented points such a column is unknown.
+    let table = format!("measured_at,f1_hz,f2_hz,phi1_m2\n{row},0.1\n");
+    assert!(read(table.as_bytes(), 2, &[], &options()).unwrap_err()[0].message.contains("unknown column"));
+}

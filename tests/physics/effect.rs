@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 
 use modalwatch::measurement::CovariateValue;
 use modalwatch::physics::effect::{respond, Target};
-use modalwatch::physics::{natural_frequencies_hz, Mass, Node, Spring, Structure};
+use modalwatch::physics::shapes::shapes_at;
+use modalwatch::physics::tangent::TangentSpace;
+use modalwatch::physics::tracked::{respond_tracked, ReferenceMode};
+use modalwatch::physics::{modes, natural_frequencies_hz, Mass, Node, Spring, Structure};
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 
@@ -198,4 +201,90 @@ fn each_mistake_of_an_effect_is_named_with_its_place() {
         let problem = &error.problems[0];
         assert!(problem.pointer == pointer && problem.message.contains(message), "{wrong}: {error}");
     }
+}
+
+/// The modes of a structure as the modes that others are paired with, with their shapes at some points.
+fn reference(structure: &Structure, points: &[usize]) -> Vec<ReferenceMode> {
+    let all = modes(structure, structure.dofs()).unwrap();
+    let shapes = shapes_at(&all, points);
+    let mode = |(shape, frequency_hz): (_, &f64)| {
+        let shape: nalgebra::DVectorView<'_, f64> = shape;
+        ReferenceMode { frequency_hz: *frequency_hz, shape: TangentSpace::new(shape.as_slice()) }
+    };
+    shapes.column_iter().zip(&all.frequencies_hz).map(mode).collect()
+}
+
+#[test]
+fn shapes_under_effects_are_those_of_the_structure_with_them_built_in() {
+    let (base, points) = (structure(), [0, 2]);
+    let known = reference(&base, &points);
+    let (mut masses, mut springs) = (base.masses().to_vec(), base.springs().to_vec());
+    masses[1].kg *= 1.3;
+    springs.push(Spring::between("new", Node::Dof(0), Node::Dof(2), 0.4));
+    let built = Structure::new(masses, springs).unwrap();
+    let targets = [Target::Masses(vec![1]), Target::AddedSpring(Node::Dof(0), Node::Dof(2))];
+    let (response, shapes) = respond_tracked(&base, &targets, &[0.3, 0.4], &points, &known).unwrap();
+    let expected = modes(&built, 3).unwrap();
+    assert!(close(&response.frequencies_hz, &expected.frequencies_hz));
+    for (mode, shape) in shapes_at(&expected, &points).column_iter().enumerate() {
+        let own = known[mode].shape.as_ref().unwrap().coordinates(&[shape[0], shape[1]]).unwrap();
+        // With two points the coordinate is the angle between the shapes, and it is not 0.
+        assert!(own[0].abs() > 1e-3 && (own[0] - shapes.coordinates[mode]).abs() < 1e-12, "mode {mode}");
+    }
+}
+
+#[test]
+fn derivatives_of_shapes_equal_finite_differences() {
+    let base = structure();
+    for points in [vec![0, 2], vec![0, 1, 2]] {
+        let known = reference(&base, &points);
+        for (target, sizes) in targets(&base) {
+            let targets = [Target::Springs(vec![2]), target.clone()];
+            let sizes: Vec<f64> = [0.1].into_iter().chain(sizes).collect();
+            let at = |structure: &Structure, sizes: &[f64]| {
+                let shapes = respond_tracked(structure, &targets, sizes, &points, &known).unwrap().1;
+                nalgebra::DVector::from_vec(shapes.coordinates)
+            };
+            let shapes = respond_tracked(&base, &targets, &sizes, &points, &known).unwrap().1;
+            let step = 1e-6;
+            for which in 0..sizes.len() {
+                let moved = |by: f64| {
+                    let mut sizes = sizes.clone();
+                    sizes[which] += by;
+                    at(&base, &sizes)
+                };
+                let difference = (moved(step) - moved(-step)) / (2.0 * step);
+                assert!((difference - shapes.by_size.column(which)).amax() < 1e-7, "{target:?}, size {which}");
+            }
+            for spring in 0..base.springs().len() {
+                let moved = |by: f64| {
+                    let mut springs = base.springs().to_vec();
+                    springs[spring].n_per_m += by;
+                    at(&Structure::new(base.masses().to_vec(), springs).unwrap(), &sizes)
+                };
+                let difference = (moved(step) - moved(-step)) / (2.0 * step);
+                assert!((difference - shapes.by_spring.column(spring)).amax() < 1e-7, "{target:?}, spring {spring}");
+            }
+        }
+    }
+}
+
+/// Two bodies, each on a spring, with a weak link: their frequencies change places where the springs become equal.
+#[test]
+fn a_mode_keeps_its_place_where_two_modes_cross() {
+    let masses = vec![Mass::at("m0", 0, 1.0), Mass::at("m1", 1, 1.0)];
+    let springs = vec![
+        Spring::between("k0", Node::Ground, Node::Dof(0), 4.0),
+        Spring::between("k1", Node::Ground, Node::Dof(1), 5.0),
+        Spring::between("link", Node::Dof(0), Node::Dof(1), 1e-4),
+    ];
+    let base = Structure::new(masses, springs).unwrap();
+    let known = reference(&base, &[0, 1]);
+    let own_hz = natural_frequencies_hz(&base, 2).unwrap();
+    let softer = respond_tracked(&base, &[Target::Springs(vec![1])], &[-0.3], &[0, 1], &known).unwrap().0;
+    assert!((softer.frequencies_hz[0] / own_hz[0] - 1.0).abs() < 1e-4, "the first body is not touched");
+    assert!((softer.frequencies_hz[1] / own_hz[1] - 0.7_f64.sqrt()).abs() < 1e-4);
+    assert!(softer.frequencies_hz[1] < softer.frequencies_hz[0], "the order has changed");
+    // The second mode alone depends on the second spring.
+    assert!(softer.by_spring[(0, 1)].abs() < 1e-6 && softer.by_spring[(1, 1)] > 1e-3);
 }

@@ -56,7 +56,7 @@ impl<'a> Drawn<'a> {
         let residuals = |fit: &Fit| -> Option<Vec<Vec<f64>>> {
             let mut by_mode = vec![vec![f64::NAN; rows.len()]; simulator.modes()];
             for (row, view) in study.view(&rows, fit)?.iter().enumerate() {
-                for (mode, residual) in view.present.iter().zip(view.residual.iter()) {
+                for (mode, residual) in view.present[..view.frequencies].iter().zip(view.residual.iter()) {
                     by_mode[*mode][row] = 100.0 * residual;
                 }
             }

@@ -1,14 +1,15 @@
-//! Measured frequencies of all rows.
+//! Measured frequencies and mode shapes of all rows.
 
 use std::fmt::Write as _;
 
+use rand::seq::SliceRandom;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::effect::Effect;
-use super::numbers::{normal, number, rfc3339};
+use super::numbers::{log_uniform, normal, number, rfc3339, rounded};
 use super::rows::{training_rows, Row};
-use super::structure::Structure;
+use super::structure::{mass_name, Structure};
 
 /// Sets the measured frequencies; `None` if a row is not stable or the order of its modes changes.
 pub fn measure(
@@ -43,12 +44,49 @@ pub fn measure(
         if row.log_f.iter().all(Option::is_none) {
             return None;
         }
+        row.free = free;
     }
     Some(())
 }
 
-/// The measurements as the program reads them.
-pub fn csv(structure: &Structure, rows: &[Row]) -> String {
+/// Share of the shapes that are not identified although the frequency is.
+const NO_SHAPE: f64 = 0.05;
+
+/// Measured shapes: the masses that they are measured at, the noise of a component as a share of the root mean square of a shape,
+/// and the shape of each mode in each row, with any norm and sign.
+pub struct Shapes {
+    pub points: Vec<usize>,
+    pub noise: f64,
+    pub rows: Vec<Vec<Option<Vec<f64>>>>,
+}
+
+impl Shapes {
+    /// Measures shapes at half of the masses, at least at two.
+    pub fn measure(rng: &mut ChaCha8Rng, structure: &Structure, effects: &[Effect], rows: &[Row]) -> Self {
+        let n = structure.masses_kg.len();
+        let mut points = (0..n).collect::<Vec<_>>();
+        points.shuffle(rng);
+        points.truncate(n.div_ceil(2).max(2));
+        points.sort_unstable();
+        let noise = rounded(rng.random_range(0.01..0.03), 2);
+        let std = noise / (points.len() as f64).sqrt();
+        let mut of_row = |(index, row): (usize, &Row)| {
+            let gains = effects.iter().map(|e| (&e.target, e.signal[index])).collect::<Vec<_>>();
+            let clean = structure.shapes(row.set, &row.free, &gains, &points).expect("the row has frequencies");
+            let mut measured = |(shape, log_f): (Vec<f64>, &Option<f64>)| {
+                let norm = log_uniform(rng, 0.1, 10.0) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+                let noisy = shape.iter().map(|x| norm * (x + std * normal(rng))).collect::<Vec<_>>();
+                (!rng.random_bool(NO_SHAPE) && log_f.is_some()).then_some(noisy)
+            };
+            clean.into_iter().zip(&row.log_f).map(&mut measured).collect()
+        };
+        let rows = rows.iter().enumerate().map(&mut of_row).collect();
+        Self { points, noise, rows }
+    }
+}
+
+/// The measurements as the program reads them, with shapes if they were measured.
+pub fn csv(structure: &Structure, rows: &[Row], shapes: Option<&Shapes>) -> String {
     let mut text = String::from("measured_at");
     for mode in 1..=structure.modes {
         let _ = write!(text, ",f{mode}_hz");
@@ -57,8 +95,14 @@ pub fn csv(structure: &Structure, rows: &[Row]) -> String {
     if let Some(spring) = structure.setting {
         let _ = write!(text, ",set_{}", structure.springs[spring].name);
     }
+    let points = shapes.map_or(&[][..], |s| &s.points[..]);
+    for mode in 1..=structure.modes {
+        for point in points {
+            let _ = write!(text, ",phi{mode}_{}", mass_name(*point));
+        }
+    }
     text.push('\n');
-    for row in rows {
+    for (index, row) in rows.iter().enumerate() {
         text += &rfc3339(row.at_s);
         for log_f in &row.log_f {
             let cell = log_f.map_or(String::new(), |l| number(l.exp()));
@@ -71,6 +115,12 @@ pub fn csv(structure: &Structure, rows: &[Row]) -> String {
         let _ = write!(text, ",{}", row.operator);
         if structure.setting.is_some() {
             let _ = write!(text, ",{}", number(row.set));
+        }
+        for shape in shapes.map_or(&[][..], |s| &s.rows[index][..]) {
+            for place in 0..points.len() {
+                let cell = shape.as_ref().map_or(String::new(), |shape| number(shape[place]));
+                let _ = write!(text, ",{cell}");
+            }
         }
         text.push('\n');
     }

@@ -22,7 +22,7 @@ pub use structure::{frequencies_hz, structure_toml};
 
 use effect::{draw_effect, draw_outside, Effect, OUTSIDE};
 use likelihood::{Data, Fit};
-use measure::{csv, measure};
+use measure::{csv, measure, Shapes};
 use rows::{draw_rows, training_rows, Row, Weather};
 use structure::Structure;
 
@@ -63,7 +63,26 @@ pub struct World {
     pub holdout_log_density: (f64, f64),
     /// The world in one line.
     pub description: String,
+    structure: Structure,
+    effects: Vec<Effect>,
+    rows: Vec<Row>,
 }
+
+impl World {
+    /// Structure file and measurements with mode shapes at half of the masses; the frequencies are the same.
+    pub fn with_shapes(&self) -> (String, String) {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(SHAPES);
+        let shapes = Shapes::measure(&mut rng, &self.structure, &self.effects, &self.rows);
+        let names = shapes.points.iter().map(|p| format!("\"{}\"", structure::mass_name(*p))).collect::<Vec<_>>();
+        let declared = format!("mode_shapes = {{ points = [{}], noise = {:?} }}\n", names.join(", "), shapes.noise);
+        let toml = self.structure_toml.replacen("measurement_noise", &format!("{declared}measurement_noise"), 1);
+        (toml, csv(&self.structure, &self.rows, Some(&shapes)))
+    }
+}
+
+/// Random stream of the mode shapes, which no other part of a world uses.
+const SHAPES: u64 = 1 << 32;
 
 /// Targets and laws of single effects.
 pub const SINGLE_FAMILIES: &[(&str, &str)] = &[
@@ -211,7 +230,7 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
     Some(World {
         seed: 0,
         structure_toml: structure.toml(),
-        csv: csv(&structure, &rows),
+        csv: csv(&structure, &rows, None),
         description: describe(&structure, rows.len(), &truths, outside, nats),
         truths,
         outside,
@@ -225,6 +244,9 @@ fn attempt_world(rng: &mut ChaCha8Rng, families: &[Family], outside: Option<&'st
             log_likelihood(&[], &base, unseen)? / scored,
             log_likelihood(&all, &truth, unseen)? / scored,
         ),
+        structure,
+        effects,
+        rows,
     })
 }
 

@@ -80,6 +80,8 @@ pub struct Row {
     pub operator: &'static str,
     /// Value of the setting; 0 without one.
     pub set: f64,
+    /// Stiffnesses of the free springs; empty before the row is measured.
+    pub free: Vec<f64>,
     /// Natural logarithms of the measured frequencies; `None` if missing.
     pub log_f: Vec<Option<f64>>,
     pub outlier: bool,
@@ -133,6 +135,7 @@ pub fn draw_rows(rng: &mut ChaCha8Rng, structure: &Structure, weather: &Weather)
                 amplitude_um: (log_sd * normal(rng) - 0.5 * log_sd * log_sd).exp(),
                 operator,
                 set,
+                free: Vec::new(),
                 log_f: Vec::new(),
                 outlier: false,
             }

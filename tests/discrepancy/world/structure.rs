@@ -103,6 +103,34 @@ impl Structure {
 
     /// Log frequencies with effects; `None` if the structure is not stable.
     pub fn log_frequencies(&self, set: f64, free: &[f64], gains: &[(&Target, f64)]) -> Option<Vec<f64>> {
+        let Changed { masses_kg, springs, kept } = self.changed(set, free, gains)?;
+        let all_hz = frequencies_hz(&masses_kg, &springs)?;
+        let mut hz = kept.iter().map(|&m| all_hz[m]).collect::<Vec<_>>();
+        for (target, gain) in gains {
+            match target {
+                Target::Scale(None) => hz.iter_mut().for_each(|f| *f *= 1.0 + gain),
+                Target::Scale(Some(mode)) => hz[*mode] *= 1.0 + gain,
+                Target::Offset => hz.iter_mut().for_each(|f| *f += gain),
+                _ => {}
+            }
+        }
+        hz.iter().all(|f| *f > 0.0).then(|| hz.iter().map(|f| f.ln()).collect())
+    }
+
+    /// Shapes of unit norm at some masses with effects, one for each measured mode.
+    pub fn shapes(&self, set: f64, free: &[f64], gains: &[(&Target, f64)], points: &[usize]) -> Option<Vec<Vec<f64>>> {
+        let Changed { masses_kg, springs, kept } = self.changed(set, free, gains)?;
+        let all = shapes(&masses_kg, &springs);
+        let at_points = |&mode: &usize| {
+            let shape = points.iter().map(|&p| all[mode][p]).collect::<Vec<_>>();
+            let norm = shape.iter().map(|x| x * x).sum::<f64>().sqrt();
+            shape.iter().map(|x| x / norm).collect()
+        };
+        Some(kept.iter().map(at_points).collect())
+    }
+
+    /// Masses and springs with effects, and the modes that are measured.
+    fn changed(&self, set: f64, free: &[f64], gains: &[(&Target, f64)]) -> Option<Changed> {
         let mut masses_kg = self.masses_kg.clone();
         let mut springs = self.springs.iter().map(|s| (s.from, s.to, s.n_per_m)).collect::<Vec<_>>();
         for (&spring, &n_per_m) in self.free.iter().zip(free) {
@@ -129,20 +157,7 @@ impl Structure {
                 Target::Scale(_) | Target::Offset => {}
             }
         }
-        if masses_kg.iter().any(|m| *m <= 0.0) {
-            return None;
-        }
-        let all_hz = frequencies_hz(&masses_kg, &springs)?;
-        let mut hz = kept.iter().map(|&m| all_hz[m]).collect::<Vec<_>>();
-        for (target, gain) in gains {
-            match target {
-                Target::Scale(None) => hz.iter_mut().for_each(|f| *f *= 1.0 + gain),
-                Target::Scale(Some(mode)) => hz[*mode] *= 1.0 + gain,
-                Target::Offset => hz.iter_mut().for_each(|f| *f += gain),
-                _ => {}
-            }
-        }
-        hz.iter().all(|f| *f > 0.0).then(|| hz.iter().map(|f| f.ln()).collect())
+        masses_kg.iter().all(|m| *m > 0.0).then_some(Changed { masses_kg, springs, kept })
     }
 
     pub fn toml(&self) -> String {
@@ -155,6 +170,13 @@ impl Structure {
         let parameters = self.setting.iter().chain(&self.free).map(|&s| self.springs[s].name.clone());
         structure_toml(self.modes, self.noise, &masses, &springs, &parameters.collect::<Vec<_>>())
     }
+}
+
+/// A structure with effects.
+struct Changed {
+    masses_kg: Vec<f64>,
+    springs: Vec<(Node, usize, f64)>,
+    kept: Vec<usize>,
 }
 
 /// Draws a chain of springs from the ground through the masses in random order, and some further springs.
@@ -207,6 +229,34 @@ pub fn mass_name(index: usize) -> String {
 /// Natural frequencies, ascending, from the eigenvalues of M^-1/2 K M^-1/2; `None` if one is not positive.
 pub fn frequencies_hz(masses_kg: &[f64], springs: &[(Node, usize, f64)]) -> Option<Vec<f64>> {
     let n = masses_kg.len();
+    let mut a = scaled_stiffness(masses_kg, springs);
+    diagonalise(&mut a, n, |_, _, _, _| {});
+    let mut squares = (0..n).map(|i| a[i * n + i]).collect::<Vec<_>>();
+    squares.sort_by(f64::total_cmp);
+    (squares[0] > 1e-6).then(|| squares.iter().map(|s| s.sqrt() / TAU).collect())
+}
+
+/// Mode shapes at all masses, in the order of the natural frequencies: M^-1/2 times the eigenvectors of M^-1/2 K M^-1/2.
+pub fn shapes(masses_kg: &[f64], springs: &[(Node, usize, f64)]) -> Vec<Vec<f64>> {
+    let n = masses_kg.len();
+    let mut a = scaled_stiffness(masses_kg, springs);
+    let mut vectors = (0..n).map(|i| (0..n).map(|j| f64::from(u8::from(i == j))).collect()).collect::<Vec<Vec<f64>>>();
+    diagonalise(&mut a, n, |p, q, c, s| {
+        for row in &mut vectors {
+            let (x, y) = (row[p], row[q]);
+            row[p] = c * x - s * y;
+            row[q] = s * x + c * y;
+        }
+    });
+    let mut order = (0..n).collect::<Vec<_>>();
+    order.sort_by(|i, j| a[i * n + i].total_cmp(&a[j * n + j]));
+    let shape = |&mode: &usize| (0..n).map(|i| vectors[i][mode] / masses_kg[i].sqrt()).collect();
+    order.iter().map(shape).collect()
+}
+
+/// M^-1/2 K M^-1/2, `[n * n]`.
+fn scaled_stiffness(masses_kg: &[f64], springs: &[(Node, usize, f64)]) -> Vec<f64> {
+    let n = masses_kg.len();
     let mut a = vec![0.0; n * n];
     for &(from, to, n_per_m) in springs {
         a[to * n + to] += n_per_m / masses_kg[to];
@@ -217,13 +267,11 @@ pub fn frequencies_hz(masses_kg: &[f64], springs: &[(Node, usize, f64)]) -> Opti
             a[to * n + from] -= coupling;
         }
     }
-    let mut squares = symmetric_eigenvalues(&mut a, n);
-    squares.sort_by(f64::total_cmp);
-    (squares[0] > 1e-6).then(|| squares.iter().map(|s| s.sqrt() / TAU).collect())
+    a
 }
 
-/// Eigenvalues of a symmetric matrix by cyclic Jacobi rotations.
-fn symmetric_eigenvalues(a: &mut [f64], n: usize) -> Vec<f64> {
+/// Makes a symmetric matrix diagonal by cyclic Jacobi rotations; each is passed on as (p, q, cosine, sine).
+fn diagonalise(a: &mut [f64], n: usize, mut rotated: impl FnMut(usize, usize, f64, f64)) {
     for _ in 0..50 {
         let diagonal: f64 = (0..n).map(|i| a[i * n + i].powi(2)).sum();
         let off: f64 = (0..n).flat_map(|i| (0..i).map(move |j| (i, j))).map(|(i, j)| a[i * n + j].powi(2)).sum();
@@ -232,18 +280,19 @@ fn symmetric_eigenvalues(a: &mut [f64], n: usize) -> Vec<f64> {
         }
         for p in 0..n {
             for q in p + 1..n {
-                rotate(a, n, p, q);
+                if let Some((c, s)) = rotate(a, n, p, q) {
+                    rotated(p, q, c, s);
+                }
             }
         }
     }
-    (0..n).map(|i| a[i * n + i]).collect()
 }
 
-/// The rotation that makes the entry (p, q) zero.
-fn rotate(a: &mut [f64], n: usize, p: usize, q: usize) {
+/// Makes the entry (p, q) zero by a rotation; its cosine and sine, or `None` if the entry is zero already.
+fn rotate(a: &mut [f64], n: usize, p: usize, q: usize) -> Option<(f64, f64)> {
     let entry = a[p * n + q];
     if entry == 0.0 {
-        return;
+        return None;
     }
     let half_cot = (a[q * n + q] - a[p * n + p]) / (2.0 * entry);
     let t = half_cot.signum() / (half_cot.abs() + half_cot.hypot(1.0));
@@ -259,4 +308,5 @@ fn rotate(a: &mut [f64], n: usize, p: usize, q: usize) {
         a[p * n + i] = c * x - s * y;
         a[q * n + i] = s * x + c * y;
     }
+    Some((c, s))
 }

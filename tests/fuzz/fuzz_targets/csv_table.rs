@@ -50,7 +50,8 @@ fn checked(bytes: &[u8], times: Times) -> Option<Vec<ModalMeasurement>> {
 }
 
 fuzz_target!(|bytes: &[u8]| {
-    let options = CsvOptions { time_column: Some("Zeit".to_owned()), ..CsvOptions::default() };
+    let points = vec!["m1".to_owned(), "m2".to_owned()];
+    let options = CsvOptions { time_column: Some("Zeit".to_owned()), points, ..CsvOptions::default() };
     let _ = offered(bytes, &covariates(), &options, 5);
     let _ = read(bytes, 3, &covariates(), &options);
     let _ = checked(bytes, Times::RowNumber);
