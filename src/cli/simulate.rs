@@ -8,7 +8,7 @@ use clap::Args;
 use super::output::write_whole;
 use super::parameter::parameter_moments;
 use crate::baseline::library::find_structure;
-use crate::measurement::{at_intervals, csv};
+use crate::measurement::{at_intervals, csv_output};
 use crate::quantity::Timestamp;
 use crate::simulator::population::Population;
 
@@ -54,7 +54,7 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let start = Timestamp::parse(&args.start).context("--start")?;
     let rows: Vec<Vec<f64>> = drawn.frequencies_hz.row_iter().map(|row| row.iter().copied().collect()).collect();
     let measurements = at_intervals(&rows, start, args.interval_s, None)?;
-    let text = csv::write(&measurements);
+    let text = csv_output::write(&measurements);
     match &args.out {
         Some(path) => write_whole(path, text.as_bytes())?,
         None => print!("{text}"),

@@ -65,6 +65,8 @@ struct Row {
 /// The rows that are still used, and those that were left out.
 #[derive(Default)]
 struct Rows {
+    /// Number of rows read.
+    read: usize,
     /// Files with a column of times.
     timed: BTreeSet<usize>,
     used: Vec<Row>,
@@ -100,9 +102,9 @@ pub fn read_tables(simulator: &Simulator, paths: &[PathBuf], how: &TableArgs<'_>
         ..simulator.expectation(Timestamp::now(), usize::MAX)
     };
     for (index, file) in files.iter().enumerate() {
-        rows.read(index, file, &expectation, &options)?;
+        rows.add(index, file, &expectation, &options)?;
     }
-    let all = rows.used.len() + rows.left_out.len();
+    let all = rows.read;
     rows.drop_empty();
     rows.settle_times(&files, how, expectation.now)?;
     rows.drop_unset();
@@ -219,8 +221,8 @@ fn named(files: &[File<'_>], left_out: &[(usize, Problem)], options: &CsvOptions
 }
 
 impl Rows {
-    /// Reads the rows of a file.
-    fn read(
+    /// Adds the rows of a file.
+    fn add(
         &mut self,
         index: usize,
         (path, bytes): &File<'_>,
@@ -243,7 +245,8 @@ impl Rows {
             );
         }
         // The rows of a table without times follow those of the tables before it.
-        let earlier_rows = self.used.len();
+        let earlier_rows = self.read;
+        self.read += table.rows.len();
         for (number, row) in table.rows.into_iter().enumerate() {
             match row {
                 Ok(mut raw) => {

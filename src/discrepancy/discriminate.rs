@@ -39,7 +39,11 @@ pub(super) fn discriminating_measurement(simulator: &Simulator, data: &Data, a: 
     if mass(ca) != mass(cb) {
         return "weighing, or a static load test, which depends on stiffness but not on mass".to_owned();
     }
-    "mode shapes, or a further mode".to_owned()
+    if data.shapes.is_some() {
+        "mode shapes at further points, or a further mode".to_owned()
+    } else {
+        "mode shapes, or a further mode".to_owned()
+    }
 }
 
 /// The mode above those measured for which two fits differ most, and the difference in per cent.

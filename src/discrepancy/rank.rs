@@ -192,8 +192,8 @@ fn by_probability(
     ranked
 }
 
-/// Removes candidates that a simpler candidate explains as well. A law with a level also explains a constant, so its covariate
-/// must add evidence to the constant effect on the same target; an oscillator must add evidence to a heavier host.
+/// Removes candidates that a simpler candidate explains as well: a law with a level also explains a constant, so its covariate must
+/// add evidence to the constant effect on the same target.
 fn drop_equivalents(ranked: &mut Vec<Ranked>) {
     let best = |r: &Ranked| r.laws.iter().map(|l| l.1).fold(f64::NEG_INFINITY, f64::max);
     let constants: Vec<(Target, f64)> = ranked
@@ -202,11 +202,6 @@ fn drop_equivalents(ranked: &mut Vec<Ranked>) {
         .map(|r| (r.candidate.target.clone(), best(r)))
         .collect();
     ranked.retain(|r| {
-        // An oscillator tuned far from all modes acts as an added mass, which has one number less.
-        if let Target::Oscillator(host) = r.candidate.target {
-            let heavier = constants.iter().find(|c| c.0 == Target::Masses(vec![host])).map(|c| c.1);
-            return heavier.is_none_or(|heavier| best(r) > heavier + COVARIATE_NATS);
-        }
         let constant = constants.iter().find(|c| c.0 == r.candidate.target).map(|c| c.1);
         r.candidate.covariate.is_none() || constant.is_none_or(|constant| best(r) > constant + COVARIATE_NATS)
     });

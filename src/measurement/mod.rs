@@ -1,11 +1,12 @@
 //! Measured natural frequencies. Values of these types have been checked.
 //!
-//! [`body`] reads raw measurements from JSON, [`csv`] reads and writes them as tables, and [`check`] checks them. [`times`] are
+//! [`body`] reads raw measurements from JSON, [`csv`] reads them as tables, [`csv_output`] writes such tables, and [`check`] checks them. [`times`] are
 //! those that a table gives as numbers, and [`order`] is that of the modes.
 
 pub mod body;
 pub mod check;
 pub mod csv;
+pub mod csv_output;
 pub mod json;
 pub mod order;
 pub mod shape;

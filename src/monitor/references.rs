@@ -102,10 +102,7 @@ impl References {
         let Assessor { store, structures, events, alarms, .. } = &*self.assessor;
         let baseline = structures.get(structure)?.trained_baseline()?;
         let (mut batch_ids, mut left_out) = self.chosen(structure, &request.choice).await?;
-        if !request.leave_out_doubtful && !left_out.is_empty() {
-            let batches = batch_ids.len() + left_out.len();
-            return Err(DeclareError::Doubtful { batches, doubtful: left_out });
-        }
+        let doubtful_already = !left_out.is_empty();
         let mut records = Vec::new();
         for id in &batch_ids {
             records.push(self.assessor.stored(structure, id).await?);
@@ -122,7 +119,7 @@ impl References {
                     Err(error) => return (Vec::new(), Err(error)),
                 };
                 let doubtful = examined.doubtful().to_vec();
-                if !request.leave_out_doubtful && !doubtful.is_empty() {
+                if !request.leave_out_doubtful && (doubtful_already || !doubtful.is_empty()) {
                     return (Vec::new(), Err(ReferenceError::Doubtful(doubtful)));
                 }
                 let state = examined.reference(request.threshold_probability);
@@ -136,13 +133,14 @@ impl References {
         let with_id =
             |DoubtfulBatch { batch, reason }: DoubtfulBatch| LeftOutBatch { batch: batch_ids[batch].clone(), reason };
         let doubtful: Vec<LeftOutBatch> = doubtful.into_iter().map(with_id).collect();
-        let batches = batch_ids.len();
+        let batches = batch_ids.len() + left_out.len();
         let state = state.map_err(|error| match error {
             ReferenceError::Assess { batch, source } => {
                 DeclareError::Assess { batch: batch_ids[batch].clone(), source }
             }
-            ReferenceError::Doubtful(doubtful) => {
-                DeclareError::Doubtful { batches, doubtful: doubtful.into_iter().map(with_id).collect() }
+            ReferenceError::Doubtful(found) => {
+                let doubtful = left_out.iter().cloned().chain(found.into_iter().map(with_id)).collect();
+                DeclareError::Doubtful { batches, doubtful }
             }
             ReferenceError::State(source) => {
                 DeclareError::Reference { source, left_out: [left_out.clone(), doubtful.clone()].concat() }

@@ -117,3 +117,21 @@ fn shapes_tell_where_a_constant_effect_acts_in_a_hundred_worlds_of_each_kind() {
         assert!(counts.honest_without >= 90, "{kind}: {counts:?}");
     }
 }
+
+#[test]
+#[ignore = "writes files"]
+fn dump() {
+    let want = std::env::var("DUMP").unwrap();
+    for item in want.split(',') {
+        let (kind, seed) = item.split_once(':').unwrap();
+        let kind = KINDS.iter().find(|k| k.0 == kind).unwrap().0;
+        let world = world::draw_single(seed.parse().unwrap(), kind, "constant");
+        let (toml, csv) = world.with_shapes();
+        let base = format!("/tmp/shapes/{seed}");
+        std::fs::write(format!("{base}.toml"), &toml).unwrap();
+        std::fs::write(format!("{base}.csv"), &csv).unwrap();
+        std::fs::write(format!("{base}-without.toml"), &world.structure_toml).unwrap();
+        std::fs::write(format!("{base}-without.csv"), &world.csv).unwrap();
+        println!("{}", world.description);
+    }
+}

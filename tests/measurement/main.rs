@@ -6,7 +6,8 @@ use std::collections::BTreeMap;
 
 use modalwatch::measurement::body::RawBatch;
 use modalwatch::measurement::check::{check_each, check_measurements, Expectation, Purpose};
-use modalwatch::measurement::csv::{read, write, CsvOptions};
+use modalwatch::measurement::csv::{read, CsvOptions};
+use modalwatch::measurement::csv_output::write;
 use modalwatch::measurement::shape::InstrumentedPoints;
 use modalwatch::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
 use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};

@@ -6,7 +6,8 @@ use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
 use modalwatch::measurement::check::{check_measurements, Expectation, Purpose};
-use modalwatch::measurement::csv::{offered, read, write, CsvOptions, Times};
+use modalwatch::measurement::csv::{offered, read, CsvOptions, Times};
+use modalwatch::measurement::csv_output::write;
 use modalwatch::measurement::{Covariate, CovariateKind, ModalMeasurement};
 use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
 use modalwatch::quantity::Timestamp;
