@@ -23,7 +23,7 @@ fn extended(base: &StructureDefinition, covariate: &str, springs: &[&str], slope
     let mut definition = base.clone();
     definition.covariates.push(CovariateDefinition { name: covariate.to_owned(), kind: CovariateKind::Number });
     definition.effects.push(EffectDefinition {
-        name: format!("effect of {covariate}"),
+        name: format!("effect-of-{covariate}"),
         description: None,
         target: TargetDefinition::Springs(springs.iter().map(|&name| name.to_owned()).collect()),
         law: LawKind::Linear,
@@ -183,7 +183,7 @@ fn a_model_with_inputs_of_another_meaning_is_not_started_from_and_the_log_says_w
     let of_first = start.train(&first, 256, &standing_still(4), |_| {}).unwrap().baseline;
     let lost = simulator(&extended(&pair(), "load_t", &["k2"], -0.004));
     let why = WarmStart::new(&of_first, &lost).unwrap_err();
-    assert_eq!(why, Unlike::Effect("effect of temperature_c".to_owned()));
+    assert_eq!(why, Unlike::Effect("effect-of-temperature_c".to_owned()));
 
     // The training then starts from random weights, with one line that says why.
     let said = |parent: Option<&Baseline>, from_scratch: bool, simulator: &Simulator| {
