@@ -79,13 +79,20 @@ impl Conditions {
         own + self.effects.len()
     }
 
-    /// Number of inputs of the flow for each measurement where it starts at the best fit; 0 where it does not.
+    /// Number of inputs of the flow for each measurement where it starts at the best fit: the features of the fit, and the size of
+    /// each effect that varies with a covariate; 0 where it does not start there.
     pub fn fixed_context(&self, parameters: usize) -> usize {
         if self.starts_at_fit {
-            fit_features(parameters)
+            fit_features(parameters) + self.effects.len()
         } else {
             0
         }
+    }
+
+    /// Position of the size of each effect in its range, from the sizes of all effects of a measurement, `[sizes]`; 0 where they are
+    /// unknown.
+    pub(super) fn effect_positions<'a>(&'a self, sizes: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
+        self.effects.iter().map(|effect| sizes.get(effect.column).map_or(0.0, |size| effect.position(*size)))
     }
 
     /// The box that the flow was trained in: the parameters of `prior` with the limits of the training box.

@@ -4,6 +4,7 @@ use candle_core::{DType, Device, Tensor};
 use nalgebra::{DMatrix, DMatrixView};
 use rayon::prelude::*;
 
+use super::conditions::Conditions;
 use super::error::InferenceError;
 use super::model::{fit_condition, Baseline};
 use super::observation::Observation;
@@ -106,15 +107,17 @@ impl Baseline {
 /// [`InferenceError::Simulation`], which cannot occur inside a checked prior.
 pub(super) fn fitted_pairs(
     simulator: &Simulator,
+    conditions: &Conditions,
     set: &TrainingSet,
     observations: &[Observation],
 ) -> Result<Pairs, InferenceError> {
     let prior = simulator.space().as_slice();
+    let width = conditions.fixed_context(prior.len());
     let (mut x, mut y) = (Vec::new(), Vec::new());
     for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
         let located = locate_all(simulator, part).map_err(|e| InferenceError::Simulation(e.to_string()))?;
         x.push(to_flow(&located, prior, &set.theta.rows(chunk * AT_A_TIME, part.len()))?.to_dtype(DType::F32)?);
-        y.push(fit_condition(&located, prior.len())?.to_dtype(DType::F32)?);
+        y.push(fit_condition(&located, part, conditions, width)?.to_dtype(DType::F32)?);
     }
     Ok(Pairs { x: Tensor::cat(&x, 0)?, y: Tensor::cat(&y, 0)? })
 }

@@ -2,6 +2,7 @@
 
 use candle_core::DType;
 
+use super::conditions::fit_features;
 use super::error::{LoadError, SELF_TEST_TOLERANCE};
 use super::manifest::{Manifest, SelfTest, FORMAT};
 use super::model::Baseline;
@@ -75,12 +76,15 @@ impl Baseline {
 fn lengths(manifest: &Manifest, simulator: &Simulator) -> Vec<(&'static str, usize, usize)> {
     let (d, m) = (simulator.space().len(), simulator.modes());
     let Manifest { architecture, conditions, whitening, self_test, calibration, .. } = manifest;
+    // Earlier versions of this program trained flows that start at the best fit without the sizes of the effects as inputs.
+    let before_effects = conditions.starts_at_fit && architecture.fixed_context == fit_features(d);
+    let fixed_context = if before_effects { fit_features(d) } else { conditions.fixed_context(d) };
     let mut all = vec![
         ("architecture.parameters", architecture.parameters, d),
         ("architecture.modes", architecture.modes, m),
         ("architecture.channels", architecture.channels, conditions.channels()),
         ("architecture.permutations", architecture.permutations.len(), architecture.units),
-        ("architecture.fixed_context", architecture.fixed_context, conditions.fixed_context(d)),
+        ("architecture.fixed_context", architecture.fixed_context, fixed_context),
         ("conditions.training_box", conditions.training_box.len(), d),
         ("whitening.mean", whitening.mean.len(), m),
         ("whitening.factor", whitening.factor.len(), m),

@@ -66,6 +66,9 @@ pub struct TrainingRecord {
     pub best_epoch: usize,
     /// Why the training ended.
     pub stopped: Stopped,
+    /// Digest of the model whose weights the training started from; `None` for random weights.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parent: Option<Digest>,
 }
 
 /// Accuracy on held-out simulated pairs, which were used neither for training nor for selecting the epoch.

@@ -39,6 +39,7 @@ pub mod calibration;
 pub mod conditions;
 mod density;
 mod error;
+pub mod extension;
 mod fitted;
 pub mod identifiability;
 mod infer;
@@ -54,6 +55,7 @@ mod real_line;
 mod resample;
 pub mod start;
 pub mod train;
+pub mod warm;
 
 pub use admit::Admitted;
 pub use error::{InferenceError, LoadError};

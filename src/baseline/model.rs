@@ -2,7 +2,7 @@
 
 use candle_core::Tensor;
 
-use super::conditions::fit_features;
+use super::conditions::Conditions;
 use super::error::InferenceError;
 use super::manifest::{Group, Manifest};
 use super::observation::{Encoder, Observation};
@@ -109,7 +109,8 @@ impl Baseline {
         self.check_modes(observations)?;
         let located =
             locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))?;
-        let context = fit_condition(&located, self.space().len())?.to_dtype(self.flow.dtype())?;
+        let (conditions, width) = (&self.manifest.conditions, self.manifest.architecture.fixed_context);
+        let context = fit_condition(&located, observations, conditions, width)?.to_dtype(self.flow.dtype())?;
         Ok((located, context))
     }
 
@@ -122,11 +123,20 @@ impl Baseline {
     }
 }
 
-/// Input of a flow that starts at the best fit, `[n, features]`, f64.
+/// Input of a flow that starts at the best fit, `[n, width]`, f64: the features of each fit, then the positions of the effects'
+/// sizes in their ranges. Flows that earlier versions of this program trained have the features only.
 ///
 /// # Errors
 /// A candle error, which would be a bug.
-pub(super) fn fit_condition(located: &[Located], parameters: usize) -> Result<Tensor, candle_core::Error> {
-    let values: Vec<f64> = located.iter().flat_map(Located::features).collect();
-    Tensor::from_vec(values, (located.len(), fit_features(parameters)), &candle_core::Device::Cpu)
+pub(super) fn fit_condition(
+    located: &[Located],
+    observations: &[Observation],
+    conditions: &Conditions,
+    width: usize,
+) -> Result<Tensor, candle_core::Error> {
+    let mut values = Vec::with_capacity(located.len() * width);
+    for (fit, observation) in located.iter().zip(observations) {
+        values.extend(fit.features().chain(conditions.effect_positions(&observation.effect_sizes)).take(width));
+    }
+    Tensor::from_vec(values, (located.len(), width), &candle_core::Device::Cpu)
 }

@@ -44,12 +44,13 @@ pub struct Nearest {
 }
 
 /// The result for measured mode shapes, which is the fit that the flow starts at. It contains the sum of the squared residuals of
-/// frequencies and shapes, but no residuals of single modes.
-fn of_fit(fit: Located, modes: usize) -> Nearest {
+/// frequencies and shapes, but no residuals of single modes. `known`: the sizes of all effects are known; otherwise the measurement
+/// cannot be compared with the simulation.
+fn of_fit(fit: Located, modes: usize, known: bool) -> Nearest {
     Nearest {
         frequencies_hz: fit.frequencies_hz,
-        chi_squared: fit.chi_squared,
-        degrees_of_freedom: fit.degrees_of_freedom.round() as usize,
+        chi_squared: if known { fit.chi_squared } else { 0.0 },
+        degrees_of_freedom: if known { fit.degrees_of_freedom.round() as usize } else { 0 },
         standardised_residuals: DVector::zeros(modes),
         projector: DMatrix::zeros(modes, modes),
     }
@@ -68,7 +69,8 @@ fn of_fit(fit: Located, modes: usize) -> Nearest {
 /// [`physics::Error`], which cannot occur inside a checked prior.
 pub fn nearest(simulator: &Simulator, observation: &Observation, start: &[f64]) -> Result<Nearest, physics::Error> {
     if observation.has_shapes() {
-        locate(simulator, observation).map(|fit| of_fit(fit, simulator.modes()))
+        let known = !observation.is_marginalised();
+        locate(simulator, observation).map(|fit| of_fit(fit, simulator.modes(), known))
     } else {
         nearest_by_frequencies(simulator, observation, start)
     }

@@ -188,8 +188,7 @@ impl Encoder {
                 }));
                 values.extend((0..modes).map(|mode| if present(mode) { 0.0 } else { 1.0 }));
             }
-            for effect in &self.conditions.effects {
-                let position = observation.effect_sizes.get(effect.column).map_or(0.0, |size| effect.position(*size));
+            for position in self.conditions.effect_positions(&observation.effect_sizes) {
                 values.extend(std::iter::repeat_n(position, modes));
             }
         }

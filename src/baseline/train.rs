@@ -39,6 +39,8 @@ const HELD_OUT_FITTED: usize = 300;
 const HELD_OUT_DRAWS: usize = 10;
 /// Draws of the self-test.
 const SELF_TEST_DRAWS: usize = 4;
+/// Purpose of the seed of the training set.
+pub(super) const TRAINING_SET: &str = "training set";
 /// Smallest number of training samples. With fewer, the covariance of the frequencies is too uncertain.
 pub const MINIMUM_SAMPLES: usize = 100;
 
@@ -141,10 +143,8 @@ pub fn train(
 ) -> Result<Trained, Error> {
     check(samples, noise_range, flow_settings, settings)?;
     let fitted = starts_at_fit(simulator);
-    // The normal distribution at a fit extends beyond the prior already, so that no margin is needed.
-    let space = if fitted { simulator.space().clone() } else { simulator.training_space() };
-    let draw = |count: usize, purpose: &str| simulator.pairs(&space, count, purpose_seed(settings.seed, purpose));
-    let training = draw(samples, "training set")?;
+    let space = space_of_flow(simulator);
+    let training = simulator.pairs(&space, samples, purpose_seed(settings.seed, TRAINING_SET))?;
     let conditions = Conditions {
         training_box: space.iter().map(|p| [p.lower, p.upper]).collect(),
         noise_range: simulator.is_noisy().then_some(noise_range),
@@ -156,23 +156,61 @@ pub fn train(
     let mut architecture =
         flow_settings.architecture(space.len(), simulator.modes(), conditions.channels(), &mut permutations);
     architecture.fixed_context = conditions.fixed_context(space.len());
-    let validation_samples = if fitted { VALIDATION_FITTED } else { VALIDATION_SAMPLES };
-    let validation = draw(validation_samples, "validation set")?;
-
     let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
-    let task = Task { simulator, space: &space, conditions: &conditions, whitening: &whitening, settings };
-    let outcome = task.run(&flow, &weights, &training, &validation, on_epoch)?;
-    let weights = checkpoint::to_bytes(&weights)?;
-    let training = TrainingRecord {
-        samples,
-        validation_samples,
-        settings: settings.clone(),
-        best_epoch: outcome.best_epoch,
-        stopped: outcome.stopped,
-    };
-    let manifest = draft_manifest(simulator, &weights, architecture, (whitening, conditions), training);
-    let digest = manifest.weights_sha256.clone();
-    certify(&Baseline::new(flow, simulator, manifest, digest)?, weights)
+    Prepared { flow, weights, space, conditions, whitening, training, parent: None }
+        .train(simulator, settings, on_epoch)
+}
+
+/// The box in which a new flow is trained.
+pub(super) fn space_of_flow(simulator: &Simulator) -> ParameterSpace {
+    // The normal distribution at a fit extends beyond the prior already, so that no margin is needed.
+    if starts_at_fit(simulator) {
+        simulator.space().clone()
+    } else {
+        simulator.training_space()
+    }
+}
+
+/// A flow with its initial weights and all that its training needs.
+pub(super) struct Prepared {
+    pub flow: Flow,
+    pub weights: Weights,
+    /// The box in which the training set was drawn.
+    pub space: ParameterSpace,
+    pub conditions: Conditions,
+    pub whitening: Whitening,
+    pub training: TrainingSet,
+    /// The model whose weights the flow starts from.
+    pub parent: Option<Digest>,
+}
+
+impl Prepared {
+    /// Trains the flow, and certifies the model.
+    pub(super) fn train(
+        self,
+        simulator: &Simulator,
+        settings: &TrainSettings,
+        on_epoch: impl FnMut(EpochReport),
+    ) -> Result<Trained, Error> {
+        let Self { flow, weights, space, conditions, whitening, training, parent } = self;
+        let validation_samples = if conditions.starts_at_fit { VALIDATION_FITTED } else { VALIDATION_SAMPLES };
+        let validation = simulator.pairs(&space, validation_samples, purpose_seed(settings.seed, "validation set"))?;
+        let task = Task { simulator, space: &space, conditions: &conditions, whitening: &whitening, settings };
+        let outcome = task.run(&flow, &weights, &training, &validation, on_epoch)?;
+        let weights = checkpoint::to_bytes(&weights)?;
+        let training = TrainingRecord {
+            samples: training.theta.nrows(),
+            validation_samples,
+            settings: settings.clone(),
+            best_epoch: outcome.best_epoch,
+            stopped: outcome.stopped,
+            parent,
+        };
+        let architecture = flow.architecture().clone();
+        let manifest = draft_manifest(simulator, &weights, architecture, (whitening, conditions), training);
+        let digest = manifest.weights_sha256.clone();
+        certify(&Baseline::new(flow, simulator, manifest, digest)?, weights)
+    }
 }
 
 /// What the training of a flow needs besides the pairs.
@@ -198,8 +236,8 @@ impl Task<'_> {
         let of_validation = self.observed(validation, "observations of validation");
         if self.conditions.starts_at_fit {
             let observations = self.observed(training, "observations");
-            let pairs = fitted_pairs(self.simulator, training, &observations)?;
-            let validation = fitted_pairs(self.simulator, validation, &of_validation)?;
+            let pairs = fitted_pairs(self.simulator, self.conditions, training, &observations)?;
+            let validation = fitted_pairs(self.simulator, self.conditions, validation, &of_validation)?;
             let epoch = |_| Ok(pairs.clone());
             return Ok(crate::flow::train::train(flow, weights, samples, epoch, &validation, self.settings, on_epoch)?);
         }
@@ -289,7 +327,12 @@ pub fn diverged(manifest: &Manifest) -> bool {
 }
 
 /// Checks the ranges of all settings.
-fn check(samples: usize, noise_range: NoiseRange, flow: &FlowSettings, settings: &TrainSettings) -> Result<(), Error> {
+pub(super) fn check(
+    samples: usize,
+    noise_range: NoiseRange,
+    flow: &FlowSettings,
+    settings: &TrainSettings,
+) -> Result<(), Error> {
     let NoiseRange { lowest, highest } = noise_range;
     if !(lowest > 0.0 && highest.is_finite() && lowest < highest && (lowest..=highest).contains(&1.0)) {
         return Err(Error::NoiseRange { lowest, highest });
@@ -314,12 +357,12 @@ fn check(samples: usize, noise_range: NoiseRange, flow: &FlowSettings, settings:
 }
 
 /// A seed for each purpose, so that the sets never share a draw.
-fn purpose_seed(seed: u64, purpose: &str) -> u64 {
+pub(super) fn purpose_seed(seed: u64, purpose: &str) -> u64 {
     stats::stream(seed, purpose).next_u64()
 }
 
 /// Ranges of sizes in a training set, of the effects that vary with a covariate.
-fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
+pub(super) fn effect_ranges(simulator: &Simulator, set: &TrainingSet) -> Vec<EffectRange> {
     let mut first = 0;
     let mut ranges = Vec::new();
     for effect in simulator.effects() {

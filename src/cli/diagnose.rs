@@ -6,19 +6,18 @@ use anyhow::Context as _;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::model::present_model;
 use super::next::join;
 use super::output::write_whole;
 use super::tables::{read_tables, TableArgs};
-use super::training::{print_record, sizes, train_into};
+use super::training::{print_record, train_extension_into};
+use crate::baseline::extension::ExtensionPlan;
 use crate::baseline::library::find_structure;
-use crate::baseline::observation::DEFAULT_NOISE_RANGE;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend as extend_structure;
 use crate::discrepancy::gain::GainMethod;
 use crate::discrepancy::learned::extension::{extend_learned, offer_anyway};
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
-use crate::flow::train::TrainSettings;
-use crate::flow::FlowSettings;
 use crate::measurement::times::TimeUnit;
 use crate::simulator::Simulator;
 
@@ -153,10 +152,19 @@ pub struct ExtendArgs {
     /// Only write the structure; its model can be trained later with `modalwatch train`
     #[arg(long)]
     no_training: bool,
-    /// Number of simulated training samples [default: as for `modalwatch train`]
+    /// Trained model of the structure, from whose weights the training starts: its .safetensors file, with its .json beside it
+    /// [default: the one in the folder of the structure file, or the shipped one]
+    #[arg(long, conflicts_with = "from_scratch")]
+    model: Option<PathBuf>,
+    /// Start the training from random weights
+    #[arg(long)]
+    from_scratch: bool,
+    /// Number of simulated training samples [default: as for the model that the training starts from; without one, as for
+    /// `modalwatch train`]
     #[arg(long)]
     samples: Option<usize>,
-    /// Number of passes over the training samples [default: as for `modalwatch train`]
+    /// Number of passes over the training samples [default: a quarter of those of the model that the training starts from; without
+    /// one, as for `modalwatch train`]
     #[arg(long)]
     epochs: Option<usize>,
     /// Write the report of the diagnosis as one HTML page
@@ -194,11 +202,16 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
     if args.no_training {
         return Ok(());
     }
-    let simulator = Simulator::new(definition)?;
-    let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
-    let settings = TrainSettings { epochs, seed: args.study.seed, ..TrainSettings::default() };
-    let flow = FlowSettings::default();
-    let trained = train_into(&args.out, &simulator, samples, DEFAULT_NOISE_RANGE, &flow, &settings)?;
+    let extension = Simulator::new(definition)?;
+    let parent = present_model(&args.study.structure, &simulator, args.model.as_deref())?;
+    let plan = ExtensionPlan {
+        parent: parent.as_deref(),
+        from_scratch: args.from_scratch,
+        samples: args.samples,
+        epochs: args.epochs,
+        seed: args.study.seed,
+    };
+    let trained = train_extension_into(&args.out, &extension, &plan)?;
     print_record(trained.baseline.manifest());
     Ok(())
 }

@@ -7,9 +7,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::output::write_whole;
 use crate::baseline::conditions::NoiseRange;
+use crate::baseline::extension::{ExtensionPlan, Progress};
 use crate::baseline::manifest::Manifest;
 use crate::baseline::train::{default_epochs, default_samples, train, Trained};
-use crate::flow::train::TrainSettings;
+use crate::flow::train::{EpochReport, TrainSettings};
 use crate::flow::FlowSettings;
 use crate::simulator::Simulator;
 
@@ -30,17 +31,45 @@ pub fn train_into(
     flow: &FlowSettings,
     settings: &TrainSettings,
 ) -> anyhow::Result<Trained> {
-    let bar = ProgressBar::new(settings.epochs as u64);
-    let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
-    bar.set_style(ProgressStyle::with_template(style).context("the template of the progress bar")?);
-    let trained = train(simulator, samples, noise_range, flow, settings, |epoch| {
-        bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
-        bar.set_position(epoch.epoch as u64);
+    let bar = progress_bar()?;
+    let trained =
+        train(simulator, samples, noise_range, flow, settings, |epoch| advance(&bar, epoch, settings.epochs))?;
+    bar.finish_and_clear();
+    write_files(out, &trained)?;
+    Ok(trained)
+}
+
+/// Trains the model of an extended structure as planned, with a progress bar, writes its two files to the folder `out`, and prints
+/// which weights the training started from.
+///
+/// # Errors
+/// A training that fails, a folder that cannot be written.
+pub fn train_extension_into(out: &Path, simulator: &Simulator, plan: &ExtensionPlan<'_>) -> anyhow::Result<Trained> {
+    let bar = progress_bar()?;
+    let trained = plan.train(simulator, &mut |progress| match progress {
+        Progress::Start(how) => bar.suspend(|| println!("{how}")),
+        Progress::Epoch { report, epochs } => advance(&bar, report, epochs),
     })?;
     bar.finish_and_clear();
-    write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
-    write_whole(&out.join("baseline.json"), &trained.manifest_json)?;
+    write_files(out, &trained)?;
     Ok(trained)
+}
+
+fn progress_bar() -> anyhow::Result<ProgressBar> {
+    let style = "{elapsed} {wide_bar} epoch {pos}/{len}, {msg}, {eta} left";
+    let style = ProgressStyle::with_template(style).context("the template of the progress bar")?;
+    Ok(ProgressBar::new(0).with_style(style))
+}
+
+fn advance(bar: &ProgressBar, epoch: EpochReport, epochs: usize) {
+    bar.set_length(epochs as u64);
+    bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
+    bar.set_position(epoch.epoch as u64);
+}
+
+fn write_files(out: &Path, trained: &Trained) -> anyhow::Result<()> {
+    write_whole(&out.join("baseline.safetensors"), &trained.weights)?;
+    write_whole(&out.join("baseline.json"), &trained.manifest_json)
 }
 
 /// Prints the identifiability and the calibration of a trained model.

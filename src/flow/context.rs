@@ -60,6 +60,13 @@ impl ContextNetwork {
         self.width - self.layers.as_ref().map_or(0, |layers| layers.features.outputs())
     }
 
+    /// The dense layers with their names; empty without a network.
+    pub(super) fn layers(&self) -> Vec<(&'static str, &Dense)> {
+        self.layers.as_ref().map_or_else(Vec::new, |layers| {
+            vec![("conv1", &layers.first.weights), ("conv2", &layers.second.weights), ("features", &layers.features)]
+        })
+    }
+
     /// Computes S(y) `[n, width]`. `y`: `[n, channels, modes]`, or `[n, fixed_context]` without a network.
     ///
     /// # Errors

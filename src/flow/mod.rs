@@ -40,6 +40,7 @@ pub mod context;
 pub mod coupling;
 pub mod dense;
 pub mod fused;
+pub mod inherit;
 mod kernel;
 mod model;
 pub mod pairs;

@@ -6,6 +6,7 @@ use candle_nn::VarBuilder;
 use super::architecture::Architecture;
 use super::context::ContextNetwork;
 use super::coupling::CouplingUnit;
+use super::dense::Dense;
 use super::permutation::Permutation;
 
 /// A conditional normalizing flow: a context network and N units, each a permutation followed by a conditional coupling
@@ -52,6 +53,19 @@ impl Flow {
 
     pub(super) fn units(&self) -> &[(Permutation, CouplingUnit)] {
         &self.units
+    }
+
+    /// All dense layers with their names, which are those of the weight file without `.weight` and `.bias`.
+    pub(super) fn layers(&self) -> Vec<(String, &Dense)> {
+        let context = self.context.layers().into_iter().map(|(name, layer)| (format!("context.{name}"), layer));
+        let units = self.units.iter().enumerate().flat_map(|(index, (_, unit))| {
+            let nets = [("on_second", Some(unit.on_second())), ("on_first", unit.on_first())];
+            nets.into_iter().filter_map(|(name, net)| Some((name, net?))).flat_map(move |(name, net)| {
+                [("input", net.input()), ("hidden", net.hidden()), ("output", net.output())]
+                    .map(|(layer, dense)| (format!("unit{index}.{name}.{layer}"), dense))
+            })
+        });
+        context.chain(units).collect()
     }
 
     /// Summary S(y) that conditions the units. `y`: `[n, channels, modes]`, or `[n, fixed_context]`; returns `[n,

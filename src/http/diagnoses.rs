@@ -38,7 +38,7 @@ struct DiagnosisBody {
     seed: Option<u64>,
 }
 
-/// Body of a request for an extension; `{}` uses the training settings of the present model.
+/// Body of a request for an extension; with `{}` the training starts from the weights of the present model.
 #[derive(Debug, Default, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 #[schema(as = ExtensionInput)]
@@ -57,6 +57,8 @@ struct ExtensionBody {
     /// damage, where a stiffness changes among the measurements, and where the discrepancy predicts measurements that it has not
     /// seen no better.
     learned: bool,
+    /// Start the training from random weights instead of those of the present model.
+    from_scratch: bool,
 }
 
 /// A diagnosis with its job.
@@ -287,9 +289,10 @@ pub async fn extend(
             return Err(ApiError::invalid_field(pointer, message));
         }
     }
-    let ExtensionBody { samples, epochs, accept_uncalibrated, learned } = body;
+    let ExtensionBody { samples, epochs, accept_uncalibrated, learned, from_scratch } = body;
     let size = |number: Option<u64>| number.map(|n| n as usize);
-    let training = ExtensionTraining { samples: size(samples), epochs: size(epochs), accept_uncalibrated, learned };
+    let (samples, epochs) = (size(samples), size(epochs));
+    let training = ExtensionTraining { samples, epochs, from_scratch, accept_uncalibrated, learned };
     let record = shared.monitor.jobs().start_extension(&id, training).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{id}"))];
     Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())

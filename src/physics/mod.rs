@@ -30,6 +30,7 @@ pub mod beam;
 pub mod effect;
 pub mod eigen;
 pub mod modes;
+pub mod shaped;
 pub mod shapes;
 mod structure;
 pub mod tangent;

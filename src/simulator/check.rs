@@ -71,7 +71,7 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
     let discrepancy = discrepancy::check::check(definition, &covariates, &mut problems);
-    let instrumented = instrumented::check(definition, &model, &mut problems);
+    let instrumented = instrumented::check(definition, &model, &effects, &mut problems);
     if !problems.is_empty() {
         return Err(problems);
     }

@@ -3,11 +3,12 @@
 use std::collections::BTreeSet;
 
 use super::definition::{DefinitionProblem, StructureDefinition};
+use super::effect::{typical_sizes, SimulationEffect};
 use super::layout::Problems;
 use super::model::SimulationModel;
 use crate::measurement::shape::InstrumentedPoints;
-use crate::physics::modes;
-use crate::physics::shapes::shapes_at;
+use crate::physics::effect::Target;
+use crate::physics::shaped::respond_shaped;
 use crate::quantity::shown;
 
 /// Smallest number of instrumented points: a shape at a single point contains no information.
@@ -23,7 +24,7 @@ pub struct Instrumented {
     pub(super) dofs: Vec<usize>,
     /// Standard deviation of each component of a measured shape of unit norm.
     pub(super) std: f64,
-    /// Their names, and the mode shapes of the nominal structure.
+    /// Their names, and the mode shapes of the nominal structure under the mean sizes of its effects.
     pub(super) points: InstrumentedPoints,
 }
 
@@ -31,6 +32,7 @@ pub struct Instrumented {
 pub(super) fn check(
     definition: &StructureDefinition,
     model: &SimulationModel,
+    effects: &[SimulationEffect],
     problems: &mut Problems,
 ) -> Option<Instrumented> {
     let given = definition.mode_shapes.as_ref()?;
@@ -45,9 +47,6 @@ pub(super) fn check(
         );
         return None;
     };
-    if !definition.effects.is_empty() {
-        wrong("", "mode shapes under effects are not simulated yet: remove mode_shapes or the effects".to_owned());
-    }
     let noise = given.noise;
     if !(noise.is_finite() && noise > 0.0 && noise < MOST_NOISE) {
         wrong("/noise", format!("a noise of {noise} is not valid: it is a share of the shape's root mean square, above 0 and below {MOST_NOISE}"));
@@ -71,8 +70,10 @@ pub(super) fn check(
     if dofs.len() != given.points.len() || !problems.is_empty() {
         return None;
     }
-    let nominal = match modes(structure, definition.modes) {
-        Ok(modes) => shapes_at(&modes, &dofs),
+    let targets: Vec<Target> = effects.iter().map(|effect| effect.target.clone()).collect();
+    let typical = typical_sizes(effects);
+    let nominal = match respond_shaped(structure, definition.modes, (&targets, &typical), &dofs, &[]) {
+        Ok(shaped) => shaped.shapes,
         Err(error) => {
             problems.push(DefinitionProblem::new("/mode_shapes", format!("at the nominal stiffnesses: {error}")));
             return None;

@@ -2,14 +2,16 @@
 
 use nalgebra::DMatrix;
 
-use super::model::{chained, structure_at, SimulationModel};
+use super::model::{chained, structure_at, Binding, SimulationModel};
 use super::respond::Response;
+use super::settings::CorrectedParameters;
 use super::simulate::Simulator;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
-use crate::physics::shapes::{modes_to_pair, shape_sensitivity, shapes_at};
+use crate::physics::shaped::{respond_shaped, Shaped};
+use crate::physics::shapes::modes_to_pair;
 use crate::physics::tracked::{respond_tracked, ReferenceMode};
-use crate::physics::{self, frequency_sensitivity, modes, Structure};
+use crate::physics::{self, Structure};
 
 /// Frequencies and mode shapes at one set of parameters, and their derivatives.
 #[derive(Debug, Clone)]
@@ -52,45 +54,57 @@ impl Simulator {
         self.instrumented().map_or(0.0, |i| i.std)
     }
 
-    /// Frequencies, Hz, `[m]`, and mode shapes of unit norm, `[points, m]`, at parameters `theta` (`[d]`), without noise.
+    /// Frequencies, Hz, `[m]`, and mode shapes of unit norm, `[points, m]`, at parameters `theta` (`[d]`) under the effects, without
+    /// noise.
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn frequencies_and_shapes(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) => {
-                let modes = modes(&structure_at(structure, bindings, theta)?, self.modes())?;
-                let shapes = shapes_at(&modes, &instrumented.dofs);
-                Ok((modes.frequencies_hz, shapes))
+                let corrected = self.corrected(theta).theta;
+                let shaped = self.shaped(structure, bindings, &corrected, self.modes(), (&instrumented.dofs, &[]))?;
+                if self.has_effects_in_single_modes() {
+                    return Ok((self.frequencies_hz(theta)?, shaped.shapes));
+                }
+                Ok((shaped.response.frequencies_hz, shaped.shapes))
             }
             _ => Ok((self.frequencies_hz(theta)?, DMatrix::zeros(0, 0))),
         }
     }
 
-    /// The modes at parameters `theta` (`[d]`) and their derivatives. If the structure has instrumented points and `with_shapes`
-    /// is true, these are the lowest `count` modes with their shapes; otherwise they are the measured modes without shapes.
+    /// The modes at parameters `theta` (`[d]`) under the effects, and their derivatives. If the structure has instrumented points and
+    /// `with_shapes` is true, these are the lowest `count` modes with their shapes; otherwise they are the measured modes without
+    /// shapes.
     ///
     /// # Errors
     /// As [`Self::frequencies_hz`].
     pub fn linearise(&self, theta: &[f64], count: usize, with_shapes: bool) -> Result<Linearised, physics::Error> {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) if with_shapes => {
-                let structure = structure_at(structure, bindings, theta)?;
-                let modes = modes(&structure, count)?;
-                let frequency_slopes = chained(&frequency_sensitivity(&structure, &modes).by_spring, bindings, theta);
                 let springs: Vec<usize> = bindings.iter().map(|b| b.spring).collect();
-                let by_spring = shape_sensitivity(&structure, &modes, &instrumented.dofs, &springs);
+                let corrected = self.corrected(theta);
+                let moved = self.effects().iter().any(|effect| effect.target.acts_on_parameters());
+                let chain = |slopes: DMatrix<f64>| if moved { slopes * &corrected.by_theta } else { slopes };
+                let Shaped { response, shapes, shape_slopes } =
+                    self.shaped(structure, bindings, &corrected.theta, count, (&instrumented.dofs, &springs))?;
+                let mut frequencies_hz = response.frequencies_hz;
+                let mut frequency_slopes = chain(chained(&response.by_spring, bindings, &corrected.theta));
+                if self.has_effects_in_single_modes() {
+                    let measured = self.respond(theta, self.modes(), &[], &[])?;
+                    frequencies_hz[..self.modes()].copy_from_slice(&measured.frequencies_hz);
+                    frequency_slopes.rows_mut(0, self.modes()).copy_from(&measured.by_parameter);
+                }
                 let by_parameter = |of_mode: DMatrix<f64>| {
                     let mut slopes = DMatrix::zeros(of_mode.nrows(), theta.len());
                     for (binding, column) in bindings.iter().zip(of_mode.column_iter()) {
-                        let slope = binding.slope(theta[binding.parameter]);
+                        let slope = binding.slope(corrected.theta[binding.parameter]);
                         slopes.column_mut(binding.parameter).axpy(slope, &column, 1.0);
                     }
-                    slopes
+                    chain(slopes)
                 };
-                let shapes = shapes_at(&modes, &instrumented.dofs);
-                let shape_slopes = by_spring.into_iter().map(by_parameter).collect();
-                Ok(Linearised { frequencies_hz: modes.frequencies_hz, frequency_slopes, shapes, shape_slopes })
+                let shape_slopes = shape_slopes.into_iter().map(by_parameter).collect();
+                Ok(Linearised { frequencies_hz, frequency_slopes, shapes, shape_slopes })
             }
             _ => {
                 let (frequencies_hz, frequency_slopes) = self.frequencies_and_jacobian(theta)?;
@@ -98,6 +112,35 @@ impl Simulator {
                 Ok(Linearised { frequencies_hz, frequency_slopes, shapes, shape_slopes })
             }
         }
+    }
+
+    /// Parameters `theta` (`[d]`) as the effects change them in all modes.
+    fn corrected(&self, theta: &[f64]) -> CorrectedParameters {
+        // No mode has this number, so that the effects on the frequency of a single mode are left out.
+        CorrectedParameters::new(theta, &self.targets(), self.sizes(), usize::MAX)
+    }
+
+    fn targets(&self) -> Vec<Target> {
+        self.effects().iter().map(|effect| effect.target.clone()).collect()
+    }
+
+    /// Whether an effect changes the parameters, or the response to them, for the frequency of a single mode only.
+    fn has_effects_in_single_modes(&self) -> bool {
+        self.effects().iter().any(|effect| matches!(effect.target, Target::InMode(..) | Target::ModeGain { .. }))
+    }
+
+    /// The lowest `count` modes of the structure under the effects at `corrected` parameters (`[d]`), with their shapes at the degrees
+    /// of freedom `points`, and their derivatives with respect to the stiffness of `springs`.
+    fn shaped(
+        &self,
+        structure: &Structure,
+        bindings: &[Binding],
+        corrected: &[f64],
+        count: usize,
+        (points, springs): (&[usize], &[usize]),
+    ) -> Result<Shaped, physics::Error> {
+        let structure = structure_at(structure, bindings, corrected)?;
+        respond_shaped(&structure, count, (&self.targets(), self.sizes()), points, springs)
     }
 
     /// Number of simulated modes to pair with the measured ones: the measured modes and a few above, which can swap with them.

@@ -80,31 +80,29 @@ impl Simulator {
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
         let mut stream = stats::stream(seed, "covariates");
         let mut effect_sizes = vec![Vec::new(); samples];
-        let mut shapes = Vec::new();
-        let exact = if self.shape_points() > 0 {
-            let simulate = |theta: &Vec<f64>| {
-                let failed = |source| Error::Physics { parameters: theta.clone(), source };
-                self.frequencies_and_shapes(theta).map_err(failed)
-            };
-            let both = rows.par_iter().map(simulate).collect::<Result<Vec<_>, _>>()?;
-            let (frequencies, of_rows): (Vec<_>, _) = both.into_iter().unzip();
-            shapes = of_rows;
-            frequencies
-        } else if self.effects().is_empty() {
-            self.exact(&rows)?
-        } else {
-            let mut drawn = Vec::with_capacity(samples);
-            for known in &mut effect_sizes {
+        let mut drawn = vec![Vec::new(); samples];
+        if !self.effects().is_empty() {
+            for (known, drawn) in effect_sizes.iter_mut().zip(&mut drawn) {
                 let covariates = effect::draw_covariates(self.effects(), &mut stream);
                 *known = self.effect_sizes(&covariates).values;
-                drawn.push(effect::draw_sizes(self.effects(), &covariates, &mut stream));
+                *drawn = effect::draw_sizes(self.effects(), &covariates, &mut stream);
             }
-            let simulate = |(theta, sizes): (&Vec<f64>, &Vec<f64>)| {
-                let failed = |source| Error::Physics { parameters: theta.clone(), source };
-                self.under(sizes).frequencies_hz(theta).map_err(failed)
+        }
+        let with_shapes = self.shape_points() > 0;
+        let simulate = |(theta, sizes): (&Vec<f64>, &Vec<f64>)| {
+            let simulator = if self.effects().is_empty() { self.clone() } else { self.under(sizes) };
+            let found = if with_shapes {
+                simulator.frequencies_and_shapes(theta)
+            } else {
+                simulator.frequencies_hz(theta).map(|frequencies_hz| (frequencies_hz, DMatrix::zeros(0, 0)))
             };
-            rows.par_iter().zip(&drawn).map(simulate).collect::<Result<Vec<_>, _>>()?
+            found.map_err(|source| Error::Physics { parameters: theta.clone(), source })
         };
+        let both = rows.par_iter().zip(&drawn).map(simulate).collect::<Result<Vec<_>, _>>()?;
+        let (exact, mut shapes): (Vec<_>, Vec<_>) = both.into_iter().unzip();
+        if !with_shapes {
+            shapes.clear();
+        }
         let frequencies_hz = DMatrix::from_fn(samples, self.modes(), |row, mode| exact[row][mode]);
         Ok(TrainingSet { theta, frequencies_hz, shapes, effect_sizes, seed })
     }

@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod warm;
+
 use std::path::Path;
 use std::process::Command;
 use std::sync::LazyLock;

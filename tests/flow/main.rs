@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod inherit;
+
 use candle_core::{DType, Device, Tensor};
 use modalwatch::flow::pairs::Pairs;
 use modalwatch::flow::train::{train, Stopped, TrainSettings};

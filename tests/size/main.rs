@@ -12,6 +12,7 @@ use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use rand::Rng as _;
 
+mod effects;
 #[allow(dead_code, reason = "shared with the tests of the API, which use all of it")]
 #[path = "../api/helpers.rs"]
 mod helpers;

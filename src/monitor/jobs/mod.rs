@@ -47,6 +47,9 @@ pub struct ExtensionResult {
     pub parent_digest: String,
     /// Digest of the trained baseline for the new version.
     pub model_digest: String,
+    /// Digest of the trained baseline whose weights its training started from; `None` for random weights.
+    #[serde(default)]
+    pub trained_from: Option<String>,
     /// Version of the undamaged reference that was renewed with it.
     pub undamaged_version: Option<u32>,
 }
@@ -259,6 +262,7 @@ impl Jobs {
         let extended = tokio::task::spawn_blocking(work).await.map_err(|_| "the extension panicked".to_owned())??;
         let accepted = self.accepted(&extended.trained, training)?;
         let Trained { baseline, manifest_json, weights } = extended.trained;
+        let trained_from = baseline.manifest().training.parent.as_ref().map(ToString::to_string);
         let (structure_digest, model_digest) = (extended.simulator.digest().clone(), baseline.digest().to_string());
         let version = NewVersion {
             digest: structure_digest.clone(),
@@ -279,6 +283,7 @@ impl Jobs {
             structure_digest: structure_digest.to_string(),
             parent_digest: parent.to_string(),
             model_digest,
+            trained_from,
             undamaged_version: switched.map_err(|e| text(&e))?,
         };
         info!(structure.id = %structure, diagnosis = %record.id, "Extended {structure}: {}", result.added.join("; "));

@@ -1,26 +1,19 @@
 //! The computations behind the jobs: the diagnosis of measurements, and the training of an extension.
 
 use serde::{Deserialize, Serialize};
+use tracing::info;
 
 use super::progress::Progress;
-use crate::baseline::observation::DEFAULT_NOISE_RANGE;
-use crate::baseline::train::{train, Trained};
+use crate::baseline::extension::{ExtensionPlan, Progress as TrainingProgress};
+use crate::baseline::train::Trained;
 use crate::baseline::Baseline;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend;
 use crate::discrepancy::learned::extension::extend_learned;
 use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
-use crate::flow::train::TrainSettings;
-use crate::flow::FlowSettings;
 use crate::measurement::order::{Disorder, Ordered};
 use crate::measurement::ModalMeasurement;
 use crate::simulator::Simulator;
-
-/// Number of simulated pairs for the extension of a structure that had no trained baseline.
-const SAMPLES: usize = 200_000;
-
-/// Number of epochs for the extension of a structure that had no trained baseline.
-const EPOCHS: usize = 80;
 
 /// Largest number of measurements that a note names.
 const MOST_NAMED: usize = 5;
@@ -46,10 +39,12 @@ impl Default for DiagnosisRequest {
 /// How an extension is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ExtensionTraining {
-    /// Number of simulated pairs; `None` for the number of the present trained baseline.
+    /// Number of simulated pairs; `None` for a number that follows from the training of the present baseline.
     pub samples: Option<usize>,
-    /// Number of epochs; `None` for the number of the present trained baseline.
+    /// Number of epochs; `None` for a number that follows from the training of the present baseline.
     pub epochs: Option<usize>,
+    /// Start from random weights instead of those of the present baseline.
+    pub from_scratch: bool,
     /// Use the flow even if it fails its calibration; every assessment then has a finding about it.
     pub accept_uncalibrated: bool,
     /// Add a learned discrepancy instead of the causes.
@@ -81,19 +76,13 @@ impl Study {
         Ok((serde_json::to_string(&outcome.diagnosis).expect("a diagnosis is plain data"), html))
     }
 
-    /// Extends the structure by the causes of the diagnosis, and trains a flow for it with the size and the noise range of the
-    /// present one.
+    /// Extends the structure by the causes of the diagnosis, and trains a flow for it, from the weights of the present one where they
+    /// can be used.
     pub(super) fn extend(
         &self,
         before: Option<&Baseline>,
         training: ExtensionTraining,
     ) -> Result<TrainedExtension, String> {
-        let before = before.map(Baseline::manifest);
-        let noise_range = before.and_then(|m| m.conditions.noise_range).unwrap_or(DEFAULT_NOISE_RANGE);
-        let samples = training.samples.or(before.map(|m| m.training.samples)).unwrap_or(SAMPLES);
-        let epochs = training.epochs.or(before.map(|m| m.training.settings.epochs)).unwrap_or(EPOCHS);
-        let mut flow = FlowSettings::default();
-        flow.units = before.map_or(flow.units, |m| m.architecture.units);
         // The fits of the diagnosis are not stored; they are computed again, with the same result, from the same data and seed.
         let (data, outcome) = self.outcome()?;
         let (definition, added, left_out) = if training.learned {
@@ -104,9 +93,15 @@ impl Study {
             (extended.definition, extended.added, extended.left_out)
         };
         let simulator = Simulator::new(definition).map_err(|e| e.to_string())?;
-        let settings = TrainSettings { epochs, seed: self.request.seed, ..TrainSettings::default() };
-        let trained = train(&simulator, samples, noise_range, &flow, &settings, |epoch| {
-            self.progress.report(&self.id, format!("training: epoch {} of {epochs}", epoch.epoch));
+        let ExtensionTraining { samples, epochs, from_scratch, accept_uncalibrated: _, learned: _ } = training;
+        let plan = ExtensionPlan { parent: before, from_scratch, samples, epochs, seed: self.request.seed };
+        let trained = plan.train(&simulator, &mut |progress| match progress {
+            TrainingProgress::Start(how) => {
+                info!(structure.id = %simulator.id(), diagnosis = %self.id, "Extension of {}: {how}", simulator.id());
+            }
+            TrainingProgress::Epoch { report, epochs } => {
+                self.progress.report(&self.id, format!("training: epoch {} of {epochs}", report.epoch));
+            }
         });
         self.progress.report(&self.id, "switching");
         Ok(TrainedExtension { added, left_out, simulator, trained: trained.map_err(|e| e.to_string())? })
