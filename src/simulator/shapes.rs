@@ -62,7 +62,7 @@ impl Simulator {
     pub fn frequencies_and_shapes(&self, theta: &[f64]) -> Result<(Vec<f64>, DMatrix<f64>), physics::Error> {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) => {
-                let corrected = self.corrected(theta).theta;
+                let corrected = self.at_mean_effects(theta).theta;
                 let shaped = self.shaped(structure, bindings, &corrected, self.modes(), (&instrumented.dofs, &[]))?;
                 if self.has_effects_in_single_modes() {
                     return Ok((self.frequencies_hz(theta)?, shaped.shapes));
@@ -83,7 +83,7 @@ impl Simulator {
         match (self.model(), self.instrumented()) {
             (SimulationModel::Matrices { structure, bindings }, Some(instrumented)) if with_shapes => {
                 let springs: Vec<usize> = bindings.iter().map(|b| b.spring).collect();
-                let corrected = self.corrected(theta);
+                let corrected = self.at_mean_effects(theta);
                 let moved = self.effects().iter().any(|effect| effect.target.acts_on_parameters());
                 let chain = |slopes: DMatrix<f64>| if moved { slopes * &corrected.by_theta } else { slopes };
                 let Shaped { response, shapes, shape_slopes } =
@@ -115,7 +115,7 @@ impl Simulator {
     }
 
     /// Parameters `theta` (`[d]`) as the effects change them in all modes.
-    fn corrected(&self, theta: &[f64]) -> CorrectedParameters {
+    fn at_mean_effects(&self, theta: &[f64]) -> CorrectedParameters {
         // No mode has this number, so that the effects on the frequency of a single mode are left out.
         CorrectedParameters::new(theta, &self.targets(), self.sizes(), usize::MAX)
     }
