@@ -128,7 +128,7 @@ impl<'a> WarmStart<'a> {
         self.parent.digest()
     }
 
-    /// Numbers of samples and of epochs that are enough: a share of those of the model, or the same where its own training started
+    /// Default numbers of samples and of epochs: a share of those of the model, or the same where its own training started
     /// from another model.
     ///
     /// Where the flow starts at the best fit, fitting the samples takes most of the time, so that there are fewer samples instead of
