@@ -161,7 +161,11 @@ fn refusal(error: DeclareError, choice: &ReferenceChoice) -> ApiError {
     post, path = "/v1/structures/{id}/reference", tag = "results", operation_id = "declare_reference",
     summary = "Declare the undamaged reference", description = "The same as `PUT`.",
     params(StructurePath),
-    request_body(content = ReferenceInput, example = json!({"from": "2026-01-01T00:00:00Z", "to": "2026-07-01T00:00:00Z"})),
+    request_body(content = ReferenceInput, examples(
+        ("batches" = (summary = "Batches by id", value = json!({"batches": ["0199a0c6-7d5e-7c3a-a5b1-0d7e6a3f9b10"]}))),
+        ("period" = (summary = "All batches of a period",
+                     value = json!({"from": "2026-01-01T00:00:00Z", "to": "2026-07-01T00:00:00Z"})))
+    )),
     responses(
         (status = 201, description = "The new version of the undamaged reference", body = Declared),
         Unknown, BodyRefused, Conflict, Busy
@@ -182,7 +186,11 @@ pub async fn post(
     summary = "Declare the undamaged reference (earlier name)",
     description = "Deprecated: use `/v1/structures/{id}/reference`, which takes the same body and gives the same answer.",
     params(StructurePath),
-    request_body(content = ReferenceInput, example = json!({"from": "2026-01-01T00:00:00Z", "to": "2026-07-01T00:00:00Z"})),
+    request_body(content = ReferenceInput, examples(
+        ("batches" = (summary = "Batches by id", value = json!({"batches": ["0199a0c6-7d5e-7c3a-a5b1-0d7e6a3f9b10"]}))),
+        ("period" = (summary = "All batches of a period",
+                     value = json!({"from": "2026-01-01T00:00:00Z", "to": "2026-07-01T00:00:00Z"})))
+    )),
     responses(
         (status = 201, description = "The new version of the undamaged reference", body = Declared, headers(
             ("Deprecation" = String, description = "When the route was deprecated (RFC 9745)"),

@@ -225,7 +225,7 @@ async fn diagnoses_that_cannot_be_made_say_why() {
     });
     let answer = answer.await;
     assert_eq!(answer["state"], "failed");
-    assert!(answer["failure"].as_str().unwrap().contains("at least 30"), "{answer}");
+    assert!(answer["failure"].as_str().unwrap().contains("at least 8"), "{answer}");
     let none = service.get(&format!("/v1/diagnoses/{id}/report")).send().await.unwrap();
     assert_eq!(code(none).await, (409, "no_report".to_owned()));
     let none = service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await;

@@ -371,8 +371,9 @@ async fn events_follow_a_job_from_beginning_to_end_and_it_is_listed() {
     let id = asked.json::<Value>().await.unwrap()["diagnosis"].clone();
     let seen = watcher.until("job", |data| data["state"] != "running").await;
     assert!(seen.len() >= 2, "{seen:?}");
-    let expected =
-        json!({ "job": id, "structure": "three-dof", "kind": "diagnosis", "state": "running", "progress": "waiting" });
+    let expected = json!({
+        "job": id, "structure": "three-dof", "kind": "diagnosis", "state": "running", "progress": "waiting", "trigger": "requested"
+    });
     assert_eq!(seen[0], ("job".to_owned(), expected));
     let state = seen.last().unwrap().1["state"].clone();
     assert_eq!(seen.last().unwrap().1["progress"], Value::Null);
