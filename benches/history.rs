@@ -18,7 +18,7 @@ use modalwatch::assessment::BatchState;
 use modalwatch::baseline::library::{find_structure, Library};
 use modalwatch::measurement::{at_intervals, MeasurementBatch};
 use modalwatch::monitor::compute::ComputeSettings;
-use modalwatch::monitor::{Monitor, MonitorSettings};
+use modalwatch::monitor::{Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest};
 use modalwatch::quantity::{Digest, StructureId, Timestamp};
 use modalwatch::simulator::population::Population;
 use modalwatch::stats;
@@ -287,7 +287,14 @@ async fn replay(threads: usize) -> f64 {
     // All other batches are assessed again under this reference.
     monitor
         .replay()
-        .declare_reference(&structure, first.into_iter().collect(), 0.05)
+        .declare_reference(
+            &structure,
+            ReferenceRequest {
+                choice: ReferenceChoice::Batches(first.into_iter().collect()),
+                leave_out_doubtful: false,
+                threshold_probability: 0.05,
+            },
+        )
         .await
         .expect("an undamaged reference");
     let waiting = async || !monitor.store().batches().pending(&structure, 1).await.expect("an answer").is_empty();

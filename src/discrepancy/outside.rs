@@ -139,7 +139,8 @@ impl OutsideSetting {
             self.rows,
             range(self.given)
         );
-        let after = if self.corrected == self.given {
+        let same = |(a, b): (&f64, &f64)| a.to_bits() == b.to_bits();
+        let after = if self.corrected.iter().zip(&self.given).all(same) {
             "no correction of its frame, scale, unit, sign or direction brings them inside; they were limited to half the width of \
              the prior beyond it"
                 .to_owned()

@@ -55,7 +55,7 @@ pub(super) fn setting_targets(simulator: &Simulator, data: &Data) -> Vec<Target>
 }
 
 fn varies(values: &[f64]) -> bool {
-    values.iter().any(|v| *v > values[0] || *v < values[0])
+    values.iter().any(|v| v.to_bits() != values[0].to_bits())
 }
 
 /// Distance of a value from the prior of a parameter as a share of its width; negative or 0 inside, margin included.

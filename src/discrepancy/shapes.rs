@@ -135,7 +135,9 @@ fn mean_mode(rows: &[&Row<'_>], mode: usize, points: usize, nominal_hz: f64) -> 
     let mut centre: Vec<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imax()).iter().copied().collect();
     // One sign, whatever the eigenvalue solver returns.
     let largest = centre.iter().copied().fold(0.0, |a: f64, x| if x.abs() > a.abs() { x } else { a });
-    centre.iter_mut().for_each(|x| *x *= largest.signum());
+    for component in &mut centre {
+        *component *= largest.signum();
+    }
     ReferenceMode { frequency_hz, shape: TangentSpace::new(&centre) }
 }
 

@@ -269,7 +269,7 @@ fn check_time(raw: &RawMeasurement, expectation: &Expectation<'_>, problems: &mu
     match Timestamp::parse(text) {
         Err(error) => problems.add(pointer(), error.to_string()),
         Ok(time) if purpose == Purpose::Assessment && time.micros() < 0 => {
-            problems.add(pointer(), format!("{time} is before 1970: it must be later"))
+            problems.add(pointer(), format!("{time} is before 1970: it must be later"));
         }
         Ok(time) if time.micros() > now.micros() + CLOCK_SKEW_MICROS => {
             problems.add(pointer(), format!("{time} is in the future: the clock of the service shows {now}"));

@@ -313,7 +313,8 @@ mod tests {
     fn a_column_is_read_as_what_it_looks_like() {
         use TimeUnit::{Days, DecimalYear, Milliseconds, Seconds, SerialDays};
         // 2024-01-01T00:00:00Z in each unit, and a recording that starts then.
-        let cases: Vec<(&str, Vec<f64>, TimeUnit, bool, &[TimeUnit])> = vec![
+        type Case<'a> = (&'a str, Vec<f64>, TimeUnit, bool, &'a [TimeUnit]);
+        let cases: Vec<Case<'_>> = vec![
             ("days with fractions", steps(0.0, 0.25, 100), Days, true, &[]),
             ("days from −3", steps(-3.0, 0.5, 20), Days, true, &[]),
             ("whole days", steps(1.0, 1.0, 400), Days, true, &[]),

@@ -149,10 +149,10 @@ mod tests {
         for _ in 0..draws {
             let error = DVector::from_fn(points, |_, _| std * stream.sample::<f64, _>(rand_distr::StandardNormal));
             let z = DVector::from_vec(space.coordinates((&centre + error).as_slice()).unwrap());
-            covariance += &z * z.transpose() / draws as f64;
+            covariance += &z * z.transpose() / f64::from(draws);
         }
         // A variance from n draws has the standard error √(2/n) = 0.7 % of itself, a covariance 0.5 % of the variance; five of them.
         let expected = DMatrix::identity(points - 1, points - 1) * (std * std);
-        assert!((covariance - expected).amax() < 5.0 * (2.0 / draws as f64).sqrt() * std * std);
+        assert!((covariance - expected).amax() < 5.0 * (2.0 / f64::from(draws)).sqrt() * std * std);
     }
 }

@@ -85,7 +85,9 @@ impl<'a> Outlook<'a> {
         let mut candidates: Vec<(usize, f64)> =
             probable.filter(|(_, r)| r.probability >= LEAST_PROBABILITY).map(|(i, r)| (i, r.probability)).collect();
         let total: f64 = candidates.iter().map(|c| c.1).sum();
-        candidates.iter_mut().for_each(|c| c.1 /= total);
+        for candidate in &mut candidates {
+            candidate.1 /= total;
+        }
         if candidates.len() < 2 {
             return Vec::new();
         }

@@ -61,8 +61,8 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
     }
     let with = |kind: Kind, place: Option<String>, conditions: Vec<Condition>| Experiment {
         kind,
-        place,
         conditions,
+        place,
         ..plain.clone()
     };
     for contrast in &contrasts {

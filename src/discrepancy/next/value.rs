@@ -89,7 +89,7 @@ impl<'a> Factored<'a> {
     fn simulate(&self, z: &[f64], y: &mut [f64]) {
         let q = y.len();
         for (row, value) in y.iter_mut().enumerate() {
-            let line = &self.lower[row * q..row * q + row + 1];
+            let line = &self.lower[row * q..=row * q + row];
             *value = self.mean[row] + line.iter().zip(z).map(|(l, z)| l * z).sum::<f64>();
         }
     }
@@ -99,7 +99,7 @@ impl<'a> Factored<'a> {
         let q = y.len();
         let mut distance = 0.0;
         for row in 0..q {
-            let line = &self.lower[row * q..row * q + row + 1];
+            let line = &self.lower[row * q..=row * q + row];
             let sum: f64 = line[..row].iter().zip(&*white).map(|(l, w)| l * w).sum();
             let value = (y[row] - self.mean[row] - sum) / line[row];
             white[row] = value;

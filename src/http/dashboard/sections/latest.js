@@ -5,6 +5,9 @@ import { age, number, percent, timeElement, words } from "../format.js";
 import { progress } from "../jobs.js";
 import { jobChip } from "../states.js";
 
+/** A posterior probability that rounds to 1 is not a certainty. */
+const ALMOST_SURE = 1 - 1e-9;
+
 /** Verdicts that name causes by which the model can be extended. */
 const EXTENDS = ["cause", "several", "ambiguous"];
 
@@ -75,7 +78,7 @@ export function latest(extend) {
         h(
           "li",
           null,
-          h("span", { class: "chip idle" }, percent(cause.probability)),
+          h("span", { class: "chip idle" }, percent(Math.min(cause.probability, ALMOST_SURE))),
           h(
             "span",
             { class: "grow" },
