@@ -59,8 +59,8 @@ fn shapes(
     let changed = nominal.with_stiffness(&changes).expect("positive stiffnesses");
     let points: Vec<usize> = points(masses).collect();
     let exact = shapes_at(&modes(&changed, simulator.modes()).expect("modes"), &points);
-    let noisy = |x: &f64| x + simulator.shape_std() * normal();
-    exact.column_iter().map(|shape| Some(shape.iter().map(noisy).collect())).collect()
+    let mut noisy = |x: &f64| x + simulator.shape_std() * normal();
+    exact.column_iter().map(|shape| Some(shape.iter().map(&mut noisy).collect())).collect()
 }
 
 /// Rows of one year in which the last tie softens with temperature.

@@ -11,7 +11,7 @@ use crate::helpers::{command, created, eventually, spawn, within, Service};
 
 #[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
 #[path = "../discrepancy/world/mod.rs"]
-mod world;
+pub(super) mod world;
 
 /// Two springs of a chain are unknown; the simulation does not depend on temperature.
 const STRUCTURE: &str = r#"

@@ -10,9 +10,7 @@ use serde_json::{json, Value};
 
 use crate::helpers::{command, created, within, Service};
 
-#[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
-#[path = "../discrepancy/world/mod.rs"]
-mod world;
+use super::diagnosis::world;
 
 /// Two springs of a chain are unknown; the simulation depends on neither temperature nor humidity.
 const STRUCTURE: &str = r#"

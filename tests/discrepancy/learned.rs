@@ -139,7 +139,7 @@ struct Tried {
 }
 
 impl Tried {
-    fn new(what: String, answer: &Value, base: f64, truth: f64) -> Self {
+    fn new(what: &str, answer: &Value, base: f64, truth: f64) -> Self {
         let after = number(answer, "/learned/gain/log_density_per_row/after");
         Self {
             what: format!("{what}: true gain {:.2} nats per row", truth - base),
@@ -164,7 +164,7 @@ fn tried_chain(seed: u64, unknown: Unknown) -> Tried {
     let first = rows.len() - (HELD_OUT * rows.len() as f64).round() as usize;
     let truth = true_log_density(&rows[first..], &measured[first..], unknown);
     Tried::new(
-        format!("{unknown:?} {seed}"),
+        &format!("{unknown:?} {seed}"),
         &answer,
         number(&answer, "/learned/gain/log_density_per_row/before"),
         truth,
@@ -176,7 +176,7 @@ fn tried_world(seed: u64) -> Tried {
     let (_, world) = Order::Kind(seed, Kind::Outside).draw();
     let answer = answer(&world.structure_toml, &world.csv, &["--learned"]);
     let (base, truth) = world.holdout_log_density;
-    Tried::new(format!("{} {seed}", world.outside.unwrap()), &answer, base, truth)
+    Tried::new(&format!("{} {seed}", world.outside.unwrap()), &answer, base, truth)
 }
 
 /// Mean and its standard error.

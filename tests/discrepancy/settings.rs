@@ -86,9 +86,8 @@ fn runs(rng: &mut ChaCha8Rng) -> String {
         columns.push(levels.into_iter().map(place).collect());
     }
     let mut text = String::from("x1,x2,factor,f1_hz,f2_hz,f3_hz,f4_hz\n");
-    for run in 0..RUNS {
-        let (x1, x2, factor) = (columns[0][run], columns[1][run], columns[2][run]);
-        let f: Vec<String> = log_frequencies([x1, x2], factor).iter().map(|l| number(l.exp())).collect();
+    for ((x1, x2), factor) in columns[0].iter().zip(&columns[1]).zip(&columns[2]) {
+        let f: Vec<String> = log_frequencies([*x1, *x2], *factor).iter().map(|l| number(l.exp())).collect();
         let _ = writeln!(text, "{x1},{x2},{factor},{}", f.join(","));
     }
     text

@@ -225,8 +225,11 @@ fn invalid_or_ambiguous_values_are_refused_with_their_line() {
     }
 }
 
+/// The shape of each mode of a row; `None` for a mode without one.
+type RowShapes = Vec<Option<Vec<f64>>>;
+
 /// Reads a table of a structure with two modes and the instrumented points `m2` and `m4`.
-fn with_shapes(table: &str) -> Result<Vec<Option<Vec<Option<Vec<f64>>>>>, String> {
+fn with_shapes(table: &str) -> Result<Vec<Option<RowShapes>>, String> {
     let options = CsvOptions { points: vec!["m2".to_owned(), "m4".to_owned()], ..options() };
     let rows = read(table.as_bytes(), 2, &[], &options).map_err(|problems| problems[0].message.clone())?;
     Ok(rows.into_iter().map(|row| row.mode_shapes).collect())
