@@ -16,14 +16,14 @@ fn log_densities(flow: &Flow, x: &Tensor, y: &Tensor) -> Vec<f64> {
 /// Observations with the inputs of the parent in the order of `inputs`, and other numbers for the new ones. `y`: `[n, inputs,
 /// modes]`, or `[n, inputs]`.
 fn with_new_inputs(y: &Tensor, inputs: &[Option<usize>], seed: u64) -> Tensor {
-    let column = |(index, input): (usize, &Option<usize>)| match input {
-        Some(from) => y.narrow(1, *from, 1).unwrap(),
-        None => {
-            let mut shape = y.dims().to_vec();
-            shape[1] = 1;
-            let count = shape.iter().product();
-            tensor(&normals(count, seed, &format!("new input {index}")), shape)
+    let column = |(index, input): (usize, &Option<usize>)| {
+        if let Some(from) = input {
+            return y.narrow(1, *from, 1).unwrap();
         }
+        let mut shape = y.dims().to_vec();
+        shape[1] = 1;
+        let count = shape.iter().product();
+        tensor(&normals(count, seed, &format!("new input {index}")), shape)
     };
     Tensor::cat(&inputs.iter().enumerate().map(column).collect::<Vec<_>>(), 1).unwrap()
 }
