@@ -188,7 +188,7 @@ fn measurements_are_judged_one_by_one() {
         ["/measurements/4/measured_at: another measurement of this batch has the same time"; 2],
         [
             "/measurements/5/measured_at: 1969-01-01T00:00:00Z is before 1970",
-            "/measurements/5/frequencies_hz/1: natural frequency",
+            "/measurements/5/frequencies_hz/1: -2 Hz is not a valid natural frequency",
         ],
     ];
     for (purpose, column) in [(Purpose::Assessment, 0), (Purpose::Diagnosis, 1)] {
