@@ -330,7 +330,8 @@ impl Wording<'_> {
             return format!("{what} is {size}");
         }
         let more = if value < 0.0 { "lower" } else { "higher" };
-        format!("{what} is {size} {more} than in the simulation")
+        let reference = if self.name.kind == "setting" { "than the values given" } else { "than in the simulation" };
+        format!("{what} is {size} {more} {reference}")
     }
 
     /// The size of the effect for each category.

@@ -121,7 +121,7 @@ pub(super) fn phrase(name: &TargetName) -> String {
         "frequency_scale" => of("the scale of the measured frequency"),
         "frequency_offset" if name.name.is_empty() => "the offset of all measured frequencies".to_owned(),
         "frequency_offset" => of("the offset of the measured frequency"),
-        "setting" => format!("the setting {}", name.name),
+        "setting" => format!("the true value of the setting {}", name.name),
         "setting_unit" => format!("the unit of the setting {}", name.name),
         "setting_direction" => format!("the direction of the setting {}", name.name),
         "setting_exchange" => format!("the order of the settings {}", name.name),
