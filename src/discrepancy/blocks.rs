@@ -67,11 +67,16 @@ impl Blocks {
         (0..self.count).map(|block| sum(block).powi(2)).sum::<f64>().sqrt() / values.len() as f64
     }
 
+    /// The places that a fold leaves out, and those that it keeps.
+    pub(super) fn fold(&self, number: usize) -> (Vec<usize>, Vec<usize>) {
+        (0..self.of.len()).partition(|place| self.of[*place] % FOLDS == number)
+    }
+
     /// Each of `rows` as a fit with the effects of `fit` to the rows of the other folds predicts it, `[rows]`. `None` if the
     /// frequencies cannot be computed in some row.
     pub(super) fn predicted(&self, study: &Study<'_>, rows: &[usize], fit: &Fit) -> Option<Vec<RowView>> {
         let fold = |number: usize| {
-            let (left, kept): (Vec<usize>, Vec<usize>) = (0..rows.len()).partition(|p| self.of[*p] % FOLDS == number);
+            let (left, kept) = self.fold(number);
             let kept: Vec<usize> = kept.iter().map(|p| rows[*p]).collect();
             let out: Vec<usize> = left.iter().map(|p| rows[*p]).collect();
             let refitted = study.fit(&kept, &fit.effects, Some(&Start::at(fit)))?;

@@ -1,13 +1,12 @@
 //! Seasonal false alarms, their cause, the structure extended by it, and a real loss afterwards, all through HTTP.
 
-use std::process::Command;
 use std::time::Duration;
 
 use rand::SeedableRng as _;
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, eventually, spawn, within, Service};
+use crate::helpers::{command, created, eventually, spawn, train_model, within, Service};
 
 #[allow(dead_code, unused_imports, reason = "of the worlds of tests/discrepancy only the frequencies are used here")]
 #[path = "../discrepancy/world/mod.rs"]
@@ -95,19 +94,7 @@ async fn wait_until_assessed(service: &Service, batches: usize) {
 async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_after_it() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
-    let own = models.join("soft");
-    std::fs::create_dir_all(&own).unwrap();
-    std::fs::write(own.join("structure.toml"), STRUCTURE).unwrap();
-    // With a narrow range of noise, a model with little training passes its calibration.
-    let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
-        .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", "0.5,2", "--structure"])
-        .arg(own.join("structure.toml"))
-        .arg("--out")
-        .arg(&own)
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&trained.stdout).into_owned();
-    assert!(trained.status.success() && said.contains("calibration passed"), "{said}");
+    train_model(&models.join("soft"), STRUCTURE, "0.5,2");
 
     let data = folder.path().join("data");
     let start = || Service::spawn(command(&data).arg("--models").arg(&models));

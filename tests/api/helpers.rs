@@ -253,3 +253,19 @@ pub fn time(seconds: usize) -> String {
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }
+
+/// Writes a structure file into a folder and trains its model there. With a narrow range of noise, such as `0.5,2`, a model with
+/// little training passes its calibration.
+pub fn train_model(folder: &Path, structure_toml: &str, noise_range: &str) {
+    std::fs::create_dir_all(folder).unwrap();
+    std::fs::write(folder.join("structure.toml"), structure_toml).unwrap();
+    let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
+        .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", noise_range, "--structure"])
+        .arg(folder.join("structure.toml"))
+        .arg("--out")
+        .arg(folder)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&trained.stdout).into_owned();
+    assert!(trained.status.success() && said.contains("calibration passed"), "{said}");
+}

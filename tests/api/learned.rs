@@ -1,14 +1,13 @@
 //! A deviation that no law describes: the structure extended by a learned discrepancy through HTTP, without its false alarms, and
 //! the alarm for a loss of stiffness that went with the temperature while it was learned and then stays.
 
-use std::process::Command;
 use std::time::Duration;
 
 use rand::SeedableRng as _;
 use rand_distr::StandardNormal;
 use serde_json::{json, Value};
 
-use crate::helpers::{command, created, within, Service};
+use crate::helpers::{command, created, train_model, within, Service};
 
 use super::diagnosis::world;
 
@@ -83,19 +82,7 @@ async fn alarms(service: &Service, version: &Value) -> Vec<(String, String)> {
 async fn a_loss_that_went_with_temperature_is_alarmed_once_it_stays() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
-    let own = models.join("unknown");
-    std::fs::create_dir_all(&own).unwrap();
-    std::fs::write(own.join("structure.toml"), STRUCTURE).unwrap();
-    // With a narrow range of noise, a model with little training passes its calibration.
-    let trained = Command::new(env!("CARGO_BIN_EXE_modalwatch"))
-        .args(["train", "--samples", "40000", "--epochs", "40", "--noise-range", "0.5,3", "--structure"])
-        .arg(own.join("structure.toml"))
-        .arg("--out")
-        .arg(&own)
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&trained.stdout).into_owned();
-    assert!(trained.status.success() && said.contains("calibration passed"), "{said}");
+    train_model(&models.join("unknown"), STRUCTURE, "0.5,3");
 
     let service = Service::spawn(command(&folder.path().join("data")).arg("--models").arg(&models));
     let mut rng = rand_chacha::ChaCha12Rng::seed_from_u64(11);

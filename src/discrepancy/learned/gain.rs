@@ -6,16 +6,13 @@ use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
 use super::input::{choose, standardised};
 use super::learn::{learn, Learned};
+use crate::discrepancy::blocks::{Blocks, FOLDS};
 use crate::discrepancy::effect::FittedEffect;
 use crate::discrepancy::fit::Fit;
 use crate::discrepancy::gain::{Change, DensityChange};
 use crate::discrepancy::model::RowView;
 use crate::discrepancy::study::Study;
 use crate::stats;
-
-/// Blocks of successive rows, for the standard error, and the folds that they are left out in, where no rows are held out.
-const BLOCKS: usize = 20;
-const FOLDS: usize = 5;
 
 /// Figures without and with a learned discrepancy, on rows that it was not learned from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -67,9 +64,9 @@ pub fn held_out_gain(
 /// are chosen anew. A fold in which nothing can be learned predicts as the simulation alone does. `None` if the simulation cannot
 /// be fitted in some fold.
 pub fn left_out_gain(study: &Study<'_>, rows: &[usize], known: &[FittedEffect]) -> Option<LearnedGain> {
-    let block = |place: usize| place * BLOCKS / rows.len();
+    let blocks = Blocks::successive(rows.len());
     let fold = |number: usize| {
-        let (out, kept): (Vec<usize>, Vec<usize>) = (0..rows.len()).partition(|p| block(*p) % FOLDS == number);
+        let (out, kept) = blocks.fold(number);
         let kept: Vec<usize> = kept.iter().map(|p| rows[*p]).collect();
         let left: Vec<usize> = out.iter().map(|p| rows[*p]).collect();
         let base = study.fit(&kept, known, None)?;
@@ -133,11 +130,6 @@ fn figures(modes: usize, before: &[Predicted], after: &[Predicted], held_out: bo
     let density = |rows: &[Predicted]| stats::mean(&rows.iter().map(|row| row.log_density).collect::<Vec<f64>>());
     let differences: Vec<f64> = after.iter().zip(before).map(|(b, a)| b.log_density - a.log_density).collect();
     let (n, mean) = (differences.len(), stats::mean(&differences));
-    let mut sums = [0.0; BLOCKS];
-    for (place, difference) in differences.iter().enumerate() {
-        sums[place * BLOCKS / n] += difference - mean;
-    }
-    let standard_error = sums.iter().map(|s| s * s).sum::<f64>().sqrt() / n as f64;
     LearnedGain {
         rows: n,
         held_out,
@@ -146,7 +138,7 @@ fn figures(modes: usize, before: &[Predicted], after: &[Predicted], held_out: bo
             before: density(before),
             after: density(after),
             difference: mean,
-            standard_error,
+            standard_error: Blocks::successive(n).standard_error(&differences, mean),
         },
         coverage90: Change { before: coverage(before), after: coverage(after) },
     }

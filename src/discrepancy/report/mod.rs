@@ -8,7 +8,7 @@ mod residuals;
 
 use super::data::{Data, TIME};
 use super::describe::{rounded, Cause, NamedNumber};
-use super::diagnosis::{Diagnosis, DiagnosisVerdict, Outcome, SURE};
+use super::diagnosis::{capitalised, Diagnosis, DiagnosisVerdict, Outcome, SURE};
 use super::grammar::Class;
 use super::misfit::{Misfit, Remainder};
 use crate::plot::{escaped, page, table_of_html, Points};
@@ -105,7 +105,7 @@ fn cause(cause: &Cause) -> String {
     format!(
         "<article class=\"card\"><h3>{}</h3><p>Probability <strong>{}</strong>. Kind: <strong>{class}</strong>. \
          {advice}</p>{table}</article>",
-        escaped(&sentence(&cause.sentence)),
+        escaped(&capitalised(&cause.sentence)),
         probability(cause.probability)
     )
 }
@@ -183,7 +183,7 @@ fn candidate_table(d: &Diagnosis, number: usize, cause: &Cause) -> String {
              height=\"8\"/></svg>",
             100.0 * p.clamp(0.0, 1.0)
         );
-        vec![escaped(&sentence(text)), difference, probability(p), bar, escaped(measurement)]
+        vec![escaped(&capitalised(text)), difference, probability(p), bar, escaped(measurement)]
     };
     let others = || d.alternatives.iter().filter(|a| a.instead_of == number);
     let mut rows = vec![row(&cause.sentence, "0".to_owned(), cause.probability, "chosen")];
@@ -336,9 +336,3 @@ const GLOSSARY: &str = "<dl>\
     means that the simulation lacks something.</dd>\
     <dt>p</dt><dd>Probability that chance alone causes at least this deviation. Below 0.001, chance is unlikely.</dd>\
     <dt>Covariate</dt><dd>A quantity that was recorded with the frequencies: temperature, load, operator, time.</dd></dl>";
-
-/// The text with a capital first letter.
-fn sentence(text: &str) -> String {
-    let mut rest = text.chars();
-    rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
-}
