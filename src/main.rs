@@ -7,6 +7,7 @@ use std::process::ExitCode;
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
+    end_quietly_without_a_reader();
     let cores = core_affinity::get_core_ids().unwrap_or_default();
     let keep_to_core = move |thread: usize| {
         // Only if the pool uses all cores: with fewer threads, several programs would be pinned to the same cores.
@@ -29,6 +30,20 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+/// Ends the program with the status of a command whose reader has left, as `head` does, instead of a panic of `println!`.
+fn end_quietly_without_a_reader() {
+    /// 128 + the number of the signal SIGPIPE.
+    const READER_LEFT: i32 = 141;
+    let usual = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        let text = panic.payload_as_str().unwrap_or_default();
+        if text.starts_with("failed printing to stdout") && text.contains("Broken pipe") {
+            std::process::exit(READER_LEFT);
+        }
+        usual(panic);
+    }));
 }
 
 /// The chain of causes in one line, without causes that the messages before them already contain.

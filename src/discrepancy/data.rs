@@ -17,7 +17,7 @@ pub const TIME: &str = "time";
 const LEAST_NOISE: f64 = 1e-5;
 
 /// Prefix of the name of a column that holds a setting, as in the header of a table.
-const SETTING: &str = "set_";
+pub(super) const SETTING: &str = "set_";
 
 /// Greatest number of numeric columns whose products are considered.
 const MOST_FACTORS: usize = 6;

@@ -8,6 +8,7 @@ use super::gain::{Gain, GainMethod};
 use super::grammar::Class;
 use super::learned::offer::{LearnedOffer, Offered};
 use super::misfit::{Misfit, Remainder};
+use super::mode_numbers::{self, ModeNumber};
 use super::next::experiment::NextMeasurement;
 use super::outside::OutsideSetting;
 use super::rank::Ranked;
@@ -62,6 +63,9 @@ pub struct Diagnosis {
     /// Parameters of which settings lie outside the prior, or outside the runs of a table.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub settings_outside: Vec<OutsideSetting>,
+    /// Modes that, by their measured shapes, are other modes of the simulation than those of their numbers.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub mode_numbers: Vec<ModeNumber>,
     /// Modes that scatter more than stated.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub scatter: Vec<ExcessScatter>,
@@ -140,6 +144,9 @@ impl Diagnosis {
     /// The answer in words.
     pub(super) fn in_words(&self) -> String {
         let mut text = self.settings_outside.iter().map(|s| capitalised(&s.sentence()) + ". ").collect::<String>();
+        if !self.mode_numbers.is_empty() {
+            text += &(capitalised(&mode_numbers::sentence(&self.mode_numbers)) + ". ");
+        }
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
             text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");

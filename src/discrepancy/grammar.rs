@@ -68,7 +68,9 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
             };
             all.push(Candidate { target: target.clone(), covariate, level, class, of, weight });
         };
-        add(None, None);
+        if !absorbed(simulator, data, &target) {
+            add(None, None);
+        }
         for column in data.columns.iter().filter(|column| can_depend(&target, column)) {
             match &column.values {
                 Values::Numbers(_) => {
@@ -98,6 +100,15 @@ pub fn candidates(simulator: &Simulator, data: &Data, rows: &[usize]) -> Vec<Can
         candidate.weight /= total;
     }
     all
+}
+
+/// Whether a constant change of a group of springs is that of a single other spring, or none, because parameters that are set in no row
+/// take the other springs of the group to any stiffness.
+fn absorbed(simulator: &Simulator, data: &Data, target: &Target) -> bool {
+    let Target::Springs(group) = target else { return false };
+    let never_set = |parameter: usize| data.settings.iter().all(|row| row[parameter].is_none());
+    let free = |spring: &usize| simulator.own_parameter(*spring).is_some_and(never_set);
+    group.len() > 1 && group.iter().filter(|spring| !free(*spring)).count() <= 1
 }
 
 fn is_category(data: &Data, covariate: Option<&str>) -> bool {

@@ -9,7 +9,7 @@
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
 //! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
-//! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated;
+//! - [`mode_numbers`]: modes whose shapes are those of other modes; [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated;
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`);
 //! - [`diagnosis`]: the result; [`describe`], `naming` and `notes`: its text; [`report`]: the HTML page;
 //! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
@@ -47,6 +47,7 @@ pub mod grammar;
 pub mod holdout;
 pub mod learned;
 pub mod misfit;
+pub mod mode_numbers;
 pub mod model;
 mod naming;
 pub mod next;
@@ -80,6 +81,7 @@ use effect::FittedEffect;
 use gain::Unseen;
 use grammar::candidates;
 use misfit::{misfits, remainder};
+use mode_numbers::mode_numbers;
 use naming::{name, Named};
 use outside::outside_settings;
 use scatter::excess_scatter;
@@ -258,6 +260,7 @@ fn run(
         verdict,
         summary: String::new(),
         settings_outside,
+        mode_numbers: mode_numbers(&study, &selection.fit),
         scatter,
         misfit,
         causes,

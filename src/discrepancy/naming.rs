@@ -72,7 +72,7 @@ pub(super) fn name(
             near || named.contains(place) || *place <= MOST_ALTERNATIVES
         };
         let shown: Vec<&Ranked> = slot.ranked.iter().enumerate().filter(shown).map(|(_, r)| r).collect();
-        let outlook = Outlook::new(study, rows, shown.clone(), selection.independent_share);
+        let mut outlook = Outlook::new(study, rows, shown.clone(), selection.independent_share);
         if unsure && all.next_measurements.is_empty() {
             all.next_measurements = outlook.next_measurements();
         }

@@ -1,5 +1,7 @@
 //! Settings that lie outside the prior of their parameter or outside the runs of a table.
 
+use std::collections::BTreeSet;
+
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
@@ -19,11 +21,13 @@ const OUTSIDE_NATS: f64 = 3.0;
 pub struct Outside {
     /// Number of rows with a setting outside.
     pub rows: usize,
-    /// Sum over all settings of the log-likelihood that they cost, nats:
+    /// Sum over all different settings of the log-likelihood that they cost, nats:
     ///
     /// ```text
     ///  Σ 3 (1 + ln(1 + z)),    z: distance from the prior as a share of its width
     /// ```
+    ///
+    /// A setting at which many rows were measured was made once, and counts once.
     pub nats: f64,
 }
 
@@ -68,6 +72,7 @@ pub(super) fn corrected_settings(
 /// all priors but in a part of the range without runs is outside as well.
 pub(super) fn outside(simulator: &Simulator, data: &Data, rows: &[usize], corrected: &[Vec<f64>]) -> Outside {
     let mut found = Outside::default();
+    let (mut counted, mut counted_rows) = (BTreeSet::new(), BTreeSet::<Vec<u64>>::new());
     for (row, theta) in rows.iter().zip(corrected) {
         let set = |k: &usize| data.settings[*row][*k].is_some();
         let mut is_outside = false;
@@ -79,12 +84,17 @@ pub(super) fn outside(simulator: &Simulator, data: &Data, rows: &[usize], correc
             let inside = beyond <= 0.0;
             if !inside {
                 is_outside = true;
-                found.nats += OUTSIDE_NATS * (1.0 + beyond.ln_1p());
+                if counted.insert((k, theta[k].to_bits())) {
+                    found.nats += OUTSIDE_NATS * (1.0 + beyond.ln_1p());
+                }
             }
         }
         if is_set && !is_outside && simulator.table().is_some_and(|table| table.is_outside(theta)) {
             is_outside = true;
-            found.nats += OUTSIDE_NATS;
+            let settings = (0..theta.len()).filter(set).map(|k| theta[k].to_bits()).collect();
+            if counted_rows.insert(settings) {
+                found.nats += OUTSIDE_NATS;
+            }
         }
         found.rows += usize::from(is_outside);
     }

@@ -34,6 +34,9 @@ const CONSTANT_NATS: f64 = 6.0;
 /// Greatest number of hosts, which are attachment points, at which an oscillator is tried.
 const MOST_HOSTS: usize = 12;
 
+/// Laws of a candidate whose log evidence lies within this of the best one are kept with their fits, nats.
+const NEARLY_AS_GOOD_NATS: f64 = 3.0;
+
 /// Number of times of a step that data can distinguish. The prior of the time of a step is uniform over them.
 const STEP_TIMES: f64 = 20.0;
 
@@ -50,6 +53,8 @@ pub struct Ranked {
     pub probability: f64,
     /// Each law tried, and its log evidence minus that of the present fit, nats.
     pub laws: Vec<(LawKind, f64)>,
+    /// Fits with its other laws that are nearly as probable, each with the probability of its law relative to the best one.
+    pub other_laws: Vec<(f64, Fit)>,
 }
 
 /// One law of one candidate, fitted.
@@ -184,7 +189,11 @@ fn by_probability(
         let laws = candidate.laws(study.data).len() as f64;
         let log_odds = log_sum(own.iter().map(gain)) - laws.ln() + candidate.weight.ln();
         let laws = own.iter().map(|t| (t.law, gain(t))).collect();
-        ranked.push(Ranked { candidate: candidate.clone(), fit: first.fit.clone(), log_odds, probability: 0.0, laws });
+        let relative = |t: &&Trial| (gain(t) - gain(first)).exp();
+        let near = own[1..].iter().filter(|t| relative(t) > (-NEARLY_AS_GOOD_NATS).exp());
+        let other_laws = near.map(|t| (relative(t), t.fit.clone())).collect();
+        let (candidate, fit) = (candidate.clone(), first.fit.clone());
+        ranked.push(Ranked { candidate, fit, log_odds, probability: 0.0, laws, other_laws });
     }
     drop_equivalents(&mut ranked);
     ranked.sort_by(|a, b| b.log_odds.total_cmp(&a.log_odds));

@@ -14,7 +14,7 @@ const MOST_NAMES: usize = 3;
 pub struct InstrumentedPoints {
     /// Names of the points, in the order of the components of a shape.
     pub names: Vec<String>,
-    /// Shape of each mode of the nominal structure, with unit norm, `[modes][points]`.
+    /// Shapes of the nominal structure with unit norm, one for each measured mode and for a few modes above, `[modes][points]`.
     pub nominal: Vec<Vec<f64>>,
 }
 

@@ -9,6 +9,7 @@ use super::model::SimulationModel;
 use crate::measurement::shape::InstrumentedPoints;
 use crate::physics::effect::Target;
 use crate::physics::shaped::respond_shaped;
+use crate::physics::shapes::modes_to_pair;
 use crate::quantity::shown;
 
 /// Smallest number of instrumented points: a shape at a single point contains no information.
@@ -72,7 +73,9 @@ pub(super) fn check(
     }
     let targets: Vec<Target> = effects.iter().map(|effect| effect.target.clone()).collect();
     let typical = typical_sizes(effects);
-    let nominal = match respond_shaped(structure, definition.modes, (&targets, &typical), &dofs, &[]) {
+    // A mode above those expected may be listed in place of one of them.
+    let modes = modes_to_pair(definition.modes, structure.dofs());
+    let nominal = match respond_shaped(structure, modes, (&targets, &typical), &dofs, &[]) {
         Ok(shaped) => shaped.shapes,
         Err(error) => {
             problems.push(DefinitionProblem::new("/mode_shapes", format!("at the nominal stiffnesses: {error}")));

@@ -44,6 +44,11 @@ impl Simulator {
         self.instrumented().map_or(0, |i| i.dofs.len())
     }
 
+    /// Degree of freedom of each instrumented point; empty without any.
+    pub fn shape_dofs(&self) -> &[usize] {
+        self.instrumented().map_or(&[], |i| &i.dofs)
+    }
+
     /// The instrumented points, if mode shapes are measured.
     pub fn instrumented_points(&self) -> Option<&InstrumentedPoints> {
         self.instrumented().map(|i| &i.points)

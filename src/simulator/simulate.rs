@@ -374,6 +374,13 @@ impl Simulator {
         binding.map_or(of_itself, |b| b.slope(p) / b.stiffness(p))
     }
 
+    /// Column of the parameter that sets the stiffness of a spring and of no other; `None` if there is none.
+    pub fn own_parameter(&self, spring: usize) -> Option<usize> {
+        let parameter = self.bindings().iter().find(|b| b.spring == spring)?.parameter;
+        let alone = self.bindings().iter().filter(|b| b.parameter == parameter).count() == 1;
+        alone.then_some(parameter)
+    }
+
     /// Name of each parameter that sets several springs together, with the indices of these springs.
     pub fn spring_groups(&self) -> Vec<(String, Vec<usize>)> {
         let group = |(column, parameter): (usize, &Parameter)| {

@@ -38,8 +38,11 @@ fn probability(answer: &Value, truth: &Truth) -> f64 {
     all.filter(|cause| is_truth(cause, truth)).filter_map(|c| c["probability"].as_f64()).fold(0.0, f64::max)
 }
 
-/// Whether an answer names the hidden cause alone, with a probability above 0.9.
+/// Whether an answer names the hidden cause alone, with a probability above 0.9. Shapes show other numbers of the modes directly.
 fn resolved(answer: &Value, truth: &Truth) -> bool {
+    if truth.kind == "mode_assignment" && answer["verdict"] == "nothing_found" {
+        return !list(answer, "mode_numbers").is_empty();
+    }
     answer["verdict"] == "cause" && is_truth(&answer["causes"][0], truth) && probability(answer, truth) > 0.9
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::discrepancy::data::{Column, Data, Values, TIME};
+use crate::discrepancy::data::{Column, Data, Origin, Values, TIME};
 use crate::discrepancy::rank::Ranked;
 use crate::measurement::CovariateValue;
 use crate::stats;
@@ -11,7 +11,10 @@ use crate::stats;
 const LOW_AND_HIGH: (f64, f64) = (0.05, 0.95);
 
 /// Greatest number of conditions of one measurement.
-const MOST_CONDITIONS: usize = 4;
+const MOST_CONDITIONS: usize = 6;
+
+/// Greatest number of categories in which the effect of a category is measured.
+const MOST_CATEGORIES: usize = 4;
 
 /// The conditions of one of the rows at hand, with some of them changed. The time is that of the last row.
 #[derive(Debug, Clone, PartialEq)]
@@ -24,11 +27,11 @@ pub(super) struct Condition {
     pub(super) set: BTreeMap<usize, f64>,
 }
 
-/// A covariate that candidates depend on, with two values at which their predictions differ.
+/// A covariate that candidates depend on, with values at which their predictions differ: two numbers, or categories.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Contrast {
     pub(super) covariate: String,
-    pub(super) values: [CovariateValue; 2],
+    pub(super) values: Vec<CovariateValue>,
 }
 
 impl Condition {
@@ -50,8 +53,8 @@ impl Condition {
 }
 
 impl Contrast {
-    /// The contrast of a covariate in `rows`: two quantiles of a number, or the category `level` and the most frequent other one.
-    /// `None` for time, which cannot be chosen, and for a covariate that does not vary.
+    /// The contrast of a covariate in `rows`: two quantiles of a number; the category `level` and the most frequent other one; or,
+    /// without a `level`, the most frequent categories, each of which may have an effect of its own. `None` for time, which cannot be chosen, and for a covariate that does not vary.
     fn new(data: &Data, rows: &[usize], covariate: &str, level: Option<&str>) -> Option<Self> {
         let column = data.column(covariate).filter(|c| c.name != TIME)?;
         let values = match &column.values {
@@ -60,19 +63,22 @@ impl Contrast {
                 if numbers.is_empty() {
                     return None;
                 }
-                [LOW_AND_HIGH.0, LOW_AND_HIGH.1].map(|q| CovariateValue::Number(stats::quantile(&numbers, q)))
+                [LOW_AND_HIGH.0, LOW_AND_HIGH.1].map(|q| CovariateValue::Number(stats::quantile(&numbers, q))).to_vec()
             }
             Values::Categories(names, _) => {
                 let counts = counts(column, rows);
-                let most = |without: Option<&str>| {
-                    let of = |index: &usize| Some(names[*index].as_str()) != without;
-                    counts.keys().copied().filter(of).max_by_key(|index| counts[index]).map(|i| names[i].as_str())
-                };
-                let first = level.or_else(|| most(None))?;
-                [first, most(Some(first))?].map(|name| CovariateValue::Category(name.to_owned()))
+                let mut frequent: Vec<usize> = counts.keys().copied().collect();
+                frequent.sort_by_key(|index| std::cmp::Reverse(counts[index]));
+                let mut chosen: Vec<&str> = frequent.into_iter().map(|index| names[index].as_str()).collect();
+                if let Some(level) = level {
+                    chosen.retain(|name| *name != level);
+                    chosen.insert(0, level);
+                }
+                chosen.truncate(if level.is_some() { 2 } else { MOST_CATEGORIES });
+                chosen.into_iter().map(|name| CovariateValue::Category(name.to_owned())).collect()
             }
         };
-        (values[0] != values[1]).then(|| Self { covariate: covariate.to_owned(), values })
+        (values.len() > 1 && values[0] != values[1]).then(|| Self { covariate: covariate.to_owned(), values })
     }
 }
 
@@ -101,22 +107,58 @@ pub(super) fn contrasts(data: &Data, rows: &[usize], ranked: &[&Ranked]) -> Vec<
     all
 }
 
-/// The rows nearest to both values of each contrast, at most [`MOST_CONDITIONS`]; the last row if there is no contrast.
+/// The contrasts of the covariates that can be chosen on their own: those of `contrasts`, and the factors of the products among
+/// them.
+pub(super) fn single_covariates(data: &Data, rows: &[usize], contrasts: &[Contrast]) -> Vec<Contrast> {
+    let mut all: Vec<Contrast> = Vec::new();
+    for contrast in contrasts {
+        let Some(column) = data.column(&contrast.covariate) else { continue };
+        let own = match column.origin {
+            Origin::Covariate => vec![contrast.clone()],
+            Origin::Product(first, second) => {
+                let factors = [first, second].map(|c| &data.columns[c]);
+                let free = factors.into_iter().filter(|factor| factor.origin == Origin::Covariate);
+                free.filter_map(|factor| Contrast::new(data, rows, &factor.name, None)).collect()
+            }
+            _ => Vec::new(),
+        };
+        for contrast in own {
+            if !all.iter().any(|known| known.covariate == contrast.covariate) {
+                all.push(contrast);
+            }
+        }
+    }
+    all
+}
+
+/// The rows nearest to the values of each contrast, at most [`MOST_CONDITIONS`]; the last row if there is no contrast.
 pub(super) fn anchors(data: &Data, rows: &[usize], contrasts: &[Contrast]) -> Vec<Condition> {
     let mut chosen: Vec<usize> = Vec::new();
-    for contrast in contrasts.iter().take(MOST_CONDITIONS / 2) {
+    for contrast in contrasts {
         let column = data.column(&contrast.covariate).expect("a contrast is one of a column");
         for value in &contrast.values {
             let row = nearest(column, rows, value);
-            if let Some(row) = row.filter(|row| !chosen.contains(row)) {
+            let represented = |known: &usize| same_category(column, *known, value);
+            if let Some(row) = row.filter(|row| !chosen.contains(row) && !chosen.iter().any(represented)) {
                 chosen.push(row);
             }
         }
     }
+    chosen.truncate(MOST_CONDITIONS);
     if chosen.is_empty() {
         chosen.extend(rows.last());
     }
     chosen.into_iter().map(Condition::of_row).collect()
+}
+
+/// Whether a row has the category `value`.
+fn same_category(column: &Column, row: usize, value: &CovariateValue) -> bool {
+    match (&column.values, value) {
+        (Values::Categories(names, indices), CovariateValue::Category(wanted)) => {
+            indices[row].is_some_and(|index| names[index] == *wanted)
+        }
+        _ => false,
+    }
 }
 
 /// The row whose value is nearest; of several the last.
@@ -144,5 +186,6 @@ pub(super) fn combinations(row: usize, a: &Contrast, b: &Contrast) -> Vec<Condit
             all.push(condition);
         }
     }
+    all.truncate(MOST_CONDITIONS);
     all
 }

@@ -32,6 +32,13 @@ pub enum Kind {
     MoreRows,
 }
 
+impl Kind {
+    /// Whether such a measurement differs from those at hand by its conditions only.
+    pub(super) fn is_of_conditions(self) -> bool {
+        matches!(self, Self::FurtherRange | Self::IndependentCovariates | Self::FurtherSettings)
+    }
+}
+
 /// A possible measurement.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Experiment {
@@ -50,6 +57,17 @@ pub(super) struct Experiment {
     pub(super) points: Vec<usize>,
     /// Name of the point, body, covariate or setting.
     pub(super) place: Option<String>,
+}
+
+impl Experiment {
+    /// Number of things to arrange for it: something done to the structure or measured on it, a second instrument, mode shapes
+    /// beside something else, conditions that were not met so far.
+    pub(super) fn effort(&self) -> usize {
+        let act = !self.kind.is_of_conditions() && !matches!(self.kind, Kind::MoreRows | Kind::SecondInstrument);
+        let beside = self.kind != Kind::ModeShapes && !self.points.is_empty();
+        let arranged = self.conditions.iter().any(|c| !c.changed.is_empty() || !c.set.is_empty());
+        [act, self.second_instrument, beside, arranged].into_iter().filter(|part| *part).count()
+    }
 }
 
 /// A measurement that would distinguish the candidates of a diagnosis.

@@ -21,16 +21,17 @@ use super::rank::Ranked;
 use super::study::Study;
 use experiment::{Experiment, Kind, NextMeasurement};
 use predict::{Prediction, Predictor};
-use value::{repeats_to_wanted, value, Normals, Value};
+use value::{repeats_to_wanted, value, Member, Normals, Value, MOST_REPEATS};
 
 /// Rows in each condition with which measurements are compared.
 const REPEATS: usize = 10;
 
 /// Candidates below this probability, and more than so many, are not simulated.
 const LEAST_PROBABILITY: f64 = 2e-3;
-const MOST_CANDIDATES: usize = 12;
+const MOST_CANDIDATES: usize = 16;
 
-/// Greatest number of measurements that are reported.
+/// Greatest number of measurements that are compared in full, beside those that join two of them, and that are reported.
+const SHORT_LIST: usize = 20;
 const MOST_REPORTED: usize = 20;
 
 /// Smallest expected probability with which a measurement is recommended for distinguishing two candidates of equal probability.
@@ -40,10 +41,28 @@ const DISTINGUISHES: f64 = 0.6;
 pub(super) struct Outlook<'a> {
     study: &'a Study<'a>,
     ranked: Vec<&'a Ranked>,
+    /// A candidate with one of its laws.
+    members: Vec<LawOfCandidate<'a>>,
     options: Vec<Experiment>,
-    /// `[options][candidates]`; `None` for a prediction that cannot be computed.
+    /// `[options][members]`; `None` for a prediction that cannot be computed.
     predictions: Vec<Vec<Option<Prediction>>>,
     normals: Normals,
+}
+
+/// A candidate, given by its place, with one of its laws.
+struct LawOfCandidate<'a> {
+    candidate: usize,
+    /// Probability of the law among those of the candidate.
+    share: f64,
+    predictor: Predictor<'a>,
+}
+
+/// A measurement with its value in [`REPEATS`] and in [`MOST_REPEATS`] rows, and the number of rows with which it suffices.
+struct Valued {
+    option: usize,
+    usual: Value,
+    most: Value,
+    repeats_to_95: Option<usize>,
 }
 
 impl<'a> Outlook<'a> {
@@ -52,35 +71,60 @@ impl<'a> Outlook<'a> {
     pub(super) fn new(study: &'a Study<'a>, rows: &[usize], ranked: Vec<&'a Ranked>, independent_share: f64) -> Self {
         let decisive: Vec<&Ranked> = ranked.iter().copied().take(MOST_CANDIDATES).collect();
         let options = options::options(study.simulator, study.data, rows, &decisive);
-        let of_candidate = |r: &&Ranked| {
-            let predictor = Predictor::new(study, &r.fit, independent_share);
-            let of_option = |e: &Experiment| predictor.predict(e, reference(study, e).as_ref());
+        let mut members = Vec::new();
+        for (candidate, r) in ranked.iter().enumerate() {
+            let laws =
+                || std::iter::once((1.0, &r.fit)).chain(r.other_laws.iter().map(|(relative, fit)| (*relative, fit)));
+            let total: f64 = laws().map(|(relative, _)| relative).sum();
+            members.extend(laws().map(|(relative, fit)| LawOfCandidate {
+                candidate,
+                share: relative / total,
+                predictor: Predictor::new(study, fit, independent_share),
+            }));
+        }
+        let (predictions, normals) = (Vec::new(), Normals::new(1, 1));
+        let mut outlook = Self { study, ranked, members, options: Vec::new(), predictions, normals };
+        outlook.add(options);
+        outlook
+    }
+
+    /// Adds measurements with the predictions for them.
+    fn add(&mut self, options: Vec<Experiment>) {
+        let of_member = |member: &LawOfCandidate<'_>| {
+            let of_option = |e: &Experiment| member.predictor.predict(e, reference(self.study, e).as_ref());
             options.iter().map(of_option).collect::<Vec<_>>()
         };
-        let by_candidate: Vec<Vec<Option<Prediction>>> = ranked.par_iter().map(of_candidate).collect();
-        let mut predictions: Vec<Vec<Option<Prediction>>> = options.iter().map(|_| Vec::new()).collect();
-        for own in by_candidate {
+        let by_member: Vec<Vec<Option<Prediction>>> = self.members.par_iter().map(of_member).collect();
+        let first = self.options.len();
+        self.predictions.extend(options.iter().map(|_| Vec::new()));
+        self.options.extend(options);
+        for own in by_member {
             for (option, prediction) in own.into_iter().enumerate() {
-                predictions[option].push(prediction);
+                self.predictions[first + option].push(prediction);
             }
         }
-        let widths = predictions.iter().flatten().flatten().map(|p| p.mean.len());
-        let normals = Normals::new(MOST_CANDIDATES.min(ranked.len()).max(2), widths.max().unwrap_or(0));
-        Self { study, ranked, options, predictions, normals }
+        let widths = self.predictions.iter().flatten().flatten().map(|p| p.mean.len());
+        self.normals = Normals::new(self.members.len(), widths.max().unwrap_or(0));
     }
 
     /// The value of an option for some candidates, given as places and probabilities that sum to 1; `None` if it cannot be
     /// computed for one of them.
     fn value(&self, option: usize, candidates: &[(usize, f64)], repeats: usize) -> Option<Value> {
-        let own = |(place, _): &(usize, f64)| self.predictions[option][*place].as_ref();
-        let predictions = candidates.iter().map(own).collect::<Option<Vec<_>>>()?;
-        let probabilities: Vec<f64> = candidates.iter().map(|c| c.1).collect();
-        value(&predictions, &probabilities, repeats, &self.normals)
+        let mut members = Vec::new();
+        for (prediction, member) in self.predictions[option].iter().zip(&self.members) {
+            let Some((_, probability)) = candidates.iter().find(|(place, _)| *place == member.candidate) else {
+                continue;
+            };
+            let (candidate, probability) = (member.candidate, probability * member.share);
+            members.push(Member { candidate, probability, prediction: prediction.as_ref()? });
+        }
+        value(&members, repeats, &self.normals)
     }
 
-    /// The measurements, the one with the largest expected probability of the right candidate first; of those that agree within
-    /// 0.01 one without a second instrument, then the one that needs fewest rows. Empty if fewer than two candidates are probable.
-    pub(super) fn next_measurements(&self) -> Vec<NextMeasurement> {
+    /// The measurements, the best first: those that reach [`value::WANTED`] with [`REPEATS`] rows or fewer in each condition, then by the
+    /// number of rows that they need, then by the expected probability of the right candidate after [`MOST_REPEATS`] rows; of equal
+    /// ones that with the least effort. Empty if fewer than two candidates are probable.
+    pub(super) fn next_measurements(&mut self) -> Vec<NextMeasurement> {
         let probable = self.ranked.iter().enumerate().take(MOST_CANDIDATES);
         let mut candidates: Vec<(usize, f64)> =
             probable.filter(|(_, r)| r.probability >= LEAST_PROBABILITY).map(|(i, r)| (i, r.probability)).collect();
@@ -91,22 +135,42 @@ impl<'a> Outlook<'a> {
         if candidates.len() < 2 {
             return Vec::new();
         }
-        let valued = |option: usize| Some((option, self.value(option, &candidates, REPEATS)?));
+        let by_value = self.by_value(&candidates);
+        let best: Vec<&Experiment> = by_value.iter().map(|option| &self.options[*option]).collect();
+        let joined = options::joined(&best);
+        let first = self.options.len();
+        self.add(joined);
+        let all: Vec<usize> = by_value.into_iter().take(SHORT_LIST).chain(first..self.options.len()).collect();
+        let mut valued: Vec<Valued> = all.par_iter().filter_map(|option| self.valued(*option, &candidates)).collect();
+        let hundredths = |value: &Value| (100.0 * value.probability).round() as i64;
+        valued.sort_by_key(|v| {
+            let rows = v.repeats_to_95.map_or(usize::MAX, |repeats| repeats.max(REPEATS));
+            let not_reached = if v.repeats_to_95.is_none() { -hundredths(&v.most) } else { 0 };
+            (rows, not_reached, self.options[v.option].effort(), -hundredths(&v.usual))
+        });
+        valued.truncate(MOST_REPORTED);
+        let now: f64 = candidates.iter().map(|c| c.1 * c.1).sum();
+        valued.iter().map(|v| self.reported(v, now, &candidates)).collect()
+    }
+
+    /// The options by the expected probability of the right candidate after [`REPEATS`] rows, the best first.
+    fn by_value(&self, candidates: &[(usize, f64)]) -> Vec<usize> {
+        let valued = |option: usize| Some((option, self.value(option, candidates, REPEATS)?));
         let mut values: Vec<(usize, Value)> = (0..self.options.len()).into_par_iter().filter_map(valued).collect();
         values.sort_by(|a, b| b.1.probability.total_cmp(&a.1.probability));
-        values.truncate(MOST_REPORTED);
-        let now: f64 = candidates.iter().map(|c| c.1 * c.1).sum();
-        let reported = |(option, value): &(usize, Value)| self.reported(*option, *value, now, &candidates);
-        let mut all: Vec<NextMeasurement> = values.par_iter().map(reported).collect();
-        let hundredths = |m: &NextMeasurement| (100.0 * m.probability_after).round() as i64;
-        all.sort_by_key(|m| (-hundredths(m), m.second_instrument, m.repeats_to_95.unwrap_or(usize::MAX)));
-        all
+        values.into_iter().map(|(option, _)| option).collect()
+    }
+
+    fn valued(&self, option: usize, candidates: &[(usize, f64)]) -> Option<Valued> {
+        let with = |repeats: usize| self.value(option, candidates, repeats);
+        let (usual, most) = (with(REPEATS)?, with(MOST_REPEATS)?);
+        Some(Valued { option, usual, most, repeats_to_95: repeats_to_wanted(with) })
     }
 
     /// A measurement as it is reported.
-    fn reported(&self, option: usize, value: Value, now: f64, candidates: &[(usize, f64)]) -> NextMeasurement {
+    fn reported(&self, valued: &Valued, now: f64, candidates: &[(usize, f64)]) -> NextMeasurement {
         let (simulator, data) = (self.study.simulator, self.study.data);
-        let experiment = &self.options[option];
+        let experiment = &self.options[valued.option];
         let ranked: Vec<&Ranked> = candidates.iter().map(|(place, _)| self.ranked[*place]).collect();
         let conditions = words::conditions(simulator, data, &ranked, experiment);
         let what = words::phrase(simulator, experiment, &conditions);
@@ -121,12 +185,12 @@ impl<'a> Outlook<'a> {
             conditions,
             repeats: if once { 1 } else { REPEATS },
             probability_now: now,
-            probability_after: value.probability,
-            standard_error: value.standard_error,
-            repeats_to_95: repeats_to_wanted(|repeats| self.value(option, candidates, repeats)),
+            probability_after: valued.usual.probability,
+            standard_error: valued.usual.standard_error,
+            repeats_to_95: valued.repeats_to_95,
             sentence: String::new(),
         };
-        measurement.sentence = words::sentence(&what, &measurement);
+        measurement.sentence = words::sentence(&what, &measurement, valued.most.probability);
         measurement
     }
 

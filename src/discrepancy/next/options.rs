@@ -1,8 +1,8 @@
 //! The measurements that are possible for a structure and its candidates.
 
-use super::condition::{anchors, combinations, contrasts, Condition, Contrast};
+use super::condition::{anchors, combinations, contrasts, single_covariates, Condition, Contrast};
 use super::experiment::{Experiment, Kind};
-use crate::discrepancy::data::{Data, Origin, Values};
+use crate::discrepancy::data::{Data, Values};
 use crate::discrepancy::rank::Ranked;
 use crate::measurement::CovariateValue;
 use crate::physics::effect::Target;
@@ -15,17 +15,23 @@ const MOST_PLACES: usize = 12;
 /// Greatest number of points of a mode shape.
 const MOST_POINTS: usize = 8;
 
-/// Mass that is hung, as a share of the mass at its point.
-const HUNG_SHARE: f64 = 0.1;
+/// Masses that are hung, as shares of the mass at their point.
+const HUNG_SHARES: [f64; 2] = [0.1, 0.5];
 
 /// Distance of a further setting from the end of the prior, as a share of the width of the prior.
-const FROM_END: f64 = 0.05;
+const FROM_END: f64 = 0.1;
 
 /// Smallest further range that is considered, as a share of the width of the range at hand.
 const LEAST_FURTHER: f64 = 0.25;
 
 /// Greatest number of pairs of covariates that are varied independently.
 const MOST_PAIRS: usize = 3;
+
+/// Greatest number of acts, and of sets of conditions, that are joined.
+const MOST_JOINED: usize = 4;
+
+/// Greatest number of conditions in which mode shapes are measured beside something else.
+const MOST_WITH_SHAPES: usize = 2;
 
 /// All measurements that are possible; `rows`: rows at hand.
 pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked: &[&Ranked]) -> Vec<Experiment> {
@@ -65,7 +71,8 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
         place,
         ..plain.clone()
     };
-    for contrast in &contrasts {
+    let single = single_covariates(data, &rows, &contrasts);
+    for contrast in &single {
         for (number, end) in beyond(data, &rows, contrast).into_iter().enumerate() {
             let mut condition = present[number.min(present.len() - 1)].clone();
             condition.changed.insert(contrast.covariate.clone(), CovariateValue::Number(end));
@@ -73,17 +80,37 @@ pub(super) fn options(simulator: &Simulator, data: &Data, rows: &[usize], ranked
         }
     }
     let last = present[0].row;
-    let mut pairs: Vec<(&Contrast, &Contrast)> = Vec::new();
-    for (index, a) in contrasts.iter().enumerate() {
-        let free = |c: &Contrast| data.column(&c.covariate).is_some_and(|column| column.origin == Origin::Covariate);
-        let others = contrasts[index + 1..].iter().filter(|b| b.covariate != a.covariate && free(a) && free(b));
-        pairs.extend(others.map(|b| (a, b)));
-    }
-    for (a, b) in pairs.into_iter().take(MOST_PAIRS) {
+    let pairs = single.iter().enumerate().flat_map(|(index, a)| single[index + 1..].iter().map(move |b| (a, b)));
+    for (a, b) in pairs.take(MOST_PAIRS) {
         let place = Some(format!("{} and {}", a.covariate, b.covariate));
         all.push(with(Kind::IndependentCovariates, place, combinations(last, a, b)));
     }
     all.extend(further_settings(simulator, ranked, &plain));
+    all
+}
+
+/// Measurements that join two others, given by value, the best first: the best of each kind of act on the structure, in the conditions
+/// of another measurement and with mode shapes beside it.
+pub(super) fn joined(by_value: &[&Experiment]) -> Vec<Experiment> {
+    let mut acts: Vec<&Experiment> = Vec::new();
+    for e in by_value.iter().filter(|e| !e.kind.is_of_conditions() && e.kind != Kind::MoreRows) {
+        let same = |known: &&Experiment| (known.kind, known.second_instrument) == (e.kind, e.second_instrument);
+        if acts.len() < MOST_JOINED && !acts.iter().any(same) {
+            acts.push(e);
+        }
+    }
+    let mut all: Vec<Experiment> = Vec::new();
+    for act in &acts {
+        let conditions = by_value.iter().filter(|e| e.kind.is_of_conditions()).take(MOST_JOINED);
+        all.extend(conditions.map(|c| Experiment { conditions: c.conditions.clone(), ..(*act).clone() }));
+    }
+    if let Some(shapes) = by_value.iter().find(|e| e.kind == Kind::ModeShapes) {
+        for act in acts.iter().filter(|e| e.kind != Kind::ModeShapes) {
+            let conditions = act.conditions[..act.conditions.len().min(MOST_WITH_SHAPES)].to_vec();
+            let modes = act.modes.max(shapes.modes);
+            all.push(Experiment { points: shapes.points.clone(), modes, conditions, ..(*act).clone() });
+        }
+    }
     all
 }
 
@@ -94,16 +121,17 @@ fn with_second_instrument(e: &Experiment, modes: usize) -> Experiment {
     Experiment { kind, second_instrument: true, modes, ..e.clone() }
 }
 
-/// A mass at each attachment point.
+/// A light and a heavy mass at each attachment point.
 fn hung_masses(structure: &Structure, plain: &Experiment) -> Vec<Experiment> {
     let points = structure.attachment_points();
-    let at = |index: usize| {
+    let at = |share: f64, index: usize| {
         let point = &points[index];
-        let kg = two_digits(HUNG_SHARE * structure.kg_at(point.dof));
+        let kg = two_digits(share * structure.kg_at(point.dof));
         let (hung, place) = (Some((point.dof, kg)), Some(point.name.clone()));
         Experiment { kind: Kind::HungMass, hung, place, ..plain.clone() }
     };
-    (0..points.len()).step_by(points.len().div_ceil(MOST_PLACES).max(1)).map(at).collect()
+    let places = || (0..points.len()).step_by(points.len().div_ceil(MOST_PLACES).max(1));
+    HUNG_SHARES.into_iter().flat_map(|share| places().map(move |index| at(share, index))).collect()
 }
 
 /// The weighing of each rigid body whose mass a candidate changes.
@@ -143,7 +171,7 @@ fn mode_shapes(simulator: &Simulator, structure: &Structure, plain: &Experiment)
 /// negative is not extended below 0, and one in per cent not above 100.
 fn beyond(data: &Data, rows: &[usize], contrast: &Contrast) -> Vec<f64> {
     let Some(column) = data.column(&contrast.covariate) else { return Vec::new() };
-    if !matches!(column.values, Values::Numbers(_)) || column.origin != Origin::Covariate {
+    if !matches!(column.values, Values::Numbers(_)) {
         return Vec::new();
     }
     let numbers = column.numbers(rows);

@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::condition::Condition;
 use super::experiment::Experiment;
-use crate::discrepancy::data::{Column, Origin, Values, TIME};
+use crate::discrepancy::data::{Column, Origin, Values, SETTING, TIME};
 use crate::discrepancy::declared::WEIGHING_STD;
 use crate::discrepancy::effect::FittedEffect;
 use crate::discrepancy::fit::Fit;
@@ -143,12 +143,17 @@ impl<'a> Predictor<'a> {
         let Some(name) = law.covariate.as_deref() else { return Input::Number(0.0) };
         let here = self.inputs[index][condition.row];
         if let (Some(Origin::Product(first, second)), Input::Pair(a, b)) = (data.column(name).map(|c| c.origin), here) {
-            let moved = |column: usize| Self::change(&data.columns[column], condition);
+            let moved = |column: usize| self.change(&data.columns[column], condition);
             return Input::Pair(a + moved(first), b + moved(second));
         }
+        if let Some(value) = self.set_value(name, condition) {
+            return Input::Number(value);
+        }
+        if law.kind == LawKind::Lagged {
+            // The measurements follow the last row within hours, in which a delayed effect hardly moves.
+            return self.inputs[index].last().copied().unwrap_or(Input::Missing);
+        }
         match condition.changed.get(name) {
-            // A covariate that stays at a value is not delayed.
-            Some(CovariateValue::Number(value)) if law.kind == LawKind::Lagged => Input::Lagged(*value, 0.0),
             Some(CovariateValue::Number(value)) => Input::Number(*value),
             Some(CovariateValue::Category(name)) => Input::Level(law.levels.iter().position(|level| level == name)),
             None if name == TIME => match data.column(TIME).map(|c| &c.values) {
@@ -159,10 +164,22 @@ impl<'a> Predictor<'a> {
         }
     }
 
+    /// Value of the column of a setting that is changed in a condition; `None` for other columns.
+    fn set_value(&self, column: &str, condition: &Condition) -> Option<f64> {
+        let parameter = column.strip_prefix(SETTING)?;
+        let of = |(k, value): (&usize, &f64)| {
+            (self.study.simulator.space().as_slice()[*k].name == parameter).then_some(*value)
+        };
+        condition.set.iter().find_map(of)
+    }
+
     /// Value of a numeric column in a condition minus that in its row; 0 if it is not changed.
-    fn change(column: &Column, condition: &Condition) -> f64 {
-        match (&column.values, condition.changed.get(&column.name)) {
-            (Values::Numbers(values), Some(CovariateValue::Number(value))) => value - values[condition.row],
+    fn change(&self, column: &Column, condition: &Condition) -> f64 {
+        let Values::Numbers(values) = &column.values else { return 0.0 };
+        let set = self.set_value(&column.name, condition);
+        match (set, condition.changed.get(&column.name)) {
+            (Some(value), _) => value - values[condition.row],
+            (None, Some(CovariateValue::Number(value))) => value - values[condition.row],
             _ => 0.0,
         }
     }

@@ -1,10 +1,11 @@
 //! The value of a measurement: the expected probability of the right candidate after it.
 //!
 //! ```text
-//!  U = Σ_i p_i E[ p_i N(y; m_i, S_i) / Σ_j p_j N(y; m_j, S_j) ],    y ~ N(m_i, S_i),    S_i = J C Jᵀ + L + W/R
+//!  U = Σ_i p_i E[ Σ_{k ∈ c(i)} p_k N(y; m_k, S_k) / Σ_j p_j N(y; m_j, S_j) ],    y ~ N(m_i, S_i),    S_i = J C Jᵀ + L + W/R
 //! ```
 //!
-//! p: probabilities of the candidates; m, S: predictions of each (see [`Prediction`]). The expectations are means over simulated
+//! i, j: candidates with one of their laws; c(i): those of the same candidate; p: their probabilities; m, S: the prediction of each
+//! (see [`Prediction`]). The expectations are means over simulated
 //! measurements. All experiments use the same standard normal numbers, so that their values differ by the experiments and not by
 //! chance.
 //!
@@ -40,6 +41,16 @@ pub(super) struct Value {
     pub(super) probability: f64,
     /// Its standard error from the number of simulated measurements.
     pub(super) standard_error: f64,
+}
+
+/// A candidate with one of its laws.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Member<'a> {
+    /// Number of the candidate.
+    pub(super) candidate: usize,
+    /// Probability of the candidate with this law.
+    pub(super) probability: f64,
+    pub(super) prediction: &'a Prediction,
 }
 
 /// Standard normal numbers for the simulated measurements of each candidate.
@@ -109,16 +120,11 @@ impl<'a> Factored<'a> {
     }
 }
 
-/// The value of a measurement with `repeats` rows in each condition; `probabilities` of the candidates sum to 1. `None` if a
+/// The value of a measurement with `repeats` rows in each condition; the probabilities of the members sum to 1. `None` if a
 /// covariance is not positive definite.
-pub(super) fn value(
-    predictions: &[&Prediction],
-    probabilities: &[f64],
-    repeats: usize,
-    normals: &Normals,
-) -> Option<Value> {
-    let factored = predictions.iter().map(|p| Factored::new(p, repeats)).collect::<Option<Vec<_>>>()?;
-    let q = predictions.first()?.mean.len();
+pub(super) fn value(members: &[Member<'_>], repeats: usize, normals: &Normals) -> Option<Value> {
+    let factored = members.iter().map(|m| Factored::new(m.prediction, repeats)).collect::<Option<Vec<_>>>()?;
+    let q = members.first()?.prediction.mean.len();
     let (mut y, mut white) = (vec![0.0; q], vec![0.0; q]);
     let mut logs = vec![0.0; factored.len()];
     let (mut expected, mut variance) = (0.0, 0.0);
@@ -126,16 +132,23 @@ pub(super) fn value(
         let (mut sum, mut squares) = (0.0, 0.0);
         for draw in 0..DRAWS {
             own.simulate(&normals.draw(truth, draw)[..q], &mut y);
-            for (log, (other, p)) in logs.iter_mut().zip(factored.iter().zip(probabilities)) {
-                *log = other.log_density(&y, &mut white) + p.ln();
+            for (log, (other, member)) in logs.iter_mut().zip(factored.iter().zip(members)) {
+                *log = other.log_density(&y, &mut white) + member.probability.ln();
             }
             let largest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            let total: f64 = logs.iter().map(|log| (log - largest).exp()).sum();
-            let right = (logs[truth] - largest).exp() / total;
+            let (mut total, mut of_truth) = (0.0, 0.0);
+            for (log, member) in logs.iter().zip(members) {
+                let weight = (log - largest).exp();
+                total += weight;
+                if member.candidate == members[truth].candidate {
+                    of_truth += weight;
+                }
+            }
+            let right = of_truth / total;
             sum += right;
             squares += right * right;
         }
-        let (n, p) = (DRAWS as f64, probabilities[truth]);
+        let (n, p) = (DRAWS as f64, members[truth].probability);
         let mean = sum / n;
         expected += p * mean;
         variance += p * p * (squares / n - mean * mean).max(0.0) / (n - 1.0);
@@ -176,6 +189,15 @@ mod tests {
         }
     }
 
+    fn members<'a>(predictions: [&'a Prediction; 2], probabilities: [f64; 2]) -> Vec<Member<'a>> {
+        let member = |place: usize| Member {
+            candidate: place,
+            probability: probabilities[place],
+            prediction: predictions[place],
+        };
+        vec![member(0), member(1)]
+    }
+
     /// U of two normal densities with equal variances and probabilities, by the trapezoidal rule.
     fn by_quadrature(distance: f64) -> f64 {
         let density = |y: f64, mean: f64| (-0.5 * (y - mean).powi(2)).exp() / std::f64::consts::TAU.sqrt();
@@ -197,7 +219,7 @@ mod tests {
         let normals = Normals::new(2, 3);
         for distance in [0.0, 0.5, 1.0, 2.0, 4.0] {
             let (a, b) = (normal(0.0, 1.0), normal(distance, 1.0));
-            let found = value(&[&a, &b], &[0.5, 0.5], 1, &normals).unwrap();
+            let found = value(&members([&a, &b], [0.5, 0.5]), 1, &normals).unwrap();
             let exact = by_quadrature(distance);
             // Four standard errors of the simulation; 1e-12 where all draws agree.
             let allowed = 4.0 * found.standard_error + 1e-12;
@@ -209,21 +231,40 @@ mod tests {
     fn n_repeats_have_the_value_of_a_distance_larger_by_the_root_of_n_and_equal_predictions_have_none() {
         let normals = Normals::new(2, 1);
         let (a, near, far) = (normal(0.0, 1.0), normal(1.0, 1.0), normal(3.0, 1.0));
-        let repeated = value(&[&a, &near], &[0.3, 0.7], 9, &normals).unwrap();
-        let distant = value(&[&a, &far], &[0.3, 0.7], 1, &normals).unwrap();
+        let repeated = value(&members([&a, &near], [0.3, 0.7]), 9, &normals).unwrap();
+        let distant = value(&members([&a, &far], [0.3, 0.7]), 1, &normals).unwrap();
         assert!((repeated.probability - distant.probability).abs() < 1e-9, "{repeated:?} {distant:?}");
         // Without information the expected probability is Σ p².
-        let none = value(&[&a, &a], &[0.3, 0.7], 5, &normals).unwrap();
+        let none = value(&members([&a, &a], [0.3, 0.7]), 5, &normals).unwrap();
         assert!((none.probability - 0.58).abs() < 1e-12 && none.standard_error < 1e-9, "{none:?}");
+    }
+
+    #[test]
+    fn two_laws_of_one_candidate_need_not_be_told_apart() {
+        let normals = Normals::new(3, 1);
+        let (a, b, c) = (normal(0.0, 1.0), normal(0.0, 1.0), normal(1.0, 1.0));
+        let of = |candidates: [usize; 3]| {
+            let one = |(place, prediction)| Member {
+                candidate: candidates[place],
+                probability: [0.25, 0.25, 0.5][place],
+                prediction,
+            };
+            let members: Vec<Member<'_>> = [&a, &b, &c].into_iter().enumerate().map(one).collect();
+            value(&members, 4, &normals).unwrap().probability
+        };
+        let one = value(&members([&a, &c], [0.5, 0.5]), 4, &Normals::new(2, 1)).unwrap();
+        // The laws are the same, so that their candidate is as probable as with one law. Four standard errors.
+        assert!((of([0, 0, 1]) - one.probability).abs() < 4.0 * one.standard_error, "{one:?}");
+        assert!(of([0, 1, 2]) < of([0, 0, 1]) - 0.1);
     }
 
     #[test]
     fn the_number_of_repeats_is_the_smallest_that_suffices() {
         let normals = Normals::new(2, 1);
         let (a, b) = (normal(0.0, 1.0), normal(1.0, 1.0));
-        let with = |repeats: usize| value(&[&a, &b], &[0.5, 0.5], repeats, &normals);
+        let with = |repeats: usize| value(&members([&a, &b], [0.5, 0.5]), repeats, &normals);
         let repeats = repeats_to_wanted(with).unwrap();
         assert!(with(repeats).unwrap().probability >= WANTED && with(repeats - 1).unwrap().probability < WANTED);
-        assert_eq!(repeats_to_wanted(|_| value(&[&a, &a], &[0.5, 0.5], 1, &normals)), None);
+        assert_eq!(repeats_to_wanted(|_| value(&members([&a, &a], [0.5, 0.5]), 1, &normals)), None);
     }
 }

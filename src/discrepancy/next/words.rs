@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::condition::Condition;
 use super::experiment::{Experiment, Kind, NextMeasurement};
 use super::value::{MOST_REPEATS, WANTED};
-use crate::discrepancy::data::{Data, Origin};
+use crate::discrepancy::data::{Data, Origin, SETTING};
 use crate::discrepancy::rank::Ranked;
 use crate::measurement::CovariateValue;
 use crate::simulator::Simulator;
@@ -25,6 +25,9 @@ pub(super) fn conditions(
             _ => names.push(&column.name),
         }
     }
+    let settings = || names.iter().filter_map(|name| name.strip_prefix(SETTING));
+    let settings: Vec<String> = settings().map(str::to_owned).collect();
+    names.retain(|name| !name.starts_with(SETTING));
     let values = |condition: &Condition| {
         let mut names: Vec<&str> = names.clone();
         names.extend(condition.changed.keys().map(String::as_str));
@@ -32,6 +35,11 @@ pub(super) fn conditions(
         for name in names {
             if let Some(value) = condition.value(data, name) {
                 values.insert(name.to_owned(), value);
+            }
+        }
+        for (column, parameter) in simulator.space().iter().enumerate().filter(|(_, p)| settings.contains(&p.name)) {
+            if let Some(value) = data.settings[condition.row][column] {
+                values.insert(parameter.name.clone(), CovariateValue::Number(value));
             }
         }
         for (column, value) in &condition.set {
@@ -73,6 +81,9 @@ pub(super) fn phrase(
         Kind::FurtherSettings => format!("the frequencies with {place} set near both ends of its range"),
         Kind::MoreRows => "more rows as those at hand".to_owned(),
     };
+    let shapes = experiment.kind != Kind::ModeShapes && !experiment.points.is_empty();
+    let beside = format!(", and the mode shapes at {}", point_names(simulator, experiment).join(", "));
+    let what = if shapes { format!("{what}{beside}") } else { what };
     let each: Vec<String> = conditions.iter().filter(|c| !c.is_empty()).map(in_words).collect();
     if each.is_empty() {
         what
@@ -109,8 +120,9 @@ fn four_digits(number: f64) -> String {
     }
 }
 
-/// The sentence of a measurement whose other fields are known; `what` is its [`phrase`].
-pub(super) fn sentence(what: &str, m: &NextMeasurement) -> String {
+/// The sentence of a measurement whose other fields are known; `what` is its [`phrase`], `most` the expected probability after
+/// [`MOST_REPEATS`] rows in each condition.
+pub(super) fn sentence(what: &str, m: &NextMeasurement, most: f64) -> String {
     let weighed_only = m.kind == Kind::Weighing && !m.second_instrument;
     let rows = match (weighed_only, m.conditions.len()) {
         (true, 1) => String::new(),
@@ -122,7 +134,7 @@ pub(super) fn sentence(what: &str, m: &NextMeasurement) -> String {
         _ if weighed_only => String::new(),
         Some(1) => format!("; one row reaches {WANTED}"),
         Some(repeats) => format!("; {repeats} rows reach {WANTED}"),
-        None => format!("; {MOST_REPEATS} rows do not reach {WANTED}"),
+        None => format!("; {MOST_REPEATS} rows reach {most:.2}"),
     };
     format!(
         "Measure {what}{rows}: the expected probability of the right cause changes from {:.2} to {:.2} ± {:.2}{reached}.",

@@ -118,7 +118,9 @@ impl Hidden {
             row.set = set;
         }
         let gain = |effect: &Effect| match (&effect.curve, effect.truth.covariate.as_deref()) {
+            // Neither what goes with time nor what follows the weather with a delay of days changes within the hours of the visit.
             (_, Some("time")) => effect.signal[last.index],
+            _ if effect.truth.law == "lagged" => effect.signal[last.index],
             (Some(curve), Some(column)) => curve(row.column(column)),
             _ => effect.signal[near.index],
         };
