@@ -253,11 +253,24 @@ impl Wording<'_> {
                 let shape = if self.effect.law.kind == LawKind::Quadratic { "quadratically" } else { "exponentially" };
                 format!("{what} {changes} {} from the 5 % to the 95 % quantile of {covariate}, {shape}", size())
             }
-            LawKind::Product => format!(
-                "{what} depends on two covariates together, {covariate}: from the 5 % to the 95 % quantile of the effect it {changes} {}",
-                size()
-            ),
+            LawKind::Product => {
+                let on = if self.has_product() {
+                    format!("two covariates together, {covariate}")
+                } else {
+                    format!("two covariates, {}, each for itself", covariate.replace(" × ", " and "))
+                };
+                format!(
+                    "{what} depends on {on}: from the 5 % to the 95 % quantile of the effect it {changes} {}",
+                    size()
+                )
+            }
         }
+    }
+
+    /// Whether the 90 % interval of the coefficient of a product excludes 0.
+    fn has_product(&self) -> bool {
+        let place = self.effect.numbers.iter().position(|n| n.name == "product_per_unit2");
+        place.is_some_and(|place| self.psi[place].abs() > Z90 * self.covariance[(place, place)].max(0.0).sqrt())
     }
 
     /// The sentence of the gain of a mode.

@@ -151,12 +151,12 @@ impl Diagnosis {
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
             text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");
         }
+        if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, self.causes.len() > 1)) {
+            text.push_str(&gain);
+        }
         if let Some(learned) = &self.learned {
             text.push(' ');
             text.push_str(&learned.summary);
-        }
-        if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, self.causes.len() > 1)) {
-            text.push_str(&gain);
         }
         text
     }
@@ -229,13 +229,17 @@ pub(super) fn capitalised(text: &str) -> String {
     rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
 }
 
-/// The gain in words: change of the error of the mode that improves most, and of the false alarms. `None` if no mode was measured
-/// in the rows held out.
+/// The gain in words: change of the error of the mode that changes most in the direction of the whole, whether the whole is better,
+/// and change of the false alarms. `None` if no mode was measured in the rows held out.
 fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
     let rms = &gain.rms_error_percent;
+    let density = &gain.log_density_per_row;
+    let (low, high) =
+        (density.difference - 2.0 * density.standard_error, density.difference + 2.0 * density.standard_error);
+    let worse = high < 0.0;
     let finite = |m: &usize| rms.before[*m].is_finite() && rms.after[*m].is_finite();
     let mode = (0..rms.before.len()).filter(finite).max_by(|a, b| {
-        let gained = |m: usize| rms.before[m] - rms.after[m];
+        let gained = |m: usize| if worse { rms.after[m] - rms.before[m] } else { rms.before[m] - rms.after[m] };
         gained(*a).total_cmp(&gained(*b))
     })?;
     let (before, after) = (rms.before[mode], rms.after[mode]);
@@ -249,8 +253,16 @@ fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
         let (before, after) = (alarms.before, alarms.after);
         format!(", and the false alarms change from {before:.0} to {after:.0} per 1000 undamaged batches")
     });
+    let all_modes = format!("{:+.2} ± {:.2} nats per row in log density", density.difference, density.standard_error);
+    let whole = if worse {
+        format!(" Over all modes these rows are predicted worse ({all_modes}): what was found in the other rows does not hold there.")
+    } else if low <= 0.0 {
+        format!(" Over all modes the prediction is not clearly better ({all_modes}).")
+    } else {
+        String::new()
+    };
     Some(format!(
-        " {with} in the simulation, the prediction error of mode {} {rows} {moved} from {before:.2} % to {after:.2} %{alarms}.",
+        " {with} in the simulation, the prediction error of mode {} {rows} {moved} from {before:.2} % to {after:.2} %{alarms}.{whole}",
         mode + 1
     ))
 }

@@ -204,7 +204,7 @@ fn the_first_recommendation_decides_ambiguous_worlds() {
 }
 
 #[test]
-#[ignore = "about 10 minutes"]
+#[ignore = "4 minutes"]
 fn the_first_recommendation_decides_a_hundred_ambiguous_worlds_and_one_at_random_fewer() {
     let all = follow_all(60_000, 100);
     let (first, random) = report(&all);

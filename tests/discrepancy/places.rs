@@ -110,7 +110,7 @@ fn shapes_tell_where_a_constant_effect_acts_in_a_few_worlds() {
 }
 
 #[test]
-#[ignore = "5 minutes"]
+#[ignore = "12 minutes"]
 fn shapes_tell_where_a_constant_effect_acts_in_a_hundred_worlds_of_each_kind() {
     for (kind, counts) in all_kinds(100) {
         assert!(counts.named >= 90, "{kind}: {counts:?}");

@@ -11,6 +11,7 @@ mod helpers;
 mod migration;
 mod models;
 mod monitoring;
+mod output;
 mod storage;
 mod supervision;
 mod world;
