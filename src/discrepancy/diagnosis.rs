@@ -151,7 +151,12 @@ impl Diagnosis {
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
             text.push_str(" A stiffness that changes with time may be damage: it is reported, but not compensated.");
         }
-        if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, self.causes.len() > 1)) {
+        let with = match self.verdict {
+            DiagnosisVerdict::Ambiguous if self.causes.len() > 1 => "With the first of them",
+            _ if self.causes.len() > 1 => "With them",
+            _ => "With it",
+        };
+        if let Some(gain) = self.gain.as_ref().and_then(|gain| gain_in_words(gain, with)) {
             text.push_str(&gain);
         }
         if let Some(learned) = &self.learned {
@@ -231,7 +236,7 @@ pub(super) fn capitalised(text: &str) -> String {
 
 /// The gain in words: change of the error of the mode that changes most in the direction of the whole, whether the whole is better,
 /// and change of the false alarms. `None` if no mode was measured in the rows held out.
-fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
+fn gain_in_words(gain: &Gain, with: &str) -> Option<String> {
     let rms = &gain.rms_error_percent;
     let density = &gain.log_density_per_row;
     let (low, high) =
@@ -243,7 +248,6 @@ fn gain_in_words(gain: &Gain, several: bool) -> Option<String> {
         gained(*a).total_cmp(&gained(*b))
     })?;
     let (before, after) = (rms.before[mode], rms.after[mode]);
-    let with = if several { "With them" } else { "With it" };
     let moved = if after < before { "falls" } else { "rises" };
     let rows = match gain.method {
         GainMethod::HeldOut => format!("on the {} rows held out", gain.holdout_rows),

@@ -78,8 +78,10 @@ use crate::simulator::Simulator;
 use blocks::Blocks;
 use data::Data;
 use effect::FittedEffect;
+use fit::Fit;
 use gain::Unseen;
 use grammar::candidates;
+use learned::offer::Offered;
 use misfit::{misfits, remainder};
 use mode_numbers::mode_numbers;
 use naming::{name, Named};
@@ -249,12 +251,8 @@ fn run(
     }
     let unexplained = left.is_some() || many_outside;
     let verdict = verdict(selection.slots.len(), ambiguous, unexplained, !scatter.is_empty());
-    let offered = if verdict == DiagnosisVerdict::NoneOfThese {
-        let offered = learned::offer::offer(&study, &training, &holdout, &selection.base);
-        offered.map_err(|why| notes.push(format!("the deviation cannot be predicted either: {why}"))).ok()
-    } else {
-        None
-    };
+    let unexplained = verdict == DiagnosisVerdict::NoneOfThese;
+    let offered = if unexplained { offered(&study, (&training, &holdout), &selection.base, &mut notes) } else { None };
     let mut diagnosis = Diagnosis {
         structure: simulator.id().to_string(),
         verdict,
@@ -290,6 +288,17 @@ fn run(
         training,
         offered,
     })
+}
+
+/// The discrepancy that could be learned; `None`, with a note, if none can.
+fn offered(
+    study: &Study<'_>,
+    (training, holdout): (&[usize], &[usize]),
+    base: &Fit,
+    notes: &mut Vec<String>,
+) -> Option<Offered> {
+    let offered = learned::offer::offer(study, training, holdout, base);
+    offered.map_err(|why| notes.push(format!("the deviation cannot be predicted either: {why}"))).ok()
 }
 
 /// The effects of the structure, then the known masses that were hung.

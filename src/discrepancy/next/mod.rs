@@ -198,7 +198,10 @@ impl<'a> Outlook<'a> {
     pub(super) fn distinguishing(&self, a: usize, b: usize) -> String {
         let candidates = [(a, 0.5), (b, 0.5)];
         let valued = |option: usize| Some((option, self.value(option, &candidates, REPEATS)?.probability));
-        let best = (0..self.options.len()).filter_map(valued).max_by(|x, y| x.1.total_cmp(&y.1));
+        let key = |(option, probability): &(usize, f64)| {
+            ((100.0 * probability).round() as i64, std::cmp::Reverse(self.options[*option].effort()))
+        };
+        let best = (0..self.options.len()).filter_map(valued).max_by_key(key);
         let Some((option, _)) = best.filter(|(_, probability)| *probability >= DISTINGUISHES) else {
             return "none of the measurements that were considered".to_owned();
         };
