@@ -73,12 +73,20 @@ impl Trial {
         self.fit.log_evidence - self.fit.outside.nats - self.cost_nats
     }
 
-    /// Fits the effect of a score test, starting from its first guess; `None` if the fit fails.
-    fn new(study: &Study<'_>, rows: &[usize], fit: &Fit, candidate: &Candidate, promise: &Promise) -> Option<Self> {
+    /// Fits the effect of a score test, starting from its first guess; `None` if the fit fails or its log evidence cannot come near
+    /// `floor`, nats.
+    fn new(
+        study: &Study<'_>,
+        rows: &[usize],
+        (fit, floor): (&Fit, f64),
+        candidate: &Candidate,
+        promise: &Promise,
+    ) -> Option<Self> {
         let effect =
             candidate.effect(study.simulator, study.data, rows, promise.law, promise.with_level, promise.step_days);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
-        let found = study.fit(rows, &effects, Some(&Start::with(fit, Some(promise.psi.clone()))))?;
+        let start = Start::with(fit, Some(promise.psi.clone()));
+        let found = study.fit_above(floor, rows, &effects, Some(&start))?;
         let cost_nats = if promise.law == LawKind::Step { STEP_TIMES.ln() } else { 0.0 };
         Some(Self { candidate: promise.candidate, law: promise.law, fit: found, cost_nats })
     }
@@ -116,17 +124,20 @@ pub fn rank(
     let merit = |p: &Promise| penalty(p) + candidates[p.candidate].weight.ln();
     promised.sort_by(|a, b| merit(b).total_cmp(&merit(a)));
 
-    let fitted = |promise: &&Promise| Trial::new(study, rows, fit, &candidates[promise.candidate], promise);
-    let mut tried: Vec<Trial> = most_promising(&promised, candidates).par_iter().filter_map(fitted).collect();
+    let fitted =
+        |floor: f64, promise: &Promise| Trial::new(study, rows, (fit, floor), &candidates[promise.candidate], promise);
+    let first = most_promising(&promised, candidates);
+    let mut tried: Vec<Trial> = first.par_iter().filter_map(|promise| fitted(f64::NEG_INFINITY, promise)).collect();
     // No constant effect can gain more than an arbitrary constant for each output.
     let ones = DVector::from_element(rows.len(), 1.0);
     let constant = whitened.free_score(&whitened.output_sums(study.outputs()), &ones);
     if constant.nats > CONSTANT_NATS {
         let left = promised.iter().filter(|p| candidates[p.candidate].covariate.is_none());
         let left = left.filter(|p| !tried.iter().any(|t| t.candidate == p.candidate)).take(CONSTANTS);
-        let constants: Vec<Trial> = left.collect::<Vec<_>>().par_iter().filter_map(fitted).collect();
-        tried.extend(constants);
-        tried.extend(unscreened(study, rows, fit, candidates));
+        let (left, floor) = (left.collect::<Vec<_>>(), best_evidence(&tried));
+        tried.extend(left.par_iter().filter_map(|promise| fitted(floor, promise)).collect::<Vec<_>>());
+        let floor = best_evidence(&tried);
+        tried.extend(unscreened(study, rows, (fit, floor), candidates));
     }
     tried.extend(corrections(study, rows, fit, candidates));
     let evidence = |t: &Trial| t.merit() + candidates[t.candidate].weight.ln() + log_density(study.data, &t.fit, 1.0);
@@ -138,11 +149,17 @@ pub fn rank(
         .filter(|p| refined.contains(&p.candidate))
         .filter(|p| !tried.iter().any(|t| t.candidate == p.candidate && t.law == p.law))
         .collect();
-    tried.extend(further.par_iter().filter_map(fitted).collect::<Vec<_>>());
+    let floor = best_evidence(&tried);
+    tried.extend(further.par_iter().filter_map(|promise| fitted(floor, promise)).collect::<Vec<_>>());
 
     let best = tried.iter().max_by(|a, b| a.merit().total_cmp(&b.merit()));
     let share = best.map_or(Some(1.0), |t| independent_share(study, rows, &t.fit))?;
     Some((by_probability(study, fit, candidates, &tried, share), share))
+}
+
+/// Largest log evidence of the fits, nats; −∞ for none.
+fn best_evidence(tried: &[Trial]) -> f64 {
+    tried.iter().map(|t| t.fit.log_evidence).fold(f64::NEG_INFINITY, f64::max)
 }
 
 /// The score tests whose effects are fitted, only the best of each candidate: the first [`FITTED`], and further ones for kinds of
@@ -222,7 +239,7 @@ fn drop_equivalents(ranked: &mut Vec<Ranked>) {
 
 /// Fits the candidates without a score test, because the frequencies have no derivative at size 0: oscillators, from several
 /// tuning frequencies, and orders of modes.
-fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candidate]) -> Vec<Trial> {
+fn unscreened(study: &Study<'_>, rows: &[usize], (fit, floor): (&Fit, f64), candidates: &[Candidate]) -> Vec<Trial> {
     let f = study.simulator.nominal_frequencies_hz();
     let mut tunings = vec![0.6 * f[0], 0.9 * f[0]];
     tunings.extend(f.windows(2).flat_map(|w| [0.7 * w[0] + 0.3 * w[1], 0.3 * w[0] + 0.7 * w[1]]));
@@ -247,7 +264,7 @@ fn unscreened(study: &Study<'_>, rows: &[usize], fit: &Fit, candidates: &[Candid
     let fitted = |(index, psi): &(usize, Option<Vec<f64>>)| {
         let effect = candidates[*index].effect(study.simulator, study.data, rows, LawKind::Constant, false, 0.0);
         let effects: Vec<FittedEffect> = fit.effects.iter().cloned().chain([effect]).collect();
-        let fit = study.fit(rows, &effects, Some(&Start::with(fit, psi.clone())))?;
+        let fit = study.fit_above(floor, rows, &effects, Some(&Start::with(fit, psi.clone())))?;
         Some(Trial { candidate: *index, law: LawKind::Constant, fit, cost_nats: 0.0 })
     };
     // Only the best tuning of an oscillator is kept.

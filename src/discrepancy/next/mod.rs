@@ -21,13 +21,16 @@ use super::rank::Ranked;
 use super::study::Study;
 use experiment::{Experiment, Kind, NextMeasurement};
 use predict::{Prediction, Predictor};
-use value::{repeats_to_wanted, value, Member, Normals, Value, MOST_REPEATS};
+use value::{repeats_to_wanted, value, Member, Normals, Value, DRAWS, FEWER_DRAWS, MOST_REPEATS, WANTED};
 
 /// Rows in each condition with which measurements are compared.
 const REPEATS: usize = 10;
 
 /// Candidates below this probability, and more than so many, are not simulated.
-const LEAST_PROBABILITY: f64 = 2e-3;
+const LEAST_PROBABILITY: f64 = 5e-3;
+
+/// A law of a candidate below this probability is not simulated.
+const LEAST_OF_LAW: f64 = 2e-3;
 const MOST_CANDIDATES: usize = 16;
 
 /// Greatest number of measurements that are compared in full, beside those that join two of them, and that are reported.
@@ -109,19 +112,25 @@ impl<'a> Outlook<'a> {
 
     /// The value of an option for some candidates, given as places and probabilities that sum to 1; `None` if it cannot be
     /// computed for one of them.
-    fn value(&self, option: usize, candidates: &[(usize, f64)], repeats: usize) -> Option<Value> {
+    fn value(&self, option: usize, candidates: &[(usize, f64)], repeats: usize, draws: usize) -> Option<Value> {
         let mut members = Vec::new();
         for (prediction, member) in self.predictions[option].iter().zip(&self.members) {
             let Some((_, probability)) = candidates.iter().find(|(place, _)| *place == member.candidate) else {
                 continue;
             };
             let (candidate, probability) = (member.candidate, probability * member.share);
-            members.push(Member { candidate, probability, prediction: prediction.as_ref()? });
+            if probability >= LEAST_OF_LAW {
+                members.push(Member { candidate, probability, prediction: prediction.as_ref()? });
+            }
         }
-        value(&members, repeats, &self.normals)
+        let total: f64 = members.iter().map(|member| member.probability).sum();
+        for member in &mut members {
+            member.probability /= total;
+        }
+        value(&members, repeats, draws, &self.normals)
     }
 
-    /// The measurements, the best first: those that reach [`value::WANTED`] with [`REPEATS`] rows or fewer in each condition, then by the
+    /// The measurements, the best first: those that reach [`WANTED`] with [`REPEATS`] rows or fewer in each condition, then by the
     /// number of rows that they need, then by the expected probability of the right candidate after [`MOST_REPEATS`] rows; of equal
     /// ones that with the least effort. Empty if fewer than two candidates are probable.
     pub(super) fn next_measurements(&mut self) -> Vec<NextMeasurement> {
@@ -155,16 +164,23 @@ impl<'a> Outlook<'a> {
 
     /// The options by the expected probability of the right candidate after [`REPEATS`] rows, the best first.
     fn by_value(&self, candidates: &[(usize, f64)]) -> Vec<usize> {
-        let valued = |option: usize| Some((option, self.value(option, candidates, REPEATS)?));
+        let valued = |option: usize| Some((option, self.value(option, candidates, REPEATS, FEWER_DRAWS)?));
         let mut values: Vec<(usize, Value)> = (0..self.options.len()).into_par_iter().filter_map(valued).collect();
         values.sort_by(|a, b| b.1.probability.total_cmp(&a.1.probability));
         values.into_iter().map(|(option, _)| option).collect()
     }
 
     fn valued(&self, option: usize, candidates: &[(usize, f64)]) -> Option<Valued> {
-        let with = |repeats: usize| self.value(option, candidates, repeats);
+        let with = |repeats: usize| self.value(option, candidates, repeats, DRAWS);
         let (usual, most) = (with(REPEATS)?, with(MOST_REPEATS)?);
-        Some(Valued { option, usual, most, repeats_to_95: repeats_to_wanted(with) })
+        let repeats_to_95 = if usual.probability >= WANTED {
+            repeats_to_wanted(with, (0, REPEATS))
+        } else if most.probability >= WANTED {
+            repeats_to_wanted(with, (REPEATS, MOST_REPEATS))
+        } else {
+            None
+        };
+        Some(Valued { option, usual, most, repeats_to_95 })
     }
 
     /// A measurement as it is reported.
@@ -197,7 +213,7 @@ impl<'a> Outlook<'a> {
     /// The measurement, in words, that best distinguishes two candidates, given as places, if both are equally probable.
     pub(super) fn distinguishing(&self, a: usize, b: usize) -> String {
         let candidates = [(a, 0.5), (b, 0.5)];
-        let valued = |option: usize| Some((option, self.value(option, &candidates, REPEATS)?.probability));
+        let valued = |option: usize| Some((option, self.value(option, &candidates, REPEATS, DRAWS)?.probability));
         let key = |(option, probability): &(usize, f64)| {
             ((100.0 * probability).round() as i64, std::cmp::Reverse(self.options[*option].effort()))
         };

@@ -19,8 +19,10 @@ use rand_distr::StandardNormal;
 use super::predict::Prediction;
 use crate::stats;
 
-/// Simulated measurements of each candidate.
-const DRAWS: usize = 64;
+/// Simulated measurements of a probable candidate, and of one with a probability below [`SELDOM`], which contributes little.
+pub(super) const DRAWS: usize = 64;
+pub(super) const FEWER_DRAWS: usize = 16;
+const SELDOM: f64 = 0.1;
 
 /// Seed of the simulated measurements. It is fixed, so that the ranking depends on nothing but the data.
 const SEED: u64 = 1;
@@ -79,7 +81,7 @@ impl Normals {
 /// A prediction for a number of repeats, with its covariance factored: S = L Lᵀ.
 struct Factored<'a> {
     mean: &'a [f64],
-    /// L, by rows, `[q][q]`.
+    /// L, by columns, `[q][q]`.
     lower: Vec<f64>,
     half_log_det: f64,
 }
@@ -92,48 +94,53 @@ impl<'a> Factored<'a> {
         }
         let lower = covariance.cholesky()?.l();
         let half_log_det = lower.diagonal().iter().map(|l| l.ln()).sum();
-        let lower = lower.transpose().as_slice().to_vec();
+        let lower = lower.as_slice().to_vec();
         Some(Self { mean: prediction.mean.as_slice(), lower, half_log_det })
     }
 
-    /// Writes m + L z to `y`.
+    /// Writes m + L z to `y`. Columns are added one after another, which the compiler turns into vector instructions.
     fn simulate(&self, z: &[f64], y: &mut [f64]) {
         let q = y.len();
-        for (row, value) in y.iter_mut().enumerate() {
-            let line = &self.lower[row * q..=row * q + row];
-            *value = self.mean[row] + line.iter().zip(z).map(|(l, z)| l * z).sum::<f64>();
+        y.copy_from_slice(self.mean);
+        for (column, z) in z.iter().enumerate() {
+            let below = &self.lower[column * q + column..(column + 1) * q];
+            y[column..].iter_mut().zip(below).for_each(|(y, l)| *y += l * z);
         }
     }
 
-    /// ln N(y; m, S) without the factor of 2π; `white` is overwritten by L⁻¹(y − m).
-    fn log_density(&self, y: &[f64], white: &mut [f64]) -> f64 {
+    /// ln N(y; m, S) without the factor of 2π; `left` is overwritten.
+    fn log_density(&self, y: &[f64], left: &mut [f64]) -> f64 {
         let q = y.len();
+        for (left, (y, mean)) in left.iter_mut().zip(y.iter().zip(self.mean)) {
+            *left = y - mean;
+        }
         let mut distance = 0.0;
-        for row in 0..q {
-            let line = &self.lower[row * q..=row * q + row];
-            let sum: f64 = line[..row].iter().zip(&*white).map(|(l, w)| l * w).sum();
-            let value = (y[row] - self.mean[row] - sum) / line[row];
-            white[row] = value;
-            distance += value * value;
+        for column in 0..q {
+            let own = &self.lower[column * q + column..(column + 1) * q];
+            let white = left[column] / own[0];
+            distance += white * white;
+            left[column + 1..].iter_mut().zip(&own[1..]).for_each(|(left, l)| *left -= l * white);
         }
         -0.5 * distance - self.half_log_det
     }
 }
 
-/// The value of a measurement with `repeats` rows in each condition; the probabilities of the members sum to 1. `None` if a
+/// The value of a measurement with `repeats` rows in each condition, from at most `draws` simulated measurements of each member; the
+/// probabilities of the members sum to 1. `None` if a
 /// covariance is not positive definite.
-pub(super) fn value(members: &[Member<'_>], repeats: usize, normals: &Normals) -> Option<Value> {
+pub(super) fn value(members: &[Member<'_>], repeats: usize, draws: usize, normals: &Normals) -> Option<Value> {
     let factored = members.iter().map(|m| Factored::new(m.prediction, repeats)).collect::<Option<Vec<_>>>()?;
     let q = members.first()?.prediction.mean.len();
-    let (mut y, mut white) = (vec![0.0; q], vec![0.0; q]);
+    let (mut y, mut left) = (vec![0.0; q], vec![0.0; q]);
     let mut logs = vec![0.0; factored.len()];
     let (mut expected, mut variance) = (0.0, 0.0);
     for (truth, own) in factored.iter().enumerate() {
         let (mut sum, mut squares) = (0.0, 0.0);
-        for draw in 0..DRAWS {
+        let draws = if members[truth].probability < SELDOM { FEWER_DRAWS.min(draws) } else { draws };
+        for draw in 0..draws {
             own.simulate(&normals.draw(truth, draw)[..q], &mut y);
             for (log, (other, member)) in logs.iter_mut().zip(factored.iter().zip(members)) {
-                *log = other.log_density(&y, &mut white) + member.probability.ln();
+                *log = other.log_density(&y, &mut left) + member.probability.ln();
             }
             let largest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
             let (mut total, mut of_truth) = (0.0, 0.0);
@@ -148,7 +155,7 @@ pub(super) fn value(members: &[Member<'_>], repeats: usize, normals: &Normals) -
             sum += right;
             squares += right * right;
         }
-        let (n, p) = (DRAWS as f64, members[truth].probability);
+        let (n, p) = (draws as f64, members[truth].probability);
         let mean = sum / n;
         expected += p * mean;
         variance += p * p * (squares / n - mean * mean).max(0.0) / (n - 1.0);
@@ -156,14 +163,17 @@ pub(super) fn value(members: &[Member<'_>], repeats: usize, normals: &Normals) -
     Some(Value { probability: expected, standard_error: variance.sqrt() })
 }
 
-/// The smallest number of repeats with which the value reaches [`WANTED`], by bisection; `None` if [`MOST_REPEATS`] do not suffice.
-/// `value_with`: the value as a function of the number of repeats.
-pub(super) fn repeats_to_wanted(value_with: impl Fn(usize) -> Option<Value>) -> Option<usize> {
+/// The smallest number of repeats with which the value reaches [`WANTED`], by bisection between a number with which it does not and
+/// one with which it does; `None` if it does not with the larger one. `value_with`: the value as a function of the number of
+/// repeats.
+pub(super) fn repeats_to_wanted(
+    value_with: impl Fn(usize) -> Option<Value>,
+    (mut too_few, mut sufficient): (usize, usize),
+) -> Option<usize> {
     let enough = |repeats: usize| value_with(repeats).is_some_and(|v| v.probability >= WANTED);
-    if !enough(MOST_REPEATS) {
+    if !enough(sufficient) {
         return None;
     }
-    let (mut too_few, mut sufficient) = (0, MOST_REPEATS);
     while sufficient - too_few > 1 {
         let middle = usize::midpoint(too_few, sufficient);
         if enough(middle) {
@@ -219,7 +229,7 @@ mod tests {
         let normals = Normals::new(2, 3);
         for distance in [0.0, 0.5, 1.0, 2.0, 4.0] {
             let (a, b) = (normal(0.0, 1.0), normal(distance, 1.0));
-            let found = value(&members([&a, &b], [0.5, 0.5]), 1, &normals).unwrap();
+            let found = value(&members([&a, &b], [0.5, 0.5]), 1, DRAWS, &normals).unwrap();
             let exact = by_quadrature(distance);
             // Four standard errors of the simulation; 1e-12 where all draws agree.
             let allowed = 4.0 * found.standard_error + 1e-12;
@@ -231,11 +241,11 @@ mod tests {
     fn n_repeats_have_the_value_of_a_distance_larger_by_the_root_of_n_and_equal_predictions_have_none() {
         let normals = Normals::new(2, 1);
         let (a, near, far) = (normal(0.0, 1.0), normal(1.0, 1.0), normal(3.0, 1.0));
-        let repeated = value(&members([&a, &near], [0.3, 0.7]), 9, &normals).unwrap();
-        let distant = value(&members([&a, &far], [0.3, 0.7]), 1, &normals).unwrap();
+        let repeated = value(&members([&a, &near], [0.3, 0.7]), 9, DRAWS, &normals).unwrap();
+        let distant = value(&members([&a, &far], [0.3, 0.7]), 1, DRAWS, &normals).unwrap();
         assert!((repeated.probability - distant.probability).abs() < 1e-9, "{repeated:?} {distant:?}");
         // Without information the expected probability is Σ p².
-        let none = value(&members([&a, &a], [0.3, 0.7]), 5, &normals).unwrap();
+        let none = value(&members([&a, &a], [0.3, 0.7]), 5, DRAWS, &normals).unwrap();
         assert!((none.probability - 0.58).abs() < 1e-12 && none.standard_error < 1e-9, "{none:?}");
     }
 
@@ -250,9 +260,9 @@ mod tests {
                 prediction,
             };
             let members: Vec<Member<'_>> = [&a, &b, &c].into_iter().enumerate().map(one).collect();
-            value(&members, 4, &normals).unwrap().probability
+            value(&members, 4, DRAWS, &normals).unwrap().probability
         };
-        let one = value(&members([&a, &c], [0.5, 0.5]), 4, &Normals::new(2, 1)).unwrap();
+        let one = value(&members([&a, &c], [0.5, 0.5]), 4, DRAWS, &Normals::new(2, 1)).unwrap();
         // The laws are the same, so that their candidate is as probable as with one law. Four standard errors.
         assert!((of([0, 0, 1]) - one.probability).abs() < 4.0 * one.standard_error, "{one:?}");
         assert!(of([0, 1, 2]) < of([0, 0, 1]) - 0.1);
@@ -262,9 +272,10 @@ mod tests {
     fn the_number_of_repeats_is_the_smallest_that_suffices() {
         let normals = Normals::new(2, 1);
         let (a, b) = (normal(0.0, 1.0), normal(1.0, 1.0));
-        let with = |repeats: usize| value(&members([&a, &b], [0.5, 0.5]), repeats, &normals);
-        let repeats = repeats_to_wanted(with).unwrap();
+        let with = |repeats: usize| value(&members([&a, &b], [0.5, 0.5]), repeats, DRAWS, &normals);
+        let repeats = repeats_to_wanted(with, (0, MOST_REPEATS)).unwrap();
         assert!(with(repeats).unwrap().probability >= WANTED && with(repeats - 1).unwrap().probability < WANTED);
-        assert_eq!(repeats_to_wanted(|_| value(&members([&a, &a], [0.5, 0.5]), 1, &normals)), None);
+        let never = |_| value(&members([&a, &a], [0.5, 0.5]), 1, DRAWS, &normals);
+        assert_eq!(repeats_to_wanted(never, (0, MOST_REPEATS)), None);
     }
 }
