@@ -78,7 +78,8 @@ impl<'a> Drawn<'a> {
             }
             None => (Vec::new(), self.rows.iter().map(|r| self.data.times_days[*r]).collect()),
         };
-        let label = if name == TIME { "days since the first row".to_owned() } else { name.to_owned() };
+        let label =
+            if name == TIME { format!("{}s since the first row", self.data.time_unit) } else { name.to_owned() };
         Axis { label, names, values }
     }
 
