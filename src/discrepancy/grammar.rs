@@ -108,7 +108,7 @@ fn absorbed(simulator: &Simulator, data: &Data, target: &Target) -> bool {
     let Target::Springs(group) = target else { return false };
     let never_set = |parameter: usize| data.settings.iter().all(|row| row[parameter].is_none());
     let free = |spring: &usize| simulator.own_parameter(*spring).is_some_and(never_set);
-    group.len() > 1 && group.iter().filter(|spring| !free(*spring)).count() <= 1
+    group.len() > 1 && group.iter().filter(|spring| !free(spring)).count() <= 1
 }
 
 fn is_category(data: &Data, covariate: Option<&str>) -> bool {

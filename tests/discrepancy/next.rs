@@ -247,9 +247,12 @@ fn a_body_that_was_weighed_and_a_second_instrument_tell_exact_equivalents_apart(
         let others: f64 = named.iter().filter(|(m, _)| !m).map(|(_, p)| p * p).sum::<f64>() / sum(false);
         let expected = (sum(true) + others) / total;
         assert!((weighed - expected).abs() < 0.05, "{now} -> {weighed}, by the odds {expected}");
-        // Each of the two leaves a pair undecided; both together decide.
-        let both = recommended[0]["probability_after"].as_f64().unwrap();
-        assert!(both > 0.9 && recommended[0]["second_instrument"] == true, "{}", recommended[0]["sentence"]);
+        // Each of the two leaves a pair undecided; both together decide. A heavy known mass may suffice without a second instrument where
+        // the scale of the instrument is hardly probable.
+        let with_second = recommended.iter().filter(|r| r["second_instrument"] == true);
+        let both = with_second.map(|r| r["probability_after"].as_f64().unwrap()).fold(0.0, f64::max);
+        let first = recommended[0]["probability_after"].as_f64().unwrap();
+        assert!(both > 0.9 && first > 0.9, "{both} {first} {}", recommended[0]["sentence"]);
         // More rows of the same kind cannot help.
         assert!(best("more_rows") < now + 0.05, "{now} -> {}", best("more_rows"));
     }

@@ -199,7 +199,7 @@ mod tests {
         }
     }
 
-    fn members<'a>(predictions: [&'a Prediction; 2], probabilities: [f64; 2]) -> Vec<Member<'a>> {
+    fn members(predictions: [&Prediction; 2], probabilities: [f64; 2]) -> Vec<Member<'_>> {
         let member = |place: usize| Member {
             candidate: place,
             probability: probabilities[place],
