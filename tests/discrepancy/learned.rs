@@ -174,9 +174,15 @@ fn tried_chain(seed: u64, unknown: Unknown) -> Tried {
 /// A world of the generator with an effect outside the laws.
 fn tried_world(seed: u64) -> Tried {
     let (_, world) = Order::Kind(seed, Kind::Outside).draw();
-    let answer = answer(&world.structure_toml, &world.csv, &["--learned"]);
+    let what = format!("{} {seed}", world.outside.unwrap());
     let (base, truth) = world.holdout_log_density;
-    Tried::new(&format!("{} {seed}", world.outside.unwrap()), &answer, base, truth)
+    let output = super::diagnose(&world.structure_toml, &world.csv, &["--json", "--learned"]);
+    if !output.status.success() {
+        // Nothing is gained where nothing can be learned.
+        let verdict = String::from_utf8(output.stderr).unwrap().trim().to_owned();
+        return Tried { what, verdict, share: 0.0, coverage: f64::NAN };
+    }
+    Tried::new(&what, &serde_json::from_slice(&output.stdout).unwrap(), base, truth)
 }
 
 /// Mean and its standard error.
@@ -192,7 +198,7 @@ fn told(family: &str, tried: &[Tried]) -> [(f64, f64); 2] {
         println!("  {}; {}: share {:.2}, coverage {:.3}", t.what, t.verdict, t.share, t.coverage);
     }
     let share = mean_and_error(tried.iter().map(|t| t.share));
-    let coverage = mean_and_error(tried.iter().map(|t| t.coverage));
+    let coverage = mean_and_error(tried.iter().map(|t| t.coverage).filter(|c| c.is_finite()));
     println!(
         "{family}: {} worlds, share of the true gain {:.3} ± {:.3}, coverage {:.3} ± {:.3}",
         tried.len(),

@@ -33,9 +33,12 @@ const LEAST_PROBABILITY: f64 = 5e-3;
 const LEAST_OF_LAW: f64 = 2e-3;
 const MOST_CANDIDATES: usize = 16;
 
-/// Greatest number of measurements that are compared in full, beside those that join two of them, and that are reported.
+/// Greatest number of measurements that are compared in full, beside the best of each kind and those that join two of them.
 const SHORT_LIST: usize = 20;
+
+/// Greatest number of measurements that are reported, and of those of one kind.
 const MOST_REPORTED: usize = 20;
+const MOST_OF_A_KIND: usize = 3;
 
 /// Smallest expected probability with which a measurement is recommended for distinguishing two candidates of equal probability.
 const DISTINGUISHES: f64 = 0.6;
@@ -149,7 +152,9 @@ impl<'a> Outlook<'a> {
         let joined = options::joined(&best);
         let first = self.options.len();
         self.add(joined);
-        let all: Vec<usize> = by_value.into_iter().take(SHORT_LIST).chain(first..self.options.len()).collect();
+        let short_list = self.at_most(1, &by_value);
+        let short_list = by_value.iter().enumerate().filter(|(place, o)| *place < SHORT_LIST || short_list.contains(o));
+        let all: Vec<usize> = short_list.map(|(_, option)| *option).chain(first..self.options.len()).collect();
         let mut valued: Vec<Valued> = all.par_iter().filter_map(|option| self.valued(*option, &candidates)).collect();
         let hundredths = |value: &Value| (100.0 * value.probability).round() as i64;
         valued.sort_by_key(|v| {
@@ -157,9 +162,27 @@ impl<'a> Outlook<'a> {
             let not_reached = if v.repeats_to_95.is_none() { -hundredths(&v.most) } else { 0 };
             (rows, not_reached, self.options[v.option].effort(), -hundredths(&v.usual))
         });
+        let order: Vec<usize> = valued.iter().map(|v| v.option).collect();
+        let reported = self.at_most(MOST_OF_A_KIND, &order);
+        valued.retain(|v| reported.contains(&v.option));
         valued.truncate(MOST_REPORTED);
         let now: f64 = candidates.iter().map(|c| c.1 * c.1).sum();
         valued.iter().map(|v| self.reported(v, now, &candidates)).collect()
+    }
+
+    /// The first `most` of each kind among some options: of the same act, instrument, and with or without mode shapes.
+    fn at_most(&self, most: usize, options: &[usize]) -> Vec<usize> {
+        let kind = |option: usize| {
+            let e = &self.options[option];
+            (e.kind, e.second_instrument, e.points.is_empty())
+        };
+        let mut chosen: Vec<usize> = Vec::new();
+        for option in options {
+            if chosen.iter().filter(|known| kind(**known) == kind(*option)).count() < most {
+                chosen.push(*option);
+            }
+        }
+        chosen
     }
 
     /// The options by the expected probability of the right candidate after [`REPEATS`] rows, the best first.
