@@ -9,7 +9,8 @@
 //!   and its result;
 //! - [`screen`], [`rank`], [`mod@select`]: score tests, evidence, and forward selection of causes;
 //! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
-//! - [`mode_numbers`]: modes whose shapes are those of other modes; [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated;
+//! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
+//!   are those of other modes;
 //! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`);
 //! - [`diagnosis`]: the result; [`describe`], `naming` and `notes`: its text; [`report`]: the HTML page;
 //! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;

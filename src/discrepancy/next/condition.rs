@@ -54,7 +54,8 @@ impl Condition {
 
 impl Contrast {
     /// The contrast of a covariate in `rows`: two quantiles of a number; the category `level` and the most frequent other one; or,
-    /// without a `level`, the most frequent categories, each of which may have an effect of its own. `None` for time, which cannot be chosen, and for a covariate that does not vary.
+    /// without a `level`, the most frequent categories, each of which may have an effect of its own. `None` for time, which cannot
+    /// be chosen, and for a covariate that does not vary.
     fn new(data: &Data, rows: &[usize], covariate: &str, level: Option<&str>) -> Option<Self> {
         let column = data.column(covariate).filter(|c| c.name != TIME)?;
         let values = match &column.values {
@@ -168,8 +169,8 @@ fn nearest(column: &Column, rows: &[usize], value: &CovariateValue) -> Option<us
             let known = rows.iter().copied().filter(|row| values[*row].is_finite());
             known.min_by(|a, b| (values[*a] - wanted).abs().total_cmp(&(values[*b] - wanted).abs()))
         }
-        (Values::Categories(names, indices), CovariateValue::Category(wanted)) => {
-            rows.iter().rev().copied().find(|row| indices[*row].is_some_and(|index| names[index] == *wanted))
+        (Values::Categories(..), CovariateValue::Category(_)) => {
+            rows.iter().rev().copied().find(|row| same_category(column, *row, value))
         }
         _ => None,
     }

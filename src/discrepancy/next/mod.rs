@@ -28,10 +28,10 @@ const REPEATS: usize = 10;
 
 /// Candidates below this probability, and more than so many, are not simulated.
 const LEAST_PROBABILITY: f64 = 5e-3;
+const MOST_CANDIDATES: usize = 16;
 
 /// A law of a candidate below this probability is not simulated.
 const LEAST_OF_LAW: f64 = 2e-3;
-const MOST_CANDIDATES: usize = 16;
 
 /// Greatest number of measurements that are compared in full, beside the best of each kind and those that join two of them.
 const SHORT_LIST: usize = 20;
@@ -194,16 +194,15 @@ impl<'a> Outlook<'a> {
     }
 
     fn valued(&self, option: usize, candidates: &[(usize, f64)]) -> Option<Valued> {
-        let with = |repeats: usize| self.value(option, candidates, repeats, DRAWS);
-        let (usual, most) = (with(REPEATS)?, with(MOST_REPEATS)?);
-        let repeats_to_95 = if usual.probability >= WANTED {
-            repeats_to_wanted(with, (0, REPEATS))
-        } else if most.probability >= WANTED {
-            repeats_to_wanted(with, (REPEATS, MOST_REPEATS))
-        } else {
-            None
+        let computed = |repeats: usize| self.value(option, candidates, repeats, DRAWS);
+        let (usual, most) = (computed(REPEATS)?, computed(MOST_REPEATS)?);
+        let with = |repeats: usize| match repeats {
+            REPEATS => Some(usual),
+            MOST_REPEATS => Some(most),
+            _ => computed(repeats),
         };
-        Some(Valued { option, usual, most, repeats_to_95 })
+        let between = if usual.probability >= WANTED { (0, REPEATS) } else { (REPEATS, MOST_REPEATS) };
+        Some(Valued { option, usual, most, repeats_to_95: repeats_to_wanted(with, between) })
     }
 
     /// A measurement as it is reported.

@@ -176,12 +176,12 @@ impl<'a> Predictor<'a> {
     /// Value of a numeric column in a condition minus that in its row; 0 if it is not changed.
     fn change(&self, column: &Column, condition: &Condition) -> f64 {
         let Values::Numbers(values) = &column.values else { return 0.0 };
-        let set = self.set_value(&column.name, condition);
-        match (set, condition.changed.get(&column.name)) {
-            (Some(value), _) => value - values[condition.row],
-            (None, Some(CovariateValue::Number(value))) => value - values[condition.row],
-            _ => 0.0,
-        }
+        let changed = match condition.changed.get(&column.name) {
+            Some(CovariateValue::Number(value)) => Some(*value),
+            _ => None,
+        };
+        let value = self.set_value(&column.name, condition).or(changed);
+        value.map_or(0.0, |value| value - values[condition.row])
     }
 
     /// Parameters and effects in one condition of a measurement.

@@ -5,9 +5,8 @@
 //! ```
 //!
 //! i, j: candidates with one of their laws; c(i): those of the same candidate; p: their probabilities; m, S: the prediction of each
-//! (see [`Prediction`]). The expectations are means over simulated
-//! measurements. All experiments use the same standard normal numbers, so that their values differ by the experiments and not by
-//! chance.
+//! (see [`Prediction`]). The expectations are means over simulated measurements. All experiments use the same standard normal
+//! numbers, so that their values differ by the experiments and not by chance.
 //!
 //! Source: Lindley (1956), On a measure of the information provided by an experiment, Ann. Math. Statist. 27, 986–1005, for the
 //! value of an experiment as an expectation over its outcomes; the probability of the right candidate takes the place of
@@ -55,7 +54,7 @@ pub(super) struct Member<'a> {
     pub(super) prediction: &'a Prediction,
 }
 
-/// Standard normal numbers for the simulated measurements of each candidate.
+/// Standard normal numbers for the simulated measurements of each member.
 pub(super) struct Normals {
     /// Quantities of one simulated measurement.
     width: usize,
@@ -126,8 +125,7 @@ impl<'a> Factored<'a> {
 }
 
 /// The value of a measurement with `repeats` rows in each condition, from at most `draws` simulated measurements of each member; the
-/// probabilities of the members sum to 1. `None` if a
-/// covariance is not positive definite.
+/// probabilities of the members sum to 1. `None` if a covariance is not positive definite.
 pub(super) fn value(members: &[Member<'_>], repeats: usize, draws: usize, normals: &Normals) -> Option<Value> {
     let factored = members.iter().map(|m| Factored::new(m.prediction, repeats)).collect::<Option<Vec<_>>>()?;
     let q = members.first()?.prediction.mean.len();

@@ -17,17 +17,20 @@ pub(super) fn conditions(
     ranked: &[&Ranked],
     experiment: &Experiment,
 ) -> Vec<BTreeMap<String, CovariateValue>> {
-    let mut names: Vec<&str> = Vec::new();
+    let (mut names, mut settings): (Vec<&str>, Vec<&str>) = (Vec::new(), Vec::new());
     for column in ranked.iter().filter_map(|r| data.column(r.candidate.covariate.as_deref()?)) {
-        match column.origin {
-            Origin::Product(first, second) => names.extend([first, second].map(|c| data.columns[c].name.as_str())),
-            Origin::Time => {}
-            _ => names.push(&column.name),
+        let single = match column.origin {
+            Origin::Product(first, second) => vec![&data.columns[first], &data.columns[second]],
+            _ => vec![column],
+        };
+        for column in single {
+            match column.origin {
+                Origin::Time => {}
+                Origin::Setting => settings.extend(column.name.strip_prefix(SETTING)),
+                _ => names.push(&column.name),
+            }
         }
     }
-    let settings = || names.iter().filter_map(|name| name.strip_prefix(SETTING));
-    let settings: Vec<String> = settings().map(str::to_owned).collect();
-    names.retain(|name| !name.starts_with(SETTING));
     let values = |condition: &Condition| {
         let mut names: Vec<&str> = names.clone();
         names.extend(condition.changed.keys().map(String::as_str));
@@ -37,7 +40,9 @@ pub(super) fn conditions(
                 values.insert(name.to_owned(), value);
             }
         }
-        for (column, parameter) in simulator.space().iter().enumerate().filter(|(_, p)| settings.contains(&p.name)) {
+        for (column, parameter) in
+            simulator.space().iter().enumerate().filter(|(_, p)| settings.contains(&p.name.as_str()))
+        {
             if let Some(value) = data.settings[condition.row][column] {
                 values.insert(parameter.name.clone(), CovariateValue::Number(value));
             }
