@@ -22,6 +22,7 @@
 //!  alarm                                 control charts, their limits, and the states of alarms
 //!  discrepancy                           diagnosis: what the simulation gets wrong, and the extension that corrects it
 //!  damage                                undamaged reference, damage thresholds, probability of damage
+//!  process                               how the parameters of a healthy structure move in time, and changes it does not explain
 //!  trust                                 whether an answer can be trusted
 //!  hierarchy                             the population behind posterior samples
 //!  baseline                              trained models: training, calibration, inference, files
@@ -117,6 +118,7 @@ pub mod parameter;
 pub mod physics;
 pub mod plot;
 pub mod posterior;
+pub mod process;
 pub mod quantity;
 pub mod reduction;
 pub mod reproduce;

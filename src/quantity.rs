@@ -135,6 +135,13 @@ impl Serialize for Timestamp {
     }
 }
 
+impl<'de> Deserialize<'de> for Timestamp {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        Self::parse(&text).map_err(serde::de::Error::custom)
+    }
+}
+
 /// Name of a structure: 1 to 64 of `a–z 0–9 - _ .`, beginning with a letter or digit.
 ///
 /// It is used as a URL path segment and as a folder name, so that no other characters are allowed.

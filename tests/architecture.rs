@@ -39,7 +39,7 @@ const EXCEPTIONS: [(&str, &str); 0] = [];
 const FOUNDATION: [&str; 5] = ["quantity", "stats", "parameter", "measurement", "fault"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
-const TABLE: [(&str, &[&str], bool); 34] = [
+const TABLE: [(&str, &[&str], bool); 35] = [
     // A macro for fault injection in tests; it uses no other module.
     ("fault", &[], false),
     ("quantity", &[], false),
@@ -63,15 +63,16 @@ const TABLE: [(&str, &[&str], bool); 34] = [
     ("hierarchy", &["posterior", "simd"], true),
     ("trust", &["baseline", "simulator", "physics"], true),
     ("discrepancy", &["physics", "plot", "simulator"], true),
-    ("damage", &["hierarchy", "posterior"], true),
+    ("process", &[], true),
+    ("damage", &["hierarchy", "posterior", "process"], true),
     ("alarm", &["damage"], true),
     (
         "assessment",
-        &["alarm", "baseline", "damage", "hierarchy", "physics", "plot", "posterior", "simulator", "trust"],
+        &["alarm", "baseline", "damage", "hierarchy", "physics", "plot", "posterior", "process", "simulator", "trust"],
         true,
     ),
-    ("store", &["access", "alarm", "assessment", "damage", "reduction", "trust", "volume"], true),
-    ("notify", &["store"], true),
+    ("store", &["access", "alarm", "assessment", "damage", "process", "reduction", "trust", "volume"], true),
+    ("notify", &["process", "store"], true),
     ("mqtt", &["monitor"], true),
     ("telemetry", &[], false),
     // Compares the methods, including the assessment of a batch.
@@ -92,6 +93,7 @@ const TABLE: [(&str, &[&str], bool); 34] = [
             "discrepancy",
             "monitor",
             "notify",
+            "process",
             "reduction",
             "simulator",
             "store",

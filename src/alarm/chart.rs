@@ -23,8 +23,10 @@ pub struct ChartPoint {
     pub shift: f64,
     /// Limit of a single shift.
     pub limit: f64,
-    /// Limit of the moving average.
+    /// Limit of the moving average, or of the slow chart of a process.
     pub ewma_limit: f64,
+    /// Evidence on the slow chart of a process, which takes the place of the moving average; `None` on other charts.
+    pub slow: Option<f64>,
     /// True when the batch does not enter the chart.
     pub held: bool,
 }
@@ -127,8 +129,9 @@ impl Series {
             return ChartStatus { ewma: self.ewma, above: false, state: self.state };
         }
         let weight = self.settings.ewma_weight;
-        self.ewma = (1.0 - weight) * self.ewma + weight * point.shift.clamp(-CLIP, CLIP);
-        let lasting = weight > 0.0 && self.ewma > point.ewma_limit;
+        let moved = (1.0 - weight) * self.ewma + weight * point.shift.clamp(-CLIP, CLIP);
+        self.ewma = point.slow.unwrap_or(moved);
+        let lasting = (weight > 0.0 || point.slow.is_some()) && self.ewma > point.ewma_limit;
         let single = point.shift > point.limit;
         let above = single || lasting;
         self.recent.push(above);
@@ -155,13 +158,18 @@ impl Series {
 impl ChartPoint {
     /// A point of a damage chart.
     pub fn damage(shift: f64, limits: &Limits, held: bool) -> Self {
-        Self { shift, limit: limits.single, ewma_limit: limits.ewma, held }
+        Self { shift, limit: limits.single, ewma_limit: limits.ewma, slow: None, held }
     }
 
     /// A point of the chart of the simulation's fit.
     pub fn fit(rejected: bool) -> Self {
-        Self { shift: f64::from(u8::from(rejected)), limit: 0.5, ewma_limit: f64::INFINITY, held: false }
+        Self { shift: f64::from(u8::from(rejected)), limit: 0.5, ewma_limit: f64::INFINITY, slow: None, held: false }
     }
+}
+
+/// Rules of the charts of a process: one point above a limit raises an alarm, because the limits were simulated for that.
+pub fn process_settings(settings: &AlarmSettings) -> AlarmSettings {
+    AlarmSettings { needed: 1, window: 1, ewma_weight: 0.0, ..*settings }
 }
 
 /// Rules of the chart of the fit: two of three batches, so that the 1 % of healthy batches that are rejected raise no alarm.
@@ -175,7 +183,8 @@ mod tests {
 
     fn states(settings: AlarmSettings, shifts: &[f64]) -> Vec<State> {
         let mut series = Series::new(settings);
-        let point = |shift: &f64| ChartPoint { shift: *shift, limit: 3.0, ewma_limit: 1.0, held: shift.is_nan() };
+        let point =
+            |shift: &f64| ChartPoint { shift: *shift, limit: 3.0, ewma_limit: 1.0, slow: None, held: shift.is_nan() };
         shifts.iter().map(|shift| series.take(&point(shift)).state).collect()
     }
 
@@ -210,7 +219,7 @@ mod tests {
     fn a_resumed_series_continues_like_an_uninterrupted_one() {
         let settings = AlarmSettings { needed: 2, window: 3, ..AlarmSettings::default() };
         let shifts = [0.3, 4.0, 0.1, 3.5, 0.0, -1.0, 2.0, 0.0, 0.0, 0.0, 0.5, 3.1, 3.2];
-        let point = |shift: f64| ChartPoint { shift, limit: 3.0, ewma_limit: 1.5, held: false };
+        let point = |shift: f64| ChartPoint { shift, limit: 3.0, ewma_limit: 1.5, slow: None, held: false };
         let mut whole = Series::new(settings);
         let all: Vec<ChartStatus> = shifts.iter().map(|s| whole.take(&point(*s))).collect();
         for cut in 1..shifts.len() {

@@ -1,15 +1,17 @@
 //! The points of a batch on the alarm charts, and their limits.
 
 use std::collections::HashMap;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
 use super::result::Assessment;
-use crate::alarm::chart::{self, fit_settings, ChartPoint, FIT_SERIES};
+use crate::alarm::chart::{self, fit_settings, process_settings, ChartPoint, FIT_SERIES};
 use crate::alarm::limits::LimitCurve;
 use crate::alarm::AlarmSettings;
 use crate::baseline::Baseline;
 use crate::damage::{UndamagedQuantity, UndamagedReference};
 use crate::parameter::DamageDirection;
+use crate::process::estimate::BatchEstimate;
+use crate::process::reference::ReferenceProcess;
 use crate::trust::{FindingCode, FindingEffect};
 
 /// From this number of degrees of freedom on, the undamaged standard deviation is treated as known exactly.
@@ -28,6 +30,30 @@ pub struct NewChartPoint {
     pub probability_limit: Option<f64>,
     /// Rules of the chart.
     pub settings: AlarmSettings,
+}
+
+/// A batch on the charts of the process behind an undamaged reference, whose evidence depends on the batches before it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewProcessPoint {
+    /// The process.
+    pub reference: Arc<ReferenceProcess>,
+    /// Version of its undamaged reference.
+    pub undamaged_version: u32,
+    /// The estimate of the batch.
+    pub estimate: BatchEstimate,
+    /// True if the batch does not move the charts.
+    pub held: bool,
+    /// Rules of the charts.
+    pub settings: AlarmSettings,
+}
+
+/// What a batch adds to the charts.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct NewCharts {
+    /// Points that do not depend on other batches.
+    pub points: Vec<NewChartPoint>,
+    /// The batch on the charts of the process; `None` without one, or if the batch is not compared with it.
+    pub process: Option<NewProcessPoint>,
 }
 
 /// Cache of simulated limits, by degrees of freedom and number of charts. A simulation keeps all cores busy for some hundredths of
@@ -66,9 +92,21 @@ pub fn chart_points(
     undamaged: Option<&UndamagedReference>,
     settings: &AlarmSettings,
     known: &KnownLimits,
-) -> Vec<NewChartPoint> {
+) -> NewCharts {
     let mut points: Vec<NewChartPoint> = fit_point(assessment, settings).into_iter().collect();
-    let Some(undamaged) = undamaged.filter(|_| assessment.trust.accepted()) else { return points };
+    let Some(undamaged) = undamaged.filter(|_| assessment.trust.accepted()) else {
+        return NewCharts { points, process: None };
+    };
+    if let Some(reference) = &undamaged.process {
+        let process = assessment.estimate.clone().map(|estimate| NewProcessPoint {
+            reference: Arc::clone(reference),
+            undamaged_version: undamaged.version,
+            estimate,
+            held: !assessment.trust.moves_charts(),
+            settings: process_settings(settings),
+        });
+        return NewCharts { points, process };
+    }
     let charted = charted(baseline, undamaged);
     for (reference, direction) in &charted {
         let Some(quantity) = assessment.quantities.iter().find(|q| q.name == reference.name) else { continue };
@@ -84,7 +122,7 @@ pub fn chart_points(
             settings: *settings,
         });
     }
-    points
+    NewCharts { points, process: None }
 }
 
 /// The point on the chart of the fit; `None` for a batch that was rejected because of its data, such as a sensor that repeats an
@@ -111,13 +149,19 @@ fn charted<'a>(
     baseline: &Baseline,
     undamaged: &'a UndamagedReference,
 ) -> Vec<(&'a UndamagedQuantity, DamageDirection)> {
-    let (space, groups) = (baseline.space(), baseline.groups());
+    let columns = charted_columns(baseline);
     let direction = |name: &str| {
-        let column = match groups.iter().find(|group| group.name == name) {
-            Some(group) => group.columns[0],
-            None => space.position(name).filter(|column| !groups.iter().any(|g| g.columns.contains(column)))?,
-        };
-        Some(space.as_slice()[column].damage).filter(|d| *d != DamageDirection::None)
+        let (_, columns) = columns.iter().find(|(own, _)| own == name)?;
+        Some(baseline.space().as_slice()[columns[0]].damage).filter(|d| *d != DamageDirection::None)
     };
     undamaged.quantities.iter().filter_map(|quantity| Some((quantity, direction(&quantity.name)?))).collect()
+}
+
+/// Parameters that the modes can distinguish, and groups of the others: name, and columns of the parameters behind it.
+pub(super) fn charted_columns(baseline: &Baseline) -> Vec<(String, Vec<usize>)> {
+    let groups = baseline.groups();
+    let alone = |column: &usize| !groups.iter().any(|group| group.columns.contains(column));
+    let parameters = baseline.space().iter().enumerate().filter(|(column, _)| alone(column));
+    let parameters = parameters.map(|(column, parameter)| (parameter.name.clone(), vec![column]));
+    parameters.chain(groups.iter().map(|group| (group.name.clone(), group.columns.clone()))).collect()
 }

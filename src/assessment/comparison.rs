@@ -1,6 +1,7 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
 use super::conditions::compare_conditions;
+use super::estimate::ProcessQuantities;
 use super::quantities::monitored_quantities;
 use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Draws, Error};
@@ -51,10 +52,18 @@ pub fn assess(
         );
         findings.push(Finding::new(FindingCode::PriorEdge, FindingEffect::Note, message));
     }
+    let process = ProcessQuantities::of(baseline);
+    let not_informed = process.not_informed(&sampled);
+    findings.extend(not_informed.iter().map(|name| not_informed_finding(name)));
     findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
     let trust = Trust::new(&samples.fit, findings);
+    let covariates = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(|p| &p.process.covariates);
+    let estimate = covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates));
     // Where the simulation does not fit the data, its parameters say nothing about damage.
-    let compared = context.undamaged.filter(|_| trust.accepted());
+    let mut quantities = damage::assess(&sampled, context.undamaged.filter(|_| trust.accepted()));
+    for quantity in quantities.iter_mut().filter(|q| not_informed.contains(&q.name)) {
+        quantity.damage = None;
+    }
     Ok(Assessment {
         model_digest: baseline.digest().clone(),
         structure_digest: baseline.simulator().digest().clone(),
@@ -68,8 +77,18 @@ pub fn assess(
         misfit_percent: misfit_percent(baseline, &samples)?,
         trust,
         assessed_at,
-        quantities: damage::assess(&sampled, compared),
+        quantities,
+        estimate,
     })
+}
+
+/// The finding about a quantity that the measurements of a batch hardly inform.
+fn not_informed_finding(name: &str) -> Finding {
+    let message = format!(
+        "the measurements say hardly more about {name} than its prior, mostly because modes are missing: it has no probability of damage \
+         and no point on its chart"
+    );
+    Finding::new(FindingCode::NotInformed, FindingEffect::Note, message)
 }
 
 /// A finding when much of the posterior lies where the table behind an emulator has no runs.

@@ -13,13 +13,14 @@ mod chart_points;
 mod comparison;
 mod conditions;
 mod detail;
+mod estimate;
 mod population;
 mod quantities;
 mod reference;
 mod result;
 mod samples;
 
-pub use chart_points::{chart_points, KnownLimits, NewChartPoint};
+pub use chart_points::{chart_points, KnownLimits, NewChartPoint, NewCharts, NewProcessPoint};
 pub use comparison::{assess, Context};
 pub use detail::{detail, BatchDetail, ModeDetail, ParameterDetail};
 pub use quantities::monitored_quantities;

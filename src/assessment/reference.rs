@@ -1,11 +1,16 @@
 //! The undamaged reference that is computed from several batches.
 
+use std::sync::Arc;
+
 use super::conditions::conditions;
+use super::estimate::{process_covariates, ProcessQuantities};
 use super::quantities::monitored_quantities;
 use super::samples::{draw, joined, BatchSamples, Draws, Error};
 use crate::baseline::Baseline;
 use crate::damage::{self, UndamagedReference};
 use crate::measurement::ModalMeasurement;
+use crate::process::fit;
+use crate::process::reference::ReferenceProcess;
 use crate::trust::{FindingEffect, Trust};
 
 /// A batch that cannot be part of the undamaged reference.
@@ -86,8 +91,13 @@ impl<'a> ReferenceBatches<'a> {
     ///
     /// # Errors
     /// [`ReferenceError`].
-    pub fn reference(self, threshold_probability: f64) -> Result<UndamagedReference, ReferenceError> {
+    pub fn reference(
+        self,
+        threshold_probability: f64,
+        mean_run_batches: f64,
+    ) -> Result<UndamagedReference, ReferenceError> {
         let Self { baseline, trusted, .. } = self;
+        let process = process(baseline, &trusted, mean_run_batches);
         let Some((_, draws, _)) = trusted.first() else {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
@@ -104,8 +114,29 @@ impl<'a> ReferenceBatches<'a> {
         let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
         let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
         reference.conditions = conditions(measurements.into_iter().flatten());
+        match process {
+            Ok(process) => reference.process = Some(Arc::new(process)),
+            Err(why) => reference.without_process = Some(why.to_string()),
+        }
         Ok(reference)
     }
+}
+
+/// The process behind some batches.
+fn process(
+    baseline: &Baseline,
+    trusted: &[(&[ModalMeasurement], Draws, BatchSamples)],
+    mean_run_batches: f64,
+) -> Result<ReferenceProcess, fit::Error> {
+    let quantities = ProcessQuantities::of(baseline);
+    let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|(batch, ..)| *batch).collect();
+    let covariates = process_covariates(&measurements);
+    let estimate = |(batch, draws, samples): &(&[ModalMeasurement], Draws, BatchSamples)| {
+        let sampled = monitored_quantities(baseline, samples, draws.per_measurement);
+        quantities.estimate(&sampled, batch, &covariates)
+    };
+    let estimates = trusted.iter().filter_map(estimate).collect();
+    ReferenceProcess::new(&quantities.quantities, &covariates, estimates, mean_run_batches)
 }
 
 /// Computes the undamaged reference from several batches, each with its draws.
@@ -116,10 +147,11 @@ pub fn undamaged_reference(
     baseline: &Baseline,
     batches: &[(&[ModalMeasurement], Draws)],
     threshold_probability: f64,
+    mean_run_batches: f64,
 ) -> Result<UndamagedReference, ReferenceError> {
     let examined = ReferenceBatches::examine(baseline, batches)?;
     if !examined.doubtful.is_empty() {
         return Err(ReferenceError::Doubtful(examined.doubtful));
     }
-    examined.reference(threshold_probability)
+    examined.reference(threshold_probability, mean_run_batches)
 }

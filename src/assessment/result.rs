@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::damage::QuantityAssessment;
+use crate::process::estimate::BatchEstimate;
 use crate::quantity::{Digest, Timestamp};
 use crate::trust::Trust;
 
@@ -60,4 +61,8 @@ pub struct Assessment {
     pub assessed_at: Timestamp,
     /// One entry for each monitored quantity.
     pub quantities: Vec<QuantityAssessment>,
+    /// The estimate that enters the process behind the undamaged reference; `None` without such a process, and in an assessment that
+    /// was read from the database.
+    #[serde(skip)]
+    pub estimate: Option<BatchEstimate>,
 }

@@ -7,6 +7,7 @@ use clap::Args;
 
 use super::measurements::read_measurements;
 use super::model::load;
+use crate::alarm::AlarmSettings;
 use crate::assessment::{self, Draws};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::measurement::MeasurementBatch;
@@ -52,7 +53,8 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let draws = |batch: &MeasurementBatch| Draws::with_seed(assessment_seed(&batch.content_digest(), model.digest()));
     let undamaged_draws = draws(&undamaged_batch);
     let batches = [(undamaged_batch.measurements.as_slice(), undamaged_draws)];
-    let mut undamaged = assessment::undamaged_reference(&model, &batches, args.threshold_probability)
+    let mean_run_batches = AlarmSettings::default().mean_run_batches;
+    let mut undamaged = assessment::undamaged_reference(&model, &batches, args.threshold_probability, mean_run_batches)
         .with_context(|| format!("{} cannot be used as undamaged reference", args.reference.display()))?;
     undamaged.version = 1;
     let context = assessment::Context { undamaged: Some(&undamaged), previous: None };

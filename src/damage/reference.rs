@@ -1,6 +1,7 @@
 //! The undamaged reference: threshold, chart reference and conditions of each quantity.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
@@ -8,6 +9,7 @@ use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 use super::pool::{Hyperparameters, QuantitySamples};
 use super::threshold::threshold;
 use crate::hierarchy::interval;
+use crate::process::reference::ReferenceProcess;
 use crate::quantity::{OutOfRange, Probability};
 use crate::stats;
 
@@ -70,6 +72,12 @@ pub struct UndamagedReference {
     pub conditions: BTreeMap<String, SeenCovariate>,
     /// Reasons to doubt its data, as sentences.
     pub doubts: Vec<String>,
+    /// How its parameters move in time; `None` if too few batches show it, which `without_process` explains.
+    #[serde(skip)]
+    pub process: Option<Arc<ReferenceProcess>>,
+    /// Why there is no process.
+    #[serde(default)]
+    pub without_process: Option<String>,
 }
 
 /// The values of a covariate in the undamaged reference.
@@ -162,6 +170,8 @@ impl UndamagedReference {
             quantities,
             conditions: BTreeMap::new(),
             doubts,
+            process: None,
+            without_process: None,
         })
     }
 }

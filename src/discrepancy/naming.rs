@@ -1,5 +1,7 @@
 //! Selection of the candidates that a diagnosis names as causes, and of the alternatives that it reports.
 
+use rayon::prelude::*;
+
 use super::describe::{self, Cause};
 use super::diagnosis::{Alternative, SURE};
 use super::grammar::Class;
@@ -76,13 +78,13 @@ pub(super) fn name(
         if unsure && all.next_measurements.is_empty() {
             all.next_measurements = outlook.next_measurements();
         }
-        let alternative = |(place, other): (usize, &&Ranked)| Alternative {
-            cause: described(other),
+        let alternative = |place: usize| Alternative {
+            cause: described(shown[place]),
             instead_of: index + 1,
-            log_evidence_difference: other.log_odds - best.log_odds,
+            log_evidence_difference: shown[place].log_odds - best.log_odds,
             discriminating_measurement: outlook.distinguishing(0, place),
         };
-        all.alternatives.extend(shown.iter().enumerate().skip(1).map(alternative));
+        all.alternatives.par_extend((1..shown.len()).into_par_iter().map(alternative));
     }
     all
 }

@@ -15,6 +15,7 @@ use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, 
 use super::shared::Shared;
 use crate::baseline::manifest::ParameterIdentifiability;
 use crate::monitor::stored::{Acknowledgement, Episode, JobState, MaintenanceWindow};
+use crate::process::reference::{LastingChange, JOINT_SERIES};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
 
 /// Maximum length of a name or note, characters.
@@ -96,7 +97,7 @@ struct AlarmItem {
     alarm: i64,
     /// `damage`, `simulation_does_not_fit` or `silence`.
     kind: String,
-    /// Only for a damage alarm.
+    /// Only for a damage alarm; absent if the parameters together raised it.
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
     /// `open`, `ended`, or `withdrawn` if data that arrived later showed that there was no alarm.
@@ -109,6 +110,12 @@ struct AlarmItem {
     peak_shift_standard_errors: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     undamaged_version: Option<u32>,
+    /// Why the alarm was raised, in one sentence; only with a process behind the undamaged reference.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sentence: Option<String>,
+    /// Onset and size of the change, as the newest batch of the alarm shows them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    change: Option<LastingChange>,
     acknowledgement: Option<AcknowledgementItem>,
     /// The latest diagnosis that the service started because of this alarm.
     #[schema(required)]
@@ -174,7 +181,9 @@ impl From<Episode> for AlarmItem {
         Self {
             alarm: e.number,
             state: e.state(),
-            parameter: damage.then_some(e.series),
+            parameter: (damage && e.series != JOINT_SERIES).then_some(e.series),
+            sentence: e.change.as_ref().map(LastingChange::sentence),
+            change: e.change,
             peak_shift_standard_errors: (damage && e.peak_shift.is_finite()).then_some(e.peak_shift),
             undamaged_version: damage.then_some(e.undamaged_version),
             kind: e.kind,

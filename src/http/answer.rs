@@ -9,6 +9,7 @@ use crate::damage::{QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
 use crate::monitor::stored::{BatchRecord, HistoryEntry, ReferenceRecord, StoredChartPoint};
 use crate::monitor::{BatchView, Missing};
+use crate::process::reference::ReferenceProcess;
 use crate::quantity::{StructureId, Timestamp};
 use crate::trust::{Finding, TrustVerdict};
 
@@ -151,9 +152,11 @@ pub struct ChartBody {
     batch: String,
     measured_to: Timestamp,
     chart: String,
-    /// Shift towards damage in standard errors. On the chart of the fit, 1 means rejected.
+    /// Shift towards damage in standard errors; with a process behind the reference, the evidence for a step on the fast chart. On the
+    /// chart of the fit, 1 means rejected.
     shift: f64,
     shift_limit: f64,
+    /// Moving average of the shifts; with a process, the evidence for a lasting loss on the slow chart.
     ewma: f64,
     ewma_limit: Option<f64>,
     /// Probability of damage at which the shift reaches its limit, if the spread is that of the undamaged reference.
@@ -358,7 +361,47 @@ pub struct Undamaged {
     conditions: std::collections::BTreeMap<String, crate::damage::SeenCovariate>,
     /// Reasons to doubt the reference.
     doubts: Vec<String>,
+    /// How the parameters move in time, which the alarm charts take into account; `null` if the reference does not show it.
+    #[schema(required)]
+    process: Option<ProcessBody>,
+    /// Why there is no process: the alarm charts then take the batches as independent of each other.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    without_process: Option<String>,
     parameters: Vec<crate::damage::UndamagedQuantity>,
+}
+
+/// How the parameters of the undamaged structure move in time.
+#[derive(Debug, Serialize, ToSchema)]
+pub struct ProcessBody {
+    /// Number of batches that show it.
+    batches: usize,
+    /// Times of the first and the last of them.
+    period: [Timestamp; 2],
+    /// Median time between batches, s.
+    step_s: f64,
+    /// Covariates whose influence was learned.
+    covariates: Vec<String>,
+    /// Correlation of each common factor without a measured cause over one step.
+    factor_correlations: Vec<f64>,
+    /// Limits of the charts in standard deviations.
+    limits: crate::process::limits::Limits,
+    /// Mean number of healthy batches to a false alarm for which the limits were computed.
+    mean_run_batches: f64,
+}
+
+impl From<&ReferenceProcess> for ProcessBody {
+    fn from(reference: &ReferenceProcess) -> Self {
+        let process = &reference.process;
+        Self {
+            batches: process.batches,
+            period: process.period,
+            step_s: process.step_s,
+            covariates: process.covariates.clone(),
+            factor_correlations: process.numbers().persistence.iter().take(process.factors).copied().collect(),
+            limits: reference.limits,
+            mean_run_batches: reference.mean_run_batches,
+        }
+    }
 }
 
 impl Undamaged {
@@ -374,6 +417,8 @@ impl Undamaged {
             batches: record.batches.clone(),
             conditions: record.state.conditions.clone(),
             doubts: record.state.doubts.clone(),
+            process: record.state.process.as_deref().map(ProcessBody::from),
+            without_process: record.state.without_process.clone(),
             parameters: record.state.quantities.clone(),
         }
     }

@@ -19,6 +19,7 @@ use crate::monitor::stored::{
     ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
 };
 use crate::monitor::Series;
+use crate::process::reference::JOINT_SERIES;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::reduction::{Reduced, Row};
 use crate::trust::{FindingCode, TrustVerdict};
@@ -313,7 +314,7 @@ fn alarm(episode: Episode) -> AlarmSpan {
     AlarmSpan {
         alarm: episode.number,
         state: episode.state(),
-        parameter: (episode.kind == "damage").then_some(episode.series),
+        parameter: (episode.kind == "damage" && episode.series != JOINT_SERIES).then_some(episode.series),
         kind: episode.kind,
         opened_at: episode.opened_at,
         ended_at: episode.ended_at,

@@ -13,7 +13,7 @@ use super::error::Error;
 use super::events::Events;
 use super::settings::MonitorSettings;
 use super::structures::{ActiveStructure, ActiveStructures};
-use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, KnownLimits, NewChartPoint};
+use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, KnownLimits, NewCharts};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedReference;
 use crate::quantity::{shown, Hertz, StructureId, Timestamp};
@@ -36,7 +36,7 @@ pub(super) struct Computed {
     newest_undamaged: u32,
     seconds: f64,
     /// The assessment with its points on the charts, or why there is none.
-    outcome: Result<(Assessment, Vec<NewChartPoint>), String>,
+    outcome: Result<(Assessment, NewCharts), String>,
 }
 
 /// A batch whose result was stored, or discarded because the structure has another version in the meantime.

@@ -122,7 +122,7 @@ impl References {
                 if !request.leave_out_doubtful && (doubtful_already || !doubtful.is_empty()) {
                     return (Vec::new(), Err(ReferenceError::Doubtful(doubtful)));
                 }
-                let state = examined.reference(request.threshold_probability);
+                let state = examined.reference(request.threshold_probability, settings.mean_run_batches);
                 if let Ok(state) = &state {
                     known_limits.prepare(&baseline, state, &settings);
                 }

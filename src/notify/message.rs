@@ -5,6 +5,7 @@
 use serde::{Deserialize, Serialize};
 use standardwebhooks::{Webhook, WebhookError};
 
+use crate::process::reference::JOINT_SERIES;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{OutboxEvent, Secret};
 
@@ -121,7 +122,7 @@ impl Message {
         let data = AlarmData {
             structure,
             alarm: number,
-            parameter: damage.then_some(facts.series),
+            parameter: (damage && facts.series != JOINT_SERIES).then_some(facts.series),
             state: match (facts.withdrawn, facts.ended_at_us) {
                 (0, None) => "open",
                 (0, Some(_)) => "ended",

@@ -2,12 +2,13 @@
 
 use sqlx::FromRow;
 
-use super::column::{elements, list, timestamp};
+use super::column::{bad_row, elements, list, timestamp};
 use super::database::Database;
 use super::diagnosis::{job_state, JobState};
 use super::error::Error;
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
+use crate::process::reference::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Series name of alarms about missing data.
@@ -40,6 +41,8 @@ pub struct Episode {
     pub acknowledgement: Option<Acknowledgement>,
     /// The latest diagnosis that the service started because of it.
     pub diagnosis: Option<EpisodeDiagnosis>,
+    /// Onset and size of the change, as the newest batch of the alarm shows them; `None` without a process.
+    pub change: Option<LastingChange>,
 }
 
 /// A diagnosis that was started because of an alarm.
@@ -104,13 +107,19 @@ struct EpisodeRow {
     diagnosis_id: Option<String>,
     diagnosis_state: Option<String>,
     diagnosis_verdict: Option<String>,
+    change: Option<String>,
 }
 
 /// Selects [`EpisodeRow`]s; a condition follows.
 macro_rules! select_episodes {
     ($condition:expr) => {
         concat!(
-            "select e.*, d.diagnosis_id, d.state as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict
+            "select e.*, d.diagnosis_id, d.state as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict,
+                 (select p.changes -> e.series from process_point p
+                  where p.structure_id = e.structure_id and p.undamaged_version = e.undamaged_version
+                    and p.measured_to_us between e.opened_at_us and coalesce(e.ended_at_us, 9e18)
+                    and p.changes -> e.series is not null
+                  order by p.measured_to_us desc, p.batch_id desc limit 1) as change
              from alarm_episode e
              left join diagnosis d on d.diagnosis_id =
                  (select max(diagnosis_id) from diagnosis where structure_id = e.structure_id and alarm = e.episode)
@@ -385,5 +394,6 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         noticed_at: timestamp(what, row.noticed_at_us)?,
         acknowledgement,
         diagnosis,
+        change: row.change.map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e))).transpose()?,
     })
 }

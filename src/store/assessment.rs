@@ -14,7 +14,7 @@ use super::error::Error;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
-use crate::assessment::{Assessment, NewChartPoint};
+use crate::assessment::{Assessment, NewCharts};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::Trust;
@@ -112,7 +112,7 @@ impl Assessments<'_> {
         structure: &StructureId,
         batch_id: &str,
         assessment: &Assessment,
-        charted: Vec<NewChartPoint>,
+        charted: NewCharts,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.database.write(move |transaction| {
@@ -362,6 +362,7 @@ async fn insert(
 
 fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
     Ok(Assessment {
+        estimate: None,
         model_digest: Digest::from_stored(row.model_digest),
         structure_digest: Digest::from_stored(row.structure_digest),
         undamaged_version: Some(row.undamaged_version).filter(|version| *version > 0),

@@ -6,13 +6,14 @@
 use std::sync::LazyLock;
 
 use super::chart_episode::{Charted, Episodes};
-use super::chart_point::{state_of, stored_point, PointRow, StoredChartPoint, POINT_COLUMNS};
+use super::chart_point::{state_of, stored_point, ChartPosition, PointRow, StoredChartPoint, POINT_COLUMNS};
 use super::error::Error;
+use super::process;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
 use crate::alarm::chart::Series;
 use crate::alarm::machine::State;
-use crate::assessment::NewChartPoint;
+use crate::assessment::{NewChartPoint, NewCharts};
 
 /// Points read at a time.
 const PAGE: usize = 500;
@@ -50,13 +51,14 @@ static SELECT_AFTER: LazyLock<String> = LazyLock::new(|| {
 
 /// Statements that insert points or replace them. Structure, time and batch are the same in all rows.
 static INSERT_POINTS: InsertStatements = InsertStatements::with_clause(
-    "insert into chart_point",
-    13,
+    "insert into chart_point (structure_id, undamaged_version, series, measured_to_us, batch_id, shift, shift_limit, ewma_limit,
+     probability_limit, held, ewma, above, state, slow)",
+    14,
     &[0, 3, 4],
     " on conflict (structure_id, undamaged_version, series, measured_to_us, batch_id) do update
      set shift = excluded.shift, shift_limit = excluded.shift_limit, ewma_limit = excluded.ewma_limit,
          probability_limit = excluded.probability_limit, held = excluded.held, ewma = excluded.ewma,
-         above = excluded.above, state = excluded.state",
+         above = excluded.above, state = excluded.state, slow = excluded.slow",
 );
 
 /// The result of storing the points of a batch.
@@ -82,16 +84,24 @@ struct Placed {
 pub(super) async fn chart(
     transaction: &mut Transaction<'_>,
     batch: &Charted<'_>,
-    points: Vec<NewChartPoint>,
+    NewCharts { mut points, process }: NewCharts,
 ) -> Result<ChartOutcome, Error> {
     let mut placed = Vec::new();
+    let mut changed_to = None;
+    if let Some(new) = process.filter(|new| new.undamaged_version == batch.newest_undamaged) {
+        let followed = process::follow(transaction, batch, &new).await?;
+        points.extend(followed.points);
+        changed_to = followed.changed_to;
+    }
     // An undamaged reference that was stored in the meantime has ended the charts of the earlier reference.
     let points = points.into_iter().filter(|new| [0, batch.newest_undamaged].contains(&new.undamaged_version));
     for charts in points.collect::<Vec<_>>().chunks(CHARTS_TOGETHER) {
         let mut about = about(transaction, batch, charts).await?;
         for new in charts {
             let own = about.extract_if(.., |row| row.series == new.series).collect();
-            placed.push(place(transaction, batch, new, own).await?);
+            placed.push(
+                place(transaction, batch, new, own, changed_to.as_ref().filter(|_| new.point.slow.is_some())).await?,
+            );
         }
     }
     placed.sort_by(|a, b| b.undamaged_version.cmp(&a.undamaged_version).then_with(|| a.row.series.cmp(&b.row.series)));
@@ -135,7 +145,8 @@ async fn insert_points(transaction: &mut Transaction<'_>, batch: &Charted<'_>, p
                 .bind(row.held)
                 .bind(row.ewma)
                 .bind(row.above)
-                .bind(&row.state);
+                .bind(&row.state)
+                .bind(row.slow);
         }
         insert.execute(transaction.connection()).await?;
     }
@@ -145,13 +156,14 @@ async fn insert_points(transaction: &mut Transaction<'_>, batch: &Charted<'_>, p
 /// Determines the state of a new point from the points before it, and updates the states of the later points of its series and
 /// the alarm episodes that follow from them. `about` contains the stored points around it.
 ///
-/// It stops where the states no longer change, because the influence of a point on the moving average and on the count of points
+/// `changed_to`: the last position at which points themselves were changed, if any. It stops behind it where the states no longer change, because the influence of a point on the moving average and on the count of points
 /// above the limit fades.
 async fn place(
     transaction: &mut Transaction<'_>,
     batch: &Charted<'_>,
     new: &NewChartPoint,
     mut about: Vec<PointRow>,
+    changed_to: Option<&ChartPosition>,
 ) -> Result<Placed, Error> {
     let undamaged_version = new.undamaged_version;
     let memory = Series::memory(&new.settings);
@@ -163,10 +175,12 @@ async fn place(
     let ewma_limit = Some(new.point.ewma_limit).filter(|limit| limit.is_finite());
     // A maintenance window that was stored later does not change a stored point.
     let held = stored.as_ref().map_or(new.point.held || batch.maintained, |row| row.held);
-    let values = (new.point.shift, new.point.limit, ewma_limit, held);
-    let same = |row: &PointRow| (row.shift, row.shift_limit, row.ewma_limit, row.held) == values;
+    let values = (new.point.shift, new.point.limit, ewma_limit, new.point.slow, held);
+    let same = |row: &PointRow| (row.shift, row.shift_limit, row.ewma_limit, row.slow, row.held) == values;
     let stored = match stored {
-        Some(row) if same(&row) => return Ok(Placed { undamaged_version, row, new: false, alarms_changed: false }),
+        Some(row) if same(&row) && changed_to.is_none() => {
+            return Ok(Placed { undamaged_version, row, new: false, alarms_changed: false })
+        }
         stored => stored,
     };
     let mut series = match before.last() {
@@ -192,6 +206,7 @@ async fn place(
         ewma: 0.0,
         above: false,
         state: String::new(),
+        slow: new.point.slow,
     };
     first.follow(&mut series);
     episodes.pass(&first)?;
@@ -204,7 +219,8 @@ async fn place(
             }
             episodes.pass(row)?;
             unchanged = if changed { 0 } else { unchanged + usize::from(!row.held) };
-            if unchanged > memory && !episodes.inside {
+            let settled = changed_to.is_none_or(|changed| row.position() > *changed);
+            if unchanged > memory && !episodes.inside && settled {
                 episodes.keep_after(&row.position());
                 break 'pages;
             }

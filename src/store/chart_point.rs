@@ -50,6 +50,7 @@ pub(super) struct PointRow {
     pub ewma: f64,
     pub above: bool,
     pub state: String,
+    pub slow: Option<f64>,
 }
 
 impl PointRow {
@@ -63,6 +64,7 @@ impl PointRow {
             shift: self.shift,
             limit: self.shift_limit,
             ewma_limit: self.ewma_limit.unwrap_or(f64::INFINITY),
+            slow: self.slow,
             held: self.held,
         }
     }
@@ -83,7 +85,7 @@ pub(super) type ChartPosition = (i64, String);
 
 /// The columns of a [`PointRow`].
 pub(super) const POINT_COLUMNS: &str =
-    "measured_to_us, batch_id, series, shift, shift_limit, ewma_limit, probability_limit, held, ewma, above, state";
+    "measured_to_us, batch_id, series, shift, shift_limit, ewma_limit, probability_limit, held, ewma, above, state, slow";
 
 /// The chart state with a name.
 pub(super) fn state_of(name: &str) -> Result<State, Error> {

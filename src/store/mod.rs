@@ -32,6 +32,7 @@ mod measurements;
 mod outbox;
 mod overview;
 mod plotted;
+mod process;
 mod quarantine;
 mod retention;
 mod rows;

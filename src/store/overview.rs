@@ -201,6 +201,7 @@ impl Overview<'_> {
 
 #[cfg(test)]
 mod tests {
+    use crate::assessment::NewCharts;
     use proptest::prelude::*;
 
     use super::super::tests::{assessment, at, batch, bridge, open};
@@ -223,8 +224,10 @@ mod tests {
             // Batches with an even start share a source, so that some of them repeat stored ones.
             let source = if start % 2 == 0 { "s".to_owned() } else { format!("s{number}") };
             let _ = store.batches().insert_batch(&batch(&source, start, None), &id, at(0)).await.unwrap();
-            let _ =
-                store.assessments().insert_assessment(&bridge(), &id, &assessment("m", None, at(1)), Vec::new()).await;
+            let _ = store
+                .assessments()
+                .insert_assessment(&bridge(), &id, &assessment("m", None, at(1)), NewCharts::default())
+                .await;
             if expire {
                 store.retention().delete_expired(at(start), 3).await.unwrap();
             }
@@ -259,7 +262,7 @@ mod tests {
         for (id, given) in
             [("b0", assessment("m", Some(1), at(1))), ("b1", assessment("m", None, at(2))), ("b1", other)]
         {
-            store.assessments().insert_assessment(&bridge(), id, &given, Vec::new()).await.unwrap();
+            store.assessments().insert_assessment(&bridge(), id, &given, NewCharts::default()).await.unwrap();
             let found = overview().await.latest.unwrap();
             let expected = store.assessments().assessment(&bridge(), &found.batch_id).await.unwrap().unwrap();
             let damages = || expected.quantities.iter().filter_map(|q| Some((q.damage.as_ref()?, q.name.clone())));

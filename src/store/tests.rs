@@ -9,7 +9,7 @@ use sqlx::Connection as _;
 
 use super::file::APPLICATION_ID;
 use super::{schema_version, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
-use crate::assessment::Assessment;
+use crate::assessment::{Assessment, NewCharts};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedReference};
 use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
@@ -67,6 +67,7 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
         damage: undamaged_version.map(|_| damage.clone()),
     };
     Assessment {
+        estimate: None,
         model_digest: Digest::of(&[model.as_bytes()]),
         structure_digest: Digest::of(&[b"v1"]),
         undamaged_version,
@@ -85,6 +86,8 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
 
 fn undamaged() -> UndamagedReference {
     UndamagedReference {
+        process: None,
+        without_process: None,
         version: 0,
         threshold_probability: 0.05,
         measurements: 2,
@@ -247,7 +250,7 @@ async fn a_comparison_with_an_earlier_trained_baseline_does_not_prevent_the_next
         ("b1", assessment("new", None, at(3))),
         ("b0", assessment("new", None, at(3))),
     ] {
-        store.assessments().insert_assessment(&bridge(), id, &assessment, Vec::new()).await.unwrap();
+        store.assessments().insert_assessment(&bridge(), id, &assessment, NewCharts::default()).await.unwrap();
     }
     assert_eq!(declare("new").await, 2);
     assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b1"]);
@@ -269,14 +272,14 @@ async fn pages_of_exceedances_contain_each_current_one_once_and_newest_first() {
         } else {
             store
                 .assessments()
-                .insert_assessment(&bridge(), &id, &assessment("m", Some(1), at(1)), Vec::new())
+                .insert_assessment(&bridge(), &id, &assessment("m", Some(1), at(1)), NewCharts::default())
                 .await
                 .unwrap();
         }
     }
     store
         .assessments()
-        .insert_assessment(&bridge(), "b07", &assessment("later", None, at(9)), Vec::new())
+        .insert_assessment(&bridge(), "b07", &assessment("later", None, at(9)), NewCharts::default())
         .await
         .unwrap();
     for limit in 1..6 {

@@ -14,6 +14,7 @@ use super::error::Error;
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};
+use crate::process::reference::ReferenceProcess;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// A stored undamaged reference.
@@ -97,6 +98,7 @@ impl References<'_> {
                 insert_state(transaction, (&id, version), &state, &digest, now).await?;
                 insert_batches(transaction, (&id, version), &batches).await?;
                 insert_quantities(transaction, (&id, version), &state.quantities).await?;
+                insert_process(transaction, (&id, version), &state).await?;
                 // The open alarms refer to the earlier reference: the new charts raise them again where they persist.
                 sqlx::query(
                     "update alarm_episode set ended_at_us = $1
@@ -193,6 +195,23 @@ impl References<'_> {
         self.newest.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
     }
 
+    /// The process of a reference, or why there is none; neither for a reference of an earlier version of the program.
+    async fn process(
+        self,
+        structure: &StructureId,
+        version: u32,
+    ) -> Result<(Option<Arc<ReferenceProcess>>, Option<String>), Error> {
+        let row: Option<(Option<String>, Option<String>)> =
+            sqlx::query_as("select process, reason from undamaged_process where structure_id = $1 and version = $2")
+                .bind(structure.as_str())
+                .bind(version)
+                .fetch_optional(&self.database.reader)
+                .await?;
+        let Some((process, without)) = row else { return Ok((None, None)) };
+        let read = |text: String| serde_json::from_str(&text).map_err(|e| bad_row("undamaged process")(&e));
+        Ok((process.map(read).transpose()?.map(Arc::new), without))
+    }
+
     async fn read_undamaged(self, structure: &StructureId) -> Result<Option<ReferenceRecord>, Error> {
         let row: Option<(u32, String, i64, f64, i64, String, String)> = sqlx::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts
@@ -221,6 +240,7 @@ impl References<'_> {
         .fetch_all(&self.database.reader)
         .await?;
         let bad = bad_row("undamaged reference");
+        let (process, without_process) = self.process(structure, version).await?;
         let quantity = |row| quantity(row, measurements as usize);
         Ok(Some(ReferenceRecord {
             state: UndamagedReference {
@@ -230,12 +250,30 @@ impl References<'_> {
                 quantities: quantities.into_iter().map(quantity).collect::<Result<_, _>>()?,
                 conditions: serde_json::from_str(&conditions).map_err(|e| bad(&e))?,
                 doubts: serde_json::from_str(&doubts).map_err(|e| bad(&e))?,
+                process,
+                without_process,
             },
             model_digest: Digest::from_stored(model_digest),
             created_at: timestamp("undamaged reference", created)?,
             batches: batches.into_iter().map(|(id,)| id).collect(),
         }))
     }
+}
+
+/// Stores the process of a reference, or why there is none.
+async fn insert_process(
+    transaction: &mut Transaction<'_>,
+    (structure, version): Key<'_>,
+    state: &UndamagedReference,
+) -> Result<(), Error> {
+    sqlx::query("insert into undamaged_process values ($1, $2, $3, $4)")
+        .bind(structure)
+        .bind(version)
+        .bind(state.process.as_deref().map(to_json).transpose()?)
+        .bind(&state.without_process)
+        .execute(transaction.connection())
+        .await?;
+    Ok(())
 }
 
 /// Structure and version of a reference.

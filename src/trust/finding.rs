@@ -60,6 +60,8 @@ pub enum FindingCode {
     Uncalibrated,
     /// Parameters that these modes cannot distinguish.
     NotIdentifiable,
+    /// The measurements say hardly more about a parameter than its prior.
+    NotInformed,
     /// Modes that the emulator of a table reproduces badly.
     EmulatorDoubtful,
 }

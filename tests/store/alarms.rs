@@ -2,7 +2,7 @@
 
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
-use modalwatch::assessment::NewChartPoint;
+use modalwatch::assessment::{NewChartPoint, NewCharts};
 use modalwatch::store::{Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
@@ -22,12 +22,17 @@ async fn assess(
     shift: f64,
 ) {
     let settings = AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() };
-    let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, held: false };
+    let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, slow: None, held: false };
     let series = "k1".to_owned();
     let point = NewChartPoint { series, undamaged_version: 1, point, probability_limit: Some(0.3), settings };
     store
         .assessments()
-        .insert_assessment(&bridge(), id, &assessment("m", Some(1), measured.1), vec![point])
+        .insert_assessment(
+            &bridge(),
+            id,
+            &assessment("m", Some(1), measured.1),
+            NewCharts { points: vec![point], process: None },
+        )
         .await
         .unwrap();
 }

@@ -9,7 +9,7 @@ mod series;
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use modalwatch::assessment::{Assessment, BatchState};
+use modalwatch::assessment::{Assessment, BatchState, NewCharts};
 use modalwatch::damage::{ChartReference, Damage, Hyperparameters, QuantityAssessment, QuantityKind, SeenCovariate};
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
@@ -74,6 +74,7 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
         damage: undamaged_version.map(|_| damage.clone()),
     };
     Assessment {
+        estimate: None,
         model_digest: Digest::of(&[model.as_bytes()]),
         structure_digest: Digest::of(&[b"v1"]),
         undamaged_version,
@@ -107,7 +108,7 @@ async fn an_assessment_comes_back_as_it_was_given_and_the_newest_is_current() {
     store.batches().insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
     let (old, new) = (assessment("m1", None, at(1)), assessment("m2", None, at(2)));
     for given in [&old, &new, &old, &old] {
-        store.assessments().insert_assessment(&bridge(), "b1", given, Vec::new()).await.unwrap();
+        store.assessments().insert_assessment(&bridge(), "b1", given, NewCharts::default()).await.unwrap();
     }
     assert_eq!(store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap(), new);
     assert_eq!(store.batches().batch(&bridge(), "b1").await.unwrap().unwrap().state, BatchState::Assessed);
@@ -186,12 +187,16 @@ async fn a_new_undamaged_reference_sends_back_only_what_was_never_compared() {
         }
         store
             .assessments()
-            .insert_assessment(&bridge(), &id, &assessment("m", version, at(i)), Vec::new())
+            .insert_assessment(&bridge(), &id, &assessment("m", version, at(i)), NewCharts::default())
             .await
             .unwrap();
     }
     assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b1"]);
-    store.assessments().insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8)), Vec::new()).await.unwrap();
+    store
+        .assessments()
+        .insert_assessment(&bridge(), "b1", &assessment("m", Some(1), at(8)), NewCharts::default())
+        .await
+        .unwrap();
     assert_eq!(
         store.reference().insert_undamaged(&bridge(), &undamaged(), &model, &["b1".into()], at(9)).await.unwrap(),
         2
@@ -206,6 +211,8 @@ async fn a_new_undamaged_reference_sends_back_only_what_was_never_compared() {
 
 fn undamaged() -> modalwatch::damage::UndamagedReference {
     modalwatch::damage::UndamagedReference {
+        process: None,
+        without_process: None,
         version: 0,
         threshold_probability: 0.05,
         measurements: 2,

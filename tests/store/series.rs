@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use modalwatch::assessment::NewCharts;
 use modalwatch::damage::QuantityKind;
 use modalwatch::store::{Extent, SeriesWindow};
 use modalwatch::trust::{FindingCode, TrustVerdict};
@@ -183,11 +184,15 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
     }
     let mut old = assessment("m1", Some(1), at(1));
     old.quantities.iter_mut().for_each(|q| q.mean = 9.9);
-    store.assessments().insert_assessment(&bridge(), "b1", &old, Vec::new()).await.unwrap();
-    store.assessments().insert_assessment(&bridge(), "b1", &assessment("m2", None, at(2)), Vec::new()).await.unwrap();
+    store.assessments().insert_assessment(&bridge(), "b1", &old, NewCharts::default()).await.unwrap();
     store
         .assessments()
-        .insert_assessment(&bridge(), "b2", &assessment("m1", Some(1), at(1)), Vec::new())
+        .insert_assessment(&bridge(), "b1", &assessment("m2", None, at(2)), NewCharts::default())
+        .await
+        .unwrap();
+    store
+        .assessments()
+        .insert_assessment(&bridge(), "b2", &assessment("m1", Some(1), at(1)), NewCharts::default())
         .await
         .unwrap();
     let version = modalwatch::quantity::Digest::of(&[b"v1"]);
@@ -227,7 +232,7 @@ async fn the_packed_column_for_plots_agrees_with_the_rows() {
             given.quantities.reverse();
             given.quantities[0].name = "k9".to_owned();
         }
-        store.assessments().insert_assessment(&bridge(), &id, &given, Vec::new()).await.unwrap();
+        store.assessments().insert_assessment(&bridge(), &id, &given, NewCharts::default()).await.unwrap();
     }
     // More batches than points, so that the series is reduced.
     let window = SeriesWindow { points: 20, ..ALL };

@@ -5,12 +5,14 @@
 //! updated with the predictions of all of them.
 //!
 //! - [`experiment`]: a measurement; `condition`: the conditions in which it is made; `options`: those that are possible;
-//! - `predict`: what a fit predicts for it; `value`: the expected probability after it; `words`: its text.
+//! - `predict`: what a fit predicts for it; `simulated`: measurements drawn from that; `value`: the expected probability after it;
+//!   `words`: its text.
 
 mod condition;
 pub mod experiment;
 mod options;
 mod predict;
+mod simulated;
 mod value;
 mod words;
 
@@ -21,7 +23,8 @@ use super::rank::Ranked;
 use super::study::Study;
 use experiment::{Experiment, Kind, NextMeasurement};
 use predict::{Prediction, Predictor};
-use value::{repeats_to_wanted, value, Member, Normals, Value, DRAWS, FEWER_DRAWS, MOST_REPEATS, WANTED};
+use simulated::Normals;
+use value::{repeats_to_wanted, value, Member, Value, BLOCKS, FEWER_BLOCKS, MOST_REPEATS, SOME_BLOCKS, WANTED};
 
 /// Rows in each condition with which measurements are compared.
 const REPEATS: usize = 10;
@@ -31,14 +34,17 @@ const LEAST_PROBABILITY: f64 = 5e-3;
 const MOST_CANDIDATES: usize = 16;
 
 /// A law of a candidate below this probability is not simulated.
-const LEAST_OF_LAW: f64 = 2e-3;
+const LEAST_OF_LAW: f64 = 2e-2;
 
 /// Greatest number of measurements that are compared in full, beside the best of each kind and those that join two of them.
-const SHORT_LIST: usize = 20;
+const SHORT_LIST: usize = 8;
 
 /// Greatest number of measurements that are reported, and of those of one kind.
 const MOST_REPORTED: usize = 20;
 const MOST_OF_A_KIND: usize = 3;
+
+/// Measurements that are compared in full to distinguish two candidates, the best by few simulations.
+const LIKELY_BEST: usize = 3;
 
 /// Smallest expected probability with which a measurement is recommended for distinguishing two candidates of equal probability.
 const DISTINGUISHES: f64 = 0.6;
@@ -50,6 +56,8 @@ pub(super) struct Outlook<'a> {
     /// A candidate with one of its laws.
     members: Vec<LawOfCandidate<'a>>,
     options: Vec<Experiment>,
+    /// Number of the options that are single measurements; those that join two of them follow.
+    single: usize,
     /// `[options][members]`; `None` for a prediction that cannot be computed.
     predictions: Vec<Vec<Option<Prediction>>>,
     normals: Normals,
@@ -88,8 +96,9 @@ impl<'a> Outlook<'a> {
                 predictor: Predictor::new(study, fit, independent_share),
             }));
         }
-        let (predictions, normals) = (Vec::new(), Normals::new(1, 1));
-        let mut outlook = Self { study, ranked, members, options: Vec::new(), predictions, normals };
+        let (predictions, normals) = (Vec::new(), Normals::new(0, 0, 0));
+        let mut outlook =
+            Self { study, ranked, members, options: Vec::new(), single: options.len(), predictions, normals };
         outlook.add(options);
         outlook
     }
@@ -110,12 +119,12 @@ impl<'a> Outlook<'a> {
             }
         }
         let widths = self.predictions.iter().flatten().flatten().map(|p| p.mean.len());
-        self.normals = Normals::new(self.members.len(), widths.max().unwrap_or(0));
+        self.normals = Normals::new(self.members.len(), BLOCKS, widths.max().unwrap_or(0));
     }
 
     /// The value of an option for some candidates, given as places and probabilities that sum to 1; `None` if it cannot be
     /// computed for one of them.
-    fn value(&self, option: usize, candidates: &[(usize, f64)], repeats: usize, draws: usize) -> Option<Value> {
+    fn value(&self, option: usize, candidates: &[(usize, f64)], repeats: usize, blocks: usize) -> Option<Value> {
         let mut members = Vec::new();
         for (prediction, member) in self.predictions[option].iter().zip(&self.members) {
             let Some((_, probability)) = candidates.iter().find(|(place, _)| *place == member.candidate) else {
@@ -130,7 +139,7 @@ impl<'a> Outlook<'a> {
         for member in &mut members {
             member.probability /= total;
         }
-        value(&members, repeats, draws, &self.normals)
+        value(&members, repeats, blocks, &self.normals)
     }
 
     /// The measurements, the best first: those that reach [`WANTED`] with [`REPEATS`] rows or fewer in each condition, then by the
@@ -187,15 +196,16 @@ impl<'a> Outlook<'a> {
 
     /// The options by the expected probability of the right candidate after [`REPEATS`] rows, the best first.
     fn by_value(&self, candidates: &[(usize, f64)]) -> Vec<usize> {
-        let valued = |option: usize| Some((option, self.value(option, candidates, REPEATS, FEWER_DRAWS)?));
+        let valued = |option: usize| Some((option, self.value(option, candidates, REPEATS, FEWER_BLOCKS)?));
         let mut values: Vec<(usize, Value)> = (0..self.options.len()).into_par_iter().filter_map(valued).collect();
         values.sort_by(|a, b| b.1.probability.total_cmp(&a.1.probability));
         values.into_iter().map(|(option, _)| option).collect()
     }
 
     fn valued(&self, option: usize, candidates: &[(usize, f64)]) -> Option<Valued> {
-        let computed = |repeats: usize| self.value(option, candidates, repeats, DRAWS);
-        let (usual, most) = (computed(REPEATS)?, computed(MOST_REPEATS)?);
+        let computed = |repeats: usize| self.value(option, candidates, repeats, SOME_BLOCKS);
+        let usual = self.value(option, candidates, REPEATS, BLOCKS)?;
+        let most = computed(MOST_REPEATS)?;
         let with = |repeats: usize| match repeats {
             REPEATS => Some(usual),
             MOST_REPEATS => Some(most),
@@ -232,14 +242,19 @@ impl<'a> Outlook<'a> {
         measurement
     }
 
-    /// The measurement, in words, that best distinguishes two candidates, given as places, if both are equally probable.
+    /// The single measurement, in words, that best distinguishes two candidates, given as places, if both are equally probable.
     pub(super) fn distinguishing(&self, a: usize, b: usize) -> String {
         let candidates = [(a, 0.5), (b, 0.5)];
-        let valued = |option: usize| Some((option, self.value(option, &candidates, REPEATS, DRAWS)?.probability));
+        let valued = |option: usize, blocks: usize| {
+            Some((option, self.value(option, &candidates, REPEATS, blocks)?.probability))
+        };
         let key = |(option, probability): &(usize, f64)| {
             ((100.0 * probability).round() as i64, std::cmp::Reverse(self.options[*option].effort()))
         };
-        let best = (0..self.options.len()).filter_map(valued).max_by_key(key);
+        let mut roughly: Vec<(usize, f64)> =
+            (0..self.single).filter_map(|option| valued(option, FEWER_BLOCKS)).collect();
+        roughly.sort_by_key(|v| std::cmp::Reverse(key(v)));
+        let best = roughly.iter().take(LIKELY_BEST).filter_map(|(option, _)| valued(*option, BLOCKS)).max_by_key(key);
         let Some((option, _)) = best.filter(|(_, probability)| *probability >= DISTINGUISHES) else {
             return "none of the measurements that were considered".to_owned();
         };

@@ -12,28 +12,27 @@
 //! value of an experiment as an expectation over its outcomes; the probability of the right candidate takes the place of
 //! information here.
 
-use rand::Rng as _;
-use rand_distr::StandardNormal;
-
 use super::predict::Prediction;
-use crate::stats;
+use super::simulated::{Factored, Normals, LANES};
 
-/// Simulated measurements of a probable candidate, and of one with a probability below [`SELDOM`], which contributes little.
-pub(super) const DRAWS: usize = 64;
-pub(super) const FEWER_DRAWS: usize = 16;
+/// Simulated measurements of a probable candidate in blocks of [`LANES`]: for the value that is reported, for the number of repeats
+/// that suffices, and for a first comparison or a candidate with a probability below [`SELDOM`], which contributes little.
+pub(super) const BLOCKS: usize = 4;
+pub(super) const SOME_BLOCKS: usize = 2;
+pub(super) const FEWER_BLOCKS: usize = 1;
 const SELDOM: f64 = 0.1;
 
-/// Seed of the simulated measurements. It is fixed, so that the ranking depends on nothing but the data.
-const SEED: u64 = 1;
-
-/// Added to the variance of every quantity, as a share of it, so that its covariance can be factored.
-const RIDGE: f64 = 1e-9;
+/// Densities below exp(−40) of the largest are counted as zero.
+const NEGLIGIBLE_NATS: f64 = 40.0;
 
 /// Expected probability that a further measurement should reach.
 pub(super) const WANTED: f64 = 0.95;
 
+/// Numbers of repeats that are considered.
+const REPEATS_CONSIDERED: [usize; 13] = [1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 60, 80, 100];
+
 /// Greatest number of repeats that is considered.
-pub(super) const MOST_REPEATS: usize = 100;
+pub(super) const MOST_REPEATS: usize = REPEATS_CONSIDERED[REPEATS_CONSIDERED.len() - 1];
 
 /// The value of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,106 +53,30 @@ pub(super) struct Member<'a> {
     pub(super) prediction: &'a Prediction,
 }
 
-/// Standard normal numbers for the simulated measurements of each member.
-pub(super) struct Normals {
-    /// Quantities of one simulated measurement.
-    width: usize,
-    /// `[candidates][draws][width]`
-    values: Vec<Vec<f64>>,
-}
-
-impl Normals {
-    /// Numbers for measurements of at most `width` quantities.
-    pub(super) fn new(candidates: usize, width: usize) -> Self {
-        let own = |candidate: usize| {
-            let mut stream = stats::stream(SEED, &format!("next measurement of candidate {candidate}"));
-            (0..DRAWS * width).map(|_| stream.sample(StandardNormal)).collect()
-        };
-        Self { width, values: (0..candidates).map(own).collect() }
-    }
-
-    fn draw(&self, candidate: usize, draw: usize) -> &[f64] {
-        &self.values[candidate][draw * self.width..(draw + 1) * self.width]
-    }
-}
-
-/// A prediction for a number of repeats, with its covariance factored: S = L Lᵀ.
-struct Factored<'a> {
-    mean: &'a [f64],
-    /// L, by columns, `[q][q]`.
-    lower: Vec<f64>,
-    half_log_det: f64,
-}
-
-impl<'a> Factored<'a> {
-    fn new(prediction: &'a Prediction, repeats: usize) -> Option<Self> {
-        let mut covariance = &prediction.lasting + &prediction.of_row / repeats as f64;
-        for place in 0..covariance.nrows() {
-            covariance[(place, place)] *= 1.0 + RIDGE;
-        }
-        let lower = covariance.cholesky()?.l();
-        let half_log_det = lower.diagonal().iter().map(|l| l.ln()).sum();
-        let lower = lower.as_slice().to_vec();
-        Some(Self { mean: prediction.mean.as_slice(), lower, half_log_det })
-    }
-
-    /// Writes m + L z to `y`. Columns are added one after another, which the compiler turns into vector instructions.
-    fn simulate(&self, z: &[f64], y: &mut [f64]) {
-        let q = y.len();
-        y.copy_from_slice(self.mean);
-        for (column, z) in z.iter().enumerate() {
-            let below = &self.lower[column * q + column..(column + 1) * q];
-            y[column..].iter_mut().zip(below).for_each(|(y, l)| *y += l * z);
-        }
-    }
-
-    /// ln N(y; m, S) without the factor of 2π; `left` is overwritten.
-    fn log_density(&self, y: &[f64], left: &mut [f64]) -> f64 {
-        let q = y.len();
-        for (left, (y, mean)) in left.iter_mut().zip(y.iter().zip(self.mean)) {
-            *left = y - mean;
-        }
-        let mut distance = 0.0;
-        for column in 0..q {
-            let own = &self.lower[column * q + column..(column + 1) * q];
-            let white = left[column] / own[0];
-            distance += white * white;
-            left[column + 1..].iter_mut().zip(&own[1..]).for_each(|(left, l)| *left -= l * white);
-        }
-        -0.5 * distance - self.half_log_det
-    }
-}
-
-/// The value of a measurement with `repeats` rows in each condition, from at most `draws` simulated measurements of each member; the
-/// probabilities of the members sum to 1. `None` if a covariance is not positive definite.
-pub(super) fn value(members: &[Member<'_>], repeats: usize, draws: usize, normals: &Normals) -> Option<Value> {
+/// The value of a measurement with `repeats` rows in each condition, from at most `blocks` blocks of simulated measurements of each
+/// member; the probabilities of the members sum to 1. `None` if a covariance is not positive definite.
+pub(super) fn value(members: &[Member<'_>], repeats: usize, blocks: usize, normals: &Normals) -> Option<Value> {
     let factored = members.iter().map(|m| Factored::new(m.prediction, repeats)).collect::<Option<Vec<_>>>()?;
+    let log_probabilities: Vec<f64> = members.iter().map(|m| m.probability.ln()).collect();
     let q = members.first()?.prediction.mean.len();
-    let (mut y, mut left) = (vec![0.0; q], vec![0.0; q]);
-    let mut logs = vec![0.0; factored.len()];
+    let (mut y, mut left) = (vec![[0.0; LANES]; q], vec![[0.0; LANES]; q]);
+    let mut logs = vec![[0.0; LANES]; members.len()];
     let (mut expected, mut variance) = (0.0, 0.0);
     for (truth, own) in factored.iter().enumerate() {
         let (mut sum, mut squares) = (0.0, 0.0);
-        let draws = if members[truth].probability < SELDOM { FEWER_DRAWS.min(draws) } else { draws };
-        for draw in 0..draws {
-            own.simulate(&normals.draw(truth, draw)[..q], &mut y);
-            for (log, (other, member)) in logs.iter_mut().zip(factored.iter().zip(members)) {
-                *log = other.log_density(&y, &mut left) + member.probability.ln();
+        let blocks = if members[truth].probability < SELDOM { FEWER_BLOCKS.min(blocks) } else { blocks };
+        for block in 0..blocks {
+            own.simulate(normals.block(truth, block, q), &mut y);
+            for ((logs, other), log_probability) in logs.iter_mut().zip(&factored).zip(&log_probabilities) {
+                *logs = other.log_densities(&y, &mut left).map(|log| log + log_probability);
             }
-            let largest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            let (mut total, mut of_truth) = (0.0, 0.0);
-            for (log, member) in logs.iter().zip(members) {
-                let weight = (log - largest).exp();
-                total += weight;
-                if member.candidate == members[truth].candidate {
-                    of_truth += weight;
-                }
+            for lane in 0..LANES {
+                let right = share_of(members[truth].candidate, members, |member| logs[member][lane]);
+                sum += right;
+                squares += right * right;
             }
-            let right = of_truth / total;
-            sum += right;
-            squares += right * right;
         }
-        let (n, p) = (draws as f64, members[truth].probability);
+        let (n, p) = ((blocks * LANES) as f64, members[truth].probability);
         let mean = sum / n;
         expected += p * mean;
         variance += p * p * (squares / n - mean * mean).max(0.0) / (n - 1.0);
@@ -161,26 +84,39 @@ pub(super) fn value(members: &[Member<'_>], repeats: usize, draws: usize, normal
     Some(Value { probability: expected, standard_error: variance.sqrt() })
 }
 
-/// The smallest number of repeats with which the value reaches [`WANTED`], by bisection between a number with which it does not and
-/// one with which it does; `None` if it does not with the larger one. `value_with`: the value as a function of the number of
-/// repeats.
+/// Probability of a candidate, given the logarithms of the probability of each member to some factor.
+fn share_of(candidate: usize, members: &[Member<'_>], log: impl Fn(usize) -> f64) -> f64 {
+    let largest = (0..members.len()).map(&log).fold(f64::NEG_INFINITY, f64::max);
+    let (mut total, mut of_candidate) = (0.0, 0.0);
+    for (place, member) in members.iter().enumerate() {
+        let nats = log(place) - largest;
+        if nats > -NEGLIGIBLE_NATS {
+            let weight = nats.exp();
+            total += weight;
+            if member.candidate == candidate {
+                of_candidate += weight;
+            }
+        }
+    }
+    of_candidate / total
+}
+
+/// The smallest number of repeats, of those considered, with which the value reaches [`WANTED`], by bisection between a number with
+/// which it does not, or 0, and one with which it does; `None` if it does not with the larger one. `value_with`: the value as a
+/// function of the number of repeats.
 pub(super) fn repeats_to_wanted(
     value_with: impl Fn(usize) -> Option<Value>,
-    (mut too_few, mut sufficient): (usize, usize),
+    (too_few, sufficient): (usize, usize),
 ) -> Option<usize> {
     let enough = |repeats: usize| value_with(repeats).is_some_and(|v| v.probability >= WANTED);
     if !enough(sufficient) {
         return None;
     }
-    while sufficient - too_few > 1 {
-        let middle = usize::midpoint(too_few, sufficient);
-        if enough(middle) {
-            sufficient = middle;
-        } else {
-            too_few = middle;
-        }
-    }
-    Some(sufficient)
+    let first = REPEATS_CONSIDERED.partition_point(|repeats| *repeats <= too_few);
+    let last = REPEATS_CONSIDERED.partition_point(|repeats| *repeats < sufficient);
+    let between = &REPEATS_CONSIDERED[first..last];
+    let place = between.partition_point(|repeats| !enough(*repeats));
+    Some(between.get(place).copied().unwrap_or(sufficient))
 }
 
 #[cfg(test)]
@@ -224,10 +160,10 @@ mod tests {
 
     #[test]
     fn the_value_of_two_normal_predictions_equals_the_integral() {
-        let normals = Normals::new(2, 3);
+        let normals = Normals::new(2, BLOCKS, 3);
         for distance in [0.0, 0.5, 1.0, 2.0, 4.0] {
             let (a, b) = (normal(0.0, 1.0), normal(distance, 1.0));
-            let found = value(&members([&a, &b], [0.5, 0.5]), 1, DRAWS, &normals).unwrap();
+            let found = value(&members([&a, &b], [0.5, 0.5]), 1, BLOCKS, &normals).unwrap();
             let exact = by_quadrature(distance);
             // Four standard errors of the simulation; 1e-12 where all draws agree.
             let allowed = 4.0 * found.standard_error + 1e-12;
@@ -237,19 +173,19 @@ mod tests {
 
     #[test]
     fn n_repeats_have_the_value_of_a_distance_larger_by_the_root_of_n_and_equal_predictions_have_none() {
-        let normals = Normals::new(2, 1);
+        let normals = Normals::new(2, BLOCKS, 1);
         let (a, near, far) = (normal(0.0, 1.0), normal(1.0, 1.0), normal(3.0, 1.0));
-        let repeated = value(&members([&a, &near], [0.3, 0.7]), 9, DRAWS, &normals).unwrap();
-        let distant = value(&members([&a, &far], [0.3, 0.7]), 1, DRAWS, &normals).unwrap();
+        let repeated = value(&members([&a, &near], [0.3, 0.7]), 9, BLOCKS, &normals).unwrap();
+        let distant = value(&members([&a, &far], [0.3, 0.7]), 1, BLOCKS, &normals).unwrap();
         assert!((repeated.probability - distant.probability).abs() < 1e-9, "{repeated:?} {distant:?}");
         // Without information the expected probability is Σ p².
-        let none = value(&members([&a, &a], [0.3, 0.7]), 5, DRAWS, &normals).unwrap();
+        let none = value(&members([&a, &a], [0.3, 0.7]), 5, BLOCKS, &normals).unwrap();
         assert!((none.probability - 0.58).abs() < 1e-12 && none.standard_error < 1e-9, "{none:?}");
     }
 
     #[test]
     fn two_laws_of_one_candidate_need_not_be_told_apart() {
-        let normals = Normals::new(3, 1);
+        let normals = Normals::new(3, BLOCKS, 1);
         let (a, b, c) = (normal(0.0, 1.0), normal(0.0, 1.0), normal(1.0, 1.0));
         let of = |candidates: [usize; 3]| {
             let one = |(place, prediction)| Member {
@@ -258,9 +194,9 @@ mod tests {
                 prediction,
             };
             let members: Vec<Member<'_>> = [&a, &b, &c].into_iter().enumerate().map(one).collect();
-            value(&members, 4, DRAWS, &normals).unwrap().probability
+            value(&members, 4, BLOCKS, &normals).unwrap().probability
         };
-        let one = value(&members([&a, &c], [0.5, 0.5]), 4, DRAWS, &Normals::new(2, 1)).unwrap();
+        let one = value(&members([&a, &c], [0.5, 0.5]), 4, BLOCKS, &Normals::new(2, BLOCKS, 1)).unwrap();
         // The laws are the same, so that their candidate is as probable as with one law. Four standard errors.
         assert!((of([0, 0, 1]) - one.probability).abs() < 4.0 * one.standard_error, "{one:?}");
         assert!(of([0, 1, 2]) < of([0, 0, 1]) - 0.1);
@@ -268,12 +204,13 @@ mod tests {
 
     #[test]
     fn the_number_of_repeats_is_the_smallest_that_suffices() {
-        let normals = Normals::new(2, 1);
+        let normals = Normals::new(2, BLOCKS, 1);
         let (a, b) = (normal(0.0, 1.0), normal(1.0, 1.0));
-        let with = |repeats: usize| value(&members([&a, &b], [0.5, 0.5]), repeats, DRAWS, &normals);
+        let with = |repeats: usize| value(&members([&a, &b], [0.5, 0.5]), repeats, BLOCKS, &normals);
         let repeats = repeats_to_wanted(with, (0, MOST_REPEATS)).unwrap();
-        assert!(with(repeats).unwrap().probability >= WANTED && with(repeats - 1).unwrap().probability < WANTED);
-        let never = |_| value(&members([&a, &a], [0.5, 0.5]), 1, DRAWS, &normals);
+        let fewer = *REPEATS_CONSIDERED.iter().rfind(|considered| **considered < repeats).unwrap();
+        assert!(with(repeats).unwrap().probability >= WANTED && with(fewer).unwrap().probability < WANTED);
+        let never = |_| value(&members([&a, &a], [0.5, 0.5]), 1, BLOCKS, &normals);
         assert_eq!(repeats_to_wanted(never, (0, MOST_REPEATS)), None);
     }
 }

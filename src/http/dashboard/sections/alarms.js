@@ -15,6 +15,8 @@ const PAST_SHOWN = 2;
 
 /** A description of an alarm. */
 export function alarmWords(alarm) {
+  if (alarm.kind === "damage" && alarm.sentence) return alarm.sentence;
+  if (alarm.kind === "damage" && !alarm.parameter) return "the parameters together have shifted towards damage";
   if (alarm.kind === "damage")
     return `${alarm.parameter} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
   if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit the measurements";

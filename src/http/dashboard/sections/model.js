@@ -161,6 +161,7 @@ function undamaged(state) {
       ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}`],
       ["Limit", `probability of damage above ${percent(state.threshold_probability)}`],
       conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
+      ["Movement in time", seasonWords(state)],
     ]),
     state.doubts.length > 0 &&
       h(
@@ -199,6 +200,19 @@ function undamaged(state) {
       ),
     ),
   ];
+}
+
+/** What the reference shows of the movement of the parameters in time. */
+function seasonWords(state) {
+  const process = state.process;
+  if (!process) return `batches are taken as independent${state.without_process ? `: ${state.without_process}` : ""}`;
+  const factors = process.factor_correlations.map((c) => number(c, 2)).join(", ");
+  const common =
+    process.factor_correlations.length > 0
+      ? `${count(process.factor_correlations.length, "common factor")} without a measured cause (correlation of successive batches ${factors})`
+      : "no common factor";
+  const covariates = process.covariates.length > 0 ? `; influence of ${process.covariates.join(", ")}` : "";
+  return `${common}${covariates}`;
 }
 
 function firstStep(info, batches) {

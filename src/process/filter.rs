@@ -1,0 +1,144 @@
+//! Kalman filter of a process.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::estimate::Observation;
+use super::model::{Numbers, Process};
+
+/// What is known about the states after some observations: normal with this mean and covariance.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Known {
+    /// `[q + d]`
+    pub mean: DVector<f64>,
+    /// `[q + d, q + d]`
+    pub covariance: DMatrix<f64>,
+}
+
+/// What an observation adds to the prediction from those before it.
+#[derive(Debug, Clone)]
+pub struct Innovation {
+    /// Indices of the quantities that are informed, `[o]`.
+    pub informed: Vec<usize>,
+    /// Difference ν of observation and prediction, `[o]`.
+    pub difference: DVector<f64>,
+    /// Inverse of its covariance S, `[o, o]`.
+    pub precision: DMatrix<f64>,
+    /// ln det S.
+    pub log_det: f64,
+    /// Gain K, `[q + d, o]`.
+    pub gain: DMatrix<f64>,
+    /// Factor by which each state decayed since the observation before, `[q + d]`.
+    pub decay: DVector<f64>,
+    /// The prediction of all quantities in standardised units, `[d]`.
+    pub predicted: DVector<f64>,
+}
+
+/// The filter of a process.
+pub struct Filter {
+    numbers: Numbers,
+    contributions: DMatrix<f64>,
+    /// Covariances of the columns of Λ; empty if they are taken as known.
+    loading_covariances: Vec<DMatrix<f64>>,
+}
+
+impl Filter {
+    /// The filter with numbers that are taken as known exactly, as in the likelihood.
+    pub fn exact(numbers: Numbers) -> Self {
+        let contributions = numbers.contributions();
+        Self { numbers, contributions, loading_covariances: Vec::new() }
+    }
+
+    /// The filter of a fitted process. What its reference leaves unknown about the common factors widens the predictions, the more
+    /// the further the factors lie from those seen.
+    pub fn of(process: &Process) -> Self {
+        Self { loading_covariances: process.loading_covariances(), ..Self::exact(process.in_operation()) }
+    }
+
+    /// The numbers of the process.
+    pub fn numbers(&self) -> &Numbers {
+        &self.numbers
+    }
+
+    /// H, `[d, q + d]`.
+    pub fn contributions(&self) -> &DMatrix<f64> {
+        &self.contributions
+    }
+
+    /// Before any observation: the stationary distribution.
+    pub fn start(&self) -> Known {
+        let n = self.numbers.variance.len();
+        Known { mean: DVector::zeros(n), covariance: DMatrix::from_diagonal(&self.numbers.variance) }
+    }
+
+    /// What is known about the states some steps later, and the factors by which they decayed.
+    pub fn predict(&self, known: &Known, steps: f64) -> (Known, DVector<f64>) {
+        let decay = self.numbers.persistence.map(|f| f.powf(steps));
+        let mut covariance = known.covariance.clone();
+        for ((i, j), element) in indices(covariance.nrows()).zip(covariance.iter_mut()) {
+            *element *= decay[i] * decay[j];
+            if i == j {
+                *element += self.numbers.variance[i] * (1.0 - decay[i] * decay[i]);
+            }
+        }
+        (Known { mean: known.mean.component_mul(&decay), covariance }, decay)
+    }
+
+    /// Takes an observation into account. `predicted`: what is known before it, at its time; `decay` as [`Self::predict`] gives it.
+    /// `None` if the covariance of the innovation is not positive definite.
+    ///
+    /// ```text
+    ///  ν = x̂ − μ − B c − H a,    S = H P Hᵀ + κ V + Σ_j h_j² C_j,    K = P Hᵀ S⁻¹
+    ///  a ← a + K ν,    P ← P − K H P
+    /// ```
+    ///
+    /// a, P: mean and covariance of the states; C_j: covariance of column j of Λ, with the h_j that the observation itself shows.
+    pub fn update(
+        &self,
+        (predicted, decay): (&Known, DVector<f64>),
+        observation: &Observation,
+    ) -> Option<(Known, Innovation)> {
+        let numbers = &self.numbers;
+        let all = &numbers.mean + &numbers.slopes * &observation.covariates + &self.contributions * &predicted.mean;
+        let informed = &observation.informed;
+        let h = self.contributions.select_rows(informed);
+        let difference = &observation.mean - all.select_rows(informed);
+        let cross = &predicted.covariance * h.transpose();
+        let errors = &h * &cross + numbers.noise * &observation.covariance;
+        let mut factored = errors.clone().cholesky()?;
+        if !self.loading_covariances.is_empty() && !informed.is_empty() {
+            let seen = &predicted.mean + &cross * factored.solve(&difference);
+            let mut widened = errors;
+            for (factor, covariance) in self.loading_covariances.iter().enumerate() {
+                widened += seen[factor].powi(2) * covariance.select_rows(informed).select_columns(informed);
+            }
+            factored = widened.cholesky()?;
+        }
+        let gain = factored.solve(&cross.transpose()).transpose();
+        let mean = &predicted.mean + &gain * &difference;
+        let mut covariance = &predicted.covariance - &gain * cross.transpose();
+        // Rounding makes the difference slightly asymmetric.
+        covariance = (&covariance + covariance.transpose()) * 0.5;
+        let log_det = 2.0 * factored.l_dirty().diagonal().iter().map(|l| l.ln()).sum::<f64>();
+        let innovation = Innovation {
+            informed: informed.clone(),
+            difference,
+            precision: factored.inverse(),
+            log_det,
+            gain,
+            decay,
+            predicted: all,
+        };
+        Some((Known { mean, covariance }, innovation))
+    }
+
+    /// Predicts to the time of an observation and takes it into account.
+    pub fn step(&self, known: &Known, observation: &Observation) -> Option<(Known, Innovation)> {
+        let (predicted, decay) = self.predict(known, observation.steps);
+        self.update((&predicted, decay), observation)
+    }
+}
+
+/// Rows and columns of the elements of a square matrix in the order of its memory.
+fn indices(n: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..n).flat_map(move |j| (0..n).map(move |i| (i, j)))
+}

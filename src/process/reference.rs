@@ -1,0 +1,261 @@
+//! The process of an undamaged reference, and the chain of batches that are compared with it.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
+
+use super::change::{change, evidence, signs, Evidence, LossEvidence, WINDOW};
+use super::estimate::BatchEstimate;
+use super::filter::{Filter, Innovation, Known};
+use super::fit::{fit, observations, Error, Quantities};
+use super::limits::{limits, Limits};
+use super::model::Process;
+use crate::parameter::DamageDirection;
+use crate::quantity::Timestamp;
+
+/// Name of the chart of all quantities together; no parameter can have a colon in its name.
+pub const JOINT_SERIES: &str = "structure:joint";
+
+/// Seed of the simulated limits. It is fixed, so that they depend on nothing but the reference and the wanted run length.
+const SEED: u64 = 1;
+
+/// 95 % quantile of the normal distribution, for intervals of 90 %.
+const NORMAL_95: f64 = 1.645;
+
+/// The process of an undamaged reference with the limits of its charts.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ReferenceProcess {
+    /// The process.
+    pub process: Process,
+    /// Which change of each quantity indicates damage, `[d]`.
+    pub directions: Vec<DamageDirection>,
+    /// Limits of the charts.
+    pub limits: Limits,
+    /// Mean number of healthy batches to a false alarm for which the limits were computed.
+    pub mean_run_batches: f64,
+    /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
+    end: Vec<f64>,
+}
+
+/// A lasting change on a chart that is above its limit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct LastingChange {
+    /// Whether the fast chart is above its limit, which finds steps; otherwise only the slow one is, which finds small lasting losses.
+    pub fast: bool,
+    /// Time of the first batch after the most probable onset.
+    pub onset: Timestamp,
+    /// Interval of 90 % for the onset: from the last batch before it to the first one after it.
+    pub onset_interval: [Timestamp; 2],
+    /// Change of each quantity that takes part.
+    pub changes: Vec<QuantityChange>,
+}
+
+/// The change of a quantity since an onset.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct QuantityChange {
+    /// Its name.
+    pub name: String,
+    /// Its unit.
+    pub unit: String,
+    /// Most probable change that the process does not explain, in the unit of the quantity.
+    pub change: f64,
+    /// Its interval of 90 %.
+    pub interval: [f64; 2],
+    /// Mean of the quantity in the reference, in its unit.
+    pub reference_mean: f64,
+    /// Difference from that mean that the weather and other healthy causes explain at the newest batch, in its unit.
+    pub explained: f64,
+}
+
+/// A batch on the charts of a process.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProcessPoint {
+    /// Evidence for a loss.
+    pub evidence: LossEvidence,
+    /// The changes by the series of the charts that are above a limit.
+    pub changes: BTreeMap<String, LastingChange>,
+}
+
+/// Batches that are compared with the process, in the order of their times.
+#[derive(Clone)]
+pub struct Chain<'a> {
+    reference: &'a ReferenceProcess,
+    filter: &'a Filter,
+    signs: Vec<f64>,
+    known: Known,
+    before: Option<Timestamp>,
+    /// The last innovations with the times of their batches and of the batches before, at most [`WINDOW`].
+    innovations: Vec<Innovation>,
+    times: Vec<[Timestamp; 2]>,
+}
+
+impl ReferenceProcess {
+    /// Fits the process to the batches of a reference, in any order, and simulates its limits.
+    ///
+    /// # Errors
+    /// [`Error`], see its variants.
+    pub fn new(
+        quantities: &Quantities,
+        covariates: &[String],
+        mut estimates: Vec<BatchEstimate>,
+        mean_run_batches: f64,
+    ) -> Result<Self, Error> {
+        estimates.sort_by_key(|estimate| estimate.at);
+        let process = fit(quantities, covariates, &estimates)?;
+        let singular = || Error::Search("a covariance is not positive definite".to_owned());
+        let limits = limits(&process, &signs(&quantities.directions), mean_run_batches, SEED).ok_or_else(singular)?;
+        let filter = Filter::of(&process);
+        let mut known = filter.start();
+        for observation in observations(&process, &estimates) {
+            known = filter.step(&known, &observation).ok_or_else(singular)?.0;
+        }
+        Ok(Self {
+            process,
+            directions: quantities.directions.clone(),
+            limits,
+            mean_run_batches,
+            end: known.to_numbers(),
+        })
+    }
+
+    /// The names of its charts: each quantity with a damage direction, then all together if there are several.
+    pub fn series(&self) -> Vec<String> {
+        let charted =
+            self.process.quantities.iter().zip(&self.directions).filter(|(_, d)| **d != DamageDirection::None);
+        let mut names: Vec<String> = charted.map(|(name, _)| name.clone()).collect();
+        if names.len() > 1 {
+            names.push(JOINT_SERIES.to_owned());
+        }
+        names
+    }
+
+    /// The limits of a series.
+    pub fn limits_of(&self, series: &str) -> Evidence {
+        if series == JOINT_SERIES {
+            self.limits.joint
+        } else {
+            self.limits.quantity
+        }
+    }
+}
+
+impl ProcessPoint {
+    /// The evidence on a chart; `None` if the batch does not inform its quantity.
+    pub fn of_series(&self, reference: &ReferenceProcess, series: &str) -> Option<Evidence> {
+        if series == JOINT_SERIES {
+            return self.evidence.joint;
+        }
+        let k = reference.process.quantities.iter().position(|name| name == series)?;
+        self.evidence.quantities[k]
+    }
+}
+
+impl Known {
+    /// Mean, then covariance by columns.
+    pub fn to_numbers(&self) -> Vec<f64> {
+        self.mean.iter().chain(self.covariance.iter()).copied().collect()
+    }
+
+    /// The inverse of [`Self::to_numbers`]; `None` if the number of values does not fit.
+    pub fn from_numbers(numbers: &[f64]) -> Option<Self> {
+        let n = (1..=numbers.len()).find(|n| n + n * n >= numbers.len()).filter(|n| n + n * n == numbers.len())?;
+        let (mean, covariance) = numbers.split_at(n);
+        Some(Self { mean: DVector::from_column_slice(mean), covariance: DMatrix::from_column_slice(n, n, covariance) })
+    }
+}
+
+impl<'a> Chain<'a> {
+    /// The chain before its first batch, which was measured at `first`: after the reference it continues from the states there.
+    pub fn start(reference: &'a ReferenceProcess, filter: &'a Filter, first: Timestamp) -> Self {
+        let end = reference.process.period[1];
+        let continued = Known::from_numbers(&reference.end).filter(|_| first > end);
+        let before = continued.as_ref().map(|_| end);
+        Self {
+            known: continued.unwrap_or_else(|| filter.start()),
+            before,
+            signs: signs(&reference.directions),
+            reference,
+            filter,
+            innovations: Vec::new(),
+            times: Vec::new(),
+        }
+    }
+
+    /// The chain after a batch at `at`, where the states were `known`.
+    pub fn resume(reference: &'a ReferenceProcess, filter: &'a Filter, known: Known, at: Timestamp) -> Self {
+        Self { known, before: Some(at), ..Self::start(reference, filter, at) }
+    }
+
+    /// What is known about the states after the last batch.
+    pub fn known(&self) -> &Known {
+        &self.known
+    }
+
+    /// Adds a batch, without its evidence. Returns whether it could be added.
+    pub fn pass(&mut self, estimate: &BatchEstimate) -> bool {
+        let end = self.reference.process.period[1];
+        if self.before.is_some_and(|before| before <= end) && estimate.at > end && !self.innovations.is_empty() {
+            // The batches so far were measured before the end of the reference, which says more about the states after it.
+            *self = Self::start(self.reference, self.filter, estimate.at);
+        }
+        let observation = self.reference.process.observation(estimate, self.before);
+        if observation.informed.is_empty() {
+            return false;
+        }
+        let Some((known, innovation)) = self.filter.step(&self.known, &observation) else { return false };
+        self.known = known;
+        if self.innovations.len() == WINDOW {
+            self.innovations.remove(0);
+            self.times.remove(0);
+        }
+        self.innovations.push(innovation);
+        self.times.push([self.before.unwrap_or(estimate.at), estimate.at]);
+        self.before = Some(estimate.at);
+        true
+    }
+
+    /// Adds a batch and returns its point on the charts; `None` if it informs no quantity.
+    pub fn take(&mut self, estimate: &BatchEstimate) -> Option<ProcessPoint> {
+        self.pass(estimate).then(|| {
+            let evidence = evidence(&self.innovations, self.filter.contributions(), &self.signs);
+            let mut point = ProcessPoint { evidence, changes: BTreeMap::new() };
+            for series in self.reference.series() {
+                let limits = self.reference.limits_of(&series);
+                let above =
+                    point.of_series(self.reference, &series).filter(|e| e.fast > limits.fast || e.slow > limits.slow);
+                let change = above.and_then(|evidence| self.change(&series, evidence.fast > limits.fast));
+                point.changes.extend(change.map(|change| (series, change)));
+            }
+            point
+        })
+    }
+
+    /// The change on a chart that is above its limit.
+    fn change(&self, series: &str, fast: bool) -> Option<LastingChange> {
+        let process = &self.reference.process;
+        let only = process.quantities.iter().position(|name| name == series);
+        let found = change(&self.innovations, self.filter.contributions(), &self.signs, only)?;
+        let newest = self.innovations.last()?;
+        let numbers = self.filter.numbers();
+        let quantity = |(k, loss): (usize, &Option<(f64, f64)>)| {
+            let (mean, std) = (*loss)?;
+            let (scale, sign) = (process.scales[k], self.signs[k]);
+            let ends = [mean - NORMAL_95 * std, mean + NORMAL_95 * std].map(|end| sign * scale.unit * end);
+            Some(QuantityChange {
+                name: process.quantities[k].clone(),
+                unit: process.units[k].clone(),
+                change: sign * scale.unit * mean,
+                interval: [ends[0].min(ends[1]), ends[0].max(ends[1])],
+                reference_mean: scale.origin + scale.unit * numbers.mean[k],
+                explained: scale.unit * (newest.predicted[k] - numbers.mean[k]),
+            })
+        };
+        Some(LastingChange {
+            fast,
+            onset: self.times[found.onset][1],
+            onset_interval: [self.times[found.onset_interval[0]][0], self.times[found.onset_interval[1]][1]],
+            changes: found.losses.iter().enumerate().filter_map(quantity).collect(),
+        })
+    }
+}

@@ -1,0 +1,226 @@
+//! Batches on the charts of the process behind an undamaged reference.
+//!
+//! What a batch shows depends on the batches before it. Each stored batch keeps its estimate and what was known about the process after
+//! it, so that a new batch continues from there; one that arrives late is inserted at its time, and the later ones are computed again.
+
+use sqlx::FromRow;
+
+use super::chart_episode::Charted;
+use super::chart_point::ChartPosition;
+use super::column::{bad_row, from_blob, to_blob};
+use super::error::Error;
+use super::transaction::Transaction;
+use crate::alarm::chart::ChartPoint;
+use crate::assessment::{NewChartPoint, NewProcessPoint};
+use crate::process::change::WINDOW;
+use crate::process::estimate::BatchEstimate;
+use crate::process::filter::{Filter, Known};
+use crate::process::reference::{Chain, ProcessPoint, ReferenceProcess};
+use crate::quantity::Timestamp;
+
+/// Later batches that are computed again at most when one arrives late.
+const MOST_LATER: usize = 2_000;
+
+/// States that differ by less than this in standardised units are equal: the influence of a late batch has faded.
+const FADED: f64 = 1e-6;
+
+/// The points of a batch on the charts of its process.
+pub(super) struct OnProcess {
+    pub points: Vec<NewChartPoint>,
+    /// The last position of a later batch that was computed again; `None` if there is none.
+    pub changed_to: Option<ChartPosition>,
+}
+
+#[derive(FromRow)]
+struct ProcessRow {
+    measured_to_us: i64,
+    batch_id: String,
+    estimate: String,
+    held: bool,
+    known: Vec<u8>,
+}
+
+impl ProcessRow {
+    fn estimate(&self) -> Result<BatchEstimate, Error> {
+        serde_json::from_str(&self.estimate).map_err(|e| bad_row("process point")(&e))
+    }
+
+    fn known(&self) -> Result<Known, Error> {
+        Known::from_numbers(&from_blob("process point", &self.known)?)
+            .ok_or_else(|| bad_row("process point")(&"the states"))
+    }
+
+    fn at(&self) -> Result<Timestamp, Error> {
+        super::column::timestamp("process point", self.measured_to_us)
+    }
+}
+
+/// Inserts a batch into the chain of its reference, computes the later ones again, and returns its points on the charts.
+pub(super) async fn follow(
+    transaction: &mut Transaction<'_>,
+    batch: &Charted<'_>,
+    new: &NewProcessPoint,
+) -> Result<OnProcess, Error> {
+    let reference: &ReferenceProcess = &new.reference;
+    let filter = Filter::of(&reference.process);
+    let before = before(transaction, batch, new.undamaged_version).await?;
+    let mut chain = match before.first() {
+        None => Chain::start(reference, &filter, new.estimate.at),
+        Some(first) => Chain::resume(reference, &filter, first.known()?, first.at()?),
+    };
+    for row in before.iter().skip(1) {
+        chain.pass(&row.estimate()?);
+    }
+    let held = new.held || batch.maintained;
+    // A batch that is held is compared with the chain but does not become part of it.
+    let point = if held { chain.clone().take(&new.estimate) } else { chain.take(&new.estimate) };
+    write(transaction, batch, new, held, (&chain, point.as_ref())).await?;
+    let mut changed_to = None;
+    let mut unchanged = 0;
+    for row in after(transaction, batch, new.undamaged_version).await? {
+        if row.held {
+            continue;
+        }
+        let again = chain.take(&row.estimate()?);
+        let old = row.known()?;
+        let same = (&old.mean - &chain.known().mean).amax() < FADED;
+        unchanged = if same { unchanged + 1 } else { 0 };
+        changed_to = Some((row.measured_to_us, row.batch_id.clone()));
+        write_again(transaction, batch, new, &row, (&chain, again.as_ref())).await?;
+        // The window of the test reaches back over the batches whose states were different.
+        if unchanged > WINDOW {
+            break;
+        }
+    }
+    let points = point.map_or_else(Vec::new, |point| points(new, &point, held));
+    Ok(OnProcess { points, changed_to })
+}
+
+fn points(new: &NewProcessPoint, point: &ProcessPoint, held: bool) -> Vec<NewChartPoint> {
+    let of_series = |series: String| {
+        let (evidence, limits) = (point.of_series(&new.reference, &series)?, new.reference.limits_of(&series));
+        Some(NewChartPoint {
+            point: ChartPoint {
+                shift: evidence.fast,
+                limit: limits.fast,
+                ewma_limit: limits.slow,
+                slow: Some(evidence.slow),
+                held,
+            },
+            series,
+            undamaged_version: new.undamaged_version,
+            probability_limit: None,
+            settings: new.settings,
+        })
+    };
+    new.reference.series().into_iter().filter_map(of_series).collect()
+}
+
+/// The last batches of the chain before a position, the oldest first.
+async fn before(
+    transaction: &mut Transaction<'_>,
+    batch: &Charted<'_>,
+    version: u32,
+) -> Result<Vec<ProcessRow>, Error> {
+    let mut rows: Vec<ProcessRow> = sqlx::query_as(
+        "select measured_to_us, batch_id, estimate, held, known from process_point
+         where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) < ($3, $4) and held = 0
+         order by measured_to_us desc, batch_id desc limit $5",
+    )
+    .bind(batch.structure)
+    .bind(version)
+    .bind(batch.position.0)
+    .bind(&batch.position.1)
+    .bind(WINDOW as i64)
+    .fetch_all(transaction.connection())
+    .await?;
+    rows.reverse();
+    Ok(rows)
+}
+
+async fn after(transaction: &mut Transaction<'_>, batch: &Charted<'_>, version: u32) -> Result<Vec<ProcessRow>, Error> {
+    Ok(sqlx::query_as(
+        "select measured_to_us, batch_id, estimate, held, known from process_point
+         where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) > ($3, $4)
+         order by measured_to_us, batch_id limit $5",
+    )
+    .bind(batch.structure)
+    .bind(version)
+    .bind(batch.position.0)
+    .bind(&batch.position.1)
+    .bind(MOST_LATER as i64)
+    .fetch_all(transaction.connection())
+    .await?)
+}
+
+/// The changes of a point as they are stored; `None` without any.
+fn changes(point: Option<&ProcessPoint>) -> Result<Option<String>, Error> {
+    let changes = point.map(|point| &point.changes).filter(|changes| !changes.is_empty());
+    changes.map(|changes| serde_json::to_string(changes).map_err(|e| bad_row("process point")(&e))).transpose()
+}
+
+async fn write(
+    transaction: &mut Transaction<'_>,
+    batch: &Charted<'_>,
+    new: &NewProcessPoint,
+    held: bool,
+    (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
+) -> Result<(), Error> {
+    let estimate = serde_json::to_string(&new.estimate).map_err(|e| bad_row("process point")(&e))?;
+    sqlx::query(
+        "insert into process_point (structure_id, undamaged_version, measured_to_us, batch_id, estimate, held, known, changes)
+         values ($1, $2, $3, $4, $5, $6, $7, $8)
+         on conflict (structure_id, undamaged_version, measured_to_us, batch_id) do update
+         set estimate = excluded.estimate, held = excluded.held, known = excluded.known, changes = excluded.changes",
+    )
+    .bind(batch.structure)
+    .bind(new.undamaged_version)
+    .bind(batch.position.0)
+    .bind(&batch.position.1)
+    .bind(estimate)
+    .bind(held)
+    .bind(to_blob(chain.known().to_numbers().into_iter()))
+    .bind(changes(point)?)
+    .execute(transaction.connection())
+    .await?;
+    Ok(())
+}
+
+/// Writes what follows for a later batch from a late one.
+async fn write_again(
+    transaction: &mut Transaction<'_>,
+    batch: &Charted<'_>,
+    new: &NewProcessPoint,
+    row: &ProcessRow,
+    (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
+) -> Result<(), Error> {
+    sqlx::query(
+        "update process_point set known = $1, changes = $2
+         where structure_id = $3 and undamaged_version = $4 and measured_to_us = $5 and batch_id = $6",
+    )
+    .bind(to_blob(chain.known().to_numbers().into_iter()))
+    .bind(changes(point)?)
+    .bind(batch.structure)
+    .bind(new.undamaged_version)
+    .bind(row.measured_to_us)
+    .bind(&row.batch_id)
+    .execute(transaction.connection())
+    .await?;
+    for series in new.reference.series() {
+        let Some(evidence) = point.and_then(|point| point.of_series(&new.reference, &series)) else { continue };
+        sqlx::query(
+            "update chart_point set shift = $1, slow = $2
+             where structure_id = $3 and undamaged_version = $4 and series = $5 and measured_to_us = $6 and batch_id = $7",
+        )
+        .bind(evidence.fast)
+        .bind(evidence.slow)
+        .bind(batch.structure)
+        .bind(new.undamaged_version)
+        .bind(&series)
+        .bind(row.measured_to_us)
+        .bind(&row.batch_id)
+        .execute(transaction.connection())
+        .await?;
+    }
+    Ok(())
+}
