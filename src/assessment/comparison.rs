@@ -43,6 +43,11 @@ pub fn assess(
         findings.extend(compare_conditions(measurements, &undamaged.conditions));
     }
     findings.extend(standing_findings(baseline));
+    if let Some(process) = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()) {
+        if !samples.fit.rejected_beside(process.usual_misfit) {
+            findings.iter_mut().for_each(accept_usual_misfit);
+        }
+    }
     let sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
     for sample in sampled.iter().filter(|s| s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS) {
         let message = format!(
@@ -58,7 +63,8 @@ pub fn assess(
     findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
     let trust = Trust::new(&samples.fit, findings);
     let covariates = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(|p| &p.process.covariates);
-    let estimate = covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates));
+    let estimate =
+        covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates, samples.fit.misfit()));
     // Where the simulation does not fit the data, its parameters say nothing about damage.
     let mut quantities = damage::assess(&sampled, context.undamaged.filter(|_| trust.accepted()));
     for quantity in quantities.iter_mut().filter(|q| not_informed.contains(&q.name)) {
@@ -80,6 +86,16 @@ pub fn assess(
         quantities,
         estimate,
     })
+}
+
+/// A misfit that the batches of the undamaged reference show as well does not reject a batch.
+fn accept_usual_misfit(finding: &mut Finding) {
+    if finding.code == FindingCode::SimulationDoesNotFit && finding.effect == FindingEffect::Reject {
+        finding.effect = FindingEffect::Note;
+        finding
+            .message
+            .push_str("; the batches of the undamaged reference deviate as much, so that the batch is accepted");
+    }
 }
 
 /// The finding about a quantity that the measurements of a batch hardly inform.

@@ -11,7 +11,18 @@ use crate::damage::{self, UndamagedReference};
 use crate::measurement::ModalMeasurement;
 use crate::process::fit;
 use crate::process::reference::ReferenceProcess;
-use crate::trust::{FindingEffect, Trust};
+use crate::stats;
+use crate::trust::fit::Misfit;
+use crate::trust::{Finding, FindingCode, FindingEffect, Trust};
+
+/// Greatest misfit, in standard deviations of the noise, that may be usual.
+const MOST_USUAL_DISTANCE: f64 = 2.0;
+
+/// Share of rejected batches from which a misfit is usual: five times what chance rejects.
+const MORE_THAN_CHANCE: f64 = 0.05;
+
+/// Quantile of the misfits of the reference that is accepted as usual.
+const USUAL_QUANTILE: f64 = 0.9;
 
 /// A batch that cannot be part of the undamaged reference.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -51,6 +62,26 @@ pub struct ReferenceBatches<'a> {
     baseline: &'a Baseline,
     trusted: Vec<(&'a [ModalMeasurement], Draws, BatchSamples)>,
     doubtful: Vec<DoubtfulBatch>,
+    usual_misfit: Misfit,
+}
+
+/// The misfit that is usual for some batches; `None` if they are too few to show it, or if the simulation fits them.
+///
+/// A simulation is an approximation: where it deviates in more batches than chance would reject, but by less than twice the noise, the
+/// deviation is a property of the simulation and not of the batch.
+fn usual_misfit(batches: &[&BatchSamples]) -> Option<Misfit> {
+    let slight = |samples: &&&BatchSamples| samples.fit.distance.is_some_and(|distance| distance < MOST_USUAL_DISTANCE);
+    let slight: Vec<&&BatchSamples> = batches.iter().filter(slight).collect();
+    let rejected = slight.iter().filter(|samples| samples.fit.rejected()).count();
+    if batches.len() < fit::FEWEST_BATCHES || (rejected as f64) < MORE_THAN_CHANCE * batches.len() as f64 {
+        return None;
+    }
+    let misfits: Vec<Misfit> = slight.iter().filter_map(|samples| samples.fit.misfit()).collect();
+    let quantile = |which: usize| {
+        let own: Vec<f64> = misfits.iter().map(|misfit| misfit[which]).collect();
+        stats::quantile(&own, USUAL_QUANTILE).max(1.0)
+    };
+    Some([quantile(0), quantile(1)])
 }
 
 impl<'a> ReferenceBatches<'a> {
@@ -62,24 +93,33 @@ impl<'a> ReferenceBatches<'a> {
         baseline: &'a Baseline,
         batches: &[(&'a [ModalMeasurement], Draws)],
     ) -> Result<Self, ReferenceError> {
-        let (mut trusted, mut doubtful) = (Vec::new(), Vec::new());
+        let (mut drawn, mut doubtful) = (Vec::new(), Vec::new());
         for (batch, (measurements, draws)) in batches.iter().enumerate() {
-            let samples = match draw(baseline, measurements, None, *draws) {
-                Ok(samples) => samples,
+            match draw(baseline, measurements, None, *draws) {
+                Ok(samples) => drawn.push((batch, *measurements, *draws, samples)),
                 Err(unusable @ Error::NoUsableMeasurement { .. }) => {
                     doubtful.push(DoubtfulBatch { batch, reason: unusable.to_string() });
-                    continue;
                 }
                 Err(source) => return Err(ReferenceError::Assess { batch, source }),
-            };
-            let trust = Trust::new(&samples.fit, samples.findings.clone());
-            // Every later batch is compared with the reference, so doubtful data must not enter it.
-            match trust.findings.iter().find(|f| f.effect != FindingEffect::Note) {
-                Some(finding) => doubtful.push(DoubtfulBatch { batch, reason: finding.message.clone() }),
-                None => trusted.push((*measurements, *draws, samples)),
             }
         }
-        Ok(Self { baseline, trusted, doubtful })
+        let of_batch: Vec<&BatchSamples> = drawn.iter().map(|(.., samples)| samples).collect();
+        let usual_misfit = usual_misfit(&of_batch);
+        let mut trusted = Vec::new();
+        for (batch, measurements, draws, samples) in drawn {
+            let trust = Trust::new(&samples.fit, samples.findings.clone());
+            let usual = usual_misfit.is_some_and(|usual| !samples.fit.rejected_beside(usual));
+            // Every later batch is compared with the reference, so doubtful data must not enter it.
+            let is_doubt = |f: &&Finding| {
+                f.effect != FindingEffect::Note && !(usual && f.code == FindingCode::SimulationDoesNotFit)
+            };
+            match trust.findings.iter().find(is_doubt) {
+                Some(finding) => doubtful.push(DoubtfulBatch { batch, reason: finding.message.clone() }),
+                None => trusted.push((measurements, draws, samples)),
+            }
+        }
+        doubtful.sort_by_key(|doubtful| doubtful.batch);
+        Ok(Self { baseline, trusted, doubtful, usual_misfit: usual_misfit.unwrap_or([1.0; 2]) })
     }
 
     /// The batches that cannot be part of the reference, in the order in which they were given.
@@ -96,8 +136,8 @@ impl<'a> ReferenceBatches<'a> {
         threshold_probability: f64,
         mean_run_batches: f64,
     ) -> Result<UndamagedReference, ReferenceError> {
-        let Self { baseline, trusted, .. } = self;
-        let process = process(baseline, &trusted, mean_run_batches);
+        let Self { baseline, trusted, usual_misfit, .. } = self;
+        let process = process(baseline, &trusted, mean_run_batches, usual_misfit);
         let Some((_, draws, _)) = trusted.first() else {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
@@ -113,6 +153,13 @@ impl<'a> ReferenceBatches<'a> {
             joined(baseline, parts, draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
         let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
         let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
+        if usual_misfit != [1.0; 2] {
+            reference.doubts.push(format!(
+                "the simulation deviates from its batches by more than their noise (by {:.1} times in one of ten), which is accepted as \
+                 usual for this structure: a diagnosis may find the cause",
+                usual_misfit[0].sqrt()
+            ));
+        }
         reference.conditions = conditions(measurements.into_iter().flatten());
         match process {
             Ok(process) => reference.process = Some(Arc::new(process)),
@@ -127,16 +174,17 @@ fn process(
     baseline: &Baseline,
     trusted: &[(&[ModalMeasurement], Draws, BatchSamples)],
     mean_run_batches: f64,
+    usual_misfit: Misfit,
 ) -> Result<ReferenceProcess, fit::Error> {
     let quantities = ProcessQuantities::of(baseline);
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|(batch, ..)| *batch).collect();
     let covariates = process_covariates(&measurements);
     let estimate = |(batch, draws, samples): &(&[ModalMeasurement], Draws, BatchSamples)| {
         let sampled = monitored_quantities(baseline, samples, draws.per_measurement);
-        quantities.estimate(&sampled, batch, &covariates)
+        quantities.estimate(&sampled, batch, &covariates, samples.fit.misfit())
     };
     let estimates = trusted.iter().filter_map(estimate).collect();
-    ReferenceProcess::new(&quantities.quantities, &covariates, estimates, mean_run_batches)
+    ReferenceProcess::new(&quantities.quantities, &covariates, estimates, mean_run_batches, usual_misfit)
 }
 
 /// Computes the undamaged reference from several batches, each with its draws.

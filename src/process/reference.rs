@@ -34,6 +34,8 @@ pub struct ReferenceProcess {
     pub limits: Limits,
     /// Mean number of healthy batches to a false alarm for which the limits were computed.
     pub mean_run_batches: f64,
+    /// Misfit of the simulation that its batches show, both statistics of the test of fit divided by their degrees of freedom, 1 where the simulation fits.
+    pub usual_misfit: [f64; 2],
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     end: Vec<f64>,
 }
@@ -100,6 +102,7 @@ impl ReferenceProcess {
         covariates: &[String],
         mut estimates: Vec<BatchEstimate>,
         mean_run_batches: f64,
+        usual_misfit: [f64; 2],
     ) -> Result<Self, Error> {
         estimates.sort_by_key(|estimate| estimate.at);
         let process = fit(quantities, covariates, &estimates)?;
@@ -115,6 +118,7 @@ impl ReferenceProcess {
             directions: quantities.directions.clone(),
             limits,
             mean_run_batches,
+            usual_misfit,
             end: known.to_numbers(),
         })
     }

@@ -194,20 +194,7 @@ async fn place(
     // No stored episode begins after the end of a series.
     let amended = stored.is_some() || !page.is_empty();
     let mut episodes = Episodes::of(transaction, batch, new, inside, amended).await?;
-    let mut first = PointRow {
-        measured_to_us: batch.position.0,
-        batch_id: batch.position.1.clone(),
-        series: new.series.clone(),
-        shift: new.point.shift,
-        shift_limit: new.point.limit,
-        ewma_limit,
-        probability_limit: new.probability_limit,
-        held,
-        ewma: 0.0,
-        above: false,
-        state: String::new(),
-        slow: new.point.slow,
-    };
+    let mut first = row_of(batch, new, ewma_limit, held);
     first.follow(&mut series);
     episodes.pass(&first)?;
     let mut unchanged = 0;
@@ -238,6 +225,24 @@ async fn place(
     }
     let alarms_changed = episodes.store(transaction, batch, new).await?;
     Ok(Placed { undamaged_version, row: first, new: true, alarms_changed })
+}
+
+/// The row of a new point, before its moving average and state are known.
+fn row_of(batch: &Charted<'_>, new: &NewChartPoint, ewma_limit: Option<f64>, held: bool) -> PointRow {
+    PointRow {
+        measured_to_us: batch.position.0,
+        batch_id: batch.position.1.clone(),
+        series: new.series.clone(),
+        shift: new.point.shift,
+        shift_limit: new.point.limit,
+        ewma_limit,
+        probability_limit: new.probability_limit,
+        held,
+        ewma: 0.0,
+        above: false,
+        state: String::new(),
+        slow: new.point.slow,
+    }
 }
 
 async fn write_status(

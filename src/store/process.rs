@@ -65,12 +65,22 @@ pub(super) async fn follow(
     let filter = Filter::of(&reference.process);
     let before = before(transaction, batch, new.undamaged_version).await?;
     let mut chain = match before.first() {
-        None => Chain::start(reference, &filter, new.estimate.at),
-        Some(first) => Chain::resume(reference, &filter, first.known()?, first.at()?),
+        Some(first) if before.len() == WINDOW => {
+            let mut chain = Chain::resume(reference, &filter, first.known()?, first.at()?);
+            for row in &before[1..] {
+                chain.pass(&row.estimate()?);
+            }
+            chain
+        }
+        // All batches of the chain are here: it begins with the first of them.
+        first => {
+            let mut chain = Chain::start(reference, &filter, first.map_or(Ok(new.estimate.at), ProcessRow::at)?);
+            for row in &before {
+                chain.pass(&row.estimate()?);
+            }
+            chain
+        }
     };
-    for row in before.iter().skip(1) {
-        chain.pass(&row.estimate()?);
-    }
     let held = new.held || batch.maintained;
     // A batch that is held is compared with the chain but does not become part of it.
     let point = if held { chain.clone().take(&new.estimate) } else { chain.take(&new.estimate) };

@@ -19,6 +19,9 @@ const SINGLE_LEVEL: f64 = 0.001;
 /// Relative misfit above which a measurement that no parameters reproduce is an outlier, rather than close to the prior.
 const GROSS: f64 = 0.05;
 
+/// T/ν and M/rank of [`fit`]: 1 on average where the simulation fits.
+pub type Misfit = [f64; 2];
+
 /// How well the simulation reproduces the measurements of a batch.
 #[derive(Debug, Clone)]
 pub struct Fit {
@@ -34,6 +37,8 @@ pub struct Fit {
     pub distance: Option<f64>,
     /// Degrees of freedom, summed over the measurements within the prior.
     pub degrees_of_freedom: usize,
+    /// T and M of [`fit`] with their degrees of freedom.
+    statistics: [(f64, usize); 2],
 }
 
 /// Finds the nearest point of the prior box for each measurement, starting at `starts`, `[n][d]`, and tests the residuals.
@@ -72,17 +77,22 @@ pub fn fit(simulator: &Simulator, observations: &[Observation], starts: &[Vec<f6
         }
     }
     let testable = degrees_of_freedom > 0;
+    let statistics = [(chi_squared, degrees_of_freedom), common_misfit(&sum, covariance)];
     Ok(Fit {
         nearest,
         outside,
         gross,
-        p_value: testable.then(|| {
-            let each = upper_tail(chi_squared, degrees_of_freedom);
-            (2.0 * each.min(common_misfit(&sum, covariance))).min(1.0)
-        }),
+        p_value: testable.then(|| p_value(statistics)),
         distance: testable.then(|| (chi_squared / degrees_of_freedom as f64).sqrt()),
         degrees_of_freedom,
+        statistics,
     })
+}
+
+/// p = 2·min(p_T, p_M) of both statistics with their degrees of freedom.
+fn p_value(statistics: [(f64, usize); 2]) -> f64 {
+    let least = statistics.map(|(statistic, degrees)| upper_tail(statistic, degrees)).into_iter().fold(1.0, f64::min);
+    (2.0 * least).min(1.0)
 }
 
 impl Fit {
@@ -90,6 +100,22 @@ impl Fit {
     pub fn rejected(&self) -> bool {
         let bad = self.outside.len() + self.gross.len();
         self.p_value.is_some_and(|p| p < LEVEL) || too_many(bad, self.nearest.len())
+    }
+
+    /// Both statistics divided by their degrees of freedom: 1 on average where the simulation fits; `None` where nothing can be tested.
+    pub fn misfit(&self) -> Option<Misfit> {
+        self.p_value?;
+        Some(self.statistics.map(|(statistic, degrees)| statistic / degrees.max(1) as f64))
+    }
+
+    /// As [`Self::rejected`], for a simulation that is known to deviate as much as `usual`.
+    pub fn rejected_beside(&self, usual: Misfit) -> bool {
+        let mut scaled = self.statistics;
+        for ((statistic, _), usual) in scaled.iter_mut().zip(usual) {
+            *statistic /= usual.max(1.0);
+        }
+        let bad = self.outside.len() + self.gross.len();
+        self.p_value.is_some() && p_value(scaled) < LEVEL || too_many(bad, self.nearest.len())
     }
 
     /// The findings of the test; `indices` are the indices of the tested measurements in their batch.
@@ -159,8 +185,9 @@ impl Fit {
     }
 }
 
-/// p-value of a misfit common to all measurements: the sum of the residuals against the sum of their covariances.
-fn common_misfit(sum: &DVector<f64>, covariance: DMatrix<f64>) -> f64 {
+/// Statistic of a misfit common to all measurements, with its degrees of freedom: the sum of the residuals against the sum of their
+/// covariances.
+fn common_misfit(sum: &DVector<f64>, covariance: DMatrix<f64>) -> (f64, usize) {
     let largest = covariance.diagonal().max();
     let eigen = covariance.symmetric_eigen();
     let (mut statistic, mut rank) = (0.0, 0);
@@ -171,7 +198,7 @@ fn common_misfit(sum: &DVector<f64>, covariance: DMatrix<f64>) -> f64 {
             rank += 1;
         }
     }
-    upper_tail(statistic, rank)
+    (statistic, rank)
 }
 
 /// P(χ²_ν ≥ x); 1 without degrees of freedom.

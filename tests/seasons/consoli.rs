@@ -1,7 +1,10 @@
 //! The Consoli Palace: two years without damage, one of them as reference.
 
+use modalwatch::process::change::AGES;
 use modalwatch::process::estimate::BatchEstimate;
+use modalwatch::process::limits::Steady;
 use modalwatch::quantity::Timestamp;
+use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 
 use super::estimates::{data, estimate, rows, simulator, Row};
@@ -52,12 +55,41 @@ fn daily(simulator: &Simulator, rows: &[Row], days: &[i64]) -> Vec<(i64, BatchEs
 #[ignore = "a study of a minute"]
 fn charts_of_the_process_over_the_second_year_of_the_consoli_palace() {
     let Some(csv) = data("consoli-palace/consoli_frequencies.csv") else { return };
-    let simulator = simulator("consoli-palace.toml");
     let (rows, days) = (rows(&csv, 5), days(&csv));
-    let healthy = daily(&simulator, &rows, &days);
+    println!("== walls and upper parts");
+    study(&simulator("consoli-palace.toml"), &rows, &days, &["walls", "upper"]);
+    println!("== one stiffness for each mode");
+    study(&modal(), &rows, &days, &["k1", "k2", "k3", "k4", "k5"]);
+}
+
+/// One body for each mode, each with a stiffness of its own: the frequencies without a model of the palace.
+fn modal() -> Simulator {
+    let stiffness = [210_540.7, 348_618.4, 475_539.7, 683_145.7, 1_799_037.5];
+    let mass = |i: usize| format!("{{ name = \"mode{i}\", kg = 1000.0 }}");
+    let spring = |i: usize| {
+        format!("{{ name = \"s{i}\", from = \"ground\", to = \"mode{i}\", n_per_m = {} }}", stiffness[i - 1])
+    };
+    let parameter = |i: usize| {
+        let law = format!("{{ exponential = {{ a = {}, b = 1.0, c = 0.0 }} }}", stiffness[i - 1]);
+        format!("{{ name = \"k{i}\", unit = \"ln\", prior = {{ uniform = [-0.3, 0.3] }}, sets = {{ spring = \"s{i}\", law = {law} }} }}")
+    };
+    let list = |one: &dyn Fn(usize) -> String| (1..=5).map(one).collect::<Vec<_>>().join(", ");
+    let text = format!(
+        "id = \"consoli-modes\"\nmodes = 5\nmeasurement_noise = {{ relative = 0.003 }}\nmass = [{}]\nspring = [{}]\nparameter = [{}]\n",
+        list(&mass),
+        list(&spring),
+        list(&parameter)
+    );
+    Simulator::new(StructureDefinition::parse_toml(&text).unwrap()).unwrap()
+}
+
+fn study(simulator: &Simulator, rows: &[Row], days: &[i64], names: &[&str]) {
+    // Shares of the walls in the stiffness of each mode, from the structure file: what a loss of the walls does to each mode.
+    let shares = if names.len() == 2 { vec![1.0, 0.0] } else { vec![0.8, 0.7, 0.4, 0.3, 0.6] };
+    let healthy = daily(simulator, rows, days);
     let split = healthy.iter().position(|(day, _)| *day >= 365).unwrap();
     let all: Vec<BatchEstimate> = healthy.iter().map(|(_, e)| e.clone()).collect();
-    let quantities = quantities(&["walls", "upper"], "ln");
+    let quantities = quantities(names, "ln");
     let reference = reference(&quantities, &all[..split], 1_095.0);
     let numbers = reference.process.numbers();
     println!(
@@ -82,31 +114,37 @@ fn charts_of_the_process_over_the_second_year_of_the_consoli_palace() {
     };
     let lowered: Vec<Row> = rows.iter().map(lowered).collect();
     let onset = days[rows.iter().position(|row| row.number == *F1_LOSS.0.start()).unwrap()];
-    let damaged = daily(&simulator, &lowered, &days);
+    let damaged = daily(simulator, &lowered, days);
     let estimates: Vec<BatchEstimate> = damaged[split..].iter().map(|(_, e)| e.clone()).collect();
     let changes = watch(&reference, &estimates);
     let first = damaged[split..].iter().zip(&changes).find(|((day, _), c)| *day >= onset && !c.is_empty());
+    let scale: Vec<f64> = reference.process.scales.iter().map(|s| 100.0 * s.unit).collect();
+    let errors = Steady::new(&reference.process).unwrap().standard_errors();
+    for (age, errors) in AGES.iter().zip(errors) {
+        let percent: Vec<f64> = errors.iter().zip(&scale).map(|(e, s)| e * s).collect();
+        println!("  standard error of a loss that has lasted {age} days, %: {percent:.2?}");
+    }
     println!("f1 lowered from day {onset}: {:?}", first.map(|((day, _), c)| (day - onset, c[0].1.sentence())));
     let (mut found, mut quiet) = (0, 0);
     for placement in 0..20 {
         let onset = 395 + placement * 17;
-        for (k, _) in quantities.names.iter().enumerate() {
-            let lost = |(day, e): &(i64, BatchEstimate)| {
-                let mut e = e.clone();
-                if *day >= onset {
-                    e.mean[k] = e.mean[k].map(|mean| mean + 0.97_f64.ln());
+        let lost = |(day, e): &(i64, BatchEstimate)| {
+            let mut e = e.clone();
+            if *day >= onset {
+                for (mean, share) in e.mean.iter_mut().zip(&shares) {
+                    *mean = mean.map(|mean| mean + f64::ln(1.0 - 0.03 * share));
                 }
-                e
-            };
-            let estimates: Vec<BatchEstimate> = healthy[split..].iter().map(lost).collect();
-            let changes = watch(&reference, &estimates);
-            let alarm = |from: i64, to: i64| {
-                healthy[split..].iter().zip(&changes).any(|((day, _), c)| (from..to).contains(day) && !c.is_empty())
-            };
-            let before = alarm(onset - 30, onset);
-            quiet += usize::from(!before);
-            found += usize::from(!before && alarm(onset, onset + 10));
-        }
+            }
+            e
+        };
+        let estimates: Vec<BatchEstimate> = healthy[split..].iter().map(lost).collect();
+        let changes = watch(&reference, &estimates);
+        let alarm = |from: i64, to: i64| {
+            healthy[split..].iter().zip(&changes).any(|((day, _), c)| (from..to).contains(day) && !c.is_empty())
+        };
+        let before = alarm(onset - 30, onset);
+        quiet += usize::from(!before);
+        found += usize::from(!before && alarm(onset, onset + 10));
     }
     println!("loss of 3 %: found within 10 days in {found} of {quiet} placements without an alarm before");
 }

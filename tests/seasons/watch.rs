@@ -17,7 +17,7 @@ pub fn quantities(names: &[&str], unit: &str) -> Quantities {
 
 /// The reference of some batches.
 pub fn reference(quantities: &Quantities, estimates: &[BatchEstimate], mean_run_batches: f64) -> ReferenceProcess {
-    ReferenceProcess::new(quantities, &[], estimates.to_vec(), mean_run_batches).unwrap()
+    ReferenceProcess::new(quantities, &[], estimates.to_vec(), mean_run_batches, [1.0; 2]).unwrap()
 }
 
 /// For each batch the changes on the charts that are above their limits, with their series.

@@ -4,6 +4,7 @@
 
 mod alarms;
 mod jobs;
+mod process;
 mod series;
 
 use std::collections::{BTreeMap, BTreeSet};
