@@ -3,7 +3,6 @@
 use super::samples::BatchSamples;
 use crate::baseline::Baseline;
 use crate::damage::{QuantityKind, QuantitySamples};
-use crate::hierarchy::PopulationEstimate;
 use crate::parameter::DamageDirection;
 
 /// Samples of everything that is monitored: each parameter, the stiffness of each spring that a parameter sets through a law, and
@@ -47,7 +46,6 @@ pub fn monitored_quantities(
     });
     let of_groups = groups.iter().map(|group| {
         let members: Vec<Vec<f64>> = group.columns.iter().map(|&column| pooled.column(column)).collect();
-        let parts: Vec<&PopulationEstimate> = group.columns.iter().map(|&column| population(column)).collect();
         let parameter = &baseline.space().as_slice()[group.columns[0]];
         QuantitySamples {
             name: group.name.clone(),
@@ -58,7 +56,7 @@ pub fn monitored_quantities(
                 .map(|i| members.iter().map(|m| m[i]).sum::<f64>() / members.len() as f64)
                 .collect(),
             draws: pooled.draws(),
-            population: PopulationEstimate::average(&parts),
+            population: samples.populations.average(&group.columns),
             prior_bound_mass: group.columns.iter().map(|&column| prior_bound_mass[column]).fold(0.0, f64::max),
             group: None,
         }
