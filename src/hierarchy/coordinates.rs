@@ -24,14 +24,17 @@ const MOST_MISSING: f64 = 0.995;
 /// a and b are normal, independent of u, with variance 1/n, and each u_k is the logarithm of the root of an inverse gamma
 /// variable with variance about 1/2n. This is the regression of each measured value on those before it.
 ///
-/// Prior: each μ_k uniform in the unit box, each standard deviation σ_k uniform, and the correlation matrix R such that each
-/// correlation alone is uniform between −1 and 1:
+/// Prior: each μ_k uniform in the unit box, each standard deviation σ_k uniform where it is small compared with the noise, and the
+/// correlation matrix R such that each correlation alone is uniform between −1 and 1:
 ///
 /// ```text
-///  p(R) ∝ |R|^(d(d−1)/2 − 1) Π_k |R_−k|^(−(d+1)/2),    equivalent to   p(Σ) ∝ |Σ|^−(d+1) Π_k (Σ⁻¹)_kk^(−(d+1)/2) σ_k
+///  p(σ_k) ∝ (σ_k² + W_kk)^(−(d−1)/8),    p(R) ∝ |R|^(d(d−1)/2 − 1) Π_k |R_−k|^(−(d+1)/2)
+///  equivalent to   p(Σ) ∝ |Σ|^−(d+1) Π_k (Σ⁻¹)_kk^(−(d+1)/2) σ_k p(σ_k)
 /// ```
 ///
-/// R_−k: R without row and column k.
+/// R_−k: R without row and column k. With a uniform σ_k, the unknown correlations would make the posterior of σ_k² too large by the
+/// factor 1 + (d − 1)(1 − R_k²)/n, where R_k² is the share of the variance of parameter k that the others explain. The exponent is
+/// a quarter of that which would remove this for R_k² = 0; more would make the correlations too small. For d = 1 it is 0.
 ///
 /// Source: J. Barnard, R. McCulloch, X.-L. Meng (2000), Modeling covariance matrices in terms of standard deviations and
 /// correlations, with application to shrinkage, Statistica Sinica 10, 1281–1311.
@@ -103,16 +106,25 @@ impl Coordinates {
         [(k, 1.0), (self.size + k, 2.0)].into_iter().chain(crosses).collect()
     }
 
+    /// Logarithm of Π σ_k p(σ_k), up to a constant.
+    pub fn log_prior_of_stds(&self, normal: &Normal) -> f64 {
+        let exponent = -0.125 * (self.size - 1) as f64;
+        let one = |k: usize| {
+            let variance = normal.covariance.rows[k][k];
+            0.5 * variance.ln() + exponent * (variance + self.noise.rows[k][k]).ln()
+        };
+        (0..self.size).map(one).sum()
+    }
+
     /// Logarithm of the prior density of θ, up to a constant. `normal`: the population at θ.
     ///
     /// The volume elements are dμ ∝ Π exp(u_k) da and dΣ = dM ∝ Π_k exp((2d + 1 − k) u_k) du db, k from 1.
     pub fn log_prior(&self, theta: &[f64], normal: &Normal) -> f64 {
         let (d, precision) = (self.size, normal.precision());
         // |Σ|^−(d+1) = |V|^(2d+2)
-        let mut log = 2.0 * (d + 1) as f64 * normal.log_root;
+        let mut log = 2.0 * (d + 1) as f64 * normal.log_root + self.log_prior_of_stds(normal);
         for k in 0..d {
             log += (2 * d + 1 - k) as f64 * theta[d + k];
-            log += 0.5 * normal.covariance.rows[k][k].ln();
             log -= 0.5 * (d + 1) as f64 * precision.rows[k][k].ln();
         }
         log

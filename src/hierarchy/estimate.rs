@@ -23,12 +23,13 @@ use crate::stats;
 ///  M:  μ = 1/n Σ_js w_js x_js,   Σ = 1/n [ Σ_js w_js (x_js − μ)(x_js − μ)ᵀ + Σ − W ],   W = 1/n Σ_j cov_w(x_j)
 /// ```
 ///
-/// Priors: μ is uniform in the prior box, each σ_k uniform up to half the width of the prior, each correlation uniform between −1
-/// and 1 (with the distribution of Barnard, McCulloch and Meng for all together). The second term of Σ is ours and corresponds to
+/// Priors: μ is uniform in the prior box; each σ_k uniform up to half the width of the prior, with a factor (σ_k² + W_kk)^(−(d−1)/8)
+/// for d correlated parameters, where W_kk is the noise of a measurement; each correlation uniform between −1 and 1 (with the
+/// distribution of Barnard, McCulloch and Meng for all together). The second term of Σ is ours and corresponds to
 /// the restricted likelihood of a normal population: it restores the variance that the fitted mean absorbs, which is Σ/n for data
 /// without noise.
 ///
-/// For one parameter, for more than eight, and for fewer than max(8, 2d + 4) measurements, Σ is diagonal: such a batch hardly
+/// For one parameter, for more than eight, and for fewer than max(8, 2d + 4, 2(d − 1)²) measurements, Σ is diagonal: such a batch hardly
 /// determines correlations, and none are reported.
 ///
 /// `samples`: x, `[n·draws, d]` in parameter units. `log_weights`: ln q(x_js | y_j) − ln r_j(x_js), nats, `[n·draws]`, up to a

@@ -29,9 +29,10 @@ const TURNS: [usize; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
 const EFFECTIVE: f64 = 0.3;
 
 /// Whether the covariance of `d` parameters is estimated from `measurements` measurements: with fewer, a correlation is hardly
-/// determined, and the standard deviations are estimated more accurately without.
+/// determined. The prior of many correlations moves the standard deviations by up to (d − 1)/√(2n) of their standard errors: below
+/// ½ from 2 (d − 1)² measurements on.
 pub(super) fn is_estimated(d: usize, measurements: usize) -> bool {
-    (2..=MOST).contains(&d) && measurements >= (2 * d + 4).max(8)
+    (2..=MOST).contains(&d) && measurements >= (2 * d + 4).max(2 * (d - 1).pow(2)).max(8)
 }
 
 /// [`DRAWS`] populations near `point`, the most probable one; `None` where its covariance is too close to singular for them.

@@ -27,13 +27,13 @@ const SIZES: [f64; 3] = [0.4, 0.9, 2.0];
 /// [`DRAWS`] states of Gibbs samplers that start at `point`.
 ///
 /// ```text
-///  s_j ~ w_j,   t_k | Σ ~ Gamma((d + 1)/2, rate (Σ⁻¹)_kk),   Σ | s, t ~ inverse Wishart(n + d, S + 2 diag t) · Π σ_k,
+///  s_j ~ w_j,   t_k | Σ ~ Gamma((d + 1)/2, rate (Σ⁻¹)_kk),   Σ | s, t ~ inverse Wishart(n + d, S + 2 diag t) · Π σ_k p(σ_k),
 ///  μ | Σ, s ~ N(x̄, Σ/n)
 /// ```
 ///
 /// s_j: the sample selected for measurement j with probability proportional to its weight; x̄ and S: mean of the selected samples
 /// and sum of the products of their deviations from it. t turns the prior of [`Coordinates`] into an inverse Wishart distribution
-/// times Π σ_k, and a Metropolis step accepts or rejects Σ by that factor and by the limits of μ and σ.
+/// times Π σ_k p(σ_k), and a Metropolis step accepts or rejects Σ by that factor and by the limits of μ and σ.
 ///
 /// For noise-dominated directions the selected samples determine Σ almost completely, so that the sampler hardly moves. Each sweep
 /// is therefore followed by Metropolis steps on L(μ, Σ), with the samples summed out, in the coordinates of the measured values.
@@ -87,10 +87,10 @@ impl Chain<'_> {
         }
         let proposed =
             self.inverse_wishart(n + d as f64, &scale).and_then(|covariance| Normal::new(state.mean, &covariance));
-        let logs = |normal: &Normal| (0..d).map(|k| normal.std(k).ln()).sum::<f64>();
+        let log = |normal: &Normal| self.coordinates.log_prior_of_stds(normal);
         let threshold: f64 = self.stream.random();
         let next = proposed
-            .filter(|proposed| self.problem.allows_stds(proposed) && threshold.ln() < logs(proposed) - logs(&state));
+            .filter(|proposed| self.problem.allows_stds(proposed) && threshold.ln() < log(proposed) - log(&state));
         let next = next.unwrap_or(state);
         let root = next.covariance.cholesky().expect("a population has a positive definite covariance");
         let mut draw = || {

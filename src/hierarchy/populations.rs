@@ -9,7 +9,7 @@ use super::small::{SmallMatrix, MOST};
 pub struct Populations {
     /// One entry per parameter, in the order of the space.
     pub parameters: Vec<PopulationEstimate>,
-    /// Correlations of the parameters; `None` for one parameter, for more than eight, for fewer than max(8, 2d + 4) measurements, and
+    /// Correlations of the parameters; `None` for one parameter, for more than eight, for fewer than max(8, 2d + 4, 2(d − 1)²) measurements, and
     /// where no estimate with correlations was found.
     pub correlations: Option<Correlations>,
     /// Effective sample size (Σw)²/Σw² of each measurement under the estimated population, averaged over the measurements.

@@ -211,7 +211,7 @@ fn intervals_of_means_standard_deviations_and_correlations_have_their_coverage()
 fn coverage_of_many_repetitions() {
     for correlation in [0.0, 0.3, 0.6, 0.9] {
         for noise in [0.02, 0.5, 1.0, 2.0] {
-            for (measurements, d) in [(20, 3), (50, 2), (50, 3), (50, 5), (50, 8), (200, 3)] {
+            for (measurements, d) in [(20, 3), (50, 2), (50, 3), (50, 5), (100, 8), (200, 3)] {
                 coverage(measurements, &vec![noise * STD; d], correlation, 500);
             }
         }
