@@ -1,7 +1,7 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
 use super::conditions::compare_conditions;
-use super::quantities::monitored_quantities;
+use super::quantities::{joint_samples, monitored_quantities};
 use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Draws, Error};
 use crate::baseline::observation::Observation;
@@ -55,6 +55,8 @@ pub fn assess(
     let trust = Trust::new(&samples.fit, findings);
     // Where the simulation does not fit the data, its parameters say nothing about damage.
     let compared = context.undamaged.filter(|_| trust.accepted());
+    let joint = joint_samples(baseline, &samples).filter(|_| trust.accepted());
+    let joint = joint.map(|joint| damage::assess_jointly(&sampled, &joint, compared));
     Ok(Assessment {
         model_digest: baseline.digest().clone(),
         structure_digest: baseline.simulator().digest().clone(),
@@ -69,6 +71,7 @@ pub fn assess(
         trust,
         assessed_at,
         quantities: damage::assess(&sampled, compared),
+        joint,
     })
 }
 

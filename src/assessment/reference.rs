@@ -1,11 +1,12 @@
 //! The undamaged reference that is computed from several batches.
 
 use super::conditions::conditions;
-use super::quantities::monitored_quantities;
+use super::quantities::{joint_samples, monitored_quantities};
 use super::samples::{draw, joined, BatchSamples, Draws, Error};
 use crate::baseline::Baseline;
-use crate::damage::{self, UndamagedReference};
+use crate::damage::{self, JointReference, UndamagedReference};
 use crate::measurement::ModalMeasurement;
+use crate::quantity::Probability;
 use crate::trust::{FindingEffect, Trust};
 
 /// A batch that cannot be part of the undamaged reference.
@@ -104,6 +105,9 @@ impl<'a> ReferenceBatches<'a> {
         let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
         let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
         reference.conditions = conditions(measurements.into_iter().flatten());
+        let level = Probability::new(threshold_probability).map_err(damage::Error::from)?;
+        let joint = joint_samples(baseline, &samples);
+        reference.joint = joint.and_then(|joint| JointReference::new(&quantities, &joint, level));
         Ok(reference)
     }
 }

@@ -64,9 +64,8 @@ fn points() -> &'static [[f64; MOST - 1]; POINTS] {
     static SEQUENCE: OnceLock<[[f64; MOST - 1]; POINTS]> = OnceLock::new();
     SEQUENCE.get_or_init(|| {
         // The level is moved to the middle of its cell of 2⁻²⁴, so that none is 0 or 1.
-        let level = |i: usize, k: usize| {
-            f64::from(sobol_burley::sample(i as u32, k as u32, SCRAMBLING)) + 0.5_f64.powi(25)
-        };
+        let level =
+            |i: usize, k: usize| f64::from(sobol_burley::sample(i as u32, k as u32, SCRAMBLING)) + 0.5_f64.powi(25);
         std::array::from_fn(|i| std::array::from_fn(|k| level(i, k)))
     })
 }
@@ -149,7 +148,10 @@ mod tests {
                     };
                     let expected = 1.0 - (-800..=800).map(integrand).sum::<f64>() * step;
                     let found = probability_of_any(&limits, |_, _| correlation);
-                    assert!((found - expected).abs() < 1e-3, "{d}, {correlation}, {limit}: {found}, expected {expected}");
+                    assert!(
+                        (found - expected).abs() < 1e-3,
+                        "{d}, {correlation}, {limit}: {found}, expected {expected}"
+                    );
                 }
             }
         }
@@ -161,7 +163,8 @@ mod tests {
         let mut stream = stats::stream(1, "test: orthant");
         for d in [3, 5, 8] {
             // R from d + 2 random vectors.
-            let vectors: Vec<Vec<f64>> = (0..d).map(|_| (0..d + 2).map(|_| stream.sample(StandardNormal)).collect()).collect();
+            let vectors: Vec<Vec<f64>> =
+                (0..d).map(|_| (0..d + 2).map(|_| stream.sample(StandardNormal)).collect()).collect();
             let dot = |k: usize, l: usize| vectors[k].iter().zip(&vectors[l]).map(|(a, b)| a * b).sum::<f64>();
             let limits: Vec<f64> = (0..d).map(|k| 0.8 + 0.2 * k as f64).collect();
             let mut any = 0;

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 
+use super::joint::JointReference;
 use super::pool::{Hyperparameters, QuantitySamples};
 use super::threshold::threshold;
 use crate::hierarchy::interval;
@@ -70,6 +71,10 @@ pub struct UndamagedReference {
     pub conditions: BTreeMap<String, SeenCovariate>,
     /// Reasons to doubt its data, as sentences.
     pub doubts: Vec<String>,
+    /// The joint probability of damage of the undamaged population and its correlations; `None` where the correlations are not
+    /// estimated, and in references of versions that did not.
+    #[serde(default)]
+    pub joint: Option<JointReference>,
 }
 
 /// The values of a covariate in the undamaged reference.
@@ -162,6 +167,7 @@ impl UndamagedReference {
             quantities,
             conditions: BTreeMap::new(),
             doubts,
+            joint: None,
         })
     }
 }
