@@ -58,7 +58,7 @@ pub struct Carrier {
 /// ```
 ///
 /// (m, Σ) and (μ_ud, σ_ud) are drawn from their posteriors, draw by draw for all quantities together; the results are the median and
-/// the central interval of the draws. Error of one probability: below 0.01, mostly below 0.001 (see `orthant`).
+/// the central interval of the draws. Error of one probability: below 0.02, below 0.002 for correlations up to 0.9 (see `orthant`).
 pub fn assess_jointly(
     samples: &[QuantitySamples],
     joint: &JointSamples,
@@ -204,9 +204,9 @@ mod tests {
             let joint = joint(&names, &[correlation]);
             let found = assess_jointly(&damaged, &joint, Some(&reference(&healthy, &joint)));
             let damage = found.damage.unwrap();
-            // The integral has an error of up to 0.01 where the correlation is 1.
-            assert!((damage.reference_probability - undamaged).abs() < 0.01, "{correlation}: {damage:?}");
-            assert!((damage.probability - now).abs() < 0.01, "{correlation}: {damage:?}");
+            // The integral has an error of up to 0.02 where the correlation is 1.
+            assert!((damage.reference_probability - undamaged).abs() < 0.02, "{correlation}: {damage:?}");
+            assert!((damage.probability - now).abs() < 0.02, "{correlation}: {damage:?}");
             assert!(damage.exceeds && damage.carriers.len() == 1 && damage.carriers[0].name == "a", "{damage:?}");
             assert!((damage.carriers[0].added - 0.2594).abs() < 1e-4, "{damage:?}");
         }
@@ -217,9 +217,9 @@ mod tests {
         let healthy = [quantity("a", 5.0, DamageDirection::Decrease), quantity("b", 5.0, DamageDirection::Increase)];
         let opposed = joint(&["a", "b"], &[-0.999_999]);
         let found = reference(&healthy, &opposed).joint.unwrap();
-        assert!((found.probability - 0.05).abs() < 0.01, "both are beyond their thresholds together: {found:?}");
+        assert!((found.probability - 0.05).abs() < 0.02, "both are beyond their thresholds together: {found:?}");
         let aligned = reference(&healthy, &joint(&["a", "b"], &[0.999_999])).joint.unwrap();
-        assert!((aligned.probability - 0.1).abs() < 0.01, "never both: {aligned:?}");
+        assert!((aligned.probability - 0.1).abs() < 0.02, "never both: {aligned:?}");
     }
 
     #[test]
