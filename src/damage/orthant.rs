@@ -22,7 +22,7 @@ const LEAST_VARIANCE: f64 = 1e-9;
 /// ```
 ///
 /// with R = L Lᵀ and the variables in ascending order of h. The integral is a mean over 32 fixed points of a scrambled Sobol'
-/// sequence. Its error is below 0.002 for equal correlations up to 0.9 and below 0.02 as they approach 1; for one variable, and for
+/// sequence. Its error is below 0.002 for equal correlations up to 0.9 and at most 1/32 as one approaches ±1; for one variable, and for
 /// independent ones, there is none beyond that of Φ (5e-7).
 ///
 /// Source: A. Genz (1992), Numerical computation of multivariate normal probabilities, Journal of Computational and Graphical
@@ -198,6 +198,6 @@ mod tests {
     fn variables_that_move_together_count_once() {
         let found = probability_of_any(&[1.645, 1.645, 2.0], |k, l| if k == l { 1.0 } else { 1.0 - 1e-12 });
         // The integrand is a step, which 32 points resolve to 1/32.
-        assert!((found - 0.05).abs() < 0.02, "{found}");
+        assert!((found - 0.05).abs() < 0.032, "{found}");
     }
 }
