@@ -76,6 +76,9 @@
 //!   2166–2175. Populations from posterior samples. A. Gelman (2006), Prior distributions for variance parameters in
 //!   hierarchical models, Bayesian Analysis 1, 515–533. The prior of their spread. T. A. Louis (1982), Finding the observed
 //!   information matrix when using the EM algorithm, J. R. Stat. Soc. B 44, 226–233. Their importance proposal.
+//! - J. Barnard, R. McCulloch, X.-L. Meng (2000), Modeling covariance matrices in terms of standard deviations and correlations,
+//!   with application to shrinkage, Statistica Sinica 10, 1281–1311. The prior of correlations. A. Genz (1992), Numerical
+//!   computation of multivariate normal probabilities, J. Comput. Graph. Stat. 1, 141–149. The joint probability of damage.
 //! - S. Talts et al. (2018), Validating Bayesian inference algorithms with simulation-based calibration,
 //!   arXiv:1804.06788; P. Lemos et al. (2023), Sampling-based accuracy testing of posterior estimators for general
 //!   inference, ICML. Ranks and TARP.

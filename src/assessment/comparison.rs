@@ -2,7 +2,7 @@
 
 use super::conditions::compare_conditions;
 use super::estimate::ProcessQuantities;
-use super::quantities::monitored_quantities;
+use super::quantities::{joint_samples, monitored_quantities};
 use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Draws, Error};
 use crate::baseline::observation::Observation;
@@ -66,10 +66,15 @@ pub fn assess(
     let estimate =
         covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates, samples.fit.misfit()));
     // Where the simulation does not fit the data, its parameters say nothing about damage.
-    let mut quantities = damage::assess(&sampled, context.undamaged.filter(|_| trust.accepted()));
+    let compared = context.undamaged.filter(|_| trust.accepted());
+    let mut quantities = damage::assess(&sampled, compared);
     for quantity in quantities.iter_mut().filter(|q| not_informed.contains(&q.name)) {
         quantity.damage = None;
     }
+    // A quantity that is not informed has no part in a joint probability either.
+    let compared = compared.filter(|_| not_informed.is_empty());
+    let joint = joint_samples(baseline, &samples).filter(|_| trust.accepted());
+    let joint = joint.map(|joint| damage::assess_jointly(&sampled, &joint, compared));
     Ok(Assessment {
         model_digest: baseline.digest().clone(),
         structure_digest: baseline.simulator().digest().clone(),
@@ -85,6 +90,7 @@ pub fn assess(
         assessed_at,
         quantities,
         estimate,
+        joint,
     })
 }
 

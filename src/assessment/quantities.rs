@@ -2,8 +2,7 @@
 
 use super::samples::BatchSamples;
 use crate::baseline::Baseline;
-use crate::damage::{QuantityKind, QuantitySamples};
-use crate::hierarchy::PopulationEstimate;
+use crate::damage::{JointSamples, QuantityKind, QuantitySamples};
 use crate::parameter::DamageDirection;
 
 /// Samples of everything that is monitored: each parameter, the stiffness of each spring that a parameter sets through a law, and
@@ -47,7 +46,6 @@ pub fn monitored_quantities(
     });
     let of_groups = groups.iter().map(|group| {
         let members: Vec<Vec<f64>> = group.columns.iter().map(|&column| pooled.column(column)).collect();
-        let parts: Vec<&PopulationEstimate> = group.columns.iter().map(|&column| population(column)).collect();
         let parameter = &baseline.space().as_slice()[group.columns[0]];
         QuantitySamples {
             name: group.name.clone(),
@@ -58,10 +56,30 @@ pub fn monitored_quantities(
                 .map(|i| members.iter().map(|m| m[i]).sum::<f64>() / members.len() as f64)
                 .collect(),
             draws: pooled.draws(),
-            population: PopulationEstimate::average(&parts),
+            population: samples.populations.average(&group.columns),
             prior_bound_mass: group.columns.iter().map(|&column| prior_bound_mass[column]).fold(0.0, f64::max),
             group: None,
         }
     });
     parameters.chain(springs).chain(of_groups).collect()
+}
+
+/// Names and correlations of the quantities that take part in the joint probability of damage: parameters with a damage direction,
+/// and groups instead of their parameters. A spring that follows a parameter is left out, because it would only repeat that
+/// parameter. `None` for fewer than two of them, for more than eight, and where the correlations are not estimated.
+pub fn joint_samples(baseline: &Baseline, samples: &BatchSamples) -> Option<JointSamples> {
+    let (space, groups) = (baseline.space(), baseline.groups());
+    let directed = |column: usize| space.as_slice()[column].damage != DamageDirection::None;
+    let is_single = |column: &usize| directed(*column) && !groups.iter().any(|group| group.columns.contains(column));
+    let singles: Vec<usize> = (0..space.len()).filter(is_single).collect();
+    let of_groups: Vec<_> = groups.iter().filter(|group| directed(group.columns[0])).collect();
+    let single_names = singles.iter().map(|&column| space.as_slice()[column].name.clone());
+    let names: Vec<String> = single_names.chain(of_groups.iter().map(|group| group.name.clone())).collect();
+    let columns = singles.iter().map(|&column| vec![column]);
+    let columns: Vec<Vec<usize>> = columns.chain(of_groups.iter().map(|group| group.columns.clone())).collect();
+    if names.len() < 2 {
+        return None;
+    }
+    let correlations = samples.populations.correlations_of(&columns)?;
+    Some(JointSamples { names, correlations })
 }

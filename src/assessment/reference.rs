@@ -4,13 +4,14 @@ use std::sync::Arc;
 
 use super::conditions::conditions;
 use super::estimate::{process_covariates, ProcessQuantities};
-use super::quantities::monitored_quantities;
+use super::quantities::{joint_samples, monitored_quantities};
 use super::samples::{draw, joined, BatchSamples, Draws, Error};
 use crate::baseline::Baseline;
-use crate::damage::{self, UndamagedReference};
+use crate::damage::{self, JointReference, UndamagedReference};
 use crate::measurement::ModalMeasurement;
 use crate::process::fit;
 use crate::process::reference::ReferenceProcess;
+use crate::quantity::Probability;
 use crate::stats;
 use crate::trust::fit::Misfit;
 use crate::trust::{Finding, FindingCode, FindingEffect, Trust};
@@ -165,6 +166,9 @@ impl<'a> ReferenceBatches<'a> {
             Ok(process) => reference.process = Some(Arc::new(process)),
             Err(why) => reference.without_process = Some(why.to_string()),
         }
+        let level = Probability::new(threshold_probability).map_err(damage::Error::from)?;
+        let joint = joint_samples(baseline, &samples);
+        reference.joint = joint.and_then(|joint| JointReference::new(&quantities, &joint, level));
         Ok(reference)
     }
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::damage::QuantityAssessment;
+use crate::damage::{JointAssessment, QuantityAssessment};
 use crate::process::estimate::BatchEstimate;
 use crate::quantity::{Digest, Timestamp};
 use crate::trust::Trust;
@@ -65,4 +65,7 @@ pub struct Assessment {
     /// was read from the database.
     #[serde(skip)]
     pub estimate: Option<BatchEstimate>,
+    /// Correlations and joint probability of damage; `None` where the batch does not determine the correlations of at least two
+    /// quantities, for a rejected batch, and in assessments stored by versions that did not estimate them.
+    pub joint: Option<JointAssessment>,
 }

@@ -17,11 +17,16 @@
 //! ```
 
 mod comparison;
+mod joint;
+mod joint_comparison;
+mod orthant;
 mod pool;
 mod reference;
 mod threshold;
 
 pub use comparison::{assess, Damage, QuantityAssessment};
+pub use joint::{Correlation, JointReference, JointSamples};
+pub use joint_comparison::{assess_jointly, Carrier, JointAssessment, JointDamage};
 pub use pool::{Hyperparameters, QuantityKind, QuantitySamples};
 pub use reference::{
     ChartReference, Error, SeenCovariate, UndamagedQuantity, UndamagedReference, MINIMUM_MEASUREMENTS,

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 
+use super::joint::JointReference;
 use super::pool::{Hyperparameters, QuantitySamples};
 use super::threshold::threshold;
 use crate::hierarchy::interval;
@@ -78,6 +79,10 @@ pub struct UndamagedReference {
     /// Why there is no process.
     #[serde(default)]
     pub without_process: Option<String>,
+    /// The joint probability of damage of the undamaged population and its correlations; `None` where the correlations are not
+    /// estimated, and in references of versions that did not.
+    #[serde(default)]
+    pub joint: Option<JointReference>,
 }
 
 /// The values of a covariate in the undamaged reference.
@@ -172,6 +177,7 @@ impl UndamagedReference {
             doubts,
             process: None,
             without_process: None,
+            joint: None,
         })
     }
 }

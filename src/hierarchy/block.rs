@@ -122,7 +122,14 @@ mod tests {
                 let (centred, mut values) = ([vec![Lanes::ZERO; block.places.end]], offsets.clone());
                 let (places, linears) = (block.places.clone(), [Lanes::ZERO]);
                 let (own, offsets) = (&mut values[places.clone()], &offsets[places.clone()]);
-                let terms = Terms { to: offsets, deviations: &centred, places, squares: &[0.0], linears: &linears };
+                let terms = Terms {
+                    to: offsets,
+                    deviations: &centred,
+                    places,
+                    squares: &[0.0],
+                    linears: &linears,
+                    crosses: &[],
+                };
                 let mut logarithms = own.to_vec();
                 let weighed = weigh(own, &mut logarithms, &terms, block.width, &Lanes([-1e4; LANES]));
                 let mut counts = vec![[0.0; LANES]; block.places.end];

@@ -4,24 +4,33 @@ use nalgebra::DMatrix;
 use rand::RngCore as _;
 use rayon::prelude::*;
 
-use super::population::{interval, PopulationEstimate, Populations, DRAWS};
-use super::problem::Problem;
-use super::{gibbs, importance};
+use super::correlation::Correlations;
+use super::normal::Normal;
+use super::population::{interval, PopulationEstimate};
+use super::populations::Populations;
+use super::problem::{Problem, State};
+use super::{gibbs, importance, joint};
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::posterior::PosteriorSamples;
 use crate::stats;
 
-/// Estimates the populations behind posterior samples. The point estimate is computed by expectation–maximisation, the
-/// draws of (μ, σ) by importance sampling, or by a Markov chain where their posterior is far from normal.
+/// Estimates the populations behind posterior samples, and the correlations of the parameters over the measurements. The point
+/// estimate is computed by expectation–maximisation, the draws of (μ, Σ) by importance sampling, or by a Markov chain where their
+/// posterior is far from normal.
 ///
 /// ```text
-///  E:  w_js ∝ N(x_js; μ, diag σ²)
-///  M:  μ = 1/n Σ_js w_js x_js,   σ² = 1/n [ Σ_js w_js (x_js − μ)² + (1 − B) σ² ],   B = 1/n Σ_j var_w(x_j)/σ²
+///  E:  w_js ∝ N(x_js; μ, Σ)
+///  M:  μ = 1/n Σ_js w_js x_js,   Σ = 1/n [ Σ_js w_js (x_js − μ)(x_js − μ)ᵀ + Σ − W ],   W = 1/n Σ_j cov_w(x_j)
 /// ```
 ///
-/// Priors: μ is uniform in the prior box, σ uniform up to half the width of the prior. The second term of σ² is ours and
-/// corresponds to the restricted likelihood of a normal population: it restores the variance that the fitted mean absorbs,
-/// which is σ²/n for data without noise.
+/// Priors: μ is uniform in the prior box; each σ_k uniform up to half the width of the prior, with a factor (σ_k² + W_kk)^(−(d−1)/8)
+/// for d correlated parameters, where W_kk is the noise of a measurement; each correlation uniform between −1 and 1 (with the
+/// distribution of Barnard, McCulloch and Meng for all together). The second term of Σ is ours and corresponds to
+/// the restricted likelihood of a normal population: it restores the variance that the fitted mean absorbs, which is Σ/n for data
+/// without noise.
+///
+/// For one parameter, for more than eight, and for fewer than max(8, 2d + 4, 2(d − 1)²) measurements, Σ is diagonal: such a batch hardly
+/// determines correlations, and none are reported.
 ///
 /// `samples`: x, `[n·draws, d]` in parameter units. `log_weights`: ln q(x_js | y_j) − ln r_j(x_js), nats, `[n·draws]`, up to a
 /// constant for each measurement, if the samples were drawn from densities r_j instead of q(· | y_j). Their exponentials
@@ -29,7 +38,7 @@ use crate::stats;
 ///
 /// Source: D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
 /// 2166–2175; prior of σ: A. Gelman (2006), Prior distributions for variance parameters in hierarchical models, Bayesian
-/// Analysis 1, 515–533.
+/// Analysis 1, 515–533; prior of the correlations: J. Barnard, R. McCulloch, X.-L. Meng (2000), Statistica Sinica 10, 1281–1311.
 pub fn populations(
     samples: &PosteriorSamples,
     log_weights: Option<&[f64]>,
@@ -37,9 +46,6 @@ pub fn populations(
     seed: u64,
 ) -> Populations {
     let problem = Problem::new(samples, log_weights, space);
-    let dimension = space.len();
-    let to_units = |column: usize, u: f64| space.as_slice()[column].from_unit(u);
-    let width = |column: usize| space.as_slice()[column].upper - space.as_slice()[column].lower;
     if problem.measurements < 2 {
         // The posterior of a single measurement is that of the mean; the spread is unknown.
         let one = |column: usize| {
@@ -47,19 +53,40 @@ pub fn populations(
             PopulationEstimate { mean: stats::mean(&mean_draws), std: None, mean_draws, std_draws: Vec::new() }
         };
         let effective_sample_size = problem.draws as f64;
-        return Populations { parameters: (0..dimension).map(one).collect(), effective_sample_size };
+        let parameters = (0..space.len()).map(one).collect();
+        return Populations { parameters, correlations: None, effective_sample_size };
+    }
+    if let Some(populations) = correlated(&problem, space, seed) {
+        return populations;
     }
     let point = problem.maximise();
     let effective_sample_size = problem.effective_sample_size(&point);
     let states = importance::draws(&problem, &point, seed).unwrap_or_else(|| gibbs::draws(&problem, &point, seed));
-    let (mut means, mut stds) =
-        (vec![Vec::with_capacity(DRAWS); dimension], vec![Vec::with_capacity(DRAWS); dimension]);
-    for state in &states {
-        for column in 0..dimension {
-            means[column].push(to_units(column, state.mean[column]));
-            stds[column].push(state.std[column] * width(column));
-        }
-    }
+    Populations { parameters: in_units(&point, &states, space), correlations: None, effective_sample_size }
+}
+
+/// The populations with correlations; `None` where these are not estimated.
+fn correlated(problem: &Problem, space: &ParameterSpace, seed: u64) -> Option<Populations> {
+    let point = normal(problem)?;
+    let effective_sample_size = problem.effective_sample_size_of_normal(&point);
+    let draws = joint::draws(problem, &point, seed)?;
+    let state = |normal: &Normal| State {
+        mean: normal.mean[..space.len()].to_vec(),
+        std: (0..space.len()).map(|k| normal.std(k)).collect(),
+    };
+    let states: Vec<State> = draws.iter().map(state).collect();
+    let parameters = in_units(&state(&point), &states, space);
+    Some(Populations { parameters, correlations: Some(Correlations::of_draws(&draws)), effective_sample_size })
+}
+
+/// The most probable normal population with full covariance; `None` where that is not estimated.
+fn normal(problem: &Problem) -> Option<Normal> {
+    let estimated = joint::is_estimated(problem.deviations.len(), problem.measurements);
+    estimated.then(|| problem.maximise_normal())
+}
+
+/// The most probable population and draws, in the unit box, as estimates of each parameter in its unit.
+fn in_units(point: &State, states: &[State], space: &ParameterSpace) -> Vec<PopulationEstimate> {
     // With few measurements the most probable σ can lie below the credible interval, and is replaced by the median.
     let within = |point: f64, draws: &[f64]| {
         let [low, high] = interval(draws);
@@ -69,14 +96,18 @@ pub fn populations(
             stats::quantile(draws, 0.5)
         }
     };
-    let one = |(column, (mean_draws, std_draws)): (usize, (Vec<f64>, Vec<f64>))| PopulationEstimate {
-        mean: within(to_units(column, point.mean[column]), &mean_draws),
-        std: Some(within(point.std[column] * width(column), &std_draws)),
-        mean_draws,
-        std_draws,
+    let one = |(column, parameter): (usize, &Parameter)| {
+        let width = parameter.upper - parameter.lower;
+        let mean_draws: Vec<f64> = states.iter().map(|state| parameter.from_unit(state.mean[column])).collect();
+        let std_draws: Vec<f64> = states.iter().map(|state| state.std[column] * width).collect();
+        PopulationEstimate {
+            mean: within(parameter.from_unit(point.mean[column]), &mean_draws),
+            std: Some(within(point.std[column] * width, &std_draws)),
+            mean_draws,
+            std_draws,
+        }
     };
-    let parameters = means.into_iter().zip(stds).enumerate().map(one).collect();
-    Populations { parameters, effective_sample_size }
+    space.iter().enumerate().map(one).collect()
 }
 
 /// Estimates the population of each parameter separately, with those of all others uniform over the prior. With many
@@ -100,20 +131,29 @@ pub fn populations_of_each(samples: &PosteriorSamples, space: &ParameterSpace, s
     };
     let each: Vec<Populations> = space.as_slice().par_iter().enumerate().map(one).collect();
     let effective_sample_size = each.iter().map(|p| p.effective_sample_size).fold(f64::INFINITY, f64::min);
-    Populations { parameters: each.into_iter().flat_map(|p| p.parameters).collect(), effective_sample_size }
+    let parameters = each.into_iter().flat_map(|p| p.parameters).collect();
+    Populations { parameters, correlations: None, effective_sample_size }
 }
 
 /// The point estimate of [`populations`] and its effective sample size, without draws of (μ, σ). `samples`: `[n·draws, d]`,
 /// parameter units; `log_weights`: `[n·draws]`, nats, as in [`populations`].
 pub fn estimate(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Populations {
     let problem = Problem::new(samples, log_weights, space);
-    let point = problem.maximise();
-    let effective_sample_size = problem.effective_sample_size(&point);
+    let found = normal(&problem);
+    let (mean, std, effective_sample_size) = if let Some(normal) = &found {
+        let std = (0..space.len()).map(|k| normal.std(k)).collect();
+        (normal.mean[..space.len()].to_vec(), std, problem.effective_sample_size_of_normal(normal))
+    } else {
+        let point = problem.maximise();
+        let effective_sample_size = problem.effective_sample_size(&point);
+        (point.mean, point.std, effective_sample_size)
+    };
     let one = |(column, p): (usize, &Parameter)| PopulationEstimate {
-        mean: p.from_unit(point.mean[column]),
-        std: Some(point.std[column] * (p.upper - p.lower)),
+        mean: p.from_unit(mean[column]),
+        std: Some(std[column] * (p.upper - p.lower)),
         mean_draws: Vec::new(),
         std_draws: Vec::new(),
     };
-    Populations { parameters: space.iter().enumerate().map(one).collect(), effective_sample_size }
+    let correlations = found.as_ref().map(Correlations::of_point);
+    Populations { parameters: space.iter().enumerate().map(one).collect(), correlations, effective_sample_size }
 }

@@ -46,7 +46,7 @@ const NEAR_ENOUGH: std::ops::RangeInclusive<f32> = 1e-12..=1e12;
 /// Terms of the logarithms of the weights.
 ///
 /// ```text
-///  log₂ w_s = to_s + Σ_k x_sk (x_sk square_k + linear_k)
+///  log₂ w_s = to_s + Σ_k x_sk (x_sk square_k + linear_k + Σ_{l<k} x_sl cross_kl)
 /// ```
 pub(super) struct Terms<'a> {
     /// Logarithms to base 2 that the terms are added to, one entry per place.
@@ -55,10 +55,12 @@ pub(super) struct Terms<'a> {
     pub deviations: &'a [Vec<Lanes>],
     /// Places of the block among those of all blocks.
     pub places: Range<usize>,
-    /// −1/2σ² · log₂ e of each parameter.
+    /// −1/2σ² · log₂ e of each parameter; with correlations, −½ P_kk · log₂ e of the precision matrix P.
     pub squares: &'a [f32],
-    /// (μ − c)/σ² · log₂ e of each parameter, with the centre c.
+    /// (μ − c)/σ² · log₂ e of each parameter, with the centre c; with correlations, P (μ − c) · log₂ e.
     pub linears: &'a [Lanes],
+    /// −P_kl · log₂ e of each parameter k and each l < k, row by row; empty without correlations.
+    pub crosses: &'a [f32],
 }
 
 /// Computes `weights` and their logarithms, one entry per place. The lanes of a measurement are `width` apart. The weights
@@ -73,7 +75,20 @@ pub(super) fn weigh_simd<S: pulp::Simd>(
     width: usize,
     divisor: &Lanes,
 ) -> Weighed {
-    for (k, some) in terms.deviations.chunks(PER_PASS).enumerate() {
+    if !terms.crosses.is_empty() {
+        match terms.deviations {
+            [a, b] => add_quadratic(simd, logarithms, terms, [a, b]),
+            [a, b, c] => add_quadratic(simd, logarithms, terms, [a, b, c]),
+            [a, b, c, d] => add_quadratic(simd, logarithms, terms, [a, b, c, d]),
+            [a, b, c, d, e] => add_quadratic(simd, logarithms, terms, [a, b, c, d, e]),
+            [a, b, c, d, e, f] => add_quadratic(simd, logarithms, terms, [a, b, c, d, e, f]),
+            [a, b, c, d, e, f, g] => add_quadratic(simd, logarithms, terms, [a, b, c, d, e, f, g]),
+            [a, b, c, d, e, f, g, h] => add_quadratic(simd, logarithms, terms, [a, b, c, d, e, f, g, h]),
+            _ => unreachable!("correlations of two to eight parameters"),
+        }
+    }
+    let apart = if terms.crosses.is_empty() { terms.deviations } else { &[] };
+    for (k, some) in apart.chunks(PER_PASS).enumerate() {
         let (squares, linears) = (&terms.squares[PER_PASS * k..], &terms.linears[PER_PASS * k..]);
         let (to, places) = ((k == 0).then_some(terms.to), &terms.places);
         match some {
@@ -164,6 +179,38 @@ fn add_terms<S: pulp::Simd, const K: usize>(
     }
 }
 
+/// Computes the logarithms with the terms of K correlated parameters.
+#[inline(always)]
+fn add_quadratic<S: pulp::Simd, const K: usize>(
+    simd: S,
+    logarithms: &mut [Lanes],
+    terms: &Terms<'_>,
+    deviations: [&Vec<Lanes>; K],
+) {
+    let count = logarithms.len();
+    let (deviations, to) = (deviations.map(|x| &x[terms.places.clone()][..count]), &terms.to[..count]);
+    let squares: [S::f32s; K] = std::array::from_fn(|k| simd.splat_f32s(terms.squares[k]));
+    let cross = |k: usize, l: usize| simd.splat_f32s(if l < k { terms.crosses[k * (k - 1) / 2 + l] } else { 0.0 });
+    let crosses: [[S::f32s; K]; K] = std::array::from_fn(|k| std::array::from_fn(|l| cross(k, l)));
+    for first in (0..LANES).step_by(S::F32_LANES) {
+        let part = first..first + S::F32_LANES;
+        let of = |lanes: &Lanes| S::as_simd_f32s(&lanes.0[part.clone()]).0[0];
+        let linears: [S::f32s; K] = std::array::from_fn(|k| of(&terms.linears[k]));
+        for (sample, logarithms) in logarithms.iter_mut().enumerate() {
+            let x: [S::f32s; K] = std::array::from_fn(|k| of(&deviations[k][sample]));
+            let mut sum = of(&to[sample]);
+            for k in 0..K {
+                let mut factor = simd.mul_add_f32s(x[k], squares[k], linears[k]);
+                for l in 0..k {
+                    factor = simd.mul_add_f32s(x[l], crosses[k][l], factor);
+                }
+                sum = simd.mul_add_f32s(x[k], factor, sum);
+            }
+            S::as_mut_simd_f32s(&mut logarithms.0[part.clone()]).0[0] = sum;
+        }
+    }
+}
+
 /// Combines the lanes `part` of all entries, in four independent rows for instruction-level parallelism.
 #[inline(always)]
 fn in_fours<S: pulp::Simd>(
@@ -243,6 +290,19 @@ pub(super) fn moments_simd<S: pulp::Simd>(_: S, weights: &[Lanes], x: &[Lanes]) 
     (first, second)
 }
 
+/// Σ w x y of each lane.
+#[pulp::with_simd(cross_moment = pulp::Arch::new())]
+#[inline(always)]
+pub(super) fn cross_moment_simd<S: pulp::Simd>(_: S, weights: &[Lanes], x: &[Lanes], y: &[Lanes]) -> Lanes {
+    let mut sum = Lanes::ZERO;
+    for ((weights, x), y) in weights.iter().zip(x).zip(y) {
+        for (((weight, x), y), sum) in weights.0.iter().zip(&x.0).zip(&y.0).zip(&mut sum.0) {
+            *sum = (weight * x).mul_add(*y, *sum);
+        }
+    }
+    sum
+}
+
 /// w ← exp(w − max w); returns the sum.
 #[pulp::with_simd(exponentials = pulp::Arch::new())]
 #[inline(always)]
@@ -275,8 +335,14 @@ mod tests {
             let linear = lanes(&|lane| LOG2_E * off(lane) / (std * std));
             let mut logarithms = weights.clone();
             let columns = [deviations];
-            let terms =
-                Terms { to: &offsets, deviations: &columns, places: 0..count, squares: &[square], linears: &[linear] };
+            let terms = Terms {
+                to: &offsets,
+                deviations: &columns,
+                places: 0..count,
+                squares: &[square],
+                linears: &[linear],
+                crosses: &[],
+            };
             // The initial divisor is too far from the largest weight.
             let found = weigh(&mut weights, &mut logarithms, &terms, LANES, &Lanes([1e4; LANES]));
             let moments = moments(&weights, &columns[0]);
@@ -328,8 +394,14 @@ mod tests {
             let linears: Vec<Lanes> = (0..parameters).map(|k| lanes(&|lane| linear(k, lane))).collect();
             // Eight measurements with two lanes each.
             let (mut weights, offsets) = (vec![Lanes::ZERO; 7], vec![Lanes::ZERO; 7]);
-            let terms =
-                Terms { to: &offsets, deviations: &columns, places: 0..7, squares: &squares, linears: &linears };
+            let terms = Terms {
+                to: &offsets,
+                deviations: &columns,
+                places: 0..7,
+                squares: &squares,
+                linears: &linears,
+                crosses: &[],
+            };
             let mut logarithms = weights.clone();
             let found = weigh(&mut weights, &mut logarithms, &terms, 8, &Lanes([-100.0; LANES]));
             // Another divisor that is close enough is kept.
@@ -351,6 +423,51 @@ mod tests {
                     assert!((f64::from(found.sum.0[own]) / sum - 1.0).abs() < 1e-5, "{parameters}, {own}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn terms_of_correlated_parameters_are_added() {
+        for parameters in 2..=8_usize {
+            let x = |k: usize, sample: usize, lane: usize| ((k + 2 * sample + 5 * lane) as f64).sin();
+            let (square, cross) =
+                (|k: usize| -0.9 - 0.1 * k as f64, |k: usize, l: usize| 0.1 * ((k + 3 * l) as f64).cos());
+            let linear = |k: usize, lane: usize| ((k + lane) as f64).cos();
+            let lanes = |f: &dyn Fn(usize) -> f64| -> Lanes { Lanes(std::array::from_fn(|lane| f(lane) as f32)) };
+            let column = |k: usize| (0..7).map(|sample| lanes(&|lane| x(k, sample, lane))).collect::<Vec<_>>();
+            let columns: Vec<Vec<Lanes>> = (0..parameters).map(column).collect();
+            let squares: Vec<f32> = (0..parameters).map(|k| square(k) as f32).collect();
+            let linears: Vec<Lanes> = (0..parameters).map(|k| lanes(&|lane| linear(k, lane))).collect();
+            let pairs = (0..parameters).flat_map(|k| (0..k).map(move |l| (k, l)));
+            let crosses: Vec<f32> = pairs.map(|(k, l)| cross(k, l) as f32).collect();
+            let (mut weights, offsets) = (vec![Lanes::ZERO; 7], vec![Lanes([0.25; LANES]); 7]);
+            let mut logarithms = weights.clone();
+            let terms = Terms {
+                to: &offsets,
+                deviations: &columns,
+                places: 0..7,
+                squares: &squares,
+                linears: &linears,
+                crosses: &crosses,
+            };
+            weigh(&mut weights, &mut logarithms, &terms, LANES, &Lanes::ZERO);
+            for sample in 0..7 {
+                for lane in 0..LANES {
+                    let mut expected = 0.25;
+                    for k in 0..parameters {
+                        let own = x(k, sample, lane);
+                        expected += own * (own * square(k) + linear(k, lane));
+                        expected += (0..k).map(|l| own * x(l, sample, lane) * cross(k, l)).sum::<f64>();
+                    }
+                    // Up to 44 terms of at most 2 in single precision.
+                    let found = f64::from(logarithms[sample].0[lane]);
+                    assert!((found - expected).abs() < 1e-5, "{parameters}: {found}, expected {expected}");
+                }
+            }
+            let direct: f64 =
+                (0..7).map(|s| f64::from(weights[s].0[3] * columns[0][s].0[3] * columns[1][s].0[3])).sum();
+            let found = f64::from(cross_moment(&weights, &columns[0], &columns[1]).0[3]);
+            assert!((found - direct).abs() < 1e-5 * direct.abs().max(1.0), "{found}, expected {direct}");
         }
     }
 

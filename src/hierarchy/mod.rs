@@ -2,11 +2,14 @@
 //! measurements.
 //!
 //! The posterior samples of each measurement j follow q(x | y_j) ∝ p(y_j | x) under a uniform prior. They suffice to
-//! compute the likelihood of a normal population (μ, σ):
+//! compute the likelihood of a normal population (μ, Σ):
 //!
 //! ```text
-//!  L(μ, σ) = Π_j ∫ p(y_j | x) N(x; μ, diag σ²) dx ∝ Π_j 1/S Σ_s N(x_js; μ, diag σ²)
+//!  L(μ, Σ) = Π_j ∫ p(y_j | x) N(x; μ, Σ) dx ∝ Π_j 1/S Σ_s N(x_js; μ, Σ)
 //! ```
+//!
+//! The parameters of a healthy structure move together, with temperature for example, so that Σ is a full matrix where the batch
+//! determines one.
 //!
 //! The pool of all samples contains the noise twice, in the positions and in the widths of the posteriors. The population
 //! contains only the variation between measurements.
@@ -45,15 +48,26 @@
 //! ```
 
 mod block;
+mod coordinates;
+mod correlation;
 mod estimate;
 mod gibbs;
 mod importance;
+mod joint;
+mod joint_chain;
 mod kernel;
+mod normal;
 mod population;
+mod populations;
 mod problem;
 mod proposal;
+mod small;
+#[cfg(test)]
+mod tests;
 mod widths;
 
+pub use correlation::Correlations;
 pub use estimate::{estimate, populations, populations_of_each};
-pub use population::{interval, PopulationEstimate, Populations, DRAWS, INTERVAL};
+pub use population::{interval, PopulationEstimate, DRAWS, INTERVAL};
+pub use populations::Populations;
 pub use proposal::proposals;

@@ -21,15 +21,6 @@ pub struct PopulationEstimate {
     pub std_draws: Vec<f64>,
 }
 
-/// The populations of all parameters.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Populations {
-    /// One entry per parameter, in the order of the space.
-    pub parameters: Vec<PopulationEstimate>,
-    /// Effective sample size (Σw)²/Σw² of each measurement under the estimated population, averaged over the measurements.
-    pub effective_sample_size: f64,
-}
-
 impl PopulationEstimate {
     /// Lower and upper end of the central credible interval of μ with probability [`INTERVAL`], in the quantity's unit.
     pub fn mean_interval(&self) -> [f64; 2] {

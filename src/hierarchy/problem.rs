@@ -16,7 +16,7 @@ pub(super) const WIDEST: f64 = 0.5;
 const NOISY: f64 = 0.3;
 
 /// Most iterations of expectation–maximisation.
-const EM_ITERATIONS: usize = 200;
+pub(super) const EM_ITERATIONS: usize = 200;
 
 /// μ and σ of every parameter in the unit box.
 #[derive(Debug, Clone)]
@@ -62,6 +62,8 @@ pub(super) struct Weights {
     pub squares: Vec<f32>,
     /// As in [`Terms`].
     pub linears: Vec<Lanes>,
+    /// As in [`Terms`].
+    pub crosses: Vec<f32>,
 }
 
 /// The samples of each parameter in the unit box, `[parameter][sample]`.
@@ -160,6 +162,7 @@ impl Problem {
             precisions: vec![0.0; d],
             squares: vec![0.0; d],
             linears: vec![Lanes::ZERO; d],
+            crosses: Vec::new(),
         }
     }
 
@@ -169,7 +172,7 @@ impl Problem {
     ///  ln w_s = offset_s − Σ_k ½((x_sk − μ_k)/σ_k)² + ½((c_k − μ_k)/σ_k)²
     /// ```
     pub(super) fn weigh(&self, state: &State, weights: &mut Weights) {
-        let Weights { values, logarithms, blocks, of_centres, precisions, squares, linears } = weights;
+        let Weights { values, logarithms, blocks, of_centres, precisions, squares, linears, .. } = weights;
         for ((square, precision), std) in squares.iter_mut().zip(&mut *precisions).zip(&state.std) {
             *precision = std.powi(-2);
             *square = (-0.5 * LOG2_E * *precision) as f32;
@@ -184,7 +187,7 @@ impl Problem {
             let places = block.places.clone();
             let (values, logarithms) = (&mut values[places.clone()], &mut logarithms[places.clone()]);
             let to = &self.offsets[places.clone()];
-            let terms = Terms { to, deviations: &self.deviations, places, squares, linears };
+            let terms = Terms { to, deviations: &self.deviations, places, squares, linears, crosses: &[] };
             *weighed = weigh(values, logarithms, &terms, block.width, &weighed.divisor);
         }
     }
@@ -212,7 +215,7 @@ impl Problem {
             let places = block.places.clone();
             let (values, logarithms) = (&mut others.values[places.clone()], &mut others.logarithms[places.clone()]);
             let (to, deviations) = (&weights.logarithms[places.clone()], std::slice::from_ref(&self.deviations[k]));
-            let terms = Terms { to, deviations, places, squares: &[square], linears: &[linear] };
+            let terms = Terms { to, deviations, places, squares: &[square], linears: &[linear], crosses: &[] };
             others.blocks[index] = weigh(values, logarithms, &terms, block.width, &old.divisor);
         }
     }
@@ -267,8 +270,14 @@ impl Problem {
 
     /// Effective sample size (Σw)²/Σw² under a population, averaged over the measurements.
     pub(super) fn effective_sample_size(&self, state: &State) -> f64 {
-        let (mut weights, mut all) = (self.buffers(), 0.0);
+        let mut weights = self.buffers();
         self.weigh(state, &mut weights);
+        self.effective_sample_size_of(&weights)
+    }
+
+    /// Effective sample size of weights, averaged over the measurements.
+    pub(super) fn effective_sample_size_of(&self, weights: &Weights) -> f64 {
+        let mut all = 0.0;
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
             let values = &weights.values[block.places.clone()];
             for (_, lanes) in block.lanes() {
@@ -282,6 +291,11 @@ impl Problem {
 
     /// ln L(μ, σ) up to a constant. `weights`: those under the same population.
     pub(super) fn log_likelihood(&self, state: &State, weights: &Weights) -> f64 {
+        self.log_sums(weights) - self.measurements as f64 * state.std.iter().map(|std| std.ln()).sum::<f64>()
+    }
+
+    /// The logarithms of the sums of the weights of each measurement, added.
+    pub(super) fn log_sums(&self, weights: &Weights) -> f64 {
         // The sums of many measurements are multiplied, so that few logarithms are needed.
         let (mut likelihood, mut product) = (-0.5 * weights.of_centres.iter().sum::<f64>(), 1.0_f64);
         for (block, weighed) in self.blocks.iter().zip(&weights.blocks) {
@@ -294,7 +308,7 @@ impl Problem {
                 }
             }
         }
-        likelihood + product.ln() - self.measurements as f64 * state.std.iter().map(|std| std.ln()).sum::<f64>()
+        likelihood + product.ln()
     }
 }
 

@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rayon::prelude::*;
 
-use super::population::Populations;
+use super::populations::Populations;
 use super::problem::{unit_columns, within, WIDEST};
 use super::widths::Widths;
 use crate::parameter::ParameterSpace;
@@ -40,15 +40,15 @@ pub fn proposals(
     let width = |k: usize| parameters[k].upper - parameters[k].lower;
     let within = within(&unit_columns(samples, space), samples.draws());
     let mean = DVector::from_fn(d, |k, _| parameters[k].to_unit(found.parameters[k].mean));
-    let precision = DMatrix::from_fn(d, d, |i, j| {
-        // A first estimate near zero must not prevent the proposals from reaching larger values.
-        let std = (found.parameters[i].std.unwrap_or(WIDEST) / width(i)).max(0.5 * within[i]).max(1e-6);
-        if i == j {
-            std.powi(-2)
-        } else {
-            0.0
-        }
-    });
+    // A first estimate near zero must not prevent the proposals from reaching larger values.
+    let std = |k: usize| (found.parameters[k].std.unwrap_or(WIDEST) / width(k)).max(0.5 * within[k]).max(1e-6);
+    let correlation = |i: usize, j: usize| match &found.correlations {
+        Some(correlations) => correlations.point(i, j),
+        None => f64::from(u8::from(i == j)),
+    };
+    let covariance = DMatrix::from_fn(d, d, |i, j| std(i) * std(j) * correlation(i, j));
+    let apart = || DMatrix::from_fn(d, d, |i, j| if i == j { std(i).powi(-2) } else { 0.0 });
+    let precision = covariance.cholesky().map_or_else(apart, |c| c.inverse());
     let widths = Widths::new(WIDTHS, TURNS, draws, d);
     let quantiles = NormalQuantiles::shared();
     let of_one = |(measurement, scrambling): (usize, u32)| {

@@ -5,7 +5,7 @@ use utoipa::ToSchema;
 
 use super::cell::{Cell, ColumnKind};
 use crate::assessment::{Assessment, BatchState};
-use crate::damage::{QuantityAssessment, QuantityKind};
+use crate::damage::{Correlation, JointDamage, JointReference, QuantityAssessment, QuantityKind};
 use crate::measurement::ModalMeasurement;
 use crate::monitor::stored::{BatchRecord, HistoryEntry, ReferenceRecord, StoredChartPoint};
 use crate::monitor::{BatchView, Missing};
@@ -108,6 +108,13 @@ pub struct AssessmentBody {
     /// Findings that qualify the results.
     findings: Vec<Finding>,
     parameters: Vec<ParameterBody>,
+    /// Correlations of the parameters that indicate damage, without the noise of the measurements; absent where the batch does not
+    /// determine them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    correlations: Vec<Correlation>,
+    /// Probability that any parameter is beyond its threshold, beside that of the undamaged reference.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    joint_damage: Option<JointDamage>,
 }
 
 /// Results for one monitored quantity. Mean and standard deviation are those of the population from which the
@@ -185,6 +192,7 @@ impl From<StoredChartPoint> for ChartBody {
 
 impl From<Assessment> for AssessmentBody {
     fn from(a: Assessment) -> Self {
+        let (correlations, joint_damage) = a.joint.map(|joint| (joint.correlations, joint.damage)).unwrap_or_default();
         let exceeds = a.quantities.iter().any(|q| q.damage.as_ref().is_some_and(|d| d.exceeds));
         Self {
             model_digest: a.model_digest.to_string(),
@@ -206,6 +214,8 @@ impl From<Assessment> for AssessmentBody {
             fit_degrees_of_freedom: a.trust.degrees_of_freedom,
             findings: a.trust.findings,
             parameters: a.quantities.into_iter().map(ParameterBody::from).collect(),
+            correlations,
+            joint_damage,
         }
     }
 }
@@ -368,6 +378,10 @@ pub struct Undamaged {
     #[serde(skip_serializing_if = "Option::is_none")]
     without_process: Option<String>,
     parameters: Vec<crate::damage::UndamagedQuantity>,
+    /// Joint probability that any parameter of the undamaged population is beyond its threshold; absent where the correlations are
+    /// not estimated.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    joint: Option<JointReference>,
 }
 
 /// How the parameters of the undamaged structure move in time.
@@ -420,6 +434,7 @@ impl Undamaged {
             process: record.state.process.as_deref().map(ProcessBody::from),
             without_process: record.state.without_process.clone(),
             parameters: record.state.quantities.clone(),
+            joint: record.state.joint.clone(),
         }
     }
 }

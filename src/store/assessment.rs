@@ -47,6 +47,7 @@ struct AssessmentRow {
     assessed_at_us: i64,
     effective_sample_size: Option<f64>,
     trust: Option<String>,
+    joint: Option<String>,
 }
 
 #[derive(FromRow)]
@@ -159,7 +160,7 @@ impl Assessments<'_> {
         let select = format!(
             "select batch_id, model_digest, undamaged_version, structure_digest, seed, draws_per_measurement,
                     measurements_used, measurements_left_out, measurements_outside, misfit_percent, assessed_at_us,
-                    effective_sample_size, trust
+                    effective_sample_size, trust, joint
              from assessment where structure_id = $1 and batch_id in (select value from {})
              order by batch_id, {CURRENT_FIRST}",
             elements!("$2")
@@ -298,8 +299,10 @@ async fn insert(
 ) -> Result<(), Error> {
     let version = a.undamaged_version.unwrap_or(0);
     let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
+    let joint = a.joint.as_ref().map(serde_json::to_string).transpose().map_err(|e| bad_row("assessment")(&e))?;
     // Two statements in one call, which saves a round trip to the thread of SQLite for every batch. PostgreSQL takes them singly.
-    let insert = "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15);
+    let insert =
+        "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16);
          update measurement_batch set state = 'assessed', failure = null where structure_id = $1 and batch_id = $2";
     sqlx::query(insert)
         .bind(structure)
@@ -317,6 +320,7 @@ async fn insert(
         .bind(a.effective_sample_size)
         .bind(trust)
         .bind(plotted::pack(a))
+        .bind(joint)
         .execute(transaction.connection())
         .await?;
     for rows in parts(a.quantities.len()) {
@@ -361,6 +365,7 @@ async fn insert(
 }
 
 fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
+    let joint = row.joint.as_deref().map(serde_json::from_str).transpose();
     Ok(Assessment {
         estimate: None,
         model_digest: Digest::from_stored(row.model_digest),
@@ -379,6 +384,7 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
         },
         assessed_at: timestamp("assessment", row.assessed_at_us)?,
         quantities: Vec::new(),
+        joint: joint.map_err(|e| bad_row("assessment")(&e))?,
     })
 }
 

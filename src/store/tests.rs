@@ -81,6 +81,7 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
         trust: Trust::unknown(),
         assessed_at,
         quantities: vec![quantity("k2"), quantity("k1")],
+        joint: None,
     }
 }
 
@@ -94,6 +95,7 @@ fn undamaged() -> UndamagedReference {
         quantities: Vec::new(),
         conditions: BTreeMap::new(),
         doubts: Vec::new(),
+        joint: None,
     }
 }
 

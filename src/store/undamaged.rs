@@ -213,14 +213,15 @@ impl References<'_> {
     }
 
     async fn read_undamaged(self, structure: &StructureId) -> Result<Option<ReferenceRecord>, Error> {
-        let row: Option<(u32, String, i64, f64, i64, String, String)> = sqlx::query_as(
-            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts
+        let row: Option<StateRow> = sqlx::query_as(
+            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint
              from undamaged_state where structure_id = $1 order by version desc limit 1",
         )
         .bind(structure.as_str())
         .fetch_optional(&self.database.reader)
         .await?;
-        let Some((version, model_digest, created, threshold_probability, measurements, conditions, doubts)) = row
+        let Some((version, model_digest, created, threshold_probability, measurements, conditions, doubts, joint)) =
+            row
         else {
             return Ok(None);
         };
@@ -252,6 +253,7 @@ impl References<'_> {
                 doubts: serde_json::from_str(&doubts).map_err(|e| bad(&e))?,
                 process,
                 without_process,
+                joint: joint.map(|joint| serde_json::from_str(&joint)).transpose().map_err(|e| bad(&e))?,
             },
             model_digest: Digest::from_stored(model_digest),
             created_at: timestamp("undamaged reference", created)?,
@@ -276,6 +278,9 @@ async fn insert_process(
     Ok(())
 }
 
+/// Version, model digest, time, threshold probability, number of measurements, conditions, doubts, joint probability.
+type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>);
+
 /// Structure and version of a reference.
 type Key<'k> = (&'k str, u32);
 
@@ -290,7 +295,7 @@ async fn insert_state(
     model_digest: &Digest,
     now: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8)")
+    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9)")
         .bind(structure)
         .bind(version)
         .bind(model_digest.as_str())
@@ -299,6 +304,7 @@ async fn insert_state(
         .bind(state.measurements as i64)
         .bind(to_json(&state.conditions)?)
         .bind(to_json(&state.doubts)?)
+        .bind(state.joint.as_ref().map(to_json).transpose()?)
         .execute(transaction.connection())
         .await?;
     Ok(())

@@ -11,7 +11,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use modalwatch::assessment::{Assessment, BatchState, NewCharts};
-use modalwatch::damage::{ChartReference, Damage, Hyperparameters, QuantityAssessment, QuantityKind, SeenCovariate};
+use modalwatch::damage::{
+    Carrier, ChartReference, Correlation, Damage, Hyperparameters, JointAssessment, JointDamage, JointReference,
+    QuantityAssessment, QuantityKind, SeenCovariate,
+};
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Digest, Hertz, StructureId, Timestamp};
 use modalwatch::store::{HistoryQuery, InsertBatch, PutStructure, Store};
@@ -48,6 +51,32 @@ async fn open() -> (Store, tempfile::TempDir) {
     let digest = Digest::of(&[b"v1"]);
     assert_eq!(store.structures().put_structure(&bridge(), "{}", &digest, at(0)).await.unwrap(), PutStructure::Created);
     (store, folder)
+}
+
+fn correlation() -> Correlation {
+    Correlation { first: "k1".to_owned(), second: "k2".to_owned(), correlation: 0.4, interval: [-0.1, 0.7] }
+}
+
+fn joint_reference() -> JointReference {
+    JointReference {
+        quantities: vec!["k1".to_owned(), "k2".to_owned()],
+        correlations: vec![correlation()],
+        probability: 0.09,
+        probability_interval: [0.07, 0.1],
+    }
+}
+
+fn joint_assessment() -> JointAssessment {
+    let carriers = vec![Carrier { name: "k2".to_owned(), probability_of_damage: 0.4, added: 0.4 }];
+    let damage = JointDamage {
+        probability: 0.43,
+        probability_interval: [0.3, 0.6],
+        reference_probability: 0.09,
+        reference_interval: [0.07, 0.1],
+        exceeds: true,
+        carriers,
+    };
+    JointAssessment { correlations: vec![correlation()], damage: Some(damage) }
 }
 
 fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestamp) -> Assessment {
@@ -89,6 +118,7 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
         trust: Trust { p_value: Some(0.3), findings: vec![finding], ..Trust::unknown() },
         assessed_at,
         quantities: vec![quantity("k2"), quantity("k1")],
+        joint: Some(joint_assessment()),
     }
 }
 
@@ -238,6 +268,7 @@ fn undamaged() -> modalwatch::damage::UndamagedReference {
         }],
         conditions: [("temperature_c".to_owned(), SeenCovariate::Range([-2.0, 7.5]))].into(),
         doubts: vec!["k1: its batches differ".to_owned()],
+        joint: Some(joint_reference()),
     }
 }
 

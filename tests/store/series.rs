@@ -63,7 +63,7 @@ async fn fill(folder: &tempfile::TempDir) {
          from n, json_each('[\"k1\",\"k2\",\"k3\",\"k4\"]') k",
         "insert into chart_point
          select 'bridge', iif(k.value like '%:%', 0, 1), k.value, at, name, iif(i = ?5, 9.0, 0.1 * (i % 9)), 3.0, 1.0, 0.3, 0, 0.2,
-                0, iif(i = ?5, 'alarming', 'normal') from n, json_each('[\"k1\",\"k2\",\"k3\",\"k4\",\"simulation:fit\"]') k",
+                0, iif(i = ?5, 'alarming', 'normal'), null from n, json_each('[\"k1\",\"k2\",\"k3\",\"k4\",\"simulation:fit\"]') k",
     ] {
         let (usual, missing) = ([1.0, 2.0, 3.0, 4.0, 5.0], [1.0, 2.0, f64::NAN, 4.0, 5.0]);
         sqlx::query(AssertSqlSafe(format!("{number} {statement}")))

@@ -199,7 +199,7 @@ async fn insert_undamaged(
     state: &Undamaged,
     created: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8)")
+    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9)")
         .bind(structure)
         .bind(state.version)
         .bind(&state.model_digest)
@@ -208,6 +208,7 @@ async fn insert_undamaged(
         .bind(state.measurements)
         .bind(&state.conditions)
         .bind(&state.doubts)
+        .bind(&state.joint)
         .execute(transaction.connection())
         .await?;
     for batch in &state.batches {

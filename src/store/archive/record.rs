@@ -158,6 +158,10 @@ pub struct Undamaged {
     pub conditions: String,
     /// Reasons to doubt it, a JSON list of sentences.
     pub doubts: String,
+    /// Joint probability of damage of the undamaged population and its correlations, JSON text; absent in archives of versions that
+    /// did not estimate them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joint: Option<String>,
     /// Its batches.
     pub batches: Vec<String>,
     /// Its quantities.
