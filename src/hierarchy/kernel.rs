@@ -451,8 +451,8 @@ mod tests {
                 crosses: &crosses,
             };
             weigh(&mut weights, &mut logarithms, &terms, LANES, &Lanes::ZERO);
-            for sample in 0..7 {
-                for lane in 0..LANES {
+            for (sample, found) in logarithms.iter().enumerate() {
+                for (lane, found) in found.0.iter().enumerate() {
                     let mut expected = 0.25;
                     for k in 0..parameters {
                         let own = x(k, sample, lane);
@@ -460,7 +460,7 @@ mod tests {
                         expected += (0..k).map(|l| own * x(l, sample, lane) * cross(k, l)).sum::<f64>();
                     }
                     // Up to 44 terms of at most 2 in single precision.
-                    let found = f64::from(logarithms[sample].0[lane]);
+                    let found = f64::from(*found);
                     assert!((found - expected).abs() < 1e-5, "{parameters}: {found}, expected {expected}");
                 }
             }

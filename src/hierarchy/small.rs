@@ -97,8 +97,8 @@ mod tests {
             let product = lower.squared();
             let (factor, unit) = (product.cholesky().unwrap(), lower.times(&lower.lower_inverse()));
             let image = lower.apply(&[1.0; MOST]);
-            for i in 0..size {
-                assert!((image[i] - lower.rows[i].iter().sum::<f64>()).abs() < 1e-12);
+            for (i, image) in image.iter().enumerate().take(size) {
+                assert!((image - lower.rows[i].iter().sum::<f64>()).abs() < 1e-12);
                 for j in 0..size {
                     assert!((factor.rows[i][j] - lower.rows[i][j]).abs() < 1e-10, "{size}: {i}, {j}");
                     assert!((unit.rows[i][j] - f64::from(u8::from(i == j))).abs() < 1e-10, "{size}: {i}, {j}");

@@ -224,7 +224,9 @@ fn usual_errors(process: &Process, estimates: &[BatchEstimate]) -> DMatrix<f64> 
     let complete: Vec<&Observation> = all.iter().filter(|o| o.informed.len() == d).collect();
     if !complete.is_empty() {
         let mut sum = DMatrix::zeros(d, d);
-        complete.iter().for_each(|o| sum += &o.covariance);
+        for observation in &complete {
+            sum += &observation.covariance;
+        }
         return sum / complete.len() as f64;
     }
     let variance = |k: usize| {

@@ -27,7 +27,7 @@ fn uneven(count: usize) -> Vec<Observation> {
     let mut stream = stats::stream(5, "test: observations of a process");
     let mut normal = || stream.sample::<f64, _>(StandardNormal);
     let one = |t: usize| {
-        let informed: Vec<usize> = (0..3).filter(|k| (t + k) % 4 != 0).collect();
+        let informed: Vec<usize> = (0..3).filter(|k| !(t + k).is_multiple_of(4)).collect();
         let o = informed.len();
         Observation {
             steps: if t == 0 { 0.0 } else { [1.0, 0.5, 3.0][t % 3] },
@@ -174,12 +174,14 @@ fn innovations(process: &Process, estimates: &[BatchEstimate]) -> Vec<super::fil
     observations(process, estimates).iter().map(one).collect()
 }
 
+/// Worlds in which a loss is looked for.
+const WORLDS: usize = 40;
+
 #[test]
 fn onset_and_size_of_a_loss_that_is_smaller_than_the_season_are_found() {
     let process = fitted(2, 365);
     let contributions = process.in_operation().contributions();
     let (mut inside, mut onsets) = (0, 0);
-    const WORLDS: usize = 40;
     for seed in 0..WORLDS as u64 {
         let after = innovations(&process, &world(100 + seed, 120, 100, [0.0, -0.03, 0.0]));
         let found = change(&after[60..], &contributions, &[-1.0; 3], Some(1)).unwrap();
@@ -225,9 +227,8 @@ fn healthy_operation_alarms_as_rarely_as_wanted() {
     let process = fitted(8, 1_000);
     let signs = [-1.0; 3];
     let limits = limits(&process, &signs, wanted, 1).unwrap();
-    println!("{limits:?} {:?}", process.numbers());
     let contributions = process.in_operation().contributions();
-    let (mut alarms, mut batches) = (0, 0);
+    let (mut alarms, mut batches) = (0, 0_i32);
     for seed in 0..20 {
         let after = innovations(&process, &world(1_000 + seed, 500, usize::MAX, [0.0; 3]));
         let mut quiet_until = 60;
@@ -247,7 +248,7 @@ fn healthy_operation_alarms_as_rarely_as_wanted() {
         }
     }
     // Alarms counted are those that begin outside the 60 batches after another one.
-    let expected = batches as f64 / (wanted + 60.0);
+    let expected = f64::from(batches) / (wanted + 60.0);
     let error = expected.sqrt();
     assert!((f64::from(alarms) - expected).abs() < 3.5 * error, "{alarms} alarms, {expected} expected");
 }

@@ -37,7 +37,8 @@ fn world(seed: u64, lost: usize, factor: impl Fn(usize) -> f64) -> Vec<BatchEsti
             Some(usual * if k == lost { factor(day) } else { 1.0 } + STIFFNESS[k] * 0.004 * error)
         };
         let mean = (0..4).map(stiffness).collect();
-        let variance = |place: usize| if place % 5 == 0 { (0.004 * STIFFNESS[place / 5]).powi(2) } else { 0.0 };
+        let variance =
+            |place: usize| if place.is_multiple_of(5) { (0.004 * STIFFNESS[place / 5]).powi(2) } else { 0.0 };
         BatchEstimate {
             at: Timestamp::from_micros(86_400_000_000 * day as i64).unwrap(),
             mean,

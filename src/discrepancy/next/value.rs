@@ -70,8 +70,8 @@ pub(super) fn value(members: &[Member<'_>], repeats: usize, blocks: usize, norma
             for ((logs, other), log_probability) in logs.iter_mut().zip(&factored).zip(&log_probabilities) {
                 *logs = other.log_densities(&y, &mut left).map(|log| log + log_probability);
             }
-            for lane in 0..LANES {
-                let right = share_of(members[truth].candidate, members, |member| logs[member][lane]);
+            let lanes = 0..LANES;
+            for right in lanes.map(|lane| share_of(members[truth].candidate, members, |member| logs[member][lane])) {
                 sum += right;
                 squares += right * right;
             }
