@@ -19,6 +19,15 @@ const EARLY: f64 = 0.1;
 const BATCHES: usize = 200_000;
 const OPERATIONS: [usize; 2] = [400, 2_000];
 
+/// Longest operation that is simulated, in batches.
+const LONGEST: usize = 2_000;
+
+/// Charts whose evidence is compared with limits: single quantities and all together, fast and slow.
+const CHARTS: usize = 4;
+
+/// Batches below the limits after which an alarm has ended.
+const QUIET: usize = 3;
+
 /// Batches after which the gain of the filter no longer changes.
 const SETTLED: usize = 200;
 
@@ -169,39 +178,39 @@ impl<'a> Operation<'a> {
 /// batches, over all charts of the structure together. Each operation has its own true process, drawn from what the reference leaves
 /// possible. `None` if the covariances of the process are not positive definite.
 ///
-/// The charts of single quantities and of all together, fast and slow, alarm equally often.
+/// The charts of single quantities and of all together, fast and slow, alarm equally often. An alarm is counted when it begins: the
+/// evidence of successive batches is correlated, so that one alarm lasts for some of them.
 pub fn limits(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64) -> Option<Limits> {
     let steady = Steady::new(process)?;
-    let longest = ((EARLY * mean_run_batches).round() as usize).max(1);
+    let longest = ((EARLY * mean_run_batches).round() as usize).clamp(1, LONGEST);
     let operations = (BATCHES / longest).clamp(OPERATIONS[0], OPERATIONS[1]);
-    let largest = |operation: usize| {
+    let simulated = |operation: usize| {
         let mut stream = stats::stream(seed, &format!("healthy operation {operation} of a process"));
         let mut operation = Operation::new(process, &steady, &mut stream)?;
-        let mut largest = [f64::NEG_INFINITY; 4];
-        for _ in 0..longest {
+        let mut next = || {
             operation.advance(None, &mut stream);
             let [quantity, joint] = operation.evidence(signs);
-            for (largest, now) in largest.iter_mut().zip([quantity.fast, quantity.slow, joint.fast, joint.slow]) {
-                *largest = largest.max(now);
-            }
-        }
-        Some(largest)
+            [quantity.fast, quantity.slow, joint.fast, joint.slow].map(|evidence| evidence as f32)
+        };
+        Some((0..QUIET + longest).map(|_| next()).collect::<Vec<[f32; CHARTS]>>())
     };
-    let all: Vec<[f64; 4]> = (0..operations).into_par_iter().filter_map(largest).collect();
-    let wanted = 1.0 - (-EARLY).exp();
+    let all: Vec<Vec<[f32; CHARTS]>> = (0..operations).into_par_iter().filter_map(simulated).collect();
+    let wanted = 1.0 - (-(longest as f64) / mean_run_batches).exp();
     let several = signs.iter().filter(|sign| **sign != 0.0).count() > 1;
-    let charts: &[usize] = if several { &[0, 1, 2, 3] } else { &[0, 1] };
-    let columns: Vec<Vec<f64>> = (0..4).map(|chart| all.iter().map(|own| own[chart]).collect()).collect();
-    let at = |level: f64| -> Vec<f64> { columns.iter().map(|column| stats::quantile(column, level)).collect() };
-    let alarmed = |limits: &[f64]| {
-        let alarms = |own: &&[f64; 4]| charts.iter().any(|chart| own[*chart] > limits[*chart]);
-        all.iter().filter(alarms).count() as f64 / all.len() as f64
+    let charts = if several { CHARTS } else { 2 };
+    let largest = |chart: usize| -> Vec<f64> {
+        let of_one = |own: &Vec<[f32; CHARTS]>| own[QUIET..].iter().map(|e| e[chart]).fold(f32::NEG_INFINITY, f32::max);
+        all.iter().map(|own| f64::from(of_one(own))).collect()
     };
-    // The share of operations with an alarm falls as the common level rises.
-    let (mut low, mut high) = (1.0 - wanted, 1.0);
+    let largest: Vec<Vec<f64>> = (0..CHARTS).map(largest).collect();
+    let at = |level: f64| -> Vec<f64> { largest.iter().map(|own| stats::quantile(own, level)).collect() };
+    // The share of operations in which an alarm begins falls as the common level of the charts rises.
+    let (mut low, mut high) = (0.0, 1.0);
     for _ in 0..40 {
         let middle = f64::midpoint(low, high);
-        if alarmed(&at(middle)) > wanted {
+        let limits = at(middle);
+        let alarmed = all.iter().filter(|own| alarm_begins(own, &limits[..charts])).count();
+        if alarmed as f64 > wanted * all.len() as f64 {
             low = middle;
         } else {
             high = middle;
@@ -210,4 +219,15 @@ pub fn limits(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64
     let found = at(high);
     let evidence = |first: usize| Evidence { fast: found[first], slow: found[first + 1] };
     Some(Limits { quantity: evidence(0), joint: evidence(2) })
+}
+
+/// Whether an alarm begins in an operation: a batch above a limit after [`QUIET`] batches below all.
+fn alarm_begins(operation: &[[f32; CHARTS]], limits: &[f64]) -> bool {
+    let mut quiet = 0;
+    operation.iter().any(|evidence| {
+        let above = evidence.iter().zip(limits).any(|(evidence, limit)| f64::from(*evidence) > *limit);
+        let begins = above && quiet >= QUIET;
+        quiet = if above { 0 } else { quiet + 1 };
+        begins
+    })
 }

@@ -16,8 +16,8 @@ const REFERENCE: usize = 365;
 const WORLDS: u64 = 20;
 /// A wanted run that is short enough to be measured.
 const SHORT_RUN: f64 = 200.0;
-/// Alarms with fewer batches between them are one.
-const QUIET: usize = 10;
+/// Batches below the limits after which an alarm has ended.
+const QUIET: usize = 3;
 const NAMES: [&str; 4] = ["k1", "k2", "k3", "k4"];
 const STIFFNESS: [f64; 4] = [4.0, 5.0, 6.0, 3.0];
 /// Sensitivity of each stiffness to the weather.
