@@ -55,7 +55,7 @@ impl ProcessQuantities {
     /// The estimate from the samples of a batch: mean and covariance of the draws of the mean of its population.
     ///
     /// Where the simulation fits the batch less well than its noise explains, the errors are larger than the draws show: their
-    /// covariance is multiplied by `misfit`, the χ² of the test of fit per degree of freedom, if that is above 1.
+    /// covariance is multiplied by the larger `misfit`, that of the single measurements or that of their mean, if it is above 1.
     ///
     /// Source: R. T. Birge (1932), The calculation of errors by the method of least squares, Physical Review 40, 207–227.
     pub fn estimate(
@@ -71,7 +71,7 @@ impl ProcessQuantities {
         let draws = own.iter().map(|s| s.population.mean_draws.len()).min().filter(|draws| *draws > 1)?;
         let centres: Vec<f64> = own.iter().map(|s| stats::mean(&s.population.mean_draws[..draws])).collect();
         let off = DMatrix::from_fn(draws, d, |draw, k| own[k].population.mean_draws[draw] - centres[k]);
-        let larger = misfit.map_or(1.0, |[each, _]| each.max(1.0));
+        let larger = misfit.map_or(1.0, |[each, of_mean]| each.max(of_mean).max(1.0));
         let covariance = off.tr_mul(&off) * (larger / (draws as f64 - 1.0));
         let at = measurements.iter().map(|m| m.measured_at).max()?;
         Some(BatchEstimate {

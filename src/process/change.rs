@@ -100,6 +100,9 @@ pub fn score(innovations: &[Innovation], contributions: &DMatrix<f64>) -> Score 
 }
 
 /// The evidence for a loss in the newest of some successive innovations, at most [`WINDOW`].
+///
+/// The quantity with the largest evidence is tested alone, the others beside it, because a loss of one looks like a loss of others
+/// with a similar effect. The largest evidence of all, for which the limits are computed, does not depend on that.
 pub fn evidence(innovations: &[Innovation], contributions: &DMatrix<f64>, signs: &[f64]) -> LossEvidence {
     let newest = innovations.last();
     let informed = |k: usize| newest.is_some_and(|newest| newest.informed.contains(&k));
@@ -111,9 +114,13 @@ pub fn evidence(innovations: &[Innovation], contributions: &DMatrix<f64>, signs:
     let mut losses = vec![0.0; signs.len()];
     for age in AGES.into_iter().filter(|age| *age <= innovations.len()) {
         let found = score(&innovations[innovations.len() - age..], contributions);
+        let (score, information) = (found.score.as_slice(), found.information.as_slice());
+        let alone: Vec<f64> = signs.iter().enumerate().map(|(k, sign)| of_one(score, information, k, *sign)).collect();
+        let best = (0..signs.len()).max_by(|a, b| alone[*a].total_cmp(&alone[*b])).unwrap_or(0);
         for (k, evidence) in quantities.iter_mut().enumerate() {
             if let Some(evidence) = evidence {
-                evidence.take(age, of_one(found.score.as_slice(), found.information.as_slice(), k, signs[k]));
+                let z = if k == best { alone[k] } else { alone[k].min(beside(score, information, signs, [k, best])) };
+                evidence.take(age, z);
             }
         }
         if let Some(joint) = &mut joint {
@@ -128,6 +135,22 @@ pub(super) fn of_one(score: &[f64], information: &[f64], k: usize, sign: f64) ->
     let own = information[k * score.len() + k];
     if own > 0.0 {
         sign * score[k] / own.sqrt()
+    } else {
+        0.0
+    }
+}
+
+/// z of a loss of quantity k beside a loss of another one: what the other one does not explain.
+///
+/// ```text
+///  z = ∓(b_k − I_ko b_o/I_oo) / √(I_kk − I_ko²/I_oo)
+/// ```
+fn beside(score: &[f64], information: &[f64], signs: &[f64], [k, other]: [usize; 2]) -> f64 {
+    let d = score.len();
+    let (own, cross, of_other) = (information[k * d + k], information[k * d + other], information[other * d + other]);
+    let left = own - cross * cross / of_other;
+    if of_other > 0.0 && left > 1e-9 * own {
+        signs[k] * (score[k] - cross * score[other] / of_other) / left.sqrt()
     } else {
         0.0
     }

@@ -28,9 +28,10 @@ async fn from_the_first_batch_to_the_probability_of_damage() {
     // A loss of 10 % in k2 alone.
     let damaged = service.post_batch("three-dof", &measurements([4.0, 4.5, 6.0], 20, 100_000)).await;
     let parameters = damaged["assessment"]["parameters"].as_array().unwrap();
-    assert_eq!(parameters[1]["probability_of_damage"], 1.0, "{damaged}");
+    // The population has a spread, so that the probability is not exactly 1.
+    assert!(parameters[1]["probability_of_damage"].as_f64().unwrap() > 0.999_99, "{damaged}");
     assert_eq!(parameters[1]["exceeds"], true);
-    assert_eq!(parameters[1]["probability_of_damage_interval"][0], 1.0, "{damaged}");
+    assert!(parameters[1]["probability_of_damage_interval"][0].as_f64().unwrap() > 0.99, "{damaged}");
     assert!((parameters[1]["relative_change"].as_f64().unwrap() + 0.1).abs() < 0.01, "{damaged}");
     for other in [0, 2] {
         // The uncertainty of the means is a small part of their already small spread.

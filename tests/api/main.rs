@@ -23,3 +23,4 @@ mod restart;
 mod ruler_frame;
 mod tables;
 mod views;
+mod z24;

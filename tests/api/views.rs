@@ -96,7 +96,8 @@ async fn the_overview_has_one_word_for_each_structure_and_its_newest_answer() {
     assert_eq!((&item["open_alarms"], &item["unacknowledged_alarms"]), (&json!(1), &json!(0)), "{item}");
     let latest = &item["latest"];
     assert_eq!((&latest["batch"], &latest["exceeds"]), (&last["batch"], &json!(true)));
-    assert_eq!((&latest["max_parameter"], &latest["max_probability_of_damage"]), (&json!("k2"), &json!(1.0)));
+    assert_eq!(latest["max_parameter"], "k2");
+    assert!(latest["max_probability_of_damage"].as_f64().unwrap() > 0.999_99, "{latest}");
 }
 
 #[tokio::test]

@@ -1,0 +1,80 @@
+//! The Z24 bridge over HTTP: the program with a trained model over a year of weather and the settlement of a pier. The data are not part
+//! of the repository; without them the test is counted as skipped.
+
+use serde_json::{json, Value};
+
+use super::helpers::{command, created, repository, train_model, Service};
+use super::needs;
+
+/// First damaged row of the table.
+const DAMAGED_FROM: usize = 3_474;
+
+/// Rows of a batch: about a day.
+const ROWS: usize = 24;
+
+/// Batches of rows whose third and fourth frequency are in order, each with whether it holds damaged rows.
+fn batches(csv: &str) -> Vec<(Vec<Value>, bool)> {
+    let row = |line: &str| {
+        let cells: Vec<&str> = line.split(',').collect();
+        let hz: Vec<Option<f64>> = cells[1..5].iter().map(|cell| cell.parse().ok()).collect();
+        (cells[0].parse::<usize>().unwrap(), hz)
+    };
+    let rows: Vec<(usize, Vec<Option<f64>>)> =
+        csv.lines().skip(1).map(row).filter(|(_, hz)| hz[3].is_none_or(|f4| hz[2].unwrap() < f4)).collect();
+    let measurement = |(place, (_, hz)): (usize, &(usize, Vec<Option<f64>>))| {
+        let at =
+            modalwatch::quantity::Timestamp::from_micros(879_202_800_000_000 + 3_600_000_000 * place as i64).unwrap();
+        json!({ "measured_at": at, "frequencies_hz": hz })
+    };
+    let all: Vec<Value> = rows.iter().enumerate().map(measurement).collect();
+    let damaged = |part: &[(usize, Vec<Option<f64>>)]| part.iter().any(|(number, _)| *number >= DAMAGED_FROM);
+    all.chunks(ROWS).zip(rows.chunks(ROWS)).map(|(own, rows)| (own.to_vec(), damaged(rows))).collect()
+}
+
+#[tokio::test]
+#[ignore = "two minutes of training; on measured data that are not part of the repository"]
+async fn a_year_of_the_z24_bridge_and_the_settlement_of_its_pier() {
+    let path = repository("../shared/data/z24-bridge/z24_frequencies.csv");
+    if !path.exists() {
+        needs::missing("the data ../shared/data/z24-bridge, which are not part of the repository");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let models = folder.path().join("models");
+    let structure = std::fs::read_to_string(repository("tests/discrepancy/z24.toml")).unwrap();
+    train_model(&models.join("z24"), &structure, "0.5,2");
+    let batches = batches(&std::fs::read_to_string(path).unwrap());
+    let first_damaged = batches.iter().position(|(_, damaged)| *damaged).unwrap();
+    for size in [60, 84, 110] {
+        let service = Service::spawn(command(&folder.path().join(format!("data-{size}"))).arg("--models").arg(&models));
+        let (mut ids, mut rejected, mut first_alarm, mut quiet_alarms) = (Vec::new(), 0, None, 0);
+        let mut alarming = false;
+        for (number, (measurements, _)) in batches.iter().enumerate() {
+            if number == size {
+                let reference = json!({ "batches": ids, "leave_out_doubtful": true });
+                created(service.post("/v1/structures/z24/reference", &reference).await).await;
+            }
+            let answer = service.post_batch("z24", measurements).await;
+            ids.push(answer["batch"].as_str().unwrap().to_owned());
+            if number < size {
+                continue;
+            }
+            let is_healthy = number < first_damaged;
+            rejected += usize::from(is_healthy && answer["assessment"]["trust"] == "rejected");
+            let charts = answer["charts"].as_array().unwrap();
+            let now = charts.iter().any(|c| c["chart"] != "simulation:fit" && c["state"] == "alarming");
+            quiet_alarms += usize::from(is_healthy && now && !alarming);
+            alarming = now;
+            if !is_healthy && now && first_alarm.is_none() {
+                first_alarm = Some(number);
+            }
+        }
+        println!("reference of {size} batches: {quiet_alarms} false damage alarms and {rejected} rejected of {} healthy batches; damage from batch {first_damaged} on, alarm with batch {first_alarm:?}", first_damaged - size);
+        let alarms = service.read("/v1/structures/z24/alarms?state=open").await;
+        for alarm in alarms["items"].as_array().unwrap() {
+            println!("  {}", alarm["sentence"].as_str().unwrap_or_default());
+        }
+        assert!(rejected <= 1 && quiet_alarms <= 1, "{rejected} {quiet_alarms}");
+        assert!((first_damaged..=first_damaged + 1).contains(&first_alarm.expect("an alarm")));
+    }
+}
