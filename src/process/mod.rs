@@ -18,7 +18,7 @@
 //! - [`estimate`]: the estimate of a batch; [`model`]: the process; [`filter`]: its Kalman filter; `smoother` and `likelihood`: its
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
 //! - [`change`]: lasting changes that the process does not explain, their onset and size; [`limits`]: what healthy operation reaches;
-//! - [`reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
+//! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
 //!
 //! Sources: A. C. Harvey (1989), Forecasting, Structural Time Series Models and the Kalman Filter, Cambridge, ch. 3 and 8, for the
 //! model; R. H. Shumway, D. S. Stoffer (1982), An approach to time series smoothing and forecasting using the EM algorithm, J. Time
