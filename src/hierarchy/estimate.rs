@@ -79,10 +79,16 @@ fn correlated(problem: &Problem, space: &ParameterSpace, seed: u64) -> Option<Po
     Some(Populations { parameters, correlations: Some(Correlations::of_draws(&draws)), effective_sample_size })
 }
 
+/// Where the posterior of one measurement is wider than so many spreads of the population, the correlations are hardly determined, and
+/// intervals with them would be too narrow: each parameter is estimated by itself.
+const MOST_NOISE: f64 = 1.5;
+
 /// The most probable normal population with full covariance; `None` where that is not estimated.
 fn normal(problem: &Problem) -> Option<Normal> {
     let estimated = joint::is_estimated(problem.deviations.len(), problem.measurements);
-    estimated.then(|| problem.maximise_normal())
+    let point = estimated.then(|| problem.maximise_normal())?;
+    let noisy = problem.within.iter().enumerate().any(|(k, within)| *within > MOST_NOISE * point.std(k));
+    (!noisy).then_some(point)
 }
 
 /// The most probable population and draws, in the unit box, as estimates of each parameter in its unit.

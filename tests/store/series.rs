@@ -55,7 +55,7 @@ async fn fill(folder: &tempfile::TempDir) {
         "insert into measurement select 'bridge', name, 0, 'logger', at, iif(i = ?5, ?2, iif(i % 10 = 3, ?3, ?1)), null,
              printf('{\"temperature_c\":%.2f,\"wind_m_per_s\":3.5,\"operator\":\"A\"}', 10 + i % 7), '{}', null from n",
         "insert into assessment select 'bridge', name, ?4, 1, 'v1', 1, 10, 1, 0, 0, x'', at, 40.0,
-             iif(i = ?6, ?8, ?7), null from n",
+             iif(i = ?6, ?8, ?7), null, null from n",
         "insert into quantity_assessment
          select 'bridge', name, ?4, 1, k.value, k.key, 'N/m', 'parameter', 4.0 + iif(i = ?5, 1.5, i % 13 * 0.01), 0.1, 0.01,
                 0.01, 0.0, 3.5, iif(i = ?6, null, 0.01 * (i % 5)), 0, 0.0, 3.9, 4.1, 0.1, 0.2, 4.0, 0.1,

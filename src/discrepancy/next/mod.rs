@@ -33,7 +33,7 @@ const REPEATS: usize = 10;
 const LEAST_PROBABILITY: f64 = 5e-3;
 const MOST_CANDIDATES: usize = 16;
 
-/// A law of a candidate below this probability is not simulated.
+/// A law of a candidate below this probability is not simulated, unless it is its best one; the others take its probability.
 const LEAST_OF_LAW: f64 = 2e-2;
 
 /// Greatest number of measurements that are compared in full, beside the best of each kind and those that join two of them.
@@ -125,19 +125,21 @@ impl<'a> Outlook<'a> {
     /// The value of an option for some candidates, given as places and probabilities that sum to 1; `None` if it cannot be
     /// computed for one of them.
     fn value(&self, option: usize, candidates: &[(usize, f64)], repeats: usize, blocks: usize) -> Option<Value> {
-        let mut members = Vec::new();
-        for (prediction, member) in self.predictions[option].iter().zip(&self.members) {
-            let Some((_, probability)) = candidates.iter().find(|(place, _)| *place == member.candidate) else {
-                continue;
-            };
-            let (candidate, probability) = (member.candidate, probability * member.share);
-            if probability >= LEAST_OF_LAW {
-                members.push(Member { candidate, probability, prediction: prediction.as_ref()? });
+        let mut members: Vec<Member<'_>> = Vec::new();
+        for (candidate, probability) in candidates {
+            let first = members.len();
+            let own = self.predictions[option].iter().zip(&self.members).filter(|(_, m)| m.candidate == *candidate);
+            for (prediction, member) in own {
+                // The first law of a candidate is its best one.
+                if members.len() == first || probability * member.share >= LEAST_OF_LAW {
+                    let (candidate, probability) = (*candidate, member.share);
+                    members.push(Member { candidate, probability, prediction: prediction.as_ref()? });
+                }
             }
-        }
-        let total: f64 = members.iter().map(|member| member.probability).sum();
-        for member in &mut members {
-            member.probability /= total;
+            let kept: f64 = members[first..].iter().map(|member| member.probability).sum();
+            for member in &mut members[first..] {
+                member.probability *= probability / kept;
+            }
         }
         value(&members, repeats, blocks, &self.normals)
     }

@@ -41,7 +41,7 @@ type BatchRow = (String, String, Option<String>, String, i64);
 
 /// Columns of an undamaged reference: version, model digest, creation in µs, threshold probability, number of measurements,
 /// conditions, doubts.
-type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>);
+type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>, Option<String>);
 
 /// The error of an export whose receiver was dropped while records were still to be sent.
 fn receiver_dropped<T>(_: T) -> Error {
@@ -131,13 +131,27 @@ impl Archive<'_> {
 
     async fn export_states(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
         let rows: Vec<StateRow> = sqlx::query_as(
-            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint
-             from undamaged_state where structure_id = $1 order by version",
+            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint,
+                    (select process from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version),
+                    (select reason from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version)
+             from undamaged_state s where structure_id = $1 order by version",
         )
         .bind(structure.as_str())
         .fetch_all(&self.database.reader)
         .await?;
-        for (version, model_digest, created, threshold_probability, measurements, conditions, doubts, joint) in rows {
+        for row in rows {
+            let (
+                version,
+                model_digest,
+                created,
+                threshold_probability,
+                measurements,
+                conditions,
+                doubts,
+                joint,
+                process,
+                without,
+            ) = row;
             let batches: Vec<(String,)> = sqlx::query_as(
                 "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
             )
@@ -162,6 +176,8 @@ impl Archive<'_> {
                 conditions,
                 doubts,
                 joint,
+                process,
+                without_process: without,
                 batches: batches.into_iter().map(|(id,)| id).collect(),
                 quantities,
             };

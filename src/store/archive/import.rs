@@ -211,6 +211,13 @@ async fn insert_undamaged(
         .bind(&state.joint)
         .execute(transaction.connection())
         .await?;
+    sqlx::query("insert into undamaged_process values ($1, $2, $3, $4)")
+        .bind(structure)
+        .bind(state.version)
+        .bind(&state.process)
+        .bind(&state.without_process)
+        .execute(transaction.connection())
+        .await?;
     for batch in &state.batches {
         sqlx::query("insert into undamaged_batch values ($1, $2, $3)")
             .bind(structure)

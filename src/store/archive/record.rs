@@ -162,6 +162,12 @@ pub struct Undamaged {
     /// did not estimate them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub joint: Option<String>,
+    /// The process of its parameters in time, JSON text; absent without one and in archives of versions without it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub process: Option<String>,
+    /// Why there is no process.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub without_process: Option<String>,
     /// Its batches.
     pub batches: Vec<String>,
     /// Its quantities.
