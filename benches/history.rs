@@ -293,6 +293,7 @@ async fn replay(threads: usize) -> f64 {
                 choice: ReferenceChoice::Batches(first.into_iter().collect()),
                 leave_out_doubtful: false,
                 threshold_probability: 0.05,
+                reason: None,
             },
         )
         .await

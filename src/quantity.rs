@@ -117,6 +117,11 @@ impl Timestamp {
         Self::from_micros(jiff::Timestamp::now().as_microsecond()).expect("the clock is within the calendar")
     }
 
+    /// The month of the year in UTC, 1 to 12.
+    pub fn month(self) -> u8 {
+        self.0.to_zoned(jiff::tz::TimeZone::UTC).month().unsigned_abs()
+    }
+
     /// Microseconds since 1970-01-01T00:00:00Z.
     pub fn micros(self) -> i64 {
         self.0.as_microsecond()

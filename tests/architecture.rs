@@ -72,7 +72,7 @@ const TABLE: [(&str, &[&str], bool); 35] = [
         true,
     ),
     ("store", &["access", "alarm", "assessment", "damage", "process", "reduction", "trust", "volume"], true),
-    ("notify", &["process", "store"], true),
+    ("notify", &["alarm", "process", "store"], true),
     ("mqtt", &["monitor"], true),
     ("telemetry", &[], false),
     // Compares the methods, including the assessment of a batch.
@@ -118,6 +118,7 @@ const TABLE: [(&str, &[&str], bool); 35] = [
             "mqtt",
             "notify",
             "plot",
+            "process",
             "reproduce",
             "simulator",
             "store",

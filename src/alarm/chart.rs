@@ -16,6 +16,11 @@ const LEAST_VARIANCE: f64 = 0.1;
 /// Series of the chart of the simulation's fit; no parameter can have a colon in its name.
 pub const FIT_SERIES: &str = "simulation:fit";
 
+/// The parameter of a chart; `None` for charts of the structure as a whole, whose names have a colon, which no parameter has.
+pub fn parameter_of(series: String) -> Option<String> {
+    (!series.contains(':')).then_some(series)
+}
+
 /// The point of a batch on the chart of one series, before the neighbouring points in time are known.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ChartPoint {

@@ -40,7 +40,8 @@ pub fn assess(
     let mut samples = draw(baseline, measurements, context.previous, draws)?;
     let mut findings = std::mem::take(&mut samples.findings);
     if let Some(undamaged) = context.undamaged {
-        findings.extend(compare_conditions(measurements, &undamaged.conditions));
+        let learned = undamaged.process.as_ref().map_or(&[][..], |process| &process.process.covariates);
+        findings.extend(compare_conditions(measurements, &undamaged.conditions, learned));
     }
     findings.extend(standing_findings(baseline));
     if let Some(process) = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()) {

@@ -31,10 +31,12 @@ pub(super) fn conditions<'a>(
 }
 
 /// Findings about values of covariates that lie outside those of the undamaged reference, followed by findings about missing
-/// covariates.
+/// covariates. `learned`: covariates whose influence the process of the reference has learned: outside their range, its charts are
+/// less sensitive instead of being held.
 pub(super) fn compare_conditions(
     measurements: &[ModalMeasurement],
     seen: &BTreeMap<String, SeenCovariate>,
+    learned: &[String],
 ) -> impl Iterator<Item = Finding> {
     let (mut outside, mut missing) = (Vec::new(), Vec::new());
     for (name, seen) in seen {
@@ -51,11 +53,14 @@ pub(super) fn compare_conditions(
             }
         }
         if let Some(example) = example {
-            let message = format!(
-                "the conditions are outside those of the undamaged reference ({example}) and may alone explain a change, so \
-                 this batch raises no alarm"
-            );
-            outside.push(Finding::new(FindingCode::Extrapolated, FindingEffect::HoldAlarm, message).of(rows));
+            let (effect, consequence) = if learned.contains(name) {
+                (FindingEffect::Note, "the alarm charts are the less sensitive, the further the conditions are outside")
+            } else {
+                (FindingEffect::HoldAlarm, "they may alone explain a change, so this batch raises no alarm")
+            };
+            let message =
+                format!("the conditions are outside those of the undamaged reference ({example}): {consequence}");
+            outside.push(Finding::new(FindingCode::Extrapolated, effect, message).of(rows));
         }
         if lacking > 0 {
             let message = format!(

@@ -9,8 +9,9 @@ use super::samples::{draw, joined, BatchSamples, Draws, Error};
 use crate::baseline::Baseline;
 use crate::damage::{self, JointReference, UndamagedReference};
 use crate::measurement::ModalMeasurement;
+use crate::process::estimate::BatchEstimate;
 use crate::process::fit;
-use crate::process::reference::ReferenceProcess;
+use crate::process::reference::{LastingChange, ReferenceProcess};
 use crate::quantity::Probability;
 use crate::stats;
 use crate::trust::fit::Misfit;
@@ -48,6 +49,9 @@ pub enum ReferenceError {
     /// Batches that cannot be trusted, at least one.
     #[error("{}", doubts(.0))]
     Doubtful(Vec<DoubtfulBatch>),
+    /// Batches of an extension after which the charts of the first reference show a lasting change.
+    #[error("{}", .0.sentence())]
+    LastingChange(Box<LastingChange>),
     /// The batches together have too few measurements, or the threshold probability is invalid.
     #[error(transparent)]
     State(#[from] damage::Error),
@@ -58,10 +62,19 @@ fn doubts(doubtful: &[DoubtfulBatch]) -> String {
     format!("these batches cannot be part of the undamaged reference: {}", each.collect::<Vec<_>>().join("; "))
 }
 
+/// A batch that can be part of a reference.
+struct TrustedBatch<'a> {
+    /// Its index among the batches that were given.
+    index: usize,
+    measurements: &'a [ModalMeasurement],
+    draws: Draws,
+    samples: BatchSamples,
+}
+
 /// Batches for an undamaged reference, of which the doubtful ones have been taken out.
 pub struct ReferenceBatches<'a> {
     baseline: &'a Baseline,
-    trusted: Vec<(&'a [ModalMeasurement], Draws, BatchSamples)>,
+    trusted: Vec<TrustedBatch<'a>>,
     doubtful: Vec<DoubtfulBatch>,
     usual_misfit: Misfit,
 }
@@ -116,7 +129,7 @@ impl<'a> ReferenceBatches<'a> {
             };
             match trust.findings.iter().find(is_doubt) {
                 Some(finding) => doubtful.push(DoubtfulBatch { batch, reason: finding.message.clone() }),
-                None => trusted.push((measurements, draws, samples)),
+                None => trusted.push(TrustedBatch { index: batch, measurements, draws, samples }),
             }
         }
         doubtful.sort_by_key(|doubtful| doubtful.batch);
@@ -126,6 +139,21 @@ impl<'a> ReferenceBatches<'a> {
     /// The batches that cannot be part of the reference, in the order in which they were given.
     pub fn doubtful(&self) -> &[DoubtfulBatch] {
         &self.doubtful
+    }
+
+    /// Whether an extension hides a loss: batches for which `is_first` is true make a process by themselves, and its charts watch all
+    /// others. A slow loss that each extension would take for a season is found so, because the first reference does not follow it.
+    ///
+    /// # Errors
+    /// [`ReferenceError::LastingChange`]. There is no test where the first batches show no process.
+    pub fn watched_by(&self, is_first: impl Fn(usize) -> bool, mean_run_batches: f64) -> Result<(), ReferenceError> {
+        let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
+        let Ok(process) = process(self.baseline, &first, mean_run_batches, self.usual_misfit) else { return Ok(()) };
+        let estimates = estimates(self.baseline, &later, &process.process.covariates);
+        match process.first_change(&estimates) {
+            Some((_, change)) => Err(ReferenceError::LastingChange(Box::new(change))),
+            None => Ok(()),
+        }
     }
 
     /// Computes the undamaged reference from the others.
@@ -138,17 +166,16 @@ impl<'a> ReferenceBatches<'a> {
         mean_run_batches: f64,
     ) -> Result<UndamagedReference, ReferenceError> {
         let Self { baseline, trusted, usual_misfit, .. } = self;
-        let process = process(baseline, &trusted, mean_run_batches, usual_misfit);
-        let Some((_, draws, _)) = trusted.first() else {
+        let process = process(baseline, &trusted.iter().collect::<Vec<_>>(), mean_run_batches, usual_misfit);
+        let Some(draws) = trusted.first().map(|batch| batch.draws) else {
             let too_few = damage::Error::TooFewMeasurements { measurements: 0, least: damage::MINIMUM_MEASUREMENTS };
             return Err(too_few.into());
         };
-        let draws = *draws;
         let (mut measurements, mut parts, mut sizes) = (Vec::new(), Vec::new(), Vec::new());
-        for (batch, _, samples) in trusted {
-            measurements.push(batch);
-            sizes.push(samples.posterior.measurements());
-            parts.push(samples);
+        for batch in trusted {
+            measurements.push(batch.measurements);
+            sizes.push(batch.samples.posterior.measurements());
+            parts.push(batch.samples);
         }
         let samples =
             joined(baseline, parts, draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
@@ -176,19 +203,25 @@ impl<'a> ReferenceBatches<'a> {
 /// The process behind some batches.
 fn process(
     baseline: &Baseline,
-    trusted: &[(&[ModalMeasurement], Draws, BatchSamples)],
+    trusted: &[&TrustedBatch<'_>],
     mean_run_batches: f64,
     usual_misfit: Misfit,
 ) -> Result<ReferenceProcess, fit::Error> {
-    let quantities = ProcessQuantities::of(baseline);
-    let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|(batch, ..)| *batch).collect();
+    let quantities = ProcessQuantities::of(baseline).quantities;
+    let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
     let covariates = process_covariates(&measurements);
-    let estimate = |(batch, draws, samples): &(&[ModalMeasurement], Draws, BatchSamples)| {
-        let sampled = monitored_quantities(baseline, samples, draws.per_measurement);
-        quantities.estimate(&sampled, batch, &covariates, samples.fit.misfit())
+    let estimates = estimates(baseline, trusted, &covariates);
+    ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)
+}
+
+/// The estimates of some batches.
+fn estimates(baseline: &Baseline, batches: &[&TrustedBatch<'_>], covariates: &[String]) -> Vec<BatchEstimate> {
+    let quantities = ProcessQuantities::of(baseline);
+    let estimate = |batch: &&TrustedBatch<'_>| {
+        let sampled = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
+        quantities.estimate(&sampled, batch.measurements, covariates, batch.samples.fit.misfit())
     };
-    let estimates = trusted.iter().filter_map(estimate).collect();
-    ReferenceProcess::new(&quantities.quantities, &covariates, estimates, mean_run_batches, usual_misfit)
+    batches.iter().filter_map(estimate).collect()
 }
 
 /// Computes the undamaged reference from several batches, each with its draws.

@@ -7,6 +7,7 @@ use anyhow::Context as _;
 use clap::Args;
 use serde::Serialize;
 
+use super::design_process::{Moving, ProcessReport, Weather};
 use super::output::write_whole;
 use super::parameter::parameter_moments;
 use crate::alarm::chart::{shared, standard_error};
@@ -50,6 +51,16 @@ pub struct DesignAlarmArgs {
     /// Weight of the latest batch in the moving average; 0 disables it
     #[arg(long, default_value_t = AlarmSettings::default().ewma_weight)]
     ewma_weight: f64,
+    /// Correlation of successive batches, from 0 to below 1, of a structure under weather that nobody measures: the standard deviations
+    /// of --parameter are then those over the seasons, and the charts of a process are designed as well
+    #[arg(long)]
+    batch_correlation: Option<f64>,
+    /// With --batch-correlation: share of the variance of each parameter that the weather makes all have in common
+    #[arg(long, default_value_t = 0.9, requires = "batch_correlation")]
+    common: f64,
+    /// With --batch-correlation: number of batches of the undamaged reference
+    #[arg(long, default_value_t = 100, requires = "batch_correlation")]
+    reference_batches: usize,
     /// Number of damaged batches within which a loss must be detected
     #[arg(long, default_value_t = 3)]
     within: usize,
@@ -78,6 +89,9 @@ struct Report {
     within_batches: usize,
     parameters: Vec<ParameterReport>,
     curve: Vec<crate::alarm::detection::DetectionPoint>,
+    /// The charts of a process, with `--batch-correlation`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    process: Option<ProcessReport>,
 }
 
 #[derive(Debug, Serialize)]
@@ -153,6 +167,7 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
         within_batches: args.within,
         parameters: watched.iter().map(parameter).collect(),
         curve: found.curve.clone(),
+        process: process_report(args, &watched, of)?,
     };
     if let Some(path) = &args.out {
         write_whole(path, html(&report, &found, &limits).as_bytes())?;
@@ -163,6 +178,28 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
         print(&report);
     }
     Ok(())
+}
+
+/// The charts of a process, if a correlation of successive batches is given.
+fn process_report(
+    args: &DesignAlarmArgs,
+    watched: &[(&Parameter, usize)],
+    of: impl Fn(usize) -> Moments,
+) -> anyhow::Result<Option<ProcessReport>> {
+    let Some(correlation) = args.batch_correlation else { return Ok(None) };
+    let weather = Weather {
+        correlation,
+        common: args.common,
+        reference: args.reference_batches,
+        mean_run_batches: args.mean_run_batches,
+        seed: args.seed,
+    };
+    let moving = |(parameter, k): &(&Parameter, usize)| {
+        let Moments { mean, std, noise_std } = of(*k);
+        Moving { parameter: (*parameter).clone(), mean, std, error: noise_std / (args.measurements as f64).sqrt() }
+    };
+    let parameters: Vec<Moving> = watched.iter().map(moving).collect();
+    weather.report(&parameters).map(Some)
 }
 
 /// The alarm settings of the arguments, which are checked.
@@ -273,6 +310,9 @@ fn print(report: &Report) {
         "a90: change that is detected within {} damaged batches with a probability of 90 %",
         report.within_batches
     );
+    if let Some(process) = &report.process {
+        process.print();
+    }
 }
 
 fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
@@ -326,10 +366,9 @@ fn html(report: &Report, found: &Detection, limits: &Limits) -> String {
     );
     let header = ["parameter", "mean", "std", "noise std of one measurement", "detected with 90 % (a90)"];
     let plots = format!("<div class=\"plots\">{}{}</div>", plot.svg(), delay.svg());
-    page(
-        &format!("Alarms of {}", report.structure),
-        &[("Detectable changes".to_owned(), facts + &table(&header, &rows) + &plots)],
-    )
+    let mut sections = vec![("Detectable changes".to_owned(), facts + &table(&header, &rows) + &plots)];
+    sections.extend(report.process.as_ref().map(ProcessReport::section));
+    page(&format!("Alarms of {}", report.structure), &sections)
 }
 
 /// A delay over the shift, where it is short enough for the plot.

@@ -6,6 +6,7 @@ mod backup;
 mod calibrate;
 mod demo;
 mod design_alarm;
+mod design_process;
 mod diagnose;
 mod doctor;
 mod healthcheck;

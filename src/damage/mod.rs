@@ -29,6 +29,6 @@ pub use joint::{Correlation, JointReference, JointSamples};
 pub use joint_comparison::{assess_jointly, Carrier, JointAssessment, JointDamage};
 pub use pool::{Hyperparameters, QuantityKind, QuantitySamples};
 pub use reference::{
-    ChartReference, Error, SeenCovariate, UndamagedQuantity, UndamagedReference, MINIMUM_MEASUREMENTS,
+    ChartReference, Error, ReferenceOrigin, SeenCovariate, UndamagedQuantity, UndamagedReference, MINIMUM_MEASUREMENTS,
 };
 pub use threshold::{probability_of_damage, threshold};

@@ -83,6 +83,20 @@ pub struct UndamagedReference {
     /// estimated, and in references of versions that did not.
     #[serde(default)]
     pub joint: Option<JointReference>,
+    /// Where it comes from.
+    #[serde(default)]
+    pub origin: ReferenceOrigin,
+}
+
+/// Where an undamaged reference comes from.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct ReferenceOrigin {
+    /// The version whose batches it contains beside others; `None` for one that was declared by itself.
+    pub extends: Option<u32>,
+    /// The first version of the chain of extensions; `None` for one that was declared by itself.
+    pub first: Option<u32>,
+    /// Why it was made, in the words of the person who declared it.
+    pub reason: Option<String>,
 }
 
 /// The values of a covariate in the undamaged reference.
@@ -178,6 +192,7 @@ impl UndamagedReference {
             process: None,
             without_process: None,
             joint: None,
+            origin: ReferenceOrigin::default(),
         })
     }
 }

@@ -13,9 +13,10 @@ use super::error::ApiError;
 use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
+use crate::alarm::chart::parameter_of;
 use crate::baseline::manifest::ParameterIdentifiability;
 use crate::monitor::stored::{Acknowledgement, Episode, JobState, MaintenanceWindow};
-use crate::process::reference::{LastingChange, JOINT_SERIES};
+use crate::process::reference::LastingChange;
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
 
 /// Maximum length of a name or note, characters.
@@ -181,7 +182,7 @@ impl From<Episode> for AlarmItem {
         Self {
             alarm: e.number,
             state: e.state(),
-            parameter: (damage && e.series != JOINT_SERIES).then_some(e.series),
+            parameter: parameter_of(e.series),
             sentence: e.change.as_ref().map(LastingChange::sentence),
             change: e.change,
             peak_shift_standard_errors: (damage && e.peak_shift.is_finite()).then_some(e.peak_shift),

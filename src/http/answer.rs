@@ -363,6 +363,12 @@ pub struct Undamaged {
     structure: String,
     version: u32,
     created_at: Timestamp,
+    /// The version that it extends; `null` if it was declared by itself.
+    #[schema(required)]
+    extends: Option<u32>,
+    /// Why it was made, if a reason was given.
+    #[schema(required)]
+    reason: Option<String>,
     model_digest: String,
     threshold_probability: f64,
     measurement_count: usize,
@@ -397,10 +403,15 @@ pub struct ProcessBody {
     covariates: Vec<String>,
     /// Correlation of each common factor without a measured cause over one step.
     factor_correlations: Vec<f64>,
+    /// The conditions that its batches have seen; absent in references of earlier versions of the program.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    coverage: Option<crate::process::coverage::Coverage>,
     /// Limits of the charts in standard deviations.
     limits: crate::process::limits::Limits,
     /// Mean number of healthy batches to a false alarm for which the limits were computed.
     mean_run_batches: f64,
+    /// The smallest lasting loss of each parameter that its chart finds with 90 % within some batches.
+    detectable: Vec<crate::process::detectable::Detectable>,
 }
 
 impl From<&ReferenceProcess> for ProcessBody {
@@ -412,8 +423,10 @@ impl From<&ReferenceProcess> for ProcessBody {
             step_s: process.step_s,
             covariates: process.covariates.clone(),
             factor_correlations: process.numbers().persistence.iter().take(process.factors).copied().collect(),
+            coverage: process.coverage.clone(),
             limits: reference.limits,
             mean_run_batches: reference.mean_run_batches,
+            detectable: reference.detectable.clone(),
         }
     }
 }
@@ -425,6 +438,8 @@ impl Undamaged {
             structure: structure.to_string(),
             version: record.state.version,
             created_at: record.created_at,
+            extends: record.state.origin.extends,
+            reason: record.state.origin.reason.clone(),
             model_digest: record.model_digest.to_string(),
             threshold_probability: record.state.threshold_probability,
             measurement_count: record.state.measurements,

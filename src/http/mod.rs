@@ -89,6 +89,8 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(history::history))
         .routes(routes!(reference::put, reference::post))
         .routes(routes!(reference::post_baseline))
+        .routes(routes!(reference::extend))
+        .routes(routes!(reference::list))
         .routes(routes!(history::exceedances))
         .routes(routes!(alarms::list))
         .routes(routes!(alarms::acknowledge))

@@ -12,7 +12,7 @@ use crate::measurement::check::Problem;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 63] = [
+pub const CODES: [(&str, StatusCode, &str); 64] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -74,6 +74,7 @@ pub const CODES: [(&str, StatusCode, &str); 63] = [
         "a measurement is already stored in a batch with other content",
     ),
     ("unusable_baseline", StatusCode::UNPROCESSABLE_ENTITY, "the batches cannot be used as the undamaged reference"),
+    ("lasting_change", StatusCode::UNPROCESSABLE_ENTITY, "the batches of an extension show a lasting change"),
     (
         "too_many_measurements",
         StatusCode::UNPROCESSABLE_ENTITY,

@@ -13,13 +13,14 @@ use super::error::ApiError;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
+use crate::alarm::chart::parameter_of;
 use crate::damage::{QuantityKind, UndamagedReference};
 use crate::measurement::CovariateKind;
 use crate::monitor::stored::{
-    ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, SeriesWindow, TrustMark,
+    ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, ReferenceVersion, SeriesWindow,
+    TrustMark,
 };
 use crate::monitor::Series;
-use crate::process::reference::JOINT_SERIES;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::reduction::{Reduced, Row};
 use crate::trust::{FindingCode, TrustVerdict};
@@ -72,6 +73,8 @@ struct SeriesBody {
     trust: Vec<TrustPoint>,
     alarms: Vec<AlarmSpan>,
     maintenance: Vec<MaintenanceSpan>,
+    /// The versions of the undamaged reference that begin in the time span, the newest first.
+    references: Vec<ReferenceSpan>,
 }
 
 /// One entry per selected measurement; `values_hz` has one value per mode. An entry without values marks a gap in time.
@@ -110,7 +113,11 @@ struct Track {
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ChartSeries)]
 struct Chart {
+    /// The parameter, `simulation:fit`, or `structure:joint` for all parameters together.
     chart: String,
+    /// True with a process behind the undamaged reference: `shift` is then the evidence on its fast chart, which finds steps, and `ewma`
+    /// that on its slow chart, which finds small lasting losses, both in standard deviations.
+    is_process: bool,
     times: Vec<Timestamp>,
     batches: Vec<String>,
     shift: Vec<Option<f64>>,
@@ -143,6 +150,17 @@ struct AlarmSpan {
     #[schema(required)]
     ended_at: Option<Timestamp>,
     state: &'static str,
+}
+
+/// The time in which a version of the undamaged reference was measured.
+#[derive(Debug, Serialize, ToSchema)]
+struct ReferenceSpan {
+    version: u32,
+    from: Timestamp,
+    to: Timestamp,
+    /// Why it was made.
+    #[schema(required)]
+    reason: Option<String>,
 }
 
 /// A maintenance window.
@@ -195,6 +213,7 @@ pub async fn series(
     };
     let episodes = shared.monitor.alarms().episodes(&id, None, false, MOST_ALARMS).await?;
     let maintenance = shared.monitor.alarms().maintenance(&id).await?;
+    let versions = shared.monitor.records().reference_versions(&id).await?;
     let body = SeriesBody {
         from,
         to,
@@ -211,6 +230,11 @@ pub async fn series(
         trust: trust.rows.into_iter().map(trust_point).collect::<Result<_, _>>()?,
         alarms: episodes.into_iter().filter(|e| !e.withdrawn && within(e.opened_at, e.ended_at)).map(alarm).collect(),
         maintenance: maintenance.into_iter().filter(|w| within(w.from, Some(w.to))).map(maintenance_span).collect(),
+        references: versions
+            .into_iter()
+            .filter(|v| within(v.measured_from, Some(v.measured_to)))
+            .map(reference_span)
+            .collect(),
         structure: id,
     };
     Ok(([(header::CACHE_CONTROL, "no-store")], Json(body)).into_response())
@@ -284,6 +308,7 @@ fn chart(series: ChartSeries) -> Result<Chart, ApiError> {
     let [shift, ewma] = columns(&rows);
     let mut chart = Chart {
         chart: series.chart,
+        is_process: series.is_process,
         times: times(&rows)?,
         batches: Vec::with_capacity(rows.len()),
         shift,
@@ -314,10 +339,19 @@ fn alarm(episode: Episode) -> AlarmSpan {
     AlarmSpan {
         alarm: episode.number,
         state: episode.state(),
-        parameter: (episode.kind == "damage" && episode.series != JOINT_SERIES).then_some(episode.series),
+        parameter: parameter_of(episode.series),
         kind: episode.kind,
         opened_at: episode.opened_at,
         ended_at: episode.ended_at,
+    }
+}
+
+fn reference_span(version: ReferenceVersion) -> ReferenceSpan {
+    ReferenceSpan {
+        version: version.version,
+        from: version.measured_from,
+        to: version.measured_to,
+        reason: version.origin.reason,
     }
 }
 

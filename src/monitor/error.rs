@@ -131,6 +131,32 @@ pub enum DeclareError {
     /// A batch is listed twice.
     #[error("batch {0} is listed twice")]
     RepeatedBatch(String),
+    /// There is no reference that could be extended.
+    #[error("structure {0} has no undamaged reference that could be extended: declare one first")]
+    NothingToExtend(StructureId),
+    /// No batch is left by which the reference could be extended.
+    #[error(
+        "undamaged reference {version} is not extended: {}",
+        if left_out.is_empty() { "all named batches are already part of it".to_owned() } else { named(left_out) }
+    )]
+    NothingNew {
+        /// Its version.
+        version: u32,
+        /// The batches that cannot be added.
+        left_out: Vec<LeftOutBatch>,
+    },
+    /// The batches of an extension show a loss.
+    #[error(
+        "the undamaged reference is not extended, because these batches differ from its first version ({first}): {change} If an \
+         inspection found the structure healthy, say so with \"despite_alarms\": true and a \"reason\"; after a repair, declare a new \
+         reference"
+    )]
+    Loss {
+        /// The first version of the chain of extensions.
+        first: u32,
+        /// The change as a sentence.
+        change: String,
+    },
     /// No batch was measured in the period.
     #[error("no batch was measured from {from} to {to}")]
     EmptyPeriod {
@@ -176,7 +202,7 @@ impl DeclareError {
     /// The batches that cannot be part of the reference, if there are any.
     pub fn left_out(&self) -> &[LeftOutBatch] {
         match self {
-            Self::Reference { left_out, .. } => left_out,
+            Self::Reference { left_out, .. } | Self::NothingNew { left_out, .. } => left_out,
             Self::Doubtful { doubtful, .. } => doubtful,
             _ => &[],
         }

@@ -62,7 +62,7 @@ use self::probe::WriterProbe;
 pub use self::reason::Reason;
 pub use self::records::{BatchView, Missing, Records, Series};
 use self::references::References;
-pub use self::references::{DeclaredReference, ReferenceChoice, ReferenceRequest};
+pub use self::references::{DeclaredReference, ExtensionRequest, ReferenceChoice, ReferenceRequest};
 pub use self::replay::Replay;
 use self::retention::Retention;
 pub use self::settings::{MissingCovariate, MonitorSettings};

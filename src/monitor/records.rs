@@ -10,7 +10,8 @@ use crate::quantity::{Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
     BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, MeasurementQuery, QuantitySeries,
-    ReferenceRecord, SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
+    ReferenceRecord, ReferenceVersion, SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview,
+    StructureSummary, TrustMark,
 };
 
 /// A batch with its results.
@@ -104,6 +105,14 @@ impl Records {
     /// [`Error::Store`].
     pub async fn reference(&self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
         Ok(self.assessor.store.reference().undamaged(structure).await?)
+    }
+
+    /// All versions of the undamaged reference of a structure, the newest first.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn reference_versions(&self, structure: &StructureId) -> Result<Vec<ReferenceVersion>, Error> {
+        Ok(self.assessor.store.reference().versions(structure).await?)
     }
 
     /// A page of the batches of a structure with their current assessments.

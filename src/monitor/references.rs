@@ -1,5 +1,6 @@
 //! The undamaged references of the structures: made from stored batches, and renewed for another trained baseline.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use tracing::{info, warn};
@@ -8,6 +9,7 @@ use super::assessor::Assessor;
 use super::compute::Place;
 use super::error::{DeclareError, Error, LeftOutBatch};
 use crate::assessment::{BatchState, DoubtfulBatch, Draws, ReferenceBatches, ReferenceError};
+use crate::damage::{ReferenceOrigin, UndamagedReference};
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{MeasuredBatch, ReferenceRecord};
 
@@ -34,6 +36,30 @@ pub struct ReferenceRequest {
     pub leave_out_doubtful: bool,
     /// Probability that the undamaged structure is below the damage threshold.
     pub threshold_probability: f64,
+    /// Why the reference is made, such as a repair.
+    pub reason: Option<String>,
+}
+
+/// An extension of the newest undamaged reference by further batches.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ExtensionRequest {
+    /// The batches to add.
+    pub choice: ReferenceChoice,
+    /// Whether batches that cannot be trusted are left out; otherwise the extension is refused and all of them are named.
+    pub leave_out_doubtful: bool,
+    /// Why the reference is extended.
+    pub reason: Option<String>,
+    /// Whether batches are accepted during which an alarm was open or a lasting change shows, because an inspection found no damage.
+    pub despite_alarms: bool,
+}
+
+/// How batches become a reference.
+struct Making {
+    leave_out_doubtful: bool,
+    threshold_probability: f64,
+    origin: ReferenceOrigin,
+    /// Ids of the batches of the first version, whose charts watch the others; `None` without that test.
+    watched_by: Option<BTreeSet<String>>,
 }
 
 /// An undamaged reference that was declared.
@@ -83,9 +109,11 @@ impl References {
             choice: ReferenceChoice::Batches(newest.batches.clone()),
             leave_out_doubtful: true,
             threshold_probability: newest.state.threshold_probability,
+            reason: newest.state.origin.reason.clone(),
         };
         let place = self.assessor.compute.wait().await;
-        let declared = self.declare(structure, request, place).await.map_err(|e| failed(&e)).ok()?;
+        let origin = newest.state.origin.clone();
+        let declared = self.declare_as(structure, request, origin, place).await.map_err(|e| failed(&e)).ok()?;
         for LeftOutBatch { batch, reason } in &declared.left_out {
             warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged reference of {structure}: {reason}");
         }
@@ -99,9 +127,68 @@ impl References {
         request: ReferenceRequest,
         place: Place,
     ) -> Result<DeclaredReference, DeclareError> {
+        let origin = ReferenceOrigin { reason: request.reason.clone(), ..ReferenceOrigin::default() };
+        self.declare_as(structure, request, origin, place).await
+    }
+
+    async fn declare_as(
+        &self,
+        structure: &StructureId,
+        request: ReferenceRequest,
+        origin: ReferenceOrigin,
+        place: Place,
+    ) -> Result<DeclaredReference, DeclareError> {
+        let chosen = self.chosen(structure, &request.choice).await?;
+        let ReferenceRequest { leave_out_doubtful, threshold_probability, .. } = request;
+        let making = Making { leave_out_doubtful, threshold_probability, origin, watched_by: None };
+        self.make(structure, chosen, making, place).await
+    }
+
+    /// Extends the newest reference by further batches, and stores the result as the next version.
+    pub(super) async fn extend(
+        &self,
+        structure: &StructureId,
+        request: ExtensionRequest,
+        place: Place,
+    ) -> Result<DeclaredReference, DeclareError> {
+        let references = self.assessor.store.reference();
+        let newest = references.undamaged(structure).await?;
+        let newest = newest.ok_or_else(|| DeclareError::NothingToExtend(structure.clone()))?;
+        let (version, origin) = (newest.state.version, &newest.state.origin);
+        let (mut added, mut left_out) = self.chosen(structure, &request.choice).await?;
+        added.retain(|id| !newest.batches.contains(id));
+        if !request.despite_alarms {
+            for (batch, alarm) in references.alarms_during(structure, &added).await? {
+                added.retain(|id| *id != batch);
+                let reason = format!("it was measured while damage alarm {alarm} was open");
+                left_out.push(LeftOutBatch { batch, reason });
+            }
+        }
+        if added.is_empty() {
+            return Err(DeclareError::NothingNew { version, left_out });
+        }
+        let first = origin.first.unwrap_or(version);
+        let of_first = references.batches_of(structure, first).await?;
+        let making = Making {
+            leave_out_doubtful: request.leave_out_doubtful,
+            threshold_probability: newest.state.threshold_probability,
+            origin: ReferenceOrigin { extends: Some(version), first: Some(first), reason: request.reason },
+            watched_by: (!request.despite_alarms).then(|| of_first.into_iter().collect()),
+        };
+        let all = newest.batches.iter().cloned().chain(added).collect();
+        self.make(structure, (all, left_out), making, place).await
+    }
+
+    /// Makes a reference from chosen batches, beside those that were left out already, and stores it.
+    async fn make(
+        &self,
+        structure: &StructureId,
+        (mut batch_ids, mut left_out): (Vec<String>, Vec<LeftOutBatch>),
+        making: Making,
+        place: Place,
+    ) -> Result<DeclaredReference, DeclareError> {
         let Assessor { store, structures, events, alarms, .. } = &*self.assessor;
         let baseline = structures.get(structure)?.trained_baseline()?;
-        let (mut batch_ids, mut left_out) = self.chosen(structure, &request.choice).await?;
         let doubtful_already = !left_out.is_empty();
         let mut records = Vec::new();
         for id in &batch_ids {
@@ -109,7 +196,12 @@ impl References {
         }
         let drawn: Vec<Draws> = records.iter().map(|record| self.assessor.draws(&baseline, record)).collect();
         let model_digest = baseline.digest().clone();
-        let (known_limits, settings) = (Arc::clone(&self.assessor.known_limits), self.assessor.settings.alarm);
+        let settings = self.assessor.settings.alarm;
+        let known_limits = Arc::clone(&self.assessor.known_limits);
+        let Making { leave_out_doubtful, threshold_probability, origin, watched_by } = making;
+        let first = origin.first.unwrap_or_default();
+        let is_first: Option<Vec<bool>> =
+            watched_by.map(|first| batch_ids.iter().map(|id| first.contains(id)).collect());
         let made = place
             .run(move || {
                 let batches: Vec<_> =
@@ -119,14 +211,20 @@ impl References {
                     Err(error) => return (Vec::new(), Err(error)),
                 };
                 let doubtful = examined.doubtful().to_vec();
-                if !request.leave_out_doubtful && (doubtful_already || !doubtful.is_empty()) {
+                if !leave_out_doubtful && (doubtful_already || !doubtful.is_empty()) {
                     return (Vec::new(), Err(ReferenceError::Doubtful(doubtful)));
                 }
-                let state = examined.reference(request.threshold_probability, settings.mean_run_batches);
-                if let Ok(state) = &state {
+                let watched =
+                    is_first.map(|first| examined.watched_by(|batch| first[batch], settings.mean_run_batches));
+                if let Some(Err(error)) = watched {
+                    return (Vec::new(), Err(error));
+                }
+                let state = examined.reference(threshold_probability, settings.mean_run_batches);
+                // The charts of a process have limits of their own.
+                if let Some(state) = state.as_ref().ok().filter(|state| state.process.is_none()) {
                     known_limits.prepare(&baseline, state, &settings);
                 }
-                (doubtful, state)
+                (doubtful, state.map(|state| UndamagedReference { origin, ..state }))
             })
             .await;
         let (doubtful, state) = made.map_err(|_| Error::Panicked)?;
@@ -142,6 +240,7 @@ impl References {
                 let doubtful = left_out.iter().cloned().chain(found.into_iter().map(with_id)).collect();
                 DeclareError::Doubtful { batches, doubtful }
             }
+            ReferenceError::LastingChange(change) => DeclareError::Loss { first, change: change.sentence() },
             ReferenceError::State(source) => {
                 DeclareError::Reference { source, left_out: [left_out.clone(), doubtful.clone()].concat() }
             }

@@ -16,7 +16,7 @@ use tracing::{error, warn};
 use super::assessor::{Assessor, Computed, Finished, Settled};
 use super::error::{DeclareError, Error};
 use super::own_task::in_own_task;
-use super::references::{DeclaredReference, ReferenceRequest, References};
+use super::references::{DeclaredReference, ExtensionRequest, ReferenceRequest, References};
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
 use crate::store;
@@ -75,6 +75,25 @@ impl Replay {
             let declared = replay.references.declare(&structure, request, place).await?;
             replay.resume_later(structure);
             Ok(declared)
+        })
+        .await
+    }
+
+    /// Extends the undamaged reference by further batches. Others are compared with it afterwards, in the background.
+    ///
+    /// # Errors
+    /// [`Error::NoModel`], [`Error::UnknownBatch`], [`DeclareError`].
+    pub async fn extend_reference(
+        &self,
+        structure: &StructureId,
+        request: ExtensionRequest,
+    ) -> Result<DeclaredReference, DeclareError> {
+        let (replay, structure) = (self.clone(), structure.clone());
+        let place = self.assessor.compute.reserve().map_err(Error::from)?;
+        in_own_task(async move {
+            let extended = replay.references.extend(&structure, request, place).await?;
+            replay.resume_later(structure);
+            Ok(extended)
         })
         .await
     }

@@ -5,5 +5,5 @@ pub use crate::store::{
     DeliveryState, DiagnosisRecord, DiagnosisTrigger, Episode, EpisodeDiagnosis, Error, EventFilter, Exceedance,
     HistoryEntry, HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, MaintenanceWindow, MeasurementPlace,
     MeasurementQuery, NewAuditEntry, PutStructure, QuantityMark, QuantitySeries, QuarantinedMessage, ReferenceRecord,
-    SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
+    ReferenceVersion, SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
 };

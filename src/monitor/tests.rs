@@ -53,7 +53,7 @@ fn batch(number: usize) -> MeasurementBatch {
 /// The declaration of these batches as the undamaged reference.
 fn reference(ids: &[String]) -> ReferenceRequest {
     let choice = ReferenceChoice::Batches(ids.to_vec());
-    ReferenceRequest { choice, leave_out_doubtful: false, threshold_probability: 0.05 }
+    ReferenceRequest { choice, leave_out_doubtful: false, threshold_probability: 0.05, reason: None }
 }
 
 async fn open(folder: &Path) -> Monitor {

@@ -5,7 +5,8 @@
 use serde::{Deserialize, Serialize};
 use standardwebhooks::{Webhook, WebhookError};
 
-use crate::process::reference::JOINT_SERIES;
+use crate::alarm::chart::parameter_of;
+use crate::process::reference::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{OutboxEvent, Secret};
 
@@ -59,6 +60,9 @@ struct AlarmData<'a> {
     kind: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
+    /// Why the alarm was raised; only with a process behind the undamaged reference.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sentence: Option<String>,
     state: &'static str,
     opened_at: Timestamp,
     opened_batch: Option<String>,
@@ -102,6 +106,7 @@ struct Facts {
     acknowledged_at_us: Option<i64>,
     acknowledged_by: Option<String>,
     acknowledgement_note: Option<String>,
+    change: Option<LastingChange>,
 }
 
 impl Message {
@@ -122,7 +127,8 @@ impl Message {
         let data = AlarmData {
             structure,
             alarm: number,
-            parameter: (damage && facts.series != JOINT_SERIES).then_some(facts.series),
+            parameter: parameter_of(facts.series),
+            sentence: facts.change.as_ref().map(LastingChange::sentence),
             state: match (facts.withdrawn, facts.ended_at_us) {
                 (0, None) => "open",
                 (0, Some(_)) => "ended",

@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantity::Timestamp;
 
+/// Unit of a parameter that is the logarithm of a factor.
+const LOGARITHM: &str = "ln";
+
 /// Estimate of the parameters from one batch.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BatchEstimate {
@@ -76,5 +79,14 @@ impl BatchEstimate {
             covariates: DVector::from_fn(covariates.len(), covariate),
             informed,
         }
+    }
+}
+
+/// A difference of a quantity in per cent of its mean; the logarithm of a factor is stated as the change of the factor.
+pub(super) fn percent(unit: &str, mean: f64, difference: f64) -> f64 {
+    if unit == LOGARITHM {
+        100.0 * difference.exp_m1()
+    } else {
+        100.0 * difference / mean
     }
 }

@@ -2,7 +2,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::estimate::Observation;
+use super::coverage::Coverage;
+use super::estimate::{Observation, Scale};
 use super::model::{Numbers, Process};
 
 /// What is known about the states after some observations: normal with this mean and covariance.
@@ -37,21 +38,36 @@ pub struct Innovation {
 pub struct Filter {
     numbers: Numbers,
     contributions: DMatrix<f64>,
-    /// Covariances of the columns of Λ; empty if they are taken as known.
+    /// What the reference leaves unknown; `None` if the numbers are taken as known exactly.
+    unknown: Option<Unknown>,
+}
+
+/// What a reference leaves unknown.
+struct Unknown {
+    /// Covariances of the columns of Λ.
     loading_covariances: Vec<DMatrix<f64>>,
+    /// The conditions that were seen, beyond which relations may bend.
+    coverage: Option<Coverage>,
+    /// Scales of the covariates.
+    covariate_scales: Vec<Scale>,
 }
 
 impl Filter {
     /// The filter with numbers that are taken as known exactly, as in the likelihood.
     pub fn exact(numbers: Numbers) -> Self {
         let contributions = numbers.contributions();
-        Self { numbers, contributions, loading_covariances: Vec::new() }
+        Self { numbers, contributions, unknown: None }
     }
 
-    /// The filter of a fitted process. What its reference leaves unknown about the common factors widens the predictions, the more
-    /// the further the factors lie from those seen.
+    /// The filter of a fitted process. What its reference leaves unknown about the common factors widens the predictions, and so do
+    /// conditions that it has not seen.
     pub fn of(process: &Process) -> Self {
-        Self { loading_covariances: process.loading_covariances(), ..Self::exact(process.in_operation()) }
+        let unknown = Unknown {
+            loading_covariances: process.loading_covariances(),
+            coverage: process.coverage.clone(),
+            covariate_scales: process.covariate_scales.clone(),
+        };
+        Self { unknown: Some(unknown), ..Self::exact(process.in_operation()) }
     }
 
     /// The numbers of the process.
@@ -87,11 +103,12 @@ impl Filter {
     /// `None` if the covariance of the innovation is not positive definite.
     ///
     /// ```text
-    ///  ν = x̂ − μ − B c − H a,    S = H P Hᵀ + κ V + Σ_j h_j² C_j,    K = P Hᵀ S⁻¹
+    ///  ν = x̂ − μ − B c − H a,    S = H P Hᵀ + κ V + Σ_j h_j² C_j + W,    K = P Hᵀ S⁻¹
     ///  a ← a + K ν,    P ← P − K H P
     /// ```
     ///
-    /// a, P: mean and covariance of the states; C_j: covariance of column j of Λ, with the h_j that the observation itself shows.
+    /// a, P: mean and covariance of the states; C_j: covariance of column j of Λ, with the h_j that the observation itself shows; W:
+    /// diagonal, see [`Coverage`], 0 within the conditions that were seen.
     pub fn update(
         &self,
         (predicted, decay): (&Known, DVector<f64>),
@@ -105,13 +122,10 @@ impl Filter {
         let cross = &predicted.covariance * h.transpose();
         let errors = &h * &cross + numbers.noise * &observation.covariance;
         let mut factored = errors.clone().cholesky()?;
-        if !self.loading_covariances.is_empty() && !informed.is_empty() {
+        if let Some(unknown) = self.unknown.as_ref().filter(|_| !informed.is_empty()) {
             let seen = &predicted.mean + &cross * factored.solve(&difference);
-            let mut widened = errors;
-            for (factor, covariance) in self.loading_covariances.iter().enumerate() {
-                widened += seen[factor].powi(2) * covariance.select_rows(informed).select_columns(informed);
-            }
-            factored = widened.cholesky()?;
+            let wider = unknown.covariance(&numbers.slopes, &seen, &observation.covariates);
+            factored = (errors + wider.select_rows(informed).select_columns(informed)).cholesky()?;
         }
         let gain = factored.solve(&cross.transpose()).transpose();
         let mean = &predicted.mean + &gain * &difference;
@@ -135,6 +149,22 @@ impl Filter {
     pub fn step(&self, known: &Known, observation: &Observation) -> Option<(Known, Innovation)> {
         let (predicted, decay) = self.predict(known, observation.steps);
         self.update((&predicted, decay), observation)
+    }
+}
+
+impl Unknown {
+    /// Covariance of the prediction of all quantities that it adds, `[d, d]`, at the states `seen` and with standardised covariates. `slopes`: B.
+    fn covariance(&self, slopes: &DMatrix<f64>, seen: &DVector<f64>, covariates: &DVector<f64>) -> DMatrix<f64> {
+        let d = slopes.nrows();
+        let mut sum = DMatrix::zeros(d, d);
+        for (factor, covariance) in self.loading_covariances.iter().enumerate() {
+            sum += seen[factor].powi(2) * covariance;
+        }
+        if let Some(coverage) = &self.coverage {
+            let wider = coverage.widening(slopes, &self.covariate_scales, covariates);
+            sum += DMatrix::from_diagonal(&wider);
+        }
+        sum
     }
 }
 

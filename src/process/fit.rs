@@ -8,6 +8,7 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
+use super::coverage::Coverage;
 use super::estimate::{BatchEstimate, Observation, Scale};
 use super::likelihood::{information, log_posterior};
 use super::model::{Process, Sizes};
@@ -212,6 +213,7 @@ fn unfitted(quantities: &Quantities, covariates: &[String], estimates: &[BatchEs
         usual_errors: Vec::new(),
         batches,
         period: [estimates[0].at, estimates[batches - 1].at],
+        coverage: Some(Coverage::of(covariates.len(), estimates)),
     };
     process.usual_errors = usual_errors(&process, estimates).as_slice().to_vec();
     Ok(process)

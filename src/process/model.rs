@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
+use super::coverage::Coverage;
 use super::estimate::{BatchEstimate, Observation, Scale};
 use crate::quantity::Timestamp;
 
@@ -114,6 +115,9 @@ pub struct Process {
     pub batches: usize,
     /// Times of the first and the last of them.
     pub period: [Timestamp; 2],
+    /// The conditions that they have seen; `None` in references of earlier versions of the program.
+    #[serde(default)]
+    pub coverage: Option<Coverage>,
 }
 
 impl Process {

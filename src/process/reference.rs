@@ -6,6 +6,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::change::{change, evidence, signs, Evidence, LossEvidence, WINDOW};
+use super::detectable::{detectable, Detectable};
 use super::estimate::BatchEstimate;
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit, observations, Error, Quantities};
@@ -34,7 +35,11 @@ pub struct ReferenceProcess {
     pub limits: Limits,
     /// Mean number of healthy batches to a false alarm for which the limits were computed.
     pub mean_run_batches: f64,
-    /// Misfit of the simulation that its batches show, both statistics of the test of fit divided by their degrees of freedom, 1 where the simulation fits.
+    /// The smallest lasting losses that the charts find; empty in references of earlier versions of the program.
+    #[serde(default)]
+    pub detectable: Vec<Detectable>,
+    /// Misfit of the simulation that its batches show: both statistics of the test of fit divided by their degrees of freedom, 1 where
+    /// the simulation fits.
     pub usual_misfit: [f64; 2],
     /// The states after the last batch of the reference, as [`Known::to_numbers`] writes them.
     end: Vec<f64>,
@@ -51,6 +56,9 @@ pub struct LastingChange {
     pub onset_interval: [Timestamp; 2],
     /// Change of each quantity that takes part.
     pub changes: Vec<QuantityChange>,
+    /// Conditions of the newest batch that the reference has not seen, each in some words: they may be a part of the cause.
+    #[serde(default)]
+    pub not_seen: Vec<String>,
 }
 
 /// The change of a quantity since an onset.
@@ -114,12 +122,27 @@ impl ReferenceProcess {
             known = filter.step(&known, &observation).ok_or_else(singular)?.0;
         }
         Ok(Self {
+            detectable: detectable(&process, &limits),
             process,
             directions: quantities.directions.clone(),
             limits,
             mean_run_batches,
             usual_misfit,
             end: known.to_numbers(),
+        })
+    }
+
+    /// The first lasting change that its charts show in batches outside the reference: its index, and the change. The joint chart is
+    /// preferred, because it names all quantities that take part.
+    pub fn first_change(&self, estimates: &[BatchEstimate]) -> Option<(usize, LastingChange)> {
+        let filter = Filter::of(&self.process);
+        let mut order: Vec<usize> = (0..estimates.len()).collect();
+        order.sort_by_key(|index| estimates[*index].at);
+        let mut chain = Chain::start(self, &filter, estimates[*order.first()?].at);
+        order.into_iter().find_map(|index| {
+            let mut changes = chain.take(&estimates[index])?.changes;
+            let joint = changes.remove(JOINT_SERIES);
+            Some((index, joint.or_else(|| changes.into_values().next())?))
         })
     }
 
@@ -224,15 +247,23 @@ impl<'a> Chain<'a> {
         self.pass(estimate).then(|| {
             let evidence = evidence(&self.innovations, self.filter.contributions(), &self.signs);
             let mut point = ProcessPoint { evidence, changes: BTreeMap::new() };
+            let not_seen = self.not_seen(estimate);
             for series in self.reference.series() {
                 let limits = self.reference.limits_of(&series);
                 let above =
                     point.of_series(self.reference, &series).filter(|e| e.fast > limits.fast || e.slow > limits.slow);
                 let change = above.and_then(|evidence| self.change(&series, evidence.fast > limits.fast));
+                let change = change.map(|change| LastingChange { not_seen: not_seen.clone(), ..change });
                 point.changes.extend(change.map(|change| (series, change)));
             }
             point
         })
+    }
+
+    /// Conditions of the newest batch that the reference has not seen.
+    fn not_seen(&self, estimate: &BatchEstimate) -> Vec<String> {
+        let process = &self.reference.process;
+        process.coverage.as_ref().map_or_else(Vec::new, |seen| seen.not_seen(&process.covariates, estimate))
     }
 
     /// The change on a chart that is above its limit.
@@ -260,6 +291,7 @@ impl<'a> Chain<'a> {
             onset: self.times[found.onset][1],
             onset_interval: [self.times[found.onset_interval[0]][0], self.times[found.onset_interval[1]][1]],
             changes: found.losses.iter().enumerate().filter_map(quantity).collect(),
+            not_seen: Vec::new(),
         })
     }
 }

@@ -1,9 +1,9 @@
 //! The sentence that says why a chart is above its limit.
 
-use super::reference::{LastingChange, QuantityChange};
+use std::fmt::Write as _;
 
-/// Unit of a parameter that is the logarithm of a factor.
-const LOGARITHM: &str = "ln";
+use super::estimate::percent;
+use super::reference::{LastingChange, QuantityChange};
 
 impl LastingChange {
     /// What has changed since when, by how much, and what the seasons explain, in one sentence.
@@ -18,11 +18,19 @@ impl LastingChange {
         let [from, to] = self.onset_interval.map(day);
         let chart =
             if self.fast { "fast chart, which finds steps," } else { "slow chart, which finds small lasting changes," };
-        format!(
+        let mut sentence = format!(
             "{} since {} (between {from} and {to}); the {chart} is above its limit.",
             joined(&parts),
             day(self.onset)
-        )
+        );
+        if !self.not_seen.is_empty() {
+            let _ = write!(
+                sentence,
+                " Weather may contribute: the undamaged reference has not seen {}.",
+                self.not_seen.join(", ")
+            );
+        }
+        sentence
     }
 }
 
@@ -34,11 +42,7 @@ impl QuantityChange {
 
     /// A difference of the quantity in per cent of its mean in the reference.
     pub fn percent(&self, difference: f64) -> f64 {
-        if self.unit == LOGARITHM {
-            100.0 * difference.exp_m1()
-        } else {
-            100.0 * difference / self.reference_mean
-        }
+        percent(&self.unit, self.reference_mean, difference)
     }
 
     fn phrase(&self) -> String {
@@ -89,6 +93,7 @@ mod tests {
             onset: at("2026-08-04T12:00:00Z"),
             onset_interval: [at("2026-08-02T00:00:00Z"), at("2026-08-06T00:00:00Z")],
             changes,
+            not_seen: Vec::new(),
         }
     }
 

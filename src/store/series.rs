@@ -9,7 +9,6 @@ use futures_util::TryStreamExt as _;
 use serde::Deserialize;
 use sqlx::Row as _;
 
-use super::alarm::Alarms;
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
@@ -76,30 +75,6 @@ pub struct QuantityMark {
     pub mean_interval: [Option<f64>; 2],
     /// 90 % credible interval of the probability of damage.
     pub probability_interval: [Option<f64>; 2],
-}
-
-/// An alarm chart over a window.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ChartSeries {
-    /// The parameter, or `simulation:fit`.
-    pub chart: String,
-    /// Points by the time of the last measurement of their batch. The values are the shift and the moving average.
-    pub points: Reduced<ChartMark>,
-}
-
-/// What a point of a chart has besides its values.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ChartMark {
-    /// The batch.
-    pub batch: String,
-    /// Limit of a single shift.
-    pub shift_limit: f64,
-    /// Limit of the moving average.
-    pub ewma_limit: Option<f64>,
-    /// True if the point does not change the chart, for example because of maintenance.
-    pub held: bool,
-    /// State of the chart after this point.
-    pub state: String,
 }
 
 /// The trust in a batch. Its p-value is the first value of its row.
@@ -194,57 +169,6 @@ impl Series<'_> {
             reducer.push(row.try_get_unchecked(0)?, &values, || ());
         }
         Ok(reducer.finish())
-    }
-
-    /// The alarm charts for the newest undamaged reference: points of batches that end in the window.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`], [`Error::Row`].
-    pub async fn chart_series(
-        self,
-        structure: &StructureId,
-        window: SeriesWindow,
-        extent: &Extent,
-    ) -> Result<Vec<ChartSeries>, Error> {
-        let (from, to) = bounds(window);
-        let (version,): (u32,) =
-            sqlx::query_as("select coalesce(max(version), 0) from undamaged_state where structure_id = $1")
-                .bind(structure.as_str())
-                .fetch_one(&self.database.reader)
-                .await?;
-        let mut all = Vec::new();
-        let alarms = Alarms { database: self.database };
-        for (version, chart) in alarms.chart_names(structure.as_str(), version).await? {
-            let mut rows = sqlx::query(
-                "select measured_to_us, shift, ewma, batch_id, shift_limit, ewma_limit, held, state from chart_point
-                 where structure_id = $1 and undamaged_version = $2 and series = $3
-                   and measured_to_us >= $4 and measured_to_us < $5",
-            )
-            .bind(structure.as_str())
-            .bind(version)
-            .bind(&chart)
-            .bind(from)
-            .bind(to)
-            .fetch(&self.database.reader);
-            let mut reducer = Reducer::new(extent.span(), window.points, 2);
-            while let Some(row) = rows.try_next().await? {
-                let values = [row.try_get_unchecked(1)?, row.try_get_unchecked(2)?];
-                let mark = || {
-                    Ok(ChartMark {
-                        batch: row.try_get_unchecked(3)?,
-                        shift_limit: row.try_get_unchecked(4)?,
-                        ewma_limit: row.try_get_unchecked(5)?,
-                        held: row.try_get_unchecked(6)?,
-                        state: row.try_get_unchecked(7)?,
-                    })
-                };
-                reducer.try_push(row.try_get_unchecked(0)?, &values, mark).map_err(|e: sqlx::Error| Error::from(e))?;
-            }
-            drop(rows);
-            all.push(ChartSeries { chart, points: reducer.finish() });
-        }
-        all.retain(|chart| !chart.points.rows.is_empty());
-        Ok(all)
     }
 }
 

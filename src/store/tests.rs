@@ -89,6 +89,7 @@ fn undamaged() -> UndamagedReference {
     UndamagedReference {
         process: None,
         without_process: None,
+        origin: crate::damage::ReferenceOrigin::default(),
         version: 0,
         threshold_probability: 0.05,
         measurements: 2,

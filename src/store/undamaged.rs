@@ -11,6 +11,7 @@ use super::batch::batch_state;
 use super::column::{bad_row, from_blob, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
+use super::reference_version::{batches_of, stored_origin};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};
@@ -214,24 +215,28 @@ impl References<'_> {
 
     async fn read_undamaged(self, structure: &StructureId) -> Result<Option<ReferenceRecord>, Error> {
         let row: Option<StateRow> = sqlx::query_as(
-            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint
+            "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint,
+                    origin
              from undamaged_state where structure_id = $1 order by version desc limit 1",
         )
         .bind(structure.as_str())
         .fetch_optional(&self.database.reader)
         .await?;
-        let Some((version, model_digest, created, threshold_probability, measurements, conditions, doubts, joint)) =
-            row
+        let Some((
+            version,
+            model_digest,
+            created,
+            threshold_probability,
+            measurements,
+            conditions,
+            doubts,
+            joint,
+            origin,
+        )) = row
         else {
             return Ok(None);
         };
-        let batches: Vec<(String,)> = sqlx::query_as(
-            "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
-        )
-        .bind(structure.as_str())
-        .bind(version)
-        .fetch_all(&self.database.reader)
-        .await?;
+        let batches = batches_of(self.database, structure, version).await?;
         let quantities: Vec<ReferenceQuantityRow> = sqlx::query_as(
             "select quantity, mean, std, threshold, detail, mean_draws, std_draws from undamaged_quantity
              where structure_id = $1 and version = $2 order by position",
@@ -254,10 +259,11 @@ impl References<'_> {
                 process,
                 without_process,
                 joint: joint.map(|joint| serde_json::from_str(&joint)).transpose().map_err(|e| bad(&e))?,
+                origin: stored_origin(origin.as_deref())?,
             },
             model_digest: Digest::from_stored(model_digest),
             created_at: timestamp("undamaged reference", created)?,
-            batches: batches.into_iter().map(|(id,)| id).collect(),
+            batches,
         }))
     }
 }
@@ -278,8 +284,8 @@ async fn insert_process(
     Ok(())
 }
 
-/// Version, model digest, time, threshold probability, number of measurements, conditions, doubts, joint probability.
-type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>);
+/// Version, model digest, time, threshold probability, number of measurements, conditions, doubts, joint probability, origin.
+type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>);
 
 /// Structure and version of a reference.
 type Key<'k> = (&'k str, u32);
@@ -295,7 +301,7 @@ async fn insert_state(
     model_digest: &Digest,
     now: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9)")
+    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
         .bind(structure)
         .bind(version)
         .bind(model_digest.as_str())
@@ -305,6 +311,7 @@ async fn insert_state(
         .bind(to_json(&state.conditions)?)
         .bind(to_json(&state.doubts)?)
         .bind(state.joint.as_ref().map(to_json).transpose()?)
+        .bind(to_json(&state.origin)?)
         .execute(transaction.connection())
         .await?;
     Ok(())

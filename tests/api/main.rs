@@ -19,6 +19,7 @@ mod needs;
 mod openapi;
 mod operations;
 mod reference;
+mod reference_extension;
 mod restart;
 mod ruler_frame;
 mod tables;

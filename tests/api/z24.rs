@@ -12,23 +12,27 @@ const DAMAGED_FROM: usize = 3_474;
 /// Rows of a batch: about a day.
 const ROWS: usize = 24;
 
-/// Batches of rows whose third and fourth frequency are in order, each with whether it holds damaged rows.
-fn batches(csv: &str) -> Vec<(Vec<Value>, bool)> {
+/// Batches of consecutive rows, each with its number of damaged rows. Rows whose third and fourth frequency are not in order, because
+/// the modes were exchanged, are left out of their batch.
+fn batches(csv: &str) -> Vec<(Vec<Value>, usize)> {
     let row = |line: &str| {
         let cells: Vec<&str> = line.split(',').collect();
         let hz: Vec<Option<f64>> = cells[1..5].iter().map(|cell| cell.parse().ok()).collect();
         (cells[0].parse::<usize>().unwrap(), hz)
     };
-    let rows: Vec<(usize, Vec<Option<f64>>)> =
-        csv.lines().skip(1).map(row).filter(|(_, hz)| hz[3].is_none_or(|f4| hz[2].unwrap() < f4)).collect();
-    let measurement = |(place, (_, hz)): (usize, &(usize, Vec<Option<f64>>))| {
+    let rows: Vec<(usize, Vec<Option<f64>>)> = csv.lines().skip(1).map(row).collect();
+    let measurement = |(place, hz): (usize, &[Option<f64>])| {
         let at =
             modalwatch::quantity::Timestamp::from_micros(879_202_800_000_000 + 3_600_000_000 * place as i64).unwrap();
         json!({ "measured_at": at, "frequencies_hz": hz })
     };
-    let all: Vec<Value> = rows.iter().enumerate().map(measurement).collect();
-    let damaged = |part: &[(usize, Vec<Option<f64>>)]| part.iter().any(|(number, _)| *number >= DAMAGED_FROM);
-    all.chunks(ROWS).zip(rows.chunks(ROWS)).map(|(own, rows)| (own.to_vec(), damaged(rows))).collect()
+    let batch = |(first, part): (usize, &[(usize, Vec<Option<f64>>)])| {
+        let used: Vec<(usize, &(usize, Vec<Option<f64>>))> =
+            (first * ROWS..).zip(part).filter(|(_, (_, hz))| hz[3].is_none_or(|f4| hz[2].unwrap() < f4)).collect();
+        let damaged = used.iter().filter(|(_, (number, _))| *number >= DAMAGED_FROM).count();
+        (used.iter().map(|(place, (_, hz))| measurement((*place, hz))).collect(), damaged)
+    };
+    rows.chunks(ROWS).enumerate().map(batch).collect()
 }
 
 #[tokio::test]
@@ -44,7 +48,9 @@ async fn a_year_of_the_z24_bridge_and_the_settlement_of_its_pier() {
     let structure = std::fs::read_to_string(repository("tests/discrepancy/z24.toml")).unwrap();
     train_model(&models.join("z24"), &structure, "0.5,2");
     let batches = batches(&std::fs::read_to_string(path).unwrap());
-    let first_damaged = batches.iter().position(|(_, damaged)| *damaged).unwrap();
+    // Six of the 24 rows of batch 144 are damaged; 145 is the first of three that are damaged throughout.
+    let first_damaged = batches.iter().position(|(measurements, damaged)| 2 * damaged > measurements.len()).unwrap();
+    let mut found = Vec::new();
     for size in [60, 84, 110] {
         let service = Service::spawn(command(&folder.path().join(format!("data-{size}"))).arg("--models").arg(&models));
         let (mut ids, mut rejected, mut first_alarm, mut quiet_alarms) = (Vec::new(), 0, None, 0);
@@ -74,7 +80,12 @@ async fn a_year_of_the_z24_bridge_and_the_settlement_of_its_pier() {
         for alarm in alarms["items"].as_array().unwrap() {
             println!("  {}", alarm["sentence"].as_str().unwrap_or_default());
         }
-        assert!(rejected <= 1 && quiet_alarms <= 1, "{rejected} {quiet_alarms}");
-        assert!((first_damaged..=first_damaged + 1).contains(&first_alarm.expect("an alarm")));
+        found.push((size, quiet_alarms, rejected, first_alarm));
+    }
+    for (size, quiet_alarms, rejected, first_alarm) in found {
+        // The wanted run is 1,000 batches; the shortest reference has 85 healthy batches after it.
+        assert!(rejected <= 1 && quiet_alarms <= usize::from(size == 60), "{size}: {rejected} {quiet_alarms}");
+        let alarm = first_alarm.expect("an alarm");
+        assert!((first_damaged..=first_damaged + 1).contains(&alarm), "{size}: alarm with batch {alarm}");
     }
 }

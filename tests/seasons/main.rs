@@ -9,6 +9,7 @@ mod estimates;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
+mod sciri;
 mod watch;
 mod worlds;
 mod z24;

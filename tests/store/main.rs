@@ -244,6 +244,7 @@ fn undamaged() -> modalwatch::damage::UndamagedReference {
     modalwatch::damage::UndamagedReference {
         process: None,
         without_process: None,
+        origin: modalwatch::damage::ReferenceOrigin::default(),
         version: 0,
         threshold_probability: 0.05,
         measurements: 2,

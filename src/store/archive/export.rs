@@ -9,6 +9,7 @@ use super::super::column::{bad_row, elements, from_blob, list, timestamp};
 use super::super::database::Database;
 use super::super::error::Error;
 use super::super::measurement_row::mode_shapes;
+use super::super::reference_version::batches_of;
 use super::super::structure::Structures;
 use super::record::{
     Acknowledged, ArchivedModel, Batch, Maintenance, Measurement, Record, Structure, Undamaged, UndamagedQuantity,
@@ -40,8 +41,9 @@ struct ExportedMeasurement {
 type BatchRow = (String, String, Option<String>, String, i64);
 
 /// Columns of an undamaged reference: version, model digest, creation in µs, threshold probability, number of measurements,
-/// conditions, doubts.
-type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>, Option<String>);
+/// conditions, doubts, joint probability, origin, process, why there is none.
+type StateRow =
+    (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>, Option<String>, Option<String>);
 
 /// The error of an export whose receiver was dropped while records were still to be sent.
 fn receiver_dropped<T>(_: T) -> Error {
@@ -132,7 +134,7 @@ impl Archive<'_> {
     async fn export_states(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
         let rows: Vec<StateRow> = sqlx::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint,
-                    (select process from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version),
+                    origin, (select process from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version),
                     (select reason from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version)
              from undamaged_state s where structure_id = $1 order by version",
         )
@@ -149,16 +151,11 @@ impl Archive<'_> {
                 conditions,
                 doubts,
                 joint,
+                origin,
                 process,
                 without,
             ) = row;
-            let batches: Vec<(String,)> = sqlx::query_as(
-                "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
-            )
-            .bind(structure.as_str())
-            .bind(version)
-            .fetch_all(&self.database.reader)
-            .await?;
+            let batches = batches_of(self.database, structure, version).await?;
             let quantities: Vec<UndamagedQuantity> = sqlx::query_as(
                 "select quantity, position, mean, std, threshold, detail, mean_draws, std_draws
                  from undamaged_quantity where structure_id = $1 and version = $2 order by position",
@@ -178,7 +175,8 @@ impl Archive<'_> {
                 joint,
                 process,
                 without_process: without,
-                batches: batches.into_iter().map(|(id,)| id).collect(),
+                origin,
+                batches,
                 quantities,
             };
             records.send(Record::UndamagedReference(state)).await.map_err(receiver_dropped)?;

@@ -199,7 +199,7 @@ async fn insert_undamaged(
     state: &Undamaged,
     created: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9)")
+    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
         .bind(structure)
         .bind(state.version)
         .bind(&state.model_digest)
@@ -209,6 +209,7 @@ async fn insert_undamaged(
         .bind(&state.conditions)
         .bind(&state.doubts)
         .bind(&state.joint)
+        .bind(&state.origin)
         .execute(transaction.connection())
         .await?;
     sqlx::query("insert into undamaged_process values ($1, $2, $3, $4)")

@@ -168,6 +168,9 @@ pub struct Undamaged {
     /// Why there is no process.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub without_process: Option<String>,
+    /// Where it comes from, JSON.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub origin: Option<String>,
     /// Its batches.
     pub batches: Vec<String>,
     /// Its quantities.

@@ -3,23 +3,36 @@
 import { h } from "../dom.js";
 import { count, local, number, timeElement, words } from "../format.js";
 import { stateChip, stateWord, urgency } from "../states.js";
-import { chart, curve, draw, mark, merged, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
+import { chart, curve, draw, mark, merged, rule, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
 import { figure } from "./figure.js";
-import { FIT_CHART, alarmSpans } from "./parameters.js";
+import { FIT_CHART, JOINT_CHART, alarmSpans } from "./parameters.js";
 import { colour } from "./theme.js";
 
 const KEYS = [
-  { mark: "dot-1", text: "shift of a batch" },
-  { mark: "dash-bad", text: "limit of the shift" },
-  { mark: "line-2", text: "moving average (EWMA)" },
-  { mark: "dash-2", text: "limit of the moving average" },
+  { mark: "dot-1", text: "single batch (shift or fast chart)" },
+  { mark: "dash-bad", text: "limit for a single batch" },
+  { mark: "line-2", text: "several batches (moving average or slow chart)" },
+  { mark: "dash-2", text: "limit for several batches" },
+  { mark: "dash", text: "a new undamaged reference begins" },
   { mark: "triangle", text: "alarm or pending" },
   { mark: "ring", text: "held: chart not updated" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
 ];
 
-const label = (chart) => (chart === FIT_CHART ? "simulation fit" : chart);
+const label = (chart) =>
+  chart === FIT_CHART ? "simulation fit" : chart === JOINT_CHART ? "all parameters together" : chart;
+
+/** Names of the two values of a chart. */
+const names = (c) =>
+  c.is_process
+    ? { one: "fast chart", several: "slow chart", unit: "standard deviations" }
+    : { one: "shift", several: "moving average", unit: "standard errors" };
+
+const hint = (c) =>
+  c.is_process
+    ? "Evidence for a lasting loss that weather and seasons do not explain, in standard deviations. The fast chart finds steps in up to three batches, the slow one small losses over up to 60. The process was learned from the undamaged reference."
+    : "Shift towards damage relative to the undamaged reference, in standard errors. In the chart “simulation fit”, 1 means a rejected batch.";
 
 const isBeyond = (state) => state === "alarming" || state === "pending";
 
@@ -28,7 +41,6 @@ export function control(group, selectBatch) {
   const frame = figure({
     name: "control",
     title: "Control chart",
-    hint: "Shift towards damage relative to the undamaged reference, in standard errors. In the chart “simulation fit”, 1 means a rejected batch.",
     keys: KEYS,
     tools: picker,
   });
@@ -51,6 +63,8 @@ export function control(group, selectBatch) {
       (a, b) => urgency(a.state.at(-1)) - urgency(b.state.at(-1)) || (a.chart === FIT_CHART) - (b.chart === FIT_CHART),
     )[0];
     const c = all.find((chart) => chart.chart === chosen) ?? worst;
+    const name = names(c);
+    frame.explain(hint(c));
     const focused = picker.contains(document.activeElement) ? document.activeElement.dataset.chart : null;
     picker.replaceChildren(
       ...all.map((other) =>
@@ -106,7 +120,7 @@ export function control(group, selectBatch) {
         curve("curve-2", { width: 2 }),
         curve("curve-2", { dash: [6, 4] }),
       ],
-      axes: [timeAxis(), valueAxis("standard errors")],
+      axes: [timeAxis(), valueAxis(name.unit)],
       scales: { y: { range: (u, low, high) => [Math.min(0, low ?? 0) - 0.5, Math.max(1, high ?? 1) * 1.08 + 0.2] } },
       hooks: {
         drawClear: [
@@ -114,6 +128,7 @@ export function control(group, selectBatch) {
             shade(u, windows, "maintenance");
             shade(u, alarms, "bad", { opacity: 0.16 });
             shade(u, filled.gaps, "ink-soft", { striped: true });
+            for (const r of series.references) rule(u, seconds(r.from), "ink-soft", [2, 4], "x");
           },
         ],
         draw: [dots],
@@ -128,22 +143,22 @@ export function control(group, selectBatch) {
       if (row < 0) return "";
       return [
         timeElement(c.times[row]),
-        ` · ${label(c.chart)}: shift ${number(c.shift[row], 3)} (limit ${number(c.shift_limit[row], 3)}), moving average ${number(c.ewma[row], 3)} (limit ${number(c.ewma_limit[row], 3)}) · ${stateOf(row)}`,
+        ` · ${label(c.chart)}: ${name.one} ${number(c.shift[row], 3)} (limit ${number(c.shift_limit[row], 3)}), ${name.several} ${number(c.ewma[row], 3)} (limit ${number(c.ewma_limit[row], 3)}) · ${stateOf(row)}`,
       ];
     }
     const last = c.times.length - 1;
     frame.summarise(
-      `Control chart for ${label(c.chart)}, ${count(c.times.length, "batch", "batches")} to ${local(c.times[last])}. Latest: ${stateOf(last)}, shift ` +
-        `${number(c.shift[last], 3)} standard errors (limit ${number(c.shift_limit[last], 3)}); ${count(alarms.length, "alarm")} in this time span. ` +
+      `Control chart for ${label(c.chart)}, ${count(c.times.length, "batch", "batches")} to ${local(c.times[last])}. Latest: ${stateOf(last)}, ${name.one} ` +
+        `${number(c.shift[last], 3)} ${name.unit} (limit ${number(c.shift_limit[last], 3)}); ${count(alarms.length, "alarm")} in this time span. ` +
         "Use the arrow keys to read the values and Enter to open the batch.",
     );
     frame.tabulate(() => ({
       columns: [
         "Time",
-        "Shift (standard errors)",
-        "Limit of the shift",
-        "Moving average",
-        "Limit of the average",
+        `${name.one} (${name.unit})`,
+        `limit of the ${name.one}`,
+        name.several,
+        `limit of the ${name.several}`,
         "State",
       ],
       rows: c.times.map((time, i) => [

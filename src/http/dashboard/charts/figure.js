@@ -18,7 +18,7 @@ export function keyList(keys) {
 
 /**
  * Creates a figure. `keys` are the legend entries `{mark, text}`; marks are classes of `figures.css`. Returns the `element`,
- * the `plot` to draw in, and `summarise(text)` (for screen readers), `read(nodes)` (values at the cursor), `empty(text)`
+ * the `plot` to draw in, `explain(text)` (another hint), and `summarise(text)` (for screen readers), `read(nodes)` (values at the cursor), `empty(text)`
  * (why there is no plot, or `null`), `tabulate(() => ({columns, rows, newestLast}))`.
  */
 export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
@@ -49,10 +49,11 @@ export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
     "Show as table",
   );
   const legend = keyList(keys);
+  const explanation = h("p", { class: "fine", hidden: !hint }, hint ?? "");
   const element = h(
     "figure",
     { class: "figure", dataset: { figure: name } },
-    h("figcaption", null, h(level, { id: `${id}-title` }, title), hint && h("p", { class: "fine" }, hint), tools),
+    h("figcaption", null, h(level, { id: `${id}-title` }, title), explanation, tools),
     legend,
     note,
     plot,
@@ -113,6 +114,10 @@ export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
     element,
     plot,
     summarise: (text) => fill(summary, text),
+    explain: (text) => {
+      explanation.hidden = false;
+      fill(explanation, text);
+    },
     read: (...nodes) => fill(readout, nodes),
     empty: (text) => {
       note.hidden = !text;

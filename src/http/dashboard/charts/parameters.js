@@ -37,13 +37,18 @@ const KEYS = [
 /** Name of the control chart for the fit of the simulation; all other charts have the name of their parameter. */
 export const FIT_CHART = "simulation:fit";
 
+/** Name of the control chart of all parameters together. */
+export const JOINT_CHART = "structure:joint";
+
 /** End of an open alarm: later than any measurement, in seconds. */
 const OPEN_END_S = 1e11;
 
 /** Time spans `[from_s, to_s]` of the alarms of a chart, without withdrawn ones. */
 export function alarmSpans(alarms, chart) {
   const isOfChart = (a) =>
-    chart === FIT_CHART ? a.kind === "simulation_does_not_fit" : a.kind === "damage" && a.parameter === chart;
+    chart === FIT_CHART
+      ? a.kind === "simulation_does_not_fit"
+      : a.kind === "damage" && (a.parameter ?? JOINT_CHART) === chart;
   return alarms
     .filter((a) => isOfChart(a) && a.state !== "withdrawn")
     .map((a) => [seconds(a.opened_at), a.ended_at ? seconds(a.ended_at) : OPEN_END_S]);

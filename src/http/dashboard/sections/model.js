@@ -45,6 +45,9 @@ export function model(structure, changed) {
                   },
                   info.undamaged ? "Declare another undamaged reference" : "Declare the undamaged reference",
                 ),
+                info.undamaged && " ",
+                info.undamaged &&
+                  h("button", { type: "button", onclick: () => declare(structure, changed, true) }, "Extend this reference"),
               ),
           ),
         ),
@@ -157,11 +160,14 @@ function undamaged(state) {
   const conditions = Object.entries(state.conditions).map(([name, seen]) => `${name} ${seenWords(seen)}`);
   return [
     facts([
-      ["Version", `${state.version}, declared ${local(state.created_at)}`],
+      ["Version", `${state.version}, declared ${local(state.created_at)}${state.extends ? `, extends version ${state.extends}` : ""}`],
+      state.reason && ["Reason", state.reason],
       ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}`],
       ["Limit", `probability of damage above ${percent(state.threshold_probability)}`],
       conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
+      state.process?.coverage && ["Months seen", state.process.coverage.months.map(monthName).join(", ")],
       ["Movement in time", seasonWords(state)],
+      state.process?.detectable?.length > 0 && ["Found with 90 %", detectableWords(state.process.detectable)],
     ]),
     state.doubts.length > 0 &&
       h(
@@ -200,6 +206,21 @@ function undamaged(state) {
       ),
     ),
   ];
+}
+
+const monthName = (month) =>
+  new Intl.DateTimeFormat("en", { month: "long", timeZone: "UTC" }).format(new Date(Date.UTC(2026, month - 1, 15)));
+
+/** The smallest lasting loss of each parameter that the charts find with the first batch, and in the long run. */
+function detectableWords(list) {
+  const names = [...new Set(list.map((d) => d.name))];
+  return names
+    .map((name) => {
+      const own = list.filter((d) => d.name === name);
+      const [first, last] = [own[0], own.at(-1)];
+      return `${name} −${number(first.loss_percent, 2)} % with the first batch, −${number(last.loss_percent, 2)} % within ${count(last.batches, "batch", "batches")}`;
+    })
+    .join("; ");
 }
 
 /** What the reference shows of the movement of the parameters in time. */
@@ -241,7 +262,7 @@ export function postLine(info) {
 }
 
 /** Dialog to choose the batches of a new undamaged reference. */
-async function declare(structure, changed) {
+async function declare(structure, changed, extend = false) {
   let items;
   try {
     ({ items } = await read(at(structure, "/history?limit=200")));
@@ -271,12 +292,14 @@ async function declare(structure, changed) {
   });
   const list = h("ul", { class: "choices", tabindex: 0, "aria-label": "Batches" }, boxes);
   const done = await ask({
-    title: "Declare the undamaged reference",
+    title: extend ? "Extend the undamaged reference" : "Declare the undamaged reference",
     body: [
       h(
         "p",
         null,
-        "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available, or the period in which it was. All batches are compared again with the new reference, and alarms based on the old one are withdrawn.",
+        extend
+          ? "The reference keeps its batches and gains others that you accept as healthy, so that it has seen more of the year. Batches of a damage alarm are not accepted, and nothing is changed if the first version of the reference shows a lasting loss in what was added since."
+          : "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available, or the period in which it was. All batches are compared again with the new reference, and alarms based on the old one are withdrawn.",
       ),
       list,
     ],
@@ -288,10 +311,16 @@ async function declare(structure, changed) {
         hint: "All batches of the period are used. Doubtful ones are left out and named.",
       },
       { name: "to", label: `to (${zone()})`, type: "datetime-local" },
-      { name: "p", label: "Limit of the probability of damage (%)", type: "text", required: true, value: "5" },
-    ],
-    confirm: "Declare",
-    submit: ({ from, to, p }) => {
+      !extend && { name: "p", label: "Limit of the probability of damage (%)", type: "text", required: true, value: "5" },
+      {
+        name: "reason",
+        label: "Reason (optional)",
+        type: "text",
+        hint: "For example a repair, after which an earlier reference no longer applies. It is kept with the version.",
+      },
+    ].filter(Boolean),
+    confirm: extend ? "Extend" : "Declare",
+    submit: ({ from, to, p, reason }) => {
       const batches = [...list.querySelectorAll("input:checked")].map((box) => box.value);
       const refuse = (title, message) => {
         throw Object.assign(new Error(message), { title });
@@ -300,8 +329,9 @@ async function declare(structure, changed) {
       const period = from === "" ? null : { from: new Date(from).toISOString(), to: new Date(to).toISOString() };
       if (period && batches.length > 0) refuse("Batches and period", "Choose either batches or a period.");
       if (!period && batches.length === 0) refuse("No batch chosen", "Choose at least one batch, or a period.");
-      const threshold_probability = Number(p.replace(",", ".")) / 100;
-      return send(at(structure, "/reference"), { ...(period ?? { batches }), threshold_probability });
+      const body = { ...(period ?? { batches }), ...(reason.trim() === "" ? {} : { reason: reason.trim() }) };
+      if (extend) return send(at(structure, "/reference/extend"), body);
+      return send(at(structure, "/reference"), { ...body, threshold_probability: Number(p.replace(",", ".")) / 100 });
     },
   });
   if (done) {

@@ -1,0 +1,123 @@
+//! The versions of an undamaged reference, and the alarms during which batches were measured.
+
+use sqlx::FromRow;
+
+use super::column::{bad_row, timestamp};
+use super::database::Database;
+use super::error::Error;
+use super::undamaged::References;
+use crate::damage::ReferenceOrigin;
+use crate::quantity::{StructureId, Timestamp};
+
+/// A version of the undamaged reference, in short.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ReferenceVersion {
+    /// Its number.
+    pub version: u32,
+    /// When it was stored.
+    pub created_at: Timestamp,
+    /// Number of measurements.
+    pub measurements: usize,
+    /// Number of batches.
+    pub batches: usize,
+    /// Time of the first measurement.
+    pub measured_from: Timestamp,
+    /// Time of the last measurement.
+    pub measured_to: Timestamp,
+    /// Where it comes from.
+    pub origin: ReferenceOrigin,
+}
+
+#[derive(FromRow)]
+struct VersionRow {
+    version: u32,
+    created_at_us: i64,
+    measurement_count: i64,
+    origin: Option<String>,
+    batches: i64,
+    measured_from_us: i64,
+    measured_to_us: i64,
+}
+
+impl References<'_> {
+    /// The ids of the batches of a version, in alphabetical order; none if there is no such version.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn batches_of(self, structure: &StructureId, version: u32) -> Result<Vec<String>, Error> {
+        batches_of(self.database, structure, version).await
+    }
+
+    /// All versions of the undamaged reference of a structure, the newest first.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn versions(self, structure: &StructureId) -> Result<Vec<ReferenceVersion>, Error> {
+        let rows: Vec<VersionRow> = sqlx::query_as(
+            "select version, s.created_at_us, s.measurement_count, origin, count(*) as batches,
+                    min(measured_from_us) as measured_from_us, max(measured_to_us) as measured_to_us
+             from undamaged_state s join undamaged_batch u using (structure_id, version)
+             join measurement_batch b using (structure_id, batch_id)
+             where structure_id = $1 group by version order by version desc",
+        )
+        .bind(structure.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        let what = "undamaged reference";
+        let version = |row: VersionRow| {
+            Ok(ReferenceVersion {
+                version: row.version,
+                created_at: timestamp(what, row.created_at_us)?,
+                measurements: row.measurement_count as usize,
+                batches: row.batches as usize,
+                measured_from: timestamp(what, row.measured_from_us)?,
+                measured_to: timestamp(what, row.measured_to_us)?,
+                origin: stored_origin(row.origin.as_deref())?,
+            })
+        };
+        rows.into_iter().map(version).collect()
+    }
+
+    /// The damage alarms during which batches were measured, that were not withdrawn: batch and number of the alarm.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn alarms_during(self, structure: &StructureId, batches: &[String]) -> Result<Vec<(String, i64)>, Error> {
+        let ids = serde_json::to_string(batches).map_err(|e| bad_row("batch")(&e))?;
+        Ok(sqlx::query_as(
+            "select b.batch_id, min(a.episode) from measurement_batch b join alarm_episode a using (structure_id)
+             where structure_id = $1 and b.batch_id in (select value from json_each($2))
+               and a.kind = 'damage' and a.withdrawn = 0 and a.opened_at_us <= b.measured_to_us
+               and (a.ended_at_us is null or a.ended_at_us > b.measured_to_us)
+             group by b.batch_id order by b.measured_to_us",
+        )
+        .bind(structure.as_str())
+        .bind(ids)
+        .fetch_all(&self.database.reader)
+        .await?)
+    }
+}
+
+/// The ids of the batches of a version, in alphabetical order; none if there is no such version.
+pub(super) async fn batches_of(
+    database: &Database,
+    structure: &StructureId,
+    version: u32,
+) -> Result<Vec<String>, Error> {
+    let batches: Vec<(String,)> = sqlx::query_as(
+        "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
+    )
+    .bind(structure.as_str())
+    .bind(version)
+    .fetch_all(&database.reader)
+    .await?;
+    Ok(batches.into_iter().map(|(id,)| id).collect())
+}
+
+/// The stored origin of a reference.
+pub(super) fn stored_origin(text: Option<&str>) -> Result<ReferenceOrigin, Error> {
+    text.map_or_else(
+        || Ok(ReferenceOrigin::default()),
+        |text| serde_json::from_str(text).map_err(|e| bad_row("undamaged reference")(&e)),
+    )
+}
