@@ -60,12 +60,55 @@ pub struct LossEvidence {
 }
 
 /// Score b and information I of a change since an onset.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Score {
     /// b, `[d]`.
     pub score: DVector<f64>,
     /// I, `[d, d]`.
     pub information: DMatrix<f64>,
+    /// M: what the states have taken of the change, `[q + d, d]`.
+    pub taken: DMatrix<f64>,
+    /// H M at the newest innovation: the part of the change that its prediction contains, `[d, d]`.
+    pub predicted: DMatrix<f64>,
+}
+
+impl Score {
+    /// Before the first changed innovation, with `states` = q + d states and `quantities` = d.
+    pub fn new(states: usize, quantities: usize) -> Self {
+        Self {
+            score: DVector::zeros(quantities),
+            information: DMatrix::zeros(quantities, quantities),
+            taken: DMatrix::zeros(states, quantities),
+            predicted: DMatrix::zeros(quantities, quantities),
+        }
+    }
+
+    /// Adds the next innovation. `contributions`: H, `[d, q + d]`.
+    pub fn add(&mut self, innovation: &Innovation, contributions: &DMatrix<f64>) {
+        for (mut row, decay) in self.taken.row_iter_mut().zip(innovation.decay.iter()) {
+            row *= *decay;
+        }
+        let d = contributions.nrows();
+        self.predicted = contributions * &self.taken;
+        let left = DMatrix::identity(d, d) - &self.predicted;
+        let signature = left.select_rows(&innovation.informed);
+        let weighted = signature.transpose() * &innovation.precision;
+        self.score += &weighted * &innovation.difference;
+        self.information += &weighted * &signature;
+        self.taken += &innovation.gain * &signature;
+    }
+
+    /// Evidence for a loss: in each quantity, and in several together. A quantity that is not the one with the largest evidence is
+    /// tested beside that one.
+    pub fn evidence(&self, signs: &[f64]) -> (Vec<f64>, f64) {
+        let (score, information) = (self.score.as_slice(), self.information.as_slice());
+        let alone: Vec<f64> = signs.iter().enumerate().map(|(k, sign)| of_one(score, information, k, *sign)).collect();
+        let best = (0..signs.len()).max_by(|a, b| alone[*a].total_cmp(&alone[*b])).unwrap_or(0);
+        let of =
+            |k: usize| if k == best { alone[k] } else { alone[k].min(beside(score, information, signs, [k, best])) };
+        let joint = of_several(score, information, signs, &mut vec![0.0; signs.len()]);
+        ((0..signs.len()).map(of).collect(), joint)
+    }
 }
 
 /// Sign by which a change of each quantity is multiplied so that a loss is positive; 0 without a damage direction.
@@ -81,20 +124,9 @@ pub fn signs(directions: &[DamageDirection]) -> Vec<f64> {
 /// The score of a change with the first of some successive innovations. `contributions`: H, `[d, q + d]`.
 pub fn score(innovations: &[Innovation], contributions: &DMatrix<f64>) -> Score {
     let (d, n) = contributions.shape();
-    let mut taken = DMatrix::zeros(n, d);
-    let mut found = Score { score: DVector::zeros(d), information: DMatrix::zeros(d, d) };
-    for (place, innovation) in innovations.iter().enumerate() {
-        if place > 0 {
-            for (mut row, decay) in taken.row_iter_mut().zip(innovation.decay.iter()) {
-                row *= *decay;
-            }
-        }
-        let left = DMatrix::identity(d, d) - contributions * &taken;
-        let signature = left.select_rows(&innovation.informed);
-        let weighted = signature.transpose() * &innovation.precision;
-        found.score += &weighted * &innovation.difference;
-        found.information += &weighted * &signature;
-        taken += &innovation.gain * &signature;
+    let mut found = Score::new(n, d);
+    for innovation in innovations {
+        found.add(innovation, contributions);
     }
     found
 }
@@ -111,20 +143,16 @@ pub fn evidence(innovations: &[Innovation], contributions: &DMatrix<f64>, signs:
         (0..signs.len()).map(|k| (charted(k) && informed(k)).then_some(Evidence::NONE)).collect();
     let several = (0..signs.len()).filter(|k| charted(*k)).count() > 1;
     let mut joint = (several && quantities.iter().any(Option::is_some)).then_some(Evidence::NONE);
-    let mut losses = vec![0.0; signs.len()];
     for age in AGES.into_iter().filter(|age| *age <= innovations.len()) {
         let found = score(&innovations[innovations.len() - age..], contributions);
-        let (score, information) = (found.score.as_slice(), found.information.as_slice());
-        let alone: Vec<f64> = signs.iter().enumerate().map(|(k, sign)| of_one(score, information, k, *sign)).collect();
-        let best = (0..signs.len()).max_by(|a, b| alone[*a].total_cmp(&alone[*b])).unwrap_or(0);
-        for (k, evidence) in quantities.iter_mut().enumerate() {
+        let (alone, together) = found.evidence(signs);
+        for (evidence, z) in quantities.iter_mut().zip(alone) {
             if let Some(evidence) = evidence {
-                let z = if k == best { alone[k] } else { alone[k].min(beside(score, information, signs, [k, best])) };
                 evidence.take(age, z);
             }
         }
         if let Some(joint) = &mut joint {
-            joint.take(age, of_several(found.score.as_slice(), found.information.as_slice(), signs, &mut losses));
+            joint.take(age, together);
         }
     }
     LossEvidence { quantities, joint }

@@ -18,7 +18,7 @@
 //! - [`estimate`]: the estimate of a batch; [`model`]: the process; [`filter`]: its Kalman filter; `smoother` and `likelihood`: its
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
-//! - [`change`]: lasting changes that the process does not explain, their onset and size; [`limits`]: what healthy operation reaches;
+//! - [`change`]: lasting changes that the process does not explain, their onset and size; [`followed`]: a change as long as it lasts; [`limits`]: what healthy operation reaches;
 //! - [`detectable`]: the smallest losses that its charts find;
 //! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
 //!
@@ -33,6 +33,7 @@ pub mod detectable;
 pub mod estimate;
 pub mod filter;
 pub mod fit;
+pub mod followed;
 mod likelihood;
 pub mod limits;
 pub mod model;

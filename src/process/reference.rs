@@ -5,11 +5,12 @@ use std::collections::BTreeMap;
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use super::change::{change, evidence, signs, Evidence, LossEvidence, WINDOW};
+use super::change::{change, evidence, score, signs, Evidence, LossEvidence, AGES, WINDOW};
 use super::detectable::{detectable, Detectable};
 use super::estimate::BatchEstimate;
 use super::filter::{Filter, Innovation, Known};
 use super::fit::{fit, observations, Error, Quantities};
+use super::followed::{Followed, Memory};
 use super::limits::{limits, Limits};
 use super::model::Process;
 use crate::parameter::DamageDirection;
@@ -98,6 +99,7 @@ pub struct Chain<'a> {
     /// The last innovations with the times of their batches and of the batches before, at most [`WINDOW`].
     innovations: Vec<Innovation>,
     times: Vec<[Timestamp; 2]>,
+    memory: Memory,
 }
 
 impl ReferenceProcess {
@@ -206,6 +208,7 @@ impl<'a> Chain<'a> {
             filter,
             innovations: Vec::new(),
             times: Vec::new(),
+            memory: Memory::default(),
         }
     }
 
@@ -217,6 +220,27 @@ impl<'a> Chain<'a> {
     /// What is known about the states after the last batch.
     pub fn known(&self) -> &Known {
         &self.known
+    }
+
+    /// What it remembers after the last batch, beside the batches of the window.
+    pub fn memory(&self) -> &Memory {
+        &self.memory
+    }
+
+    /// The chain with what it remembered after its last batch.
+    #[must_use]
+    pub fn remembering(mut self, memory: Memory) -> Self {
+        self.memory = memory;
+        self.forget();
+        self
+    }
+
+    /// Takes batches before the begin of the test out of the window.
+    fn forget(&mut self) {
+        let begin = self.memory.begin;
+        let old = self.times.iter().take_while(|[_, at]| begin.is_some_and(|begin| *at < begin)).count();
+        self.times.drain(..old);
+        self.innovations.drain(..old);
     }
 
     /// Adds a batch, without its evidence. Returns whether it could be added.
@@ -244,20 +268,100 @@ impl<'a> Chain<'a> {
 
     /// Adds a batch and returns its point on the charts; `None` if it informs no quantity.
     pub fn take(&mut self, estimate: &BatchEstimate) -> Option<ProcessPoint> {
-        self.pass(estimate).then(|| {
-            let evidence = evidence(&self.innovations, self.filter.contributions(), &self.signs);
-            let mut point = ProcessPoint { evidence, changes: BTreeMap::new() };
-            let not_seen = self.not_seen(estimate);
-            for series in self.reference.series() {
-                let limits = self.reference.limits_of(&series);
-                let above =
-                    point.of_series(self.reference, &series).filter(|e| e.fast > limits.fast || e.slow > limits.slow);
-                let change = above.and_then(|evidence| self.change(&series, evidence.fast > limits.fast));
-                let change = change.map(|change| LastingChange { not_seen: not_seen.clone(), ..change });
-                point.changes.extend(change.map(|change| (series, change)));
+        if !self.pass(estimate) {
+            return None;
+        }
+        let newest = self.innovations.last()?;
+        if let Some(followed) = &mut self.memory.followed {
+            followed.add(newest, self.filter.contributions());
+        }
+        if self.has_gone() {
+            // What the states took of the change for weather is given back.
+            if let Some(followed) = self.memory.followed.take() {
+                self.known.mean -= followed.taken(&self.signs);
             }
-            point
-        })
+            self.memory.begin = Some(estimate.at);
+            self.forget();
+        }
+        let mut found = evidence(&self.innovations, self.filter.contributions(), &self.signs);
+        let in_window = found.clone();
+        if let Some((alone, joint)) = self.memory.followed.as_ref().map(|followed| followed.score.evidence(&self.signs))
+        {
+            for (own, z) in found.quantities.iter_mut().zip(&alone) {
+                if let Some(own) = own {
+                    own.slow = own.slow.max(*z);
+                }
+            }
+            if let Some(own) = &mut found.joint {
+                own.slow = own.slow.max(joint);
+            }
+        }
+        let point = ProcessPoint { evidence: found, changes: BTreeMap::new() };
+        let above: Vec<(String, Evidence)> = self
+            .reference
+            .series()
+            .into_iter()
+            .filter_map(|series| Some((series.clone(), self.above(&point, &series)?)))
+            .collect();
+        self.follow(&above, &in_window);
+        let not_seen = self.not_seen(estimate);
+        let change = |(series, evidence): (String, Evidence)| {
+            let fast = evidence.fast > self.reference.limits_of(&series).fast;
+            let change = self.change(&series, fast)?;
+            Some((series, LastingChange { not_seen: not_seen.clone(), ..change }))
+        };
+        Some(ProcessPoint { changes: above.into_iter().filter_map(change).collect(), ..point })
+    }
+
+    /// The evidence of a series if it is above a limit.
+    fn above(&self, point: &ProcessPoint, series: &str) -> Option<Evidence> {
+        let limits = self.reference.limits_of(series);
+        point.of_series(self.reference, series).filter(|e| e.fast > limits.fast || e.slow > limits.slow)
+    }
+
+    /// Whether the change that is followed has gone, as after a repair: the last batches do not show it, or a change of the same
+    /// proportions in the opposite direction shows. Both are compared with the limits of all quantities together.
+    fn has_gone(&self) -> bool {
+        let Some(followed) = &self.memory.followed else { return false };
+        let limits = self.reference.limits.joint;
+        if followed.gone(&self.signs) > limits.fast {
+            return true;
+        }
+        let ages = AGES.into_iter().filter(|age| *age <= self.innovations.len());
+        let mut found = Evidence::NONE;
+        for age in ages {
+            let since = score(&self.innovations[self.innovations.len() - age..], self.filter.contributions());
+            found.take(age, followed.opposite(&since, &self.signs));
+        }
+        found.fast > limits.fast || found.slow > limits.slow
+    }
+
+    /// Follows the change of the series that are above a limit: the one that is followed already, or that of the window if its evidence
+    /// is larger.
+    fn follow(&mut self, above: &[(String, Evidence)], in_window: &LossEvidence) {
+        let largest = |e: &Evidence| e.fast.max(e.slow);
+        let Some((series, strongest)) = above.iter().max_by(|a, b| largest(&a.1).total_cmp(&largest(&b.1))) else {
+            self.memory.followed = None;
+            return;
+        };
+        let point = ProcessPoint { evidence: in_window.clone(), changes: BTreeMap::new() };
+        let own = point.of_series(self.reference, series).map_or(0.0, |e| largest(&e));
+        if self.memory.followed.is_some() && own < largest(strongest) {
+            return;
+        }
+        let only = self.reference.process.quantities.iter().position(|name| name == series);
+        let found = change(&self.innovations, self.filter.contributions(), &self.signs, only);
+        // A change that began before the window looks as if it had begun with its first batch.
+        let is_older = self.memory.followed.as_ref().is_some_and(|followed| followed.onset < self.times[0][1]);
+        if is_older && found.as_ref().is_some_and(|found| found.onset_interval[0] == 0) {
+            return;
+        }
+        self.memory.followed = found.map(|found| {
+            let [first, last] = found.onset_interval;
+            let interval = [self.times[first][0], self.times[last][1]];
+            let since = &self.innovations[found.onset..];
+            Followed::since(self.times[found.onset][1], interval, since, self.filter.contributions())
+        });
     }
 
     /// Conditions of the newest batch that the reference has not seen.
@@ -270,7 +374,21 @@ impl<'a> Chain<'a> {
     fn change(&self, series: &str, fast: bool) -> Option<LastingChange> {
         let process = &self.reference.process;
         let only = process.quantities.iter().position(|name| name == series);
-        let found = change(&self.innovations, self.filter.contributions(), &self.signs, only)?;
+        let in_window = change(&self.innovations, self.filter.contributions(), &self.signs, only)?;
+        // A change that began before the window is known by its score alone.
+        let followed = self.memory.followed.as_ref().filter(|followed| followed.onset < self.times[0][1]);
+        let predicted = followed.map_or_else(
+            || score(&self.innovations[in_window.onset..], self.filter.contributions()).predicted,
+            |followed| followed.score.predicted.clone(),
+        );
+        let losses = followed.map_or(in_window.losses, |followed| followed.losses(&self.signs, only));
+        let change = |k: usize, _: usize| losses[k].map_or(0.0, |(mean, _)| self.signs[k] * mean);
+        // The filter takes a part of the change for weather.
+        let taken = predicted * DVector::from_fn(losses.len(), change);
+        let onset = followed.map_or(self.times[in_window.onset][1], |followed| followed.onset);
+        let ends = in_window.onset_interval;
+        let onset_interval =
+            followed.map_or([self.times[ends[0]][0], self.times[ends[1]][1]], |followed| followed.onset_interval);
         let newest = self.innovations.last()?;
         let numbers = self.filter.numbers();
         let quantity = |(k, loss): (usize, &Option<(f64, f64)>)| {
@@ -283,14 +401,14 @@ impl<'a> Chain<'a> {
                 change: sign * scale.unit * mean,
                 interval: [ends[0].min(ends[1]), ends[0].max(ends[1])],
                 reference_mean: scale.origin + scale.unit * numbers.mean[k],
-                explained: scale.unit * (newest.predicted[k] - numbers.mean[k]),
+                explained: scale.unit * (newest.predicted[k] - numbers.mean[k] - taken[k]),
             })
         };
         Some(LastingChange {
             fast,
-            onset: self.times[found.onset][1],
-            onset_interval: [self.times[found.onset_interval[0]][0], self.times[found.onset_interval[1]][1]],
-            changes: found.losses.iter().enumerate().filter_map(quantity).collect(),
+            onset,
+            onset_interval,
+            changes: losses.iter().enumerate().filter_map(quantity).collect(),
             not_seen: Vec::new(),
         })
     }

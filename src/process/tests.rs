@@ -8,9 +8,11 @@ use super::change::{change, evidence, score};
 use super::estimate::{BatchEstimate, Observation};
 use super::filter::Filter;
 use super::fit::{fit, observations, Quantities};
+use super::followed::Memory;
 use super::likelihood::log_posterior;
 use super::limits::{limits, Steady};
 use super::model::{Numbers, Process, Sizes};
+use super::reference::{Chain, ReferenceProcess};
 use super::smoother::smooth;
 use crate::parameter::DamageDirection;
 use crate::quantity::Timestamp;
@@ -249,4 +251,48 @@ fn healthy_operation_alarms_as_rarely_as_wanted() {
     let expected = f64::from(batches) / wanted;
     let error = (expected + (0.07 * expected).powi(2)).sqrt();
     assert!((f64::from(alarms) - expected).abs() < 3.5 * error, "{alarms} alarms, {expected} expected");
+}
+
+#[test]
+fn an_alarm_lasts_as_long_as_the_damage_and_ends_with_the_repair() {
+    const REFERENCE: usize = 200;
+    const ONSET: usize = 40;
+    const REPAIR: usize = 240;
+    let estimates = world(31, REFERENCE + 300, usize::MAX, [0.0; 3]);
+    let reference = ReferenceProcess::new(&names(), &[], estimates[..REFERENCE].to_vec(), 1_000.0, [1.0; 2]).unwrap();
+    let lost = |(t, e): (usize, &BatchEstimate)| {
+        let mut e = e.clone();
+        if (ONSET..REPAIR).contains(&t) {
+            e.mean[1] = e.mean[1].map(|mean| mean - 0.04 * 4.0);
+        }
+        e
+    };
+    let batches: Vec<BatchEstimate> = estimates[REFERENCE..].iter().enumerate().map(lost).collect();
+    let filter = Filter::of(&reference.process);
+    let mut chain = Chain::start(&reference, &filter, batches[0].at);
+    let (mut points, mut chains) = (Vec::new(), Vec::new());
+    for batch in &batches {
+        points.push(chain.take(batch).unwrap());
+        chains.push(chain.clone());
+    }
+    let above = |t: usize| !points[t].changes.is_empty();
+    // The window of the test is 60 batches, and the filter takes a lasting change for weather long before the repair.
+    assert!((ONSET + 3..REPAIR).all(above), "{:?}", (ONSET..REPAIR).filter(|t| !above(*t)).collect::<Vec<_>>());
+    let last = &points[REPAIR - 1].changes["k2"];
+    assert_eq!(last.onset, batches[ONSET].at);
+    let own = last.changes.iter().find(|c| c.name == "k2").unwrap();
+    // A loss of 4 % of 4; weather explains what it has explained without the damage: within three standard deviations of 4 %.
+    assert!(own.interval[0] < -0.16 && own.interval[1] > -0.16, "{own:?}");
+    assert!(own.explained.abs() < 3.0 * 0.04 * 4.0, "{own:?}");
+    assert!((REPAIR + 4..300).all(|t| !above(t)), "{:?}", (REPAIR..300).filter(|t| above(*t)).collect::<Vec<_>>());
+
+    // A chain that is continued from what the store keeps gives the same points.
+    let at = ONSET + 90;
+    let before = at - 60;
+    let mut resumed = Chain::resume(&reference, &filter, chains[before].known().clone(), batches[before].at);
+    batches[before + 1..at].iter().for_each(|batch| assert!(resumed.pass(batch)));
+    let text = chains[at - 1].memory().to_json().unwrap();
+    let mut resumed = resumed.remembering(Memory::from_json(text.as_deref()).unwrap());
+    let again = resumed.take(&batches[at]).unwrap();
+    assert_eq!(again.changes, points[at].changes);
 }

@@ -15,6 +15,7 @@ use crate::assessment::{NewChartPoint, NewProcessPoint};
 use crate::process::change::WINDOW;
 use crate::process::estimate::BatchEstimate;
 use crate::process::filter::{Filter, Known};
+use crate::process::followed::Memory;
 use crate::process::reference::{Chain, ProcessPoint, ReferenceProcess};
 use crate::quantity::Timestamp;
 
@@ -38,6 +39,7 @@ struct ProcessRow {
     estimate: String,
     held: bool,
     known: Vec<u8>,
+    memory: Option<String>,
 }
 
 impl ProcessRow {
@@ -48,6 +50,10 @@ impl ProcessRow {
     fn known(&self) -> Result<Known, Error> {
         Known::from_numbers(&from_blob("process point", &self.known)?)
             .ok_or_else(|| bad_row("process point")(&"the states"))
+    }
+
+    fn memory(&self) -> Result<Memory, Error> {
+        Memory::from_json(self.memory.as_deref()).map_err(|e| bad_row("process point")(&e))
     }
 
     fn at(&self) -> Result<Timestamp, Error> {
@@ -64,7 +70,7 @@ pub(super) async fn follow(
     let reference: &ReferenceProcess = &new.reference;
     let filter = Filter::of(&reference.process);
     let before = before(transaction, batch, new.undamaged_version).await?;
-    let mut chain = match before.first() {
+    let chain = match before.first() {
         Some(first) if before.len() == WINDOW => {
             let mut chain = Chain::resume(reference, &filter, first.known()?, first.at()?);
             for row in &before[1..] {
@@ -81,6 +87,7 @@ pub(super) async fn follow(
             chain
         }
     };
+    let mut chain = chain.remembering(before.last().map(ProcessRow::memory).transpose()?.unwrap_or_default());
     let held = new.held || batch.maintained;
     // A batch that is held is compared with the chain but does not become part of it.
     let point = if held { chain.clone().take(&new.estimate) } else { chain.take(&new.estimate) };
@@ -93,7 +100,9 @@ pub(super) async fn follow(
         }
         let again = chain.take(&row.estimate()?);
         let old = row.known()?;
-        let same = (&old.mean - &chain.known().mean).amax() < FADED;
+        // A change that is followed adds up all batches since its onset, so that the influence of a late one does not fade.
+        let remembers = *chain.memory() != Memory::default() || row.memory.is_some();
+        let same = !remembers && (&old.mean - &chain.known().mean).amax() < FADED;
         unchanged = if same { unchanged + 1 } else { 0 };
         changed_to = Some((row.measured_to_us, row.batch_id.clone()));
         write_again(transaction, batch, new, &row, (&chain, again.as_ref())).await?;
@@ -133,7 +142,7 @@ async fn before(
     version: u32,
 ) -> Result<Vec<ProcessRow>, Error> {
     let mut rows: Vec<ProcessRow> = sqlx::query_as(
-        "select measured_to_us, batch_id, estimate, held, known from process_point
+        "select measured_to_us, batch_id, estimate, held, known, memory from process_point
          where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) < ($3, $4) and held = 0
          order by measured_to_us desc, batch_id desc limit $5",
     )
@@ -150,7 +159,7 @@ async fn before(
 
 async fn after(transaction: &mut Transaction<'_>, batch: &Charted<'_>, version: u32) -> Result<Vec<ProcessRow>, Error> {
     Ok(sqlx::query_as(
-        "select measured_to_us, batch_id, estimate, held, known from process_point
+        "select measured_to_us, batch_id, estimate, held, known, memory from process_point
          where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) > ($3, $4)
          order by measured_to_us, batch_id limit $5",
     )
@@ -161,6 +170,11 @@ async fn after(transaction: &mut Transaction<'_>, batch: &Charted<'_>, version: 
     .bind(MOST_LATER as i64)
     .fetch_all(transaction.connection())
     .await?)
+}
+
+/// What a chain remembers as it is stored; `None` if there is nothing.
+fn memory(chain: &Chain<'_>) -> Result<Option<String>, Error> {
+    chain.memory().to_json().map_err(|e| bad_row("process point")(&e))
 }
 
 /// The changes of a point as they are stored; `None` without any.
@@ -178,10 +192,12 @@ async fn write(
 ) -> Result<(), Error> {
     let estimate = serde_json::to_string(&new.estimate).map_err(|e| bad_row("process point")(&e))?;
     sqlx::query(
-        "insert into process_point (structure_id, undamaged_version, measured_to_us, batch_id, estimate, held, known, changes)
-         values ($1, $2, $3, $4, $5, $6, $7, $8)
+        "insert into process_point
+             (structure_id, undamaged_version, measured_to_us, batch_id, estimate, held, known, changes, memory)
+         values ($1, $2, $3, $4, $5, $6, $7, $8, $9)
          on conflict (structure_id, undamaged_version, measured_to_us, batch_id) do update
-         set estimate = excluded.estimate, held = excluded.held, known = excluded.known, changes = excluded.changes",
+         set estimate = excluded.estimate, held = excluded.held, known = excluded.known, changes = excluded.changes,
+             memory = excluded.memory",
     )
     .bind(batch.structure)
     .bind(new.undamaged_version)
@@ -191,6 +207,7 @@ async fn write(
     .bind(held)
     .bind(to_blob(chain.known().to_numbers().into_iter()))
     .bind(changes(point)?)
+    .bind(memory(chain)?)
     .execute(transaction.connection())
     .await?;
     Ok(())
@@ -205,7 +222,7 @@ async fn write_again(
     (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
 ) -> Result<(), Error> {
     sqlx::query(
-        "update process_point set known = $1, changes = $2
+        "update process_point set known = $1, changes = $2, memory = $7
          where structure_id = $3 and undamaged_version = $4 and measured_to_us = $5 and batch_id = $6",
     )
     .bind(to_blob(chain.known().to_numbers().into_iter()))
@@ -214,6 +231,7 @@ async fn write_again(
     .bind(new.undamaged_version)
     .bind(row.measured_to_us)
     .bind(&row.batch_id)
+    .bind(memory(chain)?)
     .execute(transaction.connection())
     .await?;
     for series in new.reference.series() {

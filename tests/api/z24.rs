@@ -12,25 +12,39 @@ const DAMAGED_FROM: usize = 3_474;
 /// Rows of a batch: about a day.
 const ROWS: usize = 24;
 
-/// Batches of consecutive rows, each with its number of damaged rows. Rows whose third and fourth frequency are not in order, because
-/// the modes were exchanged, are left out of their batch.
-fn batches(csv: &str) -> Vec<(Vec<Value>, usize)> {
-    let row = |line: &str| {
+/// A row of the table: its number, and its frequencies.
+struct Row {
+    number: usize,
+    hz: Vec<Option<f64>>,
+}
+
+impl Row {
+    fn of(line: &str) -> Self {
         let cells: Vec<&str> = line.split(',').collect();
-        let hz: Vec<Option<f64>> = cells[1..5].iter().map(|cell| cell.parse().ok()).collect();
-        (cells[0].parse::<usize>().unwrap(), hz)
-    };
-    let rows: Vec<(usize, Vec<Option<f64>>)> = csv.lines().skip(1).map(row).collect();
-    let measurement = |(place, hz): (usize, &[Option<f64>])| {
-        let at =
-            modalwatch::quantity::Timestamp::from_micros(879_202_800_000_000 + 3_600_000_000 * place as i64).unwrap();
-        json!({ "measured_at": at, "frequencies_hz": hz })
-    };
-    let batch = |(first, part): (usize, &[(usize, Vec<Option<f64>>)])| {
-        let used: Vec<(usize, &(usize, Vec<Option<f64>>))> =
-            (first * ROWS..).zip(part).filter(|(_, (_, hz))| hz[3].is_none_or(|f4| hz[2].unwrap() < f4)).collect();
-        let damaged = used.iter().filter(|(_, (number, _))| *number >= DAMAGED_FROM).count();
-        (used.iter().map(|(place, (_, hz))| measurement((*place, hz))).collect(), damaged)
+        Self { number: cells[0].parse().unwrap(), hz: cells[1..5].iter().map(|cell| cell.parse().ok()).collect() }
+    }
+
+    /// Whether the third and the fourth mode were not exchanged.
+    fn is_ordered(&self) -> bool {
+        self.hz[3].is_none_or(|f4| self.hz[2].unwrap() < f4)
+    }
+
+    /// The measurement in the row of this place, an hour after the one before.
+    fn measurement(&self, place: usize) -> Value {
+        let micros = 879_202_800_000_000 + 3_600_000_000 * place as i64;
+        let at = modalwatch::quantity::Timestamp::from_micros(micros).unwrap();
+        json!({ "measured_at": at, "frequencies_hz": self.hz })
+    }
+}
+
+/// Batches of consecutive rows, each with its number of damaged rows. Rows whose third and fourth frequency are not in order are left
+/// out of their batch.
+fn batches(csv: &str) -> Vec<(Vec<Value>, usize)> {
+    let rows: Vec<Row> = csv.lines().skip(1).map(Row::of).collect();
+    let batch = |(index, part): (usize, &[Row])| {
+        let used = || part.iter().enumerate().filter(|(_, row)| row.is_ordered());
+        let damaged = used().filter(|(_, row)| row.number >= DAMAGED_FROM).count();
+        (used().map(|(place, row)| row.measurement(index * ROWS + place)).collect(), damaged)
     };
     rows.chunks(ROWS).enumerate().map(batch).collect()
 }

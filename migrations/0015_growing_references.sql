@@ -17,3 +17,6 @@ create view alarm_facts as
                           where p.structure_id = e.structure_id and p.undamaged_version = e.undamaged_version
                             and p.batch_id = e.opened_batch)) as facts
     from alarm_episode e;
+
+-- What the chain remembers after the batch, JSON: the change that is followed, and from when on is tested; null if nothing.
+alter table process_point add column memory text;
