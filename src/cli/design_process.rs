@@ -141,12 +141,12 @@ impl ProcessReport {
     /// The facts about the charts in a sentence.
     fn facts(&self) -> String {
         format!(
-            "With a correlation of successive batches of {}, {:.0} % of the variance in common and a reference of {} batches, in which {} \
-             common factors show, the charts alarm above {:.2} (fast) and {:.2} (slow) standard deviations.",
+            "With a correlation of successive batches of {}, {:.0} % of the variance in common and a reference of {} batches, in which \
+             {}, the charts alarm above {:.2} (fast) and {:.2} (slow) standard deviations.",
             self.batch_correlation,
             100.0 * self.common_share,
             self.reference_batches,
-            self.factors,
+            if self.factors == 1 { "one common factor shows".to_owned() } else { format!("{} common factors show", self.factors) },
             self.limits.quantity.fast,
             self.limits.quantity.slow
         )
