@@ -8,6 +8,7 @@ use super::reference::{UndamagedQuantity, UndamagedReference};
 use super::threshold::{probability_of_damage, threshold};
 use crate::hierarchy::{interval, PopulationEstimate};
 use crate::parameter::DamageDirection;
+use crate::process::estimate::relative;
 use crate::quantity::Probability;
 use crate::stats;
 
@@ -25,7 +26,7 @@ pub struct Damage {
     pub pooled_probability: f64,
     /// True when the probability of damage exceeds the threshold probability p of the reference.
     pub exceeds: bool,
-    /// Relative change of the mean, (μ − μ_ud)/μ_ud.
+    /// Relative change of the mean, (μ − μ_ud)/μ_ud; for a parameter in `ln`, that of its factor, exp(μ − μ_ud) − 1.
     pub relative_change: f64,
     /// 90 % credible interval of the relative change.
     pub relative_change_interval: Option<[f64; 2]>,
@@ -98,7 +99,7 @@ fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<D
         .mean_draws
         .iter()
         .zip(reference.mean_draws.iter().cycle())
-        .map(|(mean, undamaged)| (mean - undamaged) / undamaged)
+        .map(|(mean, undamaged)| relative(&sample.unit, *undamaged, mean - undamaged))
         .collect();
     Some(Damage {
         threshold: threshold_here,
@@ -106,7 +107,7 @@ fn compare(sample: &QuantitySamples, undamaged: &UndamagedReference) -> Option<D
         probability_interval,
         pooled_probability,
         exceeds: probability > undamaged.threshold_probability,
-        relative_change: (sample.population.mean - reference.mean) / reference.mean,
+        relative_change: relative(&sample.unit, reference.mean, sample.population.mean - reference.mean),
         relative_change_interval: Some(interval(&changes)),
     })
 }

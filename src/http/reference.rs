@@ -57,7 +57,7 @@ struct ReferenceInput {
 /// What was measured since, while the structure was undamaged: either `batches`, or the period from `from` to `to`.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
-struct ExtensionInput {
+struct ReferenceExtensionInput {
     /// Ids of the batches that are added.
     #[schema(min_items = 1)]
     batches: Option<Vec<String>>,
@@ -78,7 +78,7 @@ struct ExtensionInput {
     despite_alarms: Option<bool>,
 }
 
-impl ExtensionInput {
+impl ReferenceExtensionInput {
     /// The extension that the body asks for.
     fn request(self) -> Result<ExtensionRequest, ApiError> {
         let choice = choice(self.batches, self.from.as_deref(), self.to.as_deref())?;
@@ -211,7 +211,7 @@ pub async fn put(
                    during a damage alarm are not accepted, and the extension is refused if the charts of the first version show a \
                    lasting change in what was added since: otherwise a slow loss would become part of what is healthy.",
     params(StructurePath),
-    request_body(content = ExtensionInput, examples(
+    request_body(content = ReferenceExtensionInput, examples(
         ("period" = (summary = "All batches of a period",
                      value = json!({"from": "2026-07-01T00:00:00Z", "to": "2026-10-01T00:00:00Z", "reason": "first summer"})))
     )),
@@ -228,7 +228,7 @@ pub async fn extend(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     shared.monitor.structure(&id)?;
-    let body: ExtensionInput = json_body(&headers, body, shared.limits).await?;
+    let body: ReferenceExtensionInput = json_body(&headers, body, shared.limits).await?;
     let request = body.request()?;
     let choice = request.choice.clone();
     let extended = shared.monitor.replay().extend_reference(&id, request).await;

@@ -82,11 +82,17 @@ impl BatchEstimate {
     }
 }
 
-/// A difference of a quantity in per cent of its mean; the logarithm of a factor is stated as the change of the factor.
-pub(super) fn percent(unit: &str, mean: f64, difference: f64) -> f64 {
+/// A difference of a quantity as a share of its mean. A quantity that is the logarithm of a factor (unit `ln`) has a mean that may be 0,
+/// and is stated as the change of the factor, exp(difference) − 1.
+pub fn relative(unit: &str, mean: f64, difference: f64) -> f64 {
     if unit == LOGARITHM {
-        100.0 * difference.exp_m1()
+        difference.exp_m1()
     } else {
-        100.0 * difference / mean
+        difference / mean
     }
+}
+
+/// [`relative`] in per cent.
+pub(super) fn percent(unit: &str, mean: f64, difference: f64) -> f64 {
+    100.0 * relative(unit, mean, difference)
 }

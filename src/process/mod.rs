@@ -18,8 +18,8 @@
 //! - [`estimate`]: the estimate of a batch; [`model`]: the process; [`filter`]: its Kalman filter; `smoother` and `likelihood`: its
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
-//! - [`change`]: lasting changes that the process does not explain, their onset and size; [`followed`]: a change as long as it lasts; [`limits`]: what healthy operation reaches;
-//! - [`detectable`]: the smallest losses that its charts find;
+//! - [`change`]: lasting changes that the process does not explain, their onset and size; [`followed`]: a change as long as it lasts;
+//! - [`limits`]: what healthy operation reaches; [`detectable`]: the smallest losses that the charts find;
 //! - [`mod@reference`]: the process of an undamaged reference with its limits, and the batches that are compared with it.
 //!
 //! Sources: A. C. Harvey (1989), Forecasting, Structural Time Series Models and the Kalman Filter, Cambridge, ch. 3 and 8, for the

@@ -156,8 +156,8 @@ async fn insert_points(transaction: &mut Transaction<'_>, batch: &Charted<'_>, p
 /// Determines the state of a new point from the points before it, and updates the states of the later points of its series and
 /// the alarm episodes that follow from them. `about` contains the stored points around it.
 ///
-/// `changed_to`: the last position at which points themselves were changed, if any. It stops behind it where the states no longer change, because the influence of a point on the moving average and on the count of points
-/// above the limit fades.
+/// `changed_to`: the last position at which points themselves were changed, if any. Behind it, the update stops where the states no
+/// longer change, because the influence of a point on the moving average and on the count of points above the limit fades.
 async fn place(
     transaction: &mut Transaction<'_>,
     batch: &Charted<'_>,

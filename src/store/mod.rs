@@ -35,6 +35,7 @@ mod overview;
 mod plotted;
 mod process;
 mod quarantine;
+mod reference_content;
 mod reference_version;
 mod retention;
 mod rows;

@@ -3,8 +3,8 @@
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
-use super::database::Database;
 use super::error::Error;
+use super::reference_content::{batches_of, stored_origin};
 use super::undamaged::References;
 use crate::damage::ReferenceOrigin;
 use crate::quantity::{StructureId, Timestamp};
@@ -96,28 +96,4 @@ impl References<'_> {
         .fetch_all(&self.database.reader)
         .await?)
     }
-}
-
-/// The ids of the batches of a version, in alphabetical order; none if there is no such version.
-pub(super) async fn batches_of(
-    database: &Database,
-    structure: &StructureId,
-    version: u32,
-) -> Result<Vec<String>, Error> {
-    let batches: Vec<(String,)> = sqlx::query_as(
-        "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
-    )
-    .bind(structure.as_str())
-    .bind(version)
-    .fetch_all(&database.reader)
-    .await?;
-    Ok(batches.into_iter().map(|(id,)| id).collect())
-}
-
-/// The stored origin of a reference.
-pub(super) fn stored_origin(text: Option<&str>) -> Result<ReferenceOrigin, Error> {
-    text.map_or_else(
-        || Ok(ReferenceOrigin::default()),
-        |text| serde_json::from_str(text).map_err(|e| bad_row("undamaged reference")(&e)),
-    )
 }

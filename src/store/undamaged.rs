@@ -11,7 +11,7 @@ use super::batch::batch_state;
 use super::column::{bad_row, from_blob, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
-use super::reference_version::{batches_of, stored_origin};
+use super::reference_content::{batches_of, stored_origin};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};

@@ -31,7 +31,7 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 63] = [
+const TABLE: [(&str, &str, Needs, About); 65] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
@@ -40,6 +40,8 @@ const TABLE: [(&str, &str, Needs, About); 63] = [
     ("GET", "/v1/structures/{}/history", Read, Structure),
     ("PUT", "/v1/structures/{}/reference", Admin, Structure),
     ("POST", "/v1/structures/{}/reference", Admin, Structure),
+    ("POST", "/v1/structures/{}/reference/extend", Admin, Structure),
+    ("GET", "/v1/structures/{}/references", Read, Structure),
     ("POST", "/v1/structures/{}/baseline", Admin, Structure),
     ("GET", "/v1/structures/{}/exceedances", Read, Structure),
     ("GET", "/v1/structures/{}/alarms", Read, Structure),

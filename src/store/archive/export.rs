@@ -9,7 +9,7 @@ use super::super::column::{bad_row, elements, from_blob, list, timestamp};
 use super::super::database::Database;
 use super::super::error::Error;
 use super::super::measurement_row::mode_shapes;
-use super::super::reference_version::batches_of;
+use super::super::reference_content::batches_of;
 use super::super::structure::Structures;
 use super::record::{
     Acknowledged, ArchivedModel, Batch, Maintenance, Measurement, Record, Structure, Undamaged, UndamagedQuantity,
