@@ -16,9 +16,10 @@ const LEAST_VARIANCE: f64 = 0.1;
 /// Series of the chart of the simulation's fit; no parameter can have a colon in its name.
 pub const FIT_SERIES: &str = "simulation:fit";
 
-/// The parameter of a chart; `None` for charts of the structure as a whole, whose names have a colon, which no parameter has.
+/// The parameter or the group of parameters that a chart belongs to; `None` for charts of the structure as a whole, whose names begin
+/// with `structure:` or `simulation:`.
 pub fn parameter_of(series: String) -> Option<String> {
-    (!series.contains(':')).then_some(series)
+    (!series.starts_with("structure:") && !series.starts_with("simulation:")).then_some(series)
 }
 
 /// The point of a batch on the chart of one series, before the neighbouring points in time are known.
@@ -233,6 +234,17 @@ mod tests {
             let mut rest = Series::resume(settings, all[cut - 1].ewma, all[cut - 1].state, recent);
             let found: Vec<ChartStatus> = shifts[cut..].iter().map(|s| rest.take(&point(*s))).collect();
             assert_eq!(found, all[cut..], "cut at {cut}");
+        }
+    }
+
+    #[test]
+    fn charts_of_parameters_and_groups_have_a_parameter_and_those_of_the_structure_have_none() {
+        let parameter = |series: &str| parameter_of(series.to_owned());
+        for series in ["k1", "group:k1+k2"] {
+            assert_eq!(parameter(series).as_deref(), Some(series));
+        }
+        for series in [FIT_SERIES, "structure:joint", "structure:silence"] {
+            assert_eq!(parameter(series), None, "{series}");
         }
     }
 }

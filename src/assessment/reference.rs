@@ -150,8 +150,8 @@ impl<'a> ReferenceBatches<'a> {
         let (first, later): (Vec<_>, Vec<_>) = self.trusted.iter().partition(|batch| is_first(batch.index));
         let Ok(process) = process(self.baseline, &first, mean_run_batches, self.usual_misfit) else { return Ok(()) };
         let estimates = estimates(self.baseline, &later, &process.process.covariates);
-        match process.first_change(&estimates) {
-            Some((_, change)) => Err(ReferenceError::LastingChange(Box::new(change))),
+        match process.first_change(estimates) {
+            Some(change) => Err(ReferenceError::LastingChange(Box::new(change))),
             None => Ok(()),
         }
     }

@@ -18,7 +18,7 @@ use crate::monitor::stored::ReferenceVersion;
 use crate::monitor::{
     DeclareError, DeclaredReference, ExtensionRequest, LeftOutBatch, ReferenceChoice, ReferenceRequest,
 };
-use crate::quantity::Timestamp;
+use crate::quantity::{StructureId, Timestamp};
 
 /// Threshold probability p unless the client gives another (paper §4).
 const DEFAULT_THRESHOLD_PROBABILITY: f64 = 0.05;
@@ -193,10 +193,7 @@ pub async fn put(
     let body: ReferenceInput = json_body(&headers, body, shared.limits).await?;
     let request = body.request()?;
     let choice = request.choice.clone();
-    let declared = shared.monitor.replay().declare_reference(&id, request).await;
-    let DeclaredReference { record, left_out } = declared.map_err(|error| refusal(error, &choice))?;
-    let answer = Declared { reference: Undamaged::new(&id, &record), left_out };
-    Ok((StatusCode::CREATED, Json(answer)).into_response())
+    answer(&id, shared.monitor.replay().declare_reference(&id, request).await, &choice)
 }
 
 /// `POST /v1/structures/{id}/reference/extend`: adds batches to the newest undamaged reference; 201 with its new version.
@@ -231,10 +228,7 @@ pub async fn extend(
     let body: ReferenceExtensionInput = json_body(&headers, body, shared.limits).await?;
     let request = body.request()?;
     let choice = request.choice.clone();
-    let extended = shared.monitor.replay().extend_reference(&id, request).await;
-    let DeclaredReference { record, left_out } = extended.map_err(|error| refusal(error, &choice))?;
-    let answer = Declared { reference: Undamaged::new(&id, &record), left_out };
-    Ok((StatusCode::CREATED, Json(answer)).into_response())
+    answer(&id, shared.monitor.replay().extend_reference(&id, request).await, &choice)
 }
 
 /// A version of the undamaged reference, in short.
@@ -288,6 +282,17 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
         measured_to: v.measured_to,
     };
     Ok(Json(ReferenceVersions { items: versions.into_iter().map(body).collect() }).into_response())
+}
+
+/// The answer to a declaration or an extension.
+fn answer(
+    id: &StructureId,
+    made: Result<DeclaredReference, DeclareError>,
+    choice: &ReferenceChoice,
+) -> Result<Response, ApiError> {
+    let DeclaredReference { record, left_out } = made.map_err(|error| refusal(error, choice))?;
+    let answer = Declared { reference: Undamaged::new(id, &record), left_out };
+    Ok((StatusCode::CREATED, Json(answer)).into_response())
 }
 
 /// The answer to a declaration that failed: every batch that is responsible has its entry in `errors`.

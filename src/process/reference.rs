@@ -134,17 +134,16 @@ impl ReferenceProcess {
         })
     }
 
-    /// The first lasting change that its charts show in batches outside the reference: its index, and the change. The joint chart is
-    /// preferred, because it names all quantities that take part.
-    pub fn first_change(&self, estimates: &[BatchEstimate]) -> Option<(usize, LastingChange)> {
+    /// The first lasting change that its charts show in batches outside the reference, in any order. The joint chart is preferred,
+    /// because it names all quantities that take part.
+    pub fn first_change(&self, mut estimates: Vec<BatchEstimate>) -> Option<LastingChange> {
         let filter = Filter::of(&self.process);
-        let mut order: Vec<usize> = (0..estimates.len()).collect();
-        order.sort_by_key(|index| estimates[*index].at);
-        let mut chain = Chain::start(self, &filter, estimates[*order.first()?].at);
-        order.into_iter().find_map(|index| {
-            let mut changes = chain.take(&estimates[index])?.changes;
+        estimates.sort_by_key(|estimate| estimate.at);
+        let mut chain = Chain::start(self, &filter, estimates.first()?.at);
+        estimates.iter().find_map(|estimate| {
+            let mut changes = chain.take(estimate)?.changes;
             let joint = changes.remove(JOINT_SERIES);
-            Some((index, joint.or_else(|| changes.into_values().next())?))
+            joint.or_else(|| changes.into_values().next())
         })
     }
 
