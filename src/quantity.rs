@@ -117,6 +117,11 @@ impl Timestamp {
         Self::from_micros(jiff::Timestamp::now().as_microsecond()).expect("the clock is within the calendar")
     }
 
+    /// The day in UTC in words, such as `7 August 2026`.
+    pub fn day(self) -> String {
+        self.0.to_zoned(jiff::tz::TimeZone::UTC).strftime("%-d %B %Y").to_string()
+    }
+
     /// The month of the year in UTC, 1 to 12.
     pub fn month(self) -> u8 {
         self.0.to_zoned(jiff::tz::TimeZone::UTC).month().unsigned_abs()

@@ -15,7 +15,7 @@ use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, 
 use super::shared::Shared;
 use crate::alarm::chart::parameter_of;
 use crate::baseline::manifest::ParameterIdentifiability;
-use crate::monitor::stored::{Acknowledgement, Episode, JobState, MaintenanceWindow};
+use crate::monitor::stored::{Acknowledgement, Episode, EpisodeQuery, JobState, MaintenanceWindow};
 use crate::process::reference::LastingChange;
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
 
@@ -30,6 +30,9 @@ pub struct AlarmQuery {
     /// `open` for alarms that have not ended. Default: all.
     #[param(value_type = Option<AlarmFilter>, inline)]
     state: Option<String>,
+    /// `true` also lists alarms that a later undamaged reference has superseded. Default: `false`.
+    #[param(value_type = Option<bool>)]
+    superseded: Option<String>,
     /// Maximum number of alarms on the page. Default 100.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
@@ -101,8 +104,15 @@ struct AlarmItem {
     /// Only for a damage alarm; absent if the parameters together raised it.
     #[serde(skip_serializing_if = "Option::is_none")]
     parameter: Option<String>,
-    /// `open`, `ended`, or `withdrawn` if data that arrived later showed that there was no alarm.
+    /// `open`, `ended`, `withdrawn` if data that arrived later showed that there was no alarm, or `superseded` if the charts of a later
+    /// undamaged reference cover its time.
     state: &'static str,
+    /// Version of the undamaged reference that has superseded it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    superseded_by: Option<u32>,
+    /// The alarm of an earlier undamaged reference about the same parameter and time.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    continues: Option<i64>,
     opened_at: Timestamp,
     opened_batch: Option<String>,
     ended_at: Option<Timestamp>,
@@ -182,6 +192,8 @@ impl From<Episode> for AlarmItem {
         Self {
             alarm: e.number,
             state: e.state(),
+            superseded_by: e.superseded_by,
+            continues: e.continues,
             parameter: parameter_of(e.series),
             sentence: e.change.as_ref().map(LastingChange::sentence),
             change: e.change,
@@ -204,7 +216,9 @@ impl From<Episode> for AlarmItem {
 /// 404 for the structure, 422 for the query.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/alarms", tag = "alarms", operation_id = "list_alarms",
-    summary = "Alarms", description = "Alarms with their start and end, newest first, in pages.",
+    summary = "Alarms",
+    description = "Alarms with their start and end, newest first, in pages. After a new model or undamaged reference, the alarms of the \
+                   earlier one are superseded where the new charts cover their time, and are listed only on request.",
     params(StructurePath, AlarmQuery),
     responses((status = 200, description = "A page", body = AlarmPage), Unknown, Invalid)
 )]
@@ -223,8 +237,19 @@ pub async fn list(
             return Err(ApiError::invalid_field("query/state", format!("{} is neither open nor any", shown(other))));
         }
     };
+    let superseded = match query.superseded.as_deref() {
+        None | Some("false") => false,
+        Some("true") => true,
+        Some(other) => {
+            return Err(ApiError::invalid_field(
+                "query/superseded",
+                format!("{} is neither true nor false", shown(other)),
+            ));
+        }
+    };
     let before = page_cursor(query.cursor.as_deref())?;
-    let found = shared.monitor.alarms().episodes(&id, before, open_only, limit).await?;
+    let query = EpisodeQuery { before, open_only, superseded, limit };
+    let found = shared.monitor.alarms().episodes(&id, query).await?;
     let next = (found.len() == limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
     Ok(Json(AlarmPage { structure: id, items: found.into_iter().map(AlarmItem::from).collect(), next }).into_response())
 }

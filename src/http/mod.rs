@@ -37,6 +37,7 @@ mod tests;
 mod tokens;
 #[cfg(feature = "otel")]
 mod traceparent;
+mod verdict;
 mod views;
 mod webhooks;
 

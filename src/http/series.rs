@@ -17,8 +17,8 @@ use crate::alarm::chart::parameter_of;
 use crate::damage::{QuantityKind, UndamagedReference};
 use crate::measurement::CovariateKind;
 use crate::monitor::stored::{
-    ChartMark, ChartSeries, Episode, MaintenanceWindow, QuantityMark, QuantitySeries, ReferenceVersion, SeriesWindow,
-    TrustMark,
+    ChartMark, ChartSeries, Episode, EpisodeQuery, MaintenanceWindow, QuantityMark, QuantitySeries, ReferenceVersion,
+    SeriesWindow, TrustMark,
 };
 use crate::monitor::Series;
 use crate::quantity::{shown, StructureId, Timestamp};
@@ -211,7 +211,9 @@ pub async fn series(
     let within = |begin: Timestamp, end: Option<Timestamp>| {
         to.is_none_or(|to| begin <= to) && from.is_none_or(|from| end.is_none_or(|end| end >= from))
     };
-    let episodes = shared.monitor.alarms().episodes(&id, None, false, MOST_ALARMS).await?;
+    // Alarms of a superseded reference have no points on these charts.
+    let current = EpisodeQuery { before: None, open_only: false, superseded: false, limit: MOST_ALARMS };
+    let episodes = shared.monitor.alarms().episodes(&id, current).await?;
     let maintenance = shared.monitor.alarms().maintenance(&id).await?;
     let versions = shared.monitor.records().reference_versions(&id).await?;
     let body = SeriesBody {

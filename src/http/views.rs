@@ -12,10 +12,12 @@ use super::error::ApiError;
 use super::openapi::{BatchPath, Busy, Conflict, Invalid, Unknown};
 use super::request::{structure_id, ApiPath};
 use super::shared::Shared;
+use super::verdict::{verdict, Condition, Verdict};
 use crate::access::Grant;
-use crate::alarm::machine::State as AlarmState;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
-use crate::monitor::stored::{DiagnosisTrigger, JobKind, JobRecord, JobState, LatestAssessment, StructureOverview};
+use crate::monitor::stored::{
+    DiagnosisTrigger, Episode, JobKind, JobRecord, JobState, LatestAssessment, StructureOverview,
+};
 use crate::monitor::ActiveStructure;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
@@ -35,8 +37,15 @@ struct Overview {
 #[derive(Debug, Serialize, ToSchema)]
 struct OverviewItem {
     id: StructureId,
-    /// `normal`, `pending`, `alarming`, `recovering`, `silent`, `unassessed` or `no_model`.
-    state: &'static str,
+    /// What is known about its condition, from the alarm charts alone.
+    state: Condition,
+    /// The verdict in one or two sentences: what has changed by how much since when, or why there is no verdict.
+    verdict: String,
+    /// Opening of the oldest open damage alarm.
+    #[schema(required)]
+    alarm_since: Option<Timestamp>,
+    /// Number of batches that wait for their assessment.
+    waiting_batches: u64,
     open_alarms: u64,
     unacknowledged_alarms: u64,
     #[schema(required)]
@@ -151,9 +160,11 @@ struct ModeFrequencies {
     responses((status = 200, description = "The structures by id", body = Overview))
 )]
 pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
-    let item = |found: StructureOverview| {
+    let mut open = shared.monitor.alarms().open_damage().await?;
+    let mut item = |found: StructureOverview| {
         let active = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
-        item(found, active)
+        let open = open.remove(&found.id).unwrap_or_default();
+        item(found, active, &open)
     };
     let items = shared
         .monitor
@@ -162,17 +173,21 @@ pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Resp
         .await?
         .into_iter()
         .filter(|found| grant.may_see(&found.id))
-        .map(item)
+        .map(&mut item)
         .collect();
     let jobs_running = shared.monitor.jobs().running();
     Ok(Json(Overview { items, jobs_running }).into_response())
 }
 
-fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>) -> OverviewItem {
+fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>, open: &[Episode]) -> OverviewItem {
     let baseline = active.and_then(|active| active.baseline.clone());
     let (baseline, model_missing) = (baseline.as_ref().ok(), baseline.as_ref().err());
+    let Verdict { condition, sentence } = verdict(&found, baseline.map(|b| b.digest()), open, Timestamp::now());
     OverviewItem {
-        state: state(&found, baseline.is_some()),
+        state: condition,
+        verdict: sentence,
+        alarm_since: open.iter().map(|episode| episode.opened_at).min(),
+        waiting_batches: found.waiting,
         model_digest: baseline.map(|b| b.digest().to_string()),
         model_missing: model_missing.cloned(),
         calibration_passed: baseline.map(|b| b.manifest().calibration.passed()),
@@ -184,26 +199,6 @@ fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>) 
         last_received_at: found.last_received_at,
         batches: found.batches,
         undamaged_version: found.undamaged_version,
-    }
-}
-
-/// The state of a structure in one word: the most serious condition that applies.
-fn state(found: &StructureOverview, has_model: bool) -> &'static str {
-    let on_a_chart = |state: AlarmState| found.chart_states.contains(&state);
-    if on_a_chart(AlarmState::Alarming) {
-        AlarmState::Alarming.as_str()
-    } else if on_a_chart(AlarmState::Recovering) {
-        AlarmState::Recovering.as_str()
-    } else if found.silent {
-        AlarmState::Silent.as_str()
-    } else if !has_model {
-        "no_model"
-    } else if found.latest.is_none() {
-        "unassessed"
-    } else if on_a_chart(AlarmState::Pending) {
-        AlarmState::Pending.as_str()
-    } else {
-        AlarmState::Normal.as_str()
     }
 }
 

@@ -8,7 +8,7 @@ use tracing::{error, warn};
 use super::error::Error;
 use super::events::{Events, News};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::{Acknowledgement, Episode, MaintenanceWindow, Store, StoredChartPoint};
+use crate::store::{Acknowledgement, Episode, EpisodeQuery, MaintenanceWindow, OpenAlarms, Store, StoredChartPoint};
 
 /// The alarms of the structures, with a record of those that were already published and logged.
 pub struct Alarms {
@@ -32,18 +32,20 @@ impl Alarms {
         Self { store, events, published: Mutex::default(), logged: Mutex::default() }
     }
 
-    /// Alarms of a structure, newest first, at most `limit`, with numbers below `before`.
+    /// Alarms of a structure, newest first.
     ///
     /// # Errors
     /// [`Error::Store`].
-    pub async fn episodes(
-        &self,
-        structure: &StructureId,
-        before: Option<i64>,
-        open_only: bool,
-        limit: usize,
-    ) -> Result<Vec<Episode>, Error> {
-        Ok(self.store.alarms().episodes(structure, before, open_only, limit).await?)
+    pub async fn episodes(&self, structure: &StructureId, query: EpisodeQuery) -> Result<Vec<Episode>, Error> {
+        Ok(self.store.alarms().episodes(structure, query).await?)
+    }
+
+    /// The open damage alarms of all structures.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn open_damage(&self) -> Result<OpenAlarms, Error> {
+        Ok(self.store.alarms().open_damage().await?)
     }
 
     /// Acknowledges an alarm; only the first acknowledgement is kept. `None` when there is no such alarm.

@@ -157,8 +157,9 @@ impl References {
         let (version, origin) = (newest.state.version, &newest.state.origin);
         let (mut added, mut left_out) = self.chosen(structure, &request.choice).await?;
         added.retain(|id| !newest.batches.contains(id));
+        let first = origin.first.unwrap_or(version);
         if !request.despite_alarms {
-            for (batch, alarm) in references.alarms_during(structure, &added).await? {
+            for (batch, alarm) in references.alarms_during(structure, first, &added).await? {
                 added.retain(|id| *id != batch);
                 let reason = format!("it was measured while damage alarm {alarm} was open");
                 left_out.push(LeftOutBatch { batch, reason });
@@ -167,7 +168,6 @@ impl References {
         if added.is_empty() {
             return Err(DeclareError::NothingNew { version, left_out });
         }
-        let first = origin.first.unwrap_or(version);
         let of_first = references.batches_of(structure, first).await?;
         let making = Making {
             leave_out_doubtful: request.leave_out_doubtful,

@@ -2,8 +2,9 @@
 
 pub use crate::store::{
     backup, schema_version, Acknowledgement, AuditEntry, AuditQuery, BatchRecord, ChartMark, ChartSeries, Delivery,
-    DeliveryState, DiagnosisRecord, DiagnosisTrigger, Episode, EpisodeDiagnosis, Error, EventFilter, Exceedance,
-    HistoryEntry, HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, MaintenanceWindow, MeasurementPlace,
-    MeasurementQuery, NewAuditEntry, PutStructure, QuantityMark, QuantitySeries, QuarantinedMessage, ReferenceRecord,
-    ReferenceVersion, SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
+    DeliveryState, DiagnosisRecord, DiagnosisTrigger, Episode, EpisodeDiagnosis, EpisodeQuery, Error, EventFilter,
+    Exceedance, HistoryEntry, HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, MaintenanceWindow,
+    MeasurementPlace, MeasurementQuery, NewAuditEntry, OpenAlarms, PutStructure, QuantityMark, QuantitySeries,
+    QuarantinedMessage, ReferenceRecord, ReferenceVersion, RelativeChange, SeriesWindow, StoredChartPoint,
+    StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
 };

@@ -36,7 +36,7 @@ impl LastingChange {
 
 impl QuantityChange {
     /// Whether the interval of the change excludes zero.
-    fn is_clear(&self) -> bool {
+    pub fn is_clear(&self) -> bool {
         self.interval[0] > 0.0 || self.interval[1] < 0.0
     }
 

@@ -1,5 +1,7 @@
 //! Alarm episodes and maintenance windows.
 
+use std::collections::BTreeMap;
+
 use sqlx::FromRow;
 
 use super::column::{bad_row, elements, list, timestamp};
@@ -43,7 +45,28 @@ pub struct Episode {
     pub diagnosis: Option<EpisodeDiagnosis>,
     /// Onset and size of the change, as the newest batch of the alarm shows them; `None` without a process.
     pub change: Option<LastingChange>,
+    /// The version of a later undamaged reference whose charts cover the opening of the alarm, so that they decide about that time;
+    /// `None` if there is none.
+    pub superseded_by: Option<u32>,
+    /// The latest alarm of an earlier undamaged reference about the same series and time.
+    pub continues: Option<i64>,
 }
+
+/// Which episodes are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EpisodeQuery {
+    /// Only those with numbers below.
+    pub before: Option<i64>,
+    /// Only those that have not ended.
+    pub open_only: bool,
+    /// Also those that a later undamaged reference has superseded.
+    pub superseded: bool,
+    /// Maximum number.
+    pub limit: usize,
+}
+
+/// The open damage alarms of a structure.
+pub type OpenAlarms = BTreeMap<StructureId, Vec<Episode>>;
 
 /// A diagnosis that was started because of an alarm.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -57,12 +80,13 @@ pub struct EpisodeDiagnosis {
 }
 
 impl Episode {
-    /// `open`, `ended`, or `withdrawn`.
+    /// `open`, `ended`, `superseded` or `withdrawn`.
     pub const fn state(&self) -> &'static str {
-        match (self.withdrawn, self.ended_at) {
-            (true, _) => "withdrawn",
-            (false, Some(_)) => "ended",
-            (false, None) => "open",
+        match (self.withdrawn, self.superseded_by, self.ended_at) {
+            (true, ..) => "withdrawn",
+            (false, Some(_), _) => "superseded",
+            (false, None, Some(_)) => "ended",
+            (false, None, None) => "open",
         }
     }
 }
@@ -91,6 +115,7 @@ pub struct MaintenanceWindow {
 
 #[derive(FromRow)]
 struct EpisodeRow {
+    structure_id: String,
     episode: i64,
     kind: String,
     series: String,
@@ -108,13 +133,35 @@ struct EpisodeRow {
     diagnosis_state: Option<String>,
     diagnosis_verdict: Option<String>,
     change: Option<String>,
+    superseded_by: Option<u32>,
+    continues: Option<i64>,
+}
+
+/// The version of the latest undamaged reference whose charts have a point of the series of a damage alarm `e` at its opening or
+/// before, or null.
+macro_rules! superseding_version {
+    () => {
+        "(select max(u.version) from undamaged_state u
+          where u.structure_id = e.structure_id and u.version > e.undamaged_version and e.kind = 'damage'
+            and exists (select 1 from chart_point p
+                where p.structure_id = e.structure_id and p.undamaged_version = u.version and p.series = e.series
+                  and p.measured_to_us <= e.opened_at_us))"
+    };
 }
 
 /// Selects [`EpisodeRow`]s; a condition follows.
 macro_rules! select_episodes {
     ($condition:expr) => {
         concat!(
-            "select e.*, d.diagnosis_id, d.state as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict,
+            "select e.*, ",
+            superseding_version!(),
+            " as superseded_by,
+                 (select max(o.episode) from alarm_episode o
+                  where o.structure_id = e.structure_id and o.kind = e.kind and o.series = e.series and o.withdrawn = 0
+                    and o.undamaged_version < e.undamaged_version
+                    and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
+                    and coalesce(o.ended_at_us, 9e18) >= e.opened_at_us) as continues,
+                 d.diagnosis_id, d.state as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict,
                  (select p.changes -> e.series from process_point p
                   where p.structure_id = e.structure_id and p.undamaged_version = e.undamaged_version
                     and p.measured_to_us between e.opened_at_us and coalesce(e.ended_at_us, 9e18)
@@ -174,28 +221,43 @@ pub struct Alarms<'s> {
 }
 
 impl Alarms<'_> {
-    /// Alarm episodes, newest first: those with numbers below `before`, if given, and only open ones, if `open_only`.
+    /// Alarm episodes, newest first.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn episodes(
-        self,
-        structure: &StructureId,
-        before: Option<i64>,
-        open_only: bool,
-        limit: usize,
-    ) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(
+    pub async fn episodes(self, structure: &StructureId, query: EpisodeQuery) -> Result<Vec<Episode>, Error> {
+        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(concat!(
             "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
-             order by episode desc limit $4"
-        ))
+               and ($4 = 1 or ",
+            superseding_version!(),
+            " is null) order by episode desc limit $5"
+        )))
         .bind(structure.as_str())
-        .bind(before.unwrap_or(i64::MAX))
-        .bind(open_only)
-        .bind(limit as i64)
+        .bind(query.before.unwrap_or(i64::MAX))
+        .bind(query.open_only)
+        .bind(query.superseded)
+        .bind(query.limit as i64)
         .fetch_all(&self.database.reader)
         .await?;
         rows.into_iter().map(episode).collect()
+    }
+
+    /// The open damage alarms of all structures, at most 1000, the latest ones first.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn open_damage(self) -> Result<OpenAlarms, Error> {
+        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(
+            "e.kind = 'damage' and ended_at_us is null and withdrawn = 0 order by e.opened_at_us desc, e.episode limit 1000"
+        ))
+        .fetch_all(&self.database.reader)
+        .await?;
+        let mut open = OpenAlarms::new();
+        for row in rows {
+            let structure = StructureId::parse(&row.structure_id).map_err(|e| bad_row("alarm episode")(&e))?;
+            open.entry(structure).or_default().push(episode(row)?);
+        }
+        Ok(open)
     }
 
     /// Episodes with numbers above `newest`, open episodes, and those with the given numbers, in the order of their numbers.
@@ -395,5 +457,7 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         acknowledgement,
         diagnosis,
         change: row.change.map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e))).transpose()?,
+        superseded_by: row.superseded_by,
+        continues: row.continues,
     })
 }

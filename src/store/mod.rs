@@ -58,7 +58,7 @@ use database::Database;
 use undamaged::Newest;
 use writer::Writer;
 
-pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, MaintenanceWindow};
+pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, MaintenanceWindow, OpenAlarms};
 pub use archive::Archive;
 pub use assessment::{Assessments, StoredAssessment};
 pub use audit::{Audit, AuditEntry, AuditQuery, NewAuditEntry};
@@ -75,7 +75,7 @@ pub use history::{Exceedance, History, HistoryEntry, HistoryQuery};
 pub use jobs::{JobKind, JobRecord};
 pub use measurements::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
 pub use outbox::{Delivery, DeliveryState, Outbox, OutboxEvent, Settlement, Turns};
-pub use overview::{LatestAssessment, Overview, StructureOverview};
+pub use overview::{LatestAssessment, Overview, RelativeChange, StructureOverview};
 pub use quarantine::{Quarantine, QuarantinedMessage};
 pub use reference_version::ReferenceVersion;
 pub use retention::{Deleted, Expired, Retention};

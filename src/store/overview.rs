@@ -12,7 +12,7 @@ use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
 use crate::alarm::machine::State;
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
 
 /// Summary of a structure.
@@ -36,8 +36,14 @@ pub struct StructureOverview {
     pub silent: bool,
     /// Version of its newest undamaged reference.
     pub undamaged_version: Option<u32>,
-    /// Present states of its alarm charts for the newest undamaged reference.
-    pub chart_states: Vec<State>,
+    /// Digest of the trained baseline with which that reference was made.
+    pub undamaged_model: Option<Digest>,
+    /// Present states of its alarm charts for the newest undamaged reference, by series.
+    pub charts: BTreeMap<String, State>,
+    /// Number of its batches that have no assessment yet.
+    pub waiting: u64,
+    /// When the first of them was received.
+    pub waiting_since: Option<Timestamp>,
 }
 
 /// Summary of the assessed batch that was measured last.
@@ -53,6 +59,19 @@ pub struct LatestAssessment {
     pub exceeds: bool,
     /// The largest probability of damage and its quantity.
     pub worst: Option<(f64, String)>,
+    /// Relative changes of the quantities with an open damage alarm.
+    pub changes: Vec<RelativeChange>,
+}
+
+/// Relative difference of a quantity from its mean in the undamaged reference.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RelativeChange {
+    /// The quantity.
+    pub quantity: String,
+    /// Its estimate.
+    pub change: f64,
+    /// Its interval of 90 %, if it is known.
+    pub interval: Option<[f64; 2]>,
 }
 
 #[derive(FromRow)]
@@ -65,6 +84,17 @@ struct OverviewRow {
     unacknowledged: i64,
     silent: bool,
     undamaged_version: Option<u32>,
+    undamaged_model: Option<String>,
+    waiting: i64,
+    waiting_since_us: Option<i64>,
+}
+
+#[derive(FromRow)]
+struct ChangeRow {
+    quantity: String,
+    relative_change: f64,
+    change_low: Option<f64>,
+    change_high: Option<f64>,
 }
 
 #[derive(FromRow)]
@@ -75,6 +105,7 @@ struct LatestRow {
     exceeds: bool,
     probability_of_damage: Option<f64>,
     quantity: Option<String>,
+    alarming: bool,
 }
 
 /// The part of a stored trust that the overview contains.
@@ -87,6 +118,9 @@ struct OverviewTrust {
 /// The open alarms of a structure `s`.
 const OPEN: &str =
     "from alarm_episode e where e.structure_id = s.structure_id and ended_at_us is null and withdrawn = 0";
+
+/// The batches of a structure `s` without an assessment.
+const WAITING: &str = "from measurement_batch w where w.structure_id = s.structure_id and w.state = 'received'";
 
 /// The compared quantities of an assessment `a`.
 const COMPARED: &str = "from quantity_assessment q
@@ -101,7 +135,7 @@ pub struct Overview<'s> {
 }
 
 impl Overview<'_> {
-    /// All structures by id, with three statements independent of their number.
+    /// All structures by id, with three statements for all of them and one for each with an open damage alarm.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
@@ -115,13 +149,17 @@ impl Overview<'_> {
                     (select count(*) {OPEN} and acknowledged_at_us is null) as unacknowledged,
                     exists (select 1 {OPEN} and kind = 'silence') as silent,
                     (select max(version) from undamaged_state u where u.structure_id = s.structure_id)
-                        as undamaged_version
+                        as undamaged_version,
+                    (select model_digest from undamaged_state u where u.structure_id = s.structure_id
+                     order by version desc limit 1) as undamaged_model,
+                    (select count(*) {WAITING}) as waiting,
+                    (select min(received_at_us) {WAITING}) as waiting_since_us
              from structure s left join structure_summary c using (structure_id) order by s.structure_id"
         );
         let rows: Vec<OverviewRow> =
             sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut latest = self.latest_assessments().await?;
-        let mut chart_states = self.chart_states().await?;
+        let mut charts = self.chart_states().await?;
         let what = "structure";
         let overview = |row: OverviewRow| {
             Ok(StructureOverview {
@@ -134,7 +172,10 @@ impl Overview<'_> {
                 unacknowledged_alarms: row.unacknowledged.unsigned_abs(),
                 silent: row.silent,
                 undamaged_version: row.undamaged_version,
-                chart_states: chart_states.remove(&row.structure_id).unwrap_or_default(),
+                undamaged_model: row.undamaged_model.map(Digest::from_stored),
+                charts: charts.remove(&row.structure_id).unwrap_or_default(),
+                waiting: row.waiting.unsigned_abs(),
+                waiting_since: row.waiting_since_us.map(|at| timestamp(what, at)).transpose()?,
             })
         };
         rows.into_iter().map(overview).collect()
@@ -153,47 +194,74 @@ impl Overview<'_> {
                     (select q.probability_of_damage {COMPARED}
                      order by q.probability_of_damage desc, q.position desc limit 1) as probability_of_damage,
                     (select q.quantity {COMPARED}
-                     order by q.probability_of_damage desc, q.position desc limit 1) as quantity
+                     order by q.probability_of_damage desc, q.position desc limit 1) as quantity,
+                    exists (select 1 from alarm_episode e where e.structure_id = a.structure_id and e.kind = 'damage'
+                        and e.ended_at_us is null and e.withdrawn = 0) as alarming
              from latest l cross join assessment a
              where a.structure_id = l.structure_id and a.batch_id = l.batch_id and {IS_CURRENT}"
         );
         let rows: Vec<LatestRow> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
-        let latest = |row: LatestRow| {
+        let mut all = BTreeMap::new();
+        for row in rows {
             let trust = match &row.trust {
                 Some(trust) => serde_json::from_str(trust).map_err(|e| bad_row("assessment")(&e))?,
                 // Assessments of early versions have no trust.
                 None => OverviewTrust { verdict: TrustVerdict::Accepted, findings: Vec::new() },
             };
             let latest = LatestAssessment {
+                changes: if row.alarming { self.changes(&row).await? } else { Vec::new() },
                 batch_id: row.batch_id,
                 verdict: trust.verdict,
                 findings: trust.findings.len(),
                 exceeds: row.exceeds,
                 worst: row.probability_of_damage.zip(row.quantity),
             };
-            Ok((row.structure_id, latest))
-        };
-        rows.into_iter().map(latest).collect()
+            all.insert(row.structure_id, latest);
+        }
+        Ok(all)
     }
 
-    /// The states after the last points of the charts for the newest undamaged reference, by structure.
-    async fn chart_states(self) -> Result<BTreeMap<String, Vec<State>>, Error> {
+    /// Relative changes of the quantities with an open damage alarm, in the current assessment of a batch.
+    async fn changes(self, latest: &LatestRow) -> Result<Vec<RelativeChange>, Error> {
+        let select = format!(
+            "select q.quantity, q.relative_change, q.change_low, q.change_high
+             from assessment a join quantity_assessment q using (structure_id, batch_id, model_digest, undamaged_version)
+             where a.structure_id = $1 and a.batch_id = $2 and {IS_CURRENT} and q.relative_change is not null
+               and exists (select 1 from alarm_episode e where e.structure_id = a.structure_id and e.kind = 'damage'
+                   and e.series = q.quantity and e.ended_at_us is null and e.withdrawn = 0)
+             order by q.position"
+        );
+        let rows: Vec<ChangeRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(&latest.structure_id)
+            .bind(&latest.batch_id)
+            .fetch_all(&self.database.reader)
+            .await?;
+        let change = |row: ChangeRow| RelativeChange {
+            quantity: row.quantity,
+            change: row.relative_change,
+            interval: row.change_low.zip(row.change_high).map(<[f64; 2]>::from),
+        };
+        Ok(rows.into_iter().map(change).collect())
+    }
+
+    /// The states after the last points of the charts for the newest undamaged reference, by structure and series.
+    async fn chart_states(self) -> Result<BTreeMap<String, BTreeMap<String, State>>, Error> {
         let select = format!(
             "with recursive whose (structure_id, version) as (
                  select structure_id, max(version) from undamaged_state group by structure_id
                  union select structure_id, 0 from structure),
              {CHARTS}
-             select structure_id,
+             select structure_id, series,
                     (select state from chart_point p where p.structure_id = chart.structure_id
                      and p.undamaged_version = chart.version and p.series = chart.series
                      order by measured_to_us desc, batch_id desc limit 1)
              from chart where series is not null"
         );
-        let rows: Vec<(String, String)> =
+        let rows: Vec<(String, String, String)> =
             sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
-        let mut states: BTreeMap<String, Vec<State>> = BTreeMap::new();
-        for (structure, state) in rows {
-            states.entry(structure).or_default().push(state_of(&state)?);
+        let mut states: BTreeMap<String, BTreeMap<String, State>> = BTreeMap::new();
+        for (structure, series, state) in rows {
+            states.entry(structure).or_default().insert(series, state_of(&state)?);
         }
         Ok(states)
     }

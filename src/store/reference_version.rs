@@ -78,21 +78,28 @@ impl References<'_> {
         rows.into_iter().map(version).collect()
     }
 
-    /// The damage alarms during which batches were measured, that were not withdrawn: batch and number of the alarm.
+    /// The damage alarms during which batches were measured, that were not withdrawn: batch and number of the alarm. Only alarms of
+    /// the undamaged reference of version `first` and later ones count: what an earlier one showed may have been repaired.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn alarms_during(self, structure: &StructureId, batches: &[String]) -> Result<Vec<(String, i64)>, Error> {
+    pub async fn alarms_during(
+        self,
+        structure: &StructureId,
+        first: u32,
+        batches: &[String],
+    ) -> Result<Vec<(String, i64)>, Error> {
         let ids = serde_json::to_string(batches).map_err(|e| bad_row("batch")(&e))?;
         Ok(sqlx::query_as(
             "select b.batch_id, min(a.episode) from measurement_batch b join alarm_episode a using (structure_id)
              where structure_id = $1 and b.batch_id in (select value from json_each($2))
-               and a.kind = 'damage' and a.withdrawn = 0 and a.opened_at_us <= b.measured_to_us
+               and a.kind = 'damage' and a.withdrawn = 0 and a.undamaged_version >= $3 and a.opened_at_us <= b.measured_to_us
                and (a.ended_at_us is null or a.ended_at_us > b.measured_to_us)
              group by b.batch_id order by b.measured_to_us",
         )
         .bind(structure.as_str())
         .bind(ids)
+        .bind(first)
         .fetch_all(&self.database.reader)
         .await?)
     }

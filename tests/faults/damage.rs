@@ -7,7 +7,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use modalwatch::quantity::StructureId;
-use modalwatch::store::{HistoryQuery, Store};
+use modalwatch::store::{EpisodeQuery, HistoryQuery, Store};
 use rand::Rng as _;
 use serde_json::json;
 
@@ -82,7 +82,10 @@ async fn read_all(folder: &Path, acknowledged: &Acknowledged) -> Outcome {
         let _ = store.assessments().assessment(&structure, id).await;
         let _ = store.alarms().chart_points(&structure, id).await;
     }
-    let _ = store.alarms().episodes(&structure, None, false, 100).await;
+    let _ = store
+        .alarms()
+        .episodes(&structure, EpisodeQuery { before: None, open_only: false, superseded: true, limit: 100 })
+        .await;
     let _ = store.alarms().charts(&structure, 100).await;
     let _ = store.reference().undamaged(&structure).await;
     let _ = store.structures().list().await;

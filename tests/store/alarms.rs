@@ -3,7 +3,9 @@
 use modalwatch::alarm::chart::ChartPoint;
 use modalwatch::alarm::AlarmSettings;
 use modalwatch::assessment::{NewChartPoint, NewCharts};
-use modalwatch::store::{Acknowledgement, Episode, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord};
+use modalwatch::store::{
+    Acknowledgement, Episode, EpisodeQuery, EventFilter, MaintenanceWindow, Secret, Store, WebhookRecord,
+};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
 
@@ -46,7 +48,11 @@ async fn opened() -> (Store, tempfile::TempDir) {
 }
 
 async fn episodes(store: &Store) -> Vec<Episode> {
-    store.alarms().episodes(&bridge(), None, false, 100).await.unwrap()
+    store
+        .alarms()
+        .episodes(&bridge(), EpisodeQuery { before: None, open_only: false, superseded: true, limit: 100 })
+        .await
+        .unwrap()
 }
 
 async fn states(store: &Store) -> Vec<String> {
@@ -112,7 +118,12 @@ async fn an_alarm_that_a_corrected_batch_takes_back_is_withdrawn() {
     assess(&store, "b1", batch("b1", 1_000, 1).time_span(), 1.0).await;
     assert!(episodes(&store).await[0].withdrawn);
     assert_eq!(states(&store).await, ["normal", "normal"]);
-    assert!(store.alarms().episodes(&bridge(), None, true, 10).await.unwrap().is_empty());
+    assert!(store
+        .alarms()
+        .episodes(&bridge(), EpisodeQuery { before: None, open_only: true, superseded: true, limit: 10 })
+        .await
+        .unwrap()
+        .is_empty());
 }
 
 #[tokio::test]
@@ -164,7 +175,14 @@ async fn a_batch_in_maintenance_moves_nothing_and_a_new_undamaged_reference_begi
     );
     // Computed before the new reference and stored after it, a point must not reopen an alarm that has ended.
     assess(&store, "b3", batch("b3", 3_000, 1).time_span(), 8.0).await;
-    assert_eq!(store.alarms().episodes(&bridge(), None, true, 10).await.unwrap(), []);
+    assert_eq!(
+        store
+            .alarms()
+            .episodes(&bridge(), EpisodeQuery { before: None, open_only: true, superseded: true, limit: 10 })
+            .await
+            .unwrap(),
+        []
+    );
 }
 
 #[tokio::test]

@@ -12,7 +12,7 @@ use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::fit::Quantities;
 use modalwatch::process::reference::ReferenceProcess;
 use modalwatch::quantity::Digest;
-use modalwatch::store::{Store, StoredChartPoint};
+use modalwatch::store::{EpisodeQuery, Store, StoredChartPoint};
 use rand::seq::SliceRandom as _;
 use rand::{Rng as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -104,7 +104,11 @@ async fn batches_in_any_order_give_the_same_charts_and_alarms() {
         assert!((a.shift - b.shift).abs() < 1e-4 && (a.ewma - b.ewma).abs() < 1e-4, "{a:?} {b:?}");
     }
     let episodes = |store: Store| async move {
-        let all = store.alarms().episodes(&bridge(), None, false, 100).await.unwrap();
+        let all = store
+            .alarms()
+            .episodes(&bridge(), EpisodeQuery { before: None, open_only: false, superseded: true, limit: 100 })
+            .await
+            .unwrap();
         let mut open: Vec<_> = all.into_iter().filter(|e| !e.withdrawn).collect();
         open.sort_by(|a, b| (&a.series, a.opened_at).cmp(&(&b.series, b.opened_at)));
         open

@@ -154,7 +154,7 @@ async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
     let latest = overview[0].latest.as_ref().unwrap();
     assert_eq!((overview[0].batches, latest.batch_id.as_str()), (MANY as u64, "b099999"));
     assert_eq!(overview[0].last_measured_at.unwrap().micros(), time_of(MANY - 1));
-    assert_eq!(overview[0].chart_states.len(), 5);
+    assert_eq!(overview[0].charts.len(), 5);
 
     // Of too many measurements, every third is read.
     let too_many = Extent { measurements: 1_200_000, ..extent };

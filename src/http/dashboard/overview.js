@@ -4,7 +4,7 @@ import { at, read } from "./api.js";
 import { acknowledgeDialog, alarmWords } from "./sections/alarms.js";
 import { cell, fill, h, icon, refill, throttled } from "./dom.js";
 import { age, count, percent } from "./format.js";
-import { EVERY_STATE, stateChip, stateText, stateWord, trustChip, urgency } from "./states.js";
+import { EVERY_STATE, stateChip, stateWord, trustChip, urgency } from "./states.js";
 
 /** Maximum number of structures whose open alarms are listed at the top. */
 const MOST_ALARMING = 20;
@@ -23,7 +23,7 @@ export function overview() {
       h(
         "tr",
         null,
-        ["State", "Structure", "Last measured", "Alarms", "Highest probability of damage", "Latest batch", "Model"].map(
+        ["State", "Structure and verdict", "Last measured", "Alarms", "Highest probability of damage", "Latest batch", "Model"].map(
           (c) => h("th", { scope: "col" }, c),
         ),
       ),
@@ -131,7 +131,7 @@ function row(item) {
       "th",
       { scope: "row" },
       h("a", { href: `#/structures/${encodeURIComponent(item.id)}` }, item.id),
-      h("span", { class: "fine" }, stateText(item.state)),
+      h("span", { class: "fine verdict" }, item.verdict),
     ),
     cell(
       "Last measured",
@@ -171,8 +171,7 @@ function meter(latest) {
   bar.firstChild.style.width = `${100 * value}%`;
   return h(
     "span",
-    { class: `meter ${latest.exceeds ? "bad" : ""}` },
-    latest.exceeds && icon("alarm"),
+    { class: "meter" },
     bar,
     percent(value),
   );

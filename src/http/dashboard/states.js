@@ -14,19 +14,17 @@ const STATES = {
     kind: "warn",
     text: "below the limit again; the alarm has not ended yet",
   },
+  judging: { word: "Judging", icon: "pending", kind: "idle", text: "batches wait for their assessment" },
+  not_judged: { word: "Not judged", icon: "unassessed", kind: "idle", text: "not compared with an undamaged reference" },
   no_model: { word: "No model", icon: "unassessed", kind: "idle", text: "no trained model for this structure" },
   unassessed: { word: "Not assessed", icon: "unassessed", kind: "idle", text: "no assessed batch yet" },
-  normal: { word: "Normal", icon: "check", kind: "good", text: "within all limits" },
+  normal: { word: "Normal", icon: "check", kind: "good", text: "all charts inside their limits" },
 };
 
 /** Rank of a state, 0 for the most urgent; unknown states come last. */
 export function urgency(state) {
   const rank = Object.keys(STATES).indexOf(state);
   return rank < 0 ? Object.keys(STATES).length : rank;
-}
-
-export function stateText(state) {
-  return STATES[state]?.text ?? "";
 }
 
 export function stateWord(state) {

@@ -14,7 +14,7 @@ import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
 import { maintenance } from "./sections/maintenance.js";
 import { model, postLine } from "./sections/model.js";
-import { stateChip, stateText } from "./states.js";
+import { stateChip } from "./states.js";
 
 const DAY_S = 86400;
 const SPANS = [
@@ -26,8 +26,8 @@ const SPANS = [
 ];
 /** Maximum number of points requested per series; more could not be distinguished on a screen. */
 const POINTS = 1000;
-/** Limit of the probability of damage as long as no undamaged reference specifies one. */
-const DEFAULT_LIMIT = 0.05;
+/** Probability of damage of the undamaged reference itself as long as none specifies it. */
+const USUAL_PROBABILITY = 0.05;
 
 const JUMPS = [
   ["alarms", "Alarms"],
@@ -167,7 +167,7 @@ export function structure(id) {
 
   function draw() {
     const { series, info, item } = state;
-    const limit = info.undamaged?.threshold_probability ?? DEFAULT_LIMIT;
+    const usual = info.undamaged?.threshold_probability ?? USUAL_PROBABILITY;
     const empty = (item?.batches ?? series.batches) === 0;
     charts.hidden = empty;
     for (const link of jumps.children) {
@@ -181,7 +181,7 @@ export function structure(id) {
       spanText,
       `${local(1000 * shown[0])} to ${local(1000 * shown[1])} (${zone()}), ${count(series.batches, "batch", "batches")}${series.reduced ? ", thinned for display with extremes kept" : ""}`,
     );
-    figures.parameters.update(series, limit);
+    figures.parameters.update(series, usual);
     figures.heat.update(series);
     figures.control.update(series);
     figures.trust.update(series);
@@ -256,34 +256,28 @@ export function structure(id) {
 
 const iso = (time_s) => new Date(1000 * time_s).toISOString();
 
-/** Heading with the state and a summary of the latest batch. */
+/** Heading with the state and the verdict, which follows from the alarm charts alone. */
 function head(id, { info, item }) {
   const latest = item?.latest;
-  const silent = item?.state === "silent";
-  const sentence = [];
+  const facts = [];
   if (latest && latest.trust === "rejected")
-    sentence.push("The latest batch was rejected; its probability of damage is withheld.");
+    facts.push("The latest batch was rejected; its probability of damage is withheld.");
   else if (latest && latest.max_probability_of_damage !== null && latest.max_probability_of_damage !== undefined)
-    sentence.push(
-      `Latest batch: highest probability of damage ${percent(latest.max_probability_of_damage)} (${latest.max_parameter})${latest.exceeds ? ", above the limit" : ""}.`,
+    facts.push(
+      `Highest probability of damage in the latest batch: ${percent(latest.max_probability_of_damage)} (${latest.max_parameter}).`,
     );
-  if (item && !info.model) sentence.push("There is no trained model for this structure.");
-  else if (item && !info.undamaged && item.batches > 0) sentence.push("Next step: declare the undamaged reference.");
-  if (silent) sentence.push("Check the data logger and its connection.");
+  if (item?.state === "not_judged") facts.push("Declare the undamaged reference below, under “Model”.");
+  if (item?.state === "silent") facts.push("Check the data logger and its connection.");
   return [
-    h(
-      "div",
-      { class: "row" },
-      h("h1", null, id),
-      item && stateChip(item.state),
-      item && h("span", { class: "soft" }, stateText(item.state)),
-    ),
+    h("div", { class: "row" }, h("h1", null, id), item && stateChip(item.state)),
     info.definition.description && h("p", { class: "fine" }, info.definition.description),
-    h("p", { class: "lead" }, sentence.join(" ")),
+    item && h("p", { class: "lead verdict" }, item.verdict, item.alarm_since && [" Alarm open since ", age(item.alarm_since), "."]),
     item &&
       h(
         "p",
         { class: "fine" },
+        facts.join(" "),
+        facts.length > 0 && " ",
         "Last measured ",
         age(item.last_measured_at),
         ", last received ",

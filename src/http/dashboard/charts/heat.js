@@ -1,9 +1,10 @@
-// Heat map of the probability of damage: one row per parameter, one column per batch.
+// Heat map of the probability of damage: one row per parameter, one column per batch. Its colours are neutral, because a healthy
+// structure shows high probabilities at times; a red frame marks the alarms of a parameter.
 
 import { count, local, percent, timeElement } from "../format.js";
 import { LEFT, chart, draw, mark, merged, seconds, timeAxis, valueAxis } from "./base.js";
 import { figure } from "./figure.js";
-import { rejectedBatches } from "./parameters.js";
+import { alarmSpans, rejectedBatches } from "./parameters.js";
 import { colour } from "./theme.js";
 
 /** Upper ends of the colour steps; the first step covers what an undamaged structure shows. */
@@ -19,6 +20,7 @@ export function heat(group, selectBatch) {
     keys: [
       ...ends.map((end, i) => ({ mark: `heat-${i}`, text: i === 0 ? `up to ${end} %` : `${ends[i - 1]} to ${end} %` })),
       { mark: "cross", text: "withheld: batch rejected" },
+      { mark: "alarm-frame", text: "alarm" },
     ],
   });
   let one = null;
@@ -74,6 +76,15 @@ export function heat(group, selectBatch) {
                 pen.fillRect(from, y, wide, tall);
               }
             });
+          });
+          pen.strokeStyle = colour("bad");
+          pen.lineWidth = 2 * devicePixelRatio;
+          rows.forEach((p, r) => {
+            for (const [from, to] of alarmSpans(series.alarms, p.name)) {
+              const [a, b] = [u.valToPos(from, "x", true), Math.min(u.valToPos(to, "x", true), left + width + 4)];
+              const [y, next] = [u.valToPos(r, "y", true), u.valToPos(r + 1, "y", true)];
+              pen.strokeRect(a, y, b - a, next - y - 2 * devicePixelRatio);
+            }
           });
         });
       const options = merged(group.options(), {

@@ -28,7 +28,7 @@ const KEYS = [
   { mark: "dash-bad", text: "threshold δ" },
   { mark: "dash", text: "mean of the reference" },
   { mark: "line-2", text: "probability of damage" },
-  { mark: "triangle", text: "above the limit" },
+  { mark: "dash-2", text: "probability in the reference" },
   { mark: "cross", text: "withheld: batch rejected" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
@@ -65,7 +65,7 @@ export function parameters(group, selectBatch) {
   const made = new Map();
   return {
     element: h("div", { class: "stack" }, h("h3", null, "Parameters and probability of damage"), keyList(KEYS), grid),
-    update(series, limit) {
+    update(series, usual) {
       const names = series.parameters.map((p) => p.name);
       for (const [name, one] of made) {
         if (!names.includes(name)) {
@@ -80,7 +80,7 @@ export function parameters(group, selectBatch) {
           made.set(parameter.name, one);
           grid.append(one.element);
         }
-        made.get(parameter.name).update(parameter, series, limit);
+        made.get(parameter.name).update(parameter, series, usual);
       }
     },
   };
@@ -95,7 +95,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
     charts = [];
   };
 
-  const update = (p, series, limit) => {
+  const update = (p, series, usual) => {
     end();
     if (p.times.length === 0) return frame.empty("No assessed batch in this time span.");
     frame.empty(null);
@@ -158,8 +158,8 @@ function parameterFigure(group, { name, unit }, selectBatch) {
         drawClear: [background],
         draw: [
           (u) => {
-            rule(u, limit, "bad", [2, 3]);
-            marks(u, filled.times, pod, limit, withheld);
+            rule(u, usual, "curve-2", [6, 4]);
+            crosses(u, withheld);
           },
         ],
       },
@@ -215,22 +215,15 @@ function parameterFigure(group, { name, unit }, selectBatch) {
   return { element: frame.element, update, end };
 }
 
-/** Triangles above the limit, crosses where the probability is withheld. */
-function marks(u, times, values, limit, withheld) {
-  const inside = (x) => x >= u.bbox.left && x <= u.bbox.left + u.bbox.width;
-  const many = values.filter((v) => v > limit).length > 120;
+/** Crosses where the probability is withheld. */
+function crosses(u, withheld) {
   draw(u, (pen) => {
-    pen.fillStyle = colour("bad");
-    times.forEach((time, i) => {
-      if (values[i] === null || values[i] <= limit) return;
-      const x = u.valToPos(time, "x", true);
-      if (inside(x)) mark(pen, "triangle", x, u.valToPos(values[i], "y", true), many ? 4 : 8);
-    });
     pen.strokeStyle = colour("bad");
     pen.lineWidth = 2 * devicePixelRatio;
     for (const time of withheld) {
       const x = u.valToPos(time, "x", true);
-      if (inside(x)) mark(pen, "cross", x, u.bbox.top + u.bbox.height - 8 * devicePixelRatio, 8);
+      if (x < u.bbox.left || x > u.bbox.left + u.bbox.width) continue;
+      mark(pen, "cross", x, u.bbox.top + u.bbox.height - 8 * devicePixelRatio, 8);
     }
   });
 }

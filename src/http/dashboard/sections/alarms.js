@@ -8,6 +8,7 @@ const STATE = {
   open: ["alarm", "bad", "Open"],
   ended: ["check", "good", "Ended"],
   withdrawn: ["cross", "idle", "Withdrawn"],
+  superseded: ["note", "idle", "Superseded"],
 };
 
 /** Number of past alarms shown without unfolding the list of older ones. */
@@ -83,16 +84,18 @@ export function alarms(structure) {
   );
   const load = async () => {
     try {
-      const { items } = await read(at(structure, "/alarms?limit=50"));
+      const [{ items }, all] = await Promise.all([
+        read(at(structure, "/alarms?limit=50")),
+        read(at(structure, "/alarms?limit=50&superseded=true")),
+      ]);
+      const superseded = all.items.filter((alarm) => alarm.state === "superseded");
       // Open alarms and the latest past ones are shown; older ones are folded.
       const past = items.filter((alarm) => alarm.state !== "open");
       const older = past.slice(PAST_SHOWN);
       const shown = items.filter((alarm) => !older.includes(alarm));
       refill(
         content,
-        items.length === 0
-          ? h("p", { class: "soft" }, "No alarms so far.")
-          : [
+        items.length === 0 ? h("p", { class: "soft" }, "No alarms so far.") : [
               h("ul", { class: "alarms" }, shown.map(line)),
               older.length > 0 &&
                 h(
@@ -102,6 +105,18 @@ export function alarms(structure) {
                   h("ul", { class: "alarms" }, older.map(line)),
                 ),
             ],
+        superseded.length > 0 &&
+          h(
+            "details",
+            { dataset: { key: "superseded" } },
+            h("summary", null, `${count(superseded.length, "alarm")} of earlier undamaged references or models`),
+            h(
+              "p",
+              { class: "fine" },
+              "The present charts judge the same time again. What they find is listed above; these are kept as a record.",
+            ),
+            h("ul", { class: "alarms" }, superseded.map(line)),
+          ),
       );
     } catch (error) {
       fill(content, problem(error, load));
@@ -110,6 +125,7 @@ export function alarms(structure) {
   const line = (alarm) => {
     const [sign, kind, word] = STATE[alarm.state] ?? ["note", "idle", alarm.state];
     const open = alarm.state === "open";
+    const superseded = alarm.state === "superseded";
     return h(
       "li",
       { class: open && !alarm.acknowledgement ? "unseen" : "seen", dataset: { key: alarm.alarm } },
@@ -123,7 +139,8 @@ export function alarms(structure) {
           { class: "fine" },
           "from ",
           timeElement(alarm.opened_at),
-          alarm.ended_at && [" to ", timeElement(alarm.ended_at)],
+          !superseded && alarm.ended_at && [" to ", timeElement(alarm.ended_at)],
+          superseded && ` (undamaged reference ${alarm.undamaged_version}, superseded by ${alarm.superseded_by})`,
         ),
         alarm.acknowledgement &&
           h(
@@ -133,6 +150,7 @@ export function alarms(structure) {
             timeElement(alarm.acknowledgement.at),
             alarm.acknowledgement.note && `: ${alarm.acknowledgement.note}`,
           ),
+        alarm.continues && h("span", { class: "fine" }, `first raised as alarm ${alarm.continues}, with an earlier reference or model`),
         diagnosisLine(alarm.diagnosis),
       ),
       open &&

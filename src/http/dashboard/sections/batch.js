@@ -197,8 +197,6 @@ function parameterTable(a) {
             ? "withheld"
             : "–"
           : percentWithin(p.probability_of_damage, ...(p.probability_of_damage_interval ?? [null, null])),
-        p.exceeds && " ",
-        p.exceeds && h("span", { class: "chip bad" }, icon("alarm"), "above the limit"),
       ),
     );
   const columns = [

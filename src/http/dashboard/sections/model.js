@@ -163,7 +163,7 @@ function undamaged(state) {
       ["Version", `${state.version}, declared ${local(state.created_at)}${state.extends ? `, extends version ${state.extends}` : ""}`],
       state.reason && ["Reason", state.reason],
       ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}`],
-      ["Limit", `probability of damage above ${percent(state.threshold_probability)}`],
+      ["Threshold δ", `below it are ${percent(state.threshold_probability)} of the healthy values`],
       conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
       state.process?.coverage && ["Months seen", state.process.coverage.months.map(monthName).join(", ")],
       ["Movement in time", seasonWords(state)],
@@ -299,7 +299,7 @@ async function declare(structure, changed, extend = false) {
         null,
         extend
           ? "The reference keeps its batches and gains others that you accept as healthy, so that it has seen more of the year. Batches of a damage alarm are not accepted, and nothing is changed if the first version of the reference shows a lasting loss in what was added since."
-          : "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available, or the period in which it was. All batches are compared again with the new reference, and alarms based on the old one are withdrawn.",
+          : "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available, or the period in which it was. All batches are compared again with the new reference, and its alarms replace those of the old one where it covers their time.",
       ),
       list,
     ],
@@ -311,7 +311,7 @@ async function declare(structure, changed, extend = false) {
         hint: "All batches of the period are used. Doubtful ones are left out and named.",
       },
       { name: "to", label: `to (${zone()})`, type: "datetime-local" },
-      !extend && { name: "p", label: "Limit of the probability of damage (%)", type: "text", required: true, value: "5" },
+      !extend && { name: "p", label: "Share of healthy values below the threshold δ (%)", type: "text", required: true, value: "5" },
       {
         name: "reason",
         label: "Reason (optional)",

@@ -1,0 +1,357 @@
+//! The verdict about a structure: one state and one sentence, from the alarm charts of the newest undamaged reference alone.
+//!
+//! A probability of damage above that of the reference is no verdict: one of twenty healthy batches shows it.
+
+use std::fmt::Write as _;
+
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use crate::alarm::chart::FIT_SERIES;
+use crate::alarm::machine::State as AlarmState;
+use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
+use crate::process::reference::QuantityChange;
+use crate::quantity::{Digest, Timestamp};
+
+/// A batch that waits longer for its assessment than this is not one that has just arrived, µs.
+const JUST_ARRIVED_US: i64 = 5_000_000;
+
+/// What is known about the condition of a structure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Condition {
+    /// A chart is in alarm.
+    Alarming,
+    /// A chart was in alarm and is below its limit again, but not yet for long enough.
+    Recovering,
+    /// No measurement within the configured time.
+    Silent,
+    /// There is no trained model.
+    NoModel,
+    /// No batch has been assessed.
+    Unassessed,
+    /// Batches wait for their assessment, for example after a new model or a new undamaged reference.
+    Judging,
+    /// There is no undamaged reference for the trained model in use, or no batch was compared with it.
+    NotJudged,
+    /// A point is above a limit, but not yet enough of them for an alarm.
+    Pending,
+    /// All charts are inside their limits.
+    Normal,
+}
+
+/// The verdict about a structure.
+#[derive(Debug)]
+pub(super) struct Verdict {
+    /// The most serious condition that applies.
+    pub condition: Condition,
+    /// The verdict in one or two sentences: what has changed by how much since when, or why there is no verdict.
+    pub sentence: String,
+}
+
+/// The verdict about a structure at a time: `model` is the digest of the trained model in use, `open` are its open damage alarms.
+pub(super) fn verdict(found: &StructureOverview, model: Option<&Digest>, open: &[Episode], now: Timestamp) -> Verdict {
+    let condition = condition(found, model, now);
+    Verdict { sentence: sentence(found, model, open, condition), condition }
+}
+
+fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) -> Condition {
+    let on_a_chart = |state: AlarmState| found.charts.values().any(|own| *own == state);
+    let waits = found.waiting_since.is_some_and(|since| since.micros() < now.micros() - JUST_ARRIVED_US);
+    if on_a_chart(AlarmState::Alarming) {
+        Condition::Alarming
+    } else if on_a_chart(AlarmState::Recovering) {
+        Condition::Recovering
+    } else if found.silent {
+        Condition::Silent
+    } else if model.is_none() {
+        Condition::NoModel
+    } else if waits {
+        Condition::Judging
+    } else if found.latest.is_none() {
+        Condition::Unassessed
+    } else if why_not_judged(found, model).is_some() {
+        Condition::NotJudged
+    } else if on_a_chart(AlarmState::Pending) {
+        Condition::Pending
+    } else {
+        Condition::Normal
+    }
+}
+
+/// Why the batches are not judged, if they are not.
+fn why_not_judged(found: &StructureOverview, model: Option<&Digest>) -> Option<String> {
+    let Some(version) = found.undamaged_version else {
+        return Some("Not judged: no undamaged reference has been declared.".to_owned());
+    };
+    if found.undamaged_model.as_ref() != model {
+        return Some(format!(
+            "Not judged: the undamaged reference, version {version}, was made with another trained model. Declare it again."
+        ));
+    }
+    let compared = found.charts.keys().any(|series| series != FIT_SERIES);
+    (!compared)
+        .then(|| format!("Not judged yet: no batch has been compared with the undamaged reference, version {version}."))
+}
+
+fn sentence(found: &StructureOverview, model: Option<&Digest>, open: &[Episode], condition: Condition) -> String {
+    let mut sentence = match condition {
+        Condition::Alarming | Condition::Recovering => in_alarm(found, open),
+        Condition::Silent => match found.last_measured_at {
+            Some(at) => format!("No measurement since {}.", at.day()),
+            None => "No measurement within the configured time.".to_owned(),
+        },
+        Condition::NoModel => "Not judged: there is no trained model for this structure.".to_owned(),
+        Condition::Unassessed => "No batch has been assessed yet.".to_owned(),
+        Condition::Judging => {
+            format!("Judging: {} of {} batches are assessed.", found.batches - found.waiting, found.batches)
+        }
+        Condition::NotJudged => why_not_judged(found, model).unwrap_or_default(),
+        Condition::Pending => format!(
+            "{} above its limit; the next batches decide whether this is an alarm.",
+            names_in(found, AlarmState::Pending)
+        ),
+        Condition::Normal => "No alarm: all charts are inside their limits.".to_owned(),
+    };
+    if condition == Condition::Recovering {
+        sentence.push_str(" The latest batches are below the limit again; the alarm has not ended yet.");
+    }
+    if matches!(condition, Condition::Alarming | Condition::Recovering) && found.waiting > 1 {
+        let _ = write!(sentence, " {} of {} batches are assessed.", found.batches - found.waiting, found.batches);
+    }
+    let rejected = found.latest.as_ref().is_some_and(|latest| latest.verdict == crate::trust::TrustVerdict::Rejected);
+    if rejected && matches!(condition, Condition::Pending | Condition::Normal) {
+        sentence.push_str(" The latest batch was rejected and is not judged.");
+    }
+    sentence
+}
+
+/// The charts in a state, in words.
+fn names_in(found: &StructureOverview, state: AlarmState) -> String {
+    let of_state = found.charts.iter().filter(|(_, own)| **own == state).map(|(series, _)| match series.as_str() {
+        FIT_SERIES => "the fit of the simulation".to_owned(),
+        crate::process::reference::JOINT_SERIES => "the chart of all parameters together".to_owned(),
+        name => format!("the chart of {name}"),
+    });
+    let names: Vec<String> = of_state.collect();
+    let mut text = names.join(" and ");
+    if let Some(first) = text.get(..1).map(str::to_uppercase) {
+        text.replace_range(..1, &first);
+    }
+    format!("{text} {}", if names.len() == 1 { "is" } else { "are each" })
+}
+
+/// What has changed, as the open damage alarms show it, and whether the simulation fits.
+fn in_alarm(found: &StructureOverview, open: &[Episode]) -> String {
+    let of_latest = found.latest.as_ref().map_or(&[][..], |latest| &latest.changes);
+    let mut parts: Vec<String> = Vec::new();
+    let mut named: Vec<&str> = Vec::new();
+    // Alarms of one parameter come before that of all together, which names the same changes.
+    let mut ordered: Vec<&Episode> = open.iter().collect();
+    ordered.sort_by_key(|episode| (episode.series.starts_with("structure:"), episode.opened_at));
+    for episode in ordered {
+        let is_joint = episode.series.starts_with("structure:");
+        match &episode.change {
+            Some(change) => {
+                let clear: Vec<&QuantityChange> = change
+                    .changes
+                    .iter()
+                    .filter(|c| c.is_clear() && (is_joint || c.name == episode.series))
+                    .filter(|c| !named.contains(&c.name.as_str()))
+                    .collect();
+                parts.extend(clear.iter().map(|c| of_process(c, change.onset)));
+                named.extend(clear.iter().map(|c| c.name.as_str()));
+            }
+            None if is_joint => {}
+            None => {
+                parts.push(of_batch(episode, of_latest.iter().find(|c| c.quantity == episode.series)));
+                named.push(&episode.series);
+            }
+        }
+    }
+    if parts.is_empty() {
+        if let Some(since) = open.iter().map(|episode| episode.opened_at).min() {
+            parts.push(format!("the parameters together have shifted towards damage since {}", since.day()));
+        }
+    }
+    let fits = !found.charts.get(FIT_SERIES).is_some_and(|state| state.in_episode());
+    if !fits {
+        parts.push("the simulation does not fit the measurements".to_owned());
+    }
+    let mut text = parts.join("; ");
+    text.push('.');
+    text
+}
+
+fn signed(percent: f64) -> String {
+    format!("{percent:+.1}").replace('-', "−")
+}
+
+/// The change of a quantity that the process of the reference does not explain.
+fn of_process(change: &QuantityChange, onset: Timestamp) -> String {
+    let [low, high] = change.interval.map(|end| signed(change.percent(end)));
+    let mut text = format!(
+        "{} {} % ({low} to {high} %) since {}",
+        change.name,
+        signed(change.percent(change.change)),
+        onset.day()
+    );
+    let explained = change.percent(change.explained);
+    if explained.abs() >= 0.05 {
+        let _ = write!(text, ", beside {} % that weather and seasons explain", signed(explained));
+    }
+    text
+}
+
+/// The change of a quantity in the latest batch, beside the opening of its alarm.
+fn of_batch(episode: &Episode, latest: Option<&RelativeChange>) -> String {
+    let name = episode.series.trim_start_matches("group:");
+    let since = episode.opened_at.day();
+    match latest {
+        None => format!("{name} has shifted towards damage, alarm since {since}"),
+        Some(RelativeChange { change, interval, .. }) => {
+            let interval = interval.map_or_else(String::new, |[low, high]| {
+                format!(" ({} to {} %)", signed(100.0 * low), signed(100.0 * high))
+            });
+            format!("{name} {} %{interval} in the latest batch, alarm since {since}", signed(100.0 * change))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::monitor::stored::LatestAssessment;
+    use crate::process::reference::LastingChange;
+    use crate::quantity::StructureId;
+    use crate::trust::TrustVerdict;
+
+    fn at(day: i64) -> Timestamp {
+        Timestamp::from_micros(1_780_000_000_000_000 + day * 86_400_000_000).unwrap()
+    }
+
+    fn digest() -> Digest {
+        Digest::of(&[b"model"])
+    }
+
+    /// A structure with a reference for its model, whose charts are all normal.
+    fn healthy() -> StructureOverview {
+        let latest = LatestAssessment {
+            batch_id: "b".to_owned(),
+            verdict: TrustVerdict::Accepted,
+            findings: 0,
+            exceeds: true,
+            worst: Some((0.4, "k1".to_owned())),
+            changes: Vec::new(),
+        };
+        StructureOverview {
+            id: StructureId::parse("bridge").unwrap(),
+            batches: 20,
+            last_measured_at: Some(at(20)),
+            last_received_at: Some(at(20)),
+            latest: Some(latest),
+            open_alarms: 0,
+            unacknowledged_alarms: 0,
+            silent: false,
+            undamaged_version: Some(1),
+            undamaged_model: Some(digest()),
+            charts: BTreeMap::from([
+                (FIT_SERIES.to_owned(), AlarmState::Normal),
+                ("k1".to_owned(), AlarmState::Normal),
+            ]),
+            waiting: 0,
+            waiting_since: None,
+        }
+    }
+
+    fn episode(series: &str, change: Option<LastingChange>) -> Episode {
+        Episode {
+            number: 1,
+            kind: "damage".to_owned(),
+            series: series.to_owned(),
+            undamaged_version: 1,
+            opened_at: at(15),
+            opened_batch: None,
+            ended_at: None,
+            withdrawn: false,
+            peak_shift: 5.0,
+            noticed_at: at(15),
+            acknowledgement: None,
+            diagnosis: None,
+            change,
+            superseded_by: None,
+            continues: None,
+        }
+    }
+
+    #[test]
+    fn a_probability_of_damage_above_that_of_the_reference_is_no_verdict() {
+        let found = verdict(&healthy(), Some(&digest()), &[], at(21));
+        assert_eq!(found.condition, Condition::Normal);
+        assert_eq!(found.sentence, "No alarm: all charts are inside their limits.");
+    }
+
+    #[test]
+    fn without_a_reference_of_the_model_in_use_nothing_is_judged() {
+        let none = StructureOverview { undamaged_version: None, undamaged_model: None, ..healthy() };
+        let other = StructureOverview { undamaged_model: Some(Digest::of(&[b"another"])), ..healthy() };
+        let fresh =
+            StructureOverview { charts: BTreeMap::from([(FIT_SERIES.to_owned(), AlarmState::Normal)]), ..healthy() };
+        for (found, words) in [(none, "no undamaged reference"), (other, "another trained model"), (fresh, "no batch")]
+        {
+            let found = verdict(&found, Some(&digest()), &[], at(21));
+            assert_eq!(found.condition, Condition::NotJudged, "{words}");
+            assert!(found.sentence.contains(words), "{}", found.sentence);
+        }
+    }
+
+    #[test]
+    fn batches_that_wait_are_counted_and_one_that_has_just_arrived_is_not() {
+        let mut found = StructureOverview { batches: 2_920, waiting: 2_420, waiting_since: Some(at(3)), ..healthy() };
+        let judging = verdict(&found, Some(&digest()), &[], at(21));
+        assert_eq!(judging.condition, Condition::Judging);
+        assert_eq!(judging.sentence, "Judging: 500 of 2920 batches are assessed.");
+        (found.waiting, found.waiting_since) = (1, Some(at(21)));
+        assert_eq!(verdict(&found, Some(&digest()), &[], at(21)).condition, Condition::Normal);
+        // An alarm is not hidden by batches that wait.
+        found = StructureOverview { waiting: 20, waiting_since: Some(at(3)), ..found };
+        found.charts.insert("k1".to_owned(), AlarmState::Alarming);
+        let alarm = verdict(&found, Some(&digest()), &[episode("k1", None)], at(21));
+        assert_eq!(alarm.condition, Condition::Alarming);
+        assert!(alarm.sentence.contains("2900 of 2920 batches are assessed"), "{}", alarm.sentence);
+    }
+
+    #[test]
+    fn an_alarm_is_a_change_with_its_interval_and_its_onset() {
+        let mut found = healthy();
+        found.charts.insert("k1".to_owned(), AlarmState::Alarming);
+        let change = |name: &str, change: f64, half: f64, explained: f64| QuantityChange {
+            name: name.to_owned(),
+            unit: "N/m".to_owned(),
+            change,
+            interval: [change - half, change + half],
+            reference_mean: 100.0,
+            explained,
+        };
+        let lasting = LastingChange {
+            fast: true,
+            onset: at(14),
+            onset_interval: [at(13), at(14)],
+            changes: vec![change("k1", -7.9, 0.5, 0.4), change("k2", -0.1, 0.5, 0.0)],
+            not_seen: Vec::new(),
+        };
+        let open = [episode("structure:joint", Some(lasting.clone())), episode("k1", Some(lasting))];
+        let alarm = verdict(&found, Some(&digest()), &open, at(21));
+        assert_eq!(
+            alarm.sentence,
+            "k1 −7.9 % (−8.4 to −7.4 %) since 11 June 2026, beside +0.4 % that weather and seasons explain."
+        );
+
+        let changes = vec![RelativeChange { quantity: "k1".to_owned(), change: -0.08, interval: Some([-0.1, -0.06]) }];
+        found.latest.as_mut().unwrap().changes = changes;
+        let alarm = verdict(&found, Some(&digest()), &[episode("k1", None)], at(21));
+        assert_eq!(alarm.sentence, "k1 −8.0 % (−10.0 to −6.0 %) in the latest batch, alarm since 12 June 2026.");
+    }
+}

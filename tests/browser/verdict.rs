@@ -1,0 +1,165 @@
+//! The verdict about a structure: the page and the JSON say the same, from the alarm charts alone.
+
+use serde_json::{json, Value};
+
+use crate::chromium::Page;
+use crate::dashboard::{at, turn};
+use crate::helpers::{created, eventually, measurements, spawn, Service};
+
+const HEALTHY: [f64; 3] = [4.0, 5.0, 6.0];
+const DAY_S: usize = 86_400;
+const REFERENCE: &str = "/v1/structures/three-dof/reference";
+
+/// The number of pixels of the heat map in the red of alarms.
+const RED_PIXELS: &str = "(() => {
+    const probe = document.body.appendChild(document.createElement('span'));
+    probe.style.color = 'var(--bad)';
+    const red = getComputedStyle(probe).color.match(/[0-9.]+/g).slice(0, 3).map(Number);
+    probe.remove();
+    const canvas = document.querySelector('[data-figure=\"heat\"] canvas');
+    const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+    let found = 0;
+    for (let i = 0; i < data.length; i += 4)
+        if (data[i + 3] === 255 && red.every((value, c) => Math.abs(data[i + c] - value) < 3)) found += 1;
+    return found;
+})()";
+
+/// Everything on the page that has the colour or the sign of an alarm.
+const ALARMING: &str =
+    "[...document.querySelectorAll('.bad, .chip.bad')].filter((e) => e.offsetParent !== null).map((e) => e.textContent)";
+
+async fn post(service: &Service, k: [f64; 3], count: usize, day: usize) -> Value {
+    service.post_batch("three-dof", &measurements(k, count, day * DAY_S)).await
+}
+
+async fn overview(service: &Service) -> Value {
+    let all = service.read("/v1/overview").await;
+    all["items"].as_array().unwrap().iter().find(|item| item["id"] == "three-dof").unwrap().clone()
+}
+
+fn visit(page: &mut Page, service: &Service) {
+    page.visit(&at(service, "#/structures/three-dof"));
+    page.wait_for("document.querySelector('.lead.verdict') !== null");
+}
+
+fn verdict_on(page: &mut Page) -> String {
+    page.evaluate("document.querySelector('.lead.verdict').textContent").as_str().unwrap().to_owned()
+}
+
+/// Change and interval in a sentence such as `k2 −8.0 % (−10.0 to −6.0 %) …`, in per cent.
+fn change_in(sentence: &str, name: &str) -> [f64; 3] {
+    let after = sentence.split(&format!("{name} ")).nth(1).unwrap_or_else(|| panic!("{name} is not in: {sentence}"));
+    let plain = after.replace('−', "-");
+    let numbers = plain.split(|c: char| !(c.is_ascii_digit() || c == '.' || c == '-' || c == '+'));
+    let values: Vec<f64> = numbers.filter_map(|text| text.parse().ok()).take(3).collect();
+    values.try_into().unwrap_or_else(|_| panic!("no change with an interval: {sentence}"))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_an_undamaged_reference_nothing_is_called_normal() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    for day in 0..3 {
+        post(&service, HEALTHY, 10, day).await;
+    }
+    let item = overview(&service).await;
+    assert_eq!(item["state"], "not_judged", "{item}");
+    assert!(item["verdict"].as_str().unwrap().contains("no undamaged reference"), "{item}");
+    let mut page = Page::open();
+    page.visit(&at(&service, ""));
+    page.wait_for("document.querySelector('tr[data-structure=three-dof]')?.textContent.includes('Not judged')");
+    visit(&mut page, &service);
+    assert!(verdict_on(&mut page).contains("no undamaged reference"));
+    let text = page.evaluate("document.body.textContent");
+    for word in ["Normal", "inside their limits", "within all limits"] {
+        assert!(!text.as_str().unwrap().contains(word), "{word}");
+    }
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_healthy_structure_looks_healthy_although_a_probability_exceeds_that_of_the_reference() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    let mut ids = Vec::new();
+    for day in 0..6 {
+        ids.push(post(&service, HEALTHY, 20, day).await["batch"].clone());
+    }
+    created(service.post(REFERENCE, &json!({ "batches": ids })).await).await;
+    // One of some healthy batches of few measurements shows a probability of damage above 5 %; that one shall be the latest.
+    let mut found = None;
+    for day in 6..60 {
+        if post(&service, HEALTHY, 3, day).await["assessment"]["exceeds"] == true {
+            found = Some(overview(&service).await);
+            break;
+        }
+    }
+    let item = found.expect("a healthy batch with a probability of damage above that of the reference");
+    assert_eq!((&item["latest"]["exceeds"], &item["open_alarms"]), (&json!(true), &json!(0)), "{item}");
+    assert!(["normal", "pending"].contains(&item["state"].as_str().unwrap()), "{item}");
+    let mut page = Page::open();
+    page.look("light", 1280);
+    page.visit(&at(&service, ""));
+    page.wait_for("document.querySelector('tr[data-structure=three-dof] .meter') !== null");
+    assert_eq!(page.evaluate(ALARMING), json!([]), "the fleet");
+    visit(&mut page, &service);
+    page.wait_for("document.querySelector('[data-figure=\"heat\"] canvas') !== null");
+    assert_eq!(verdict_on(&mut page).trim(), item["verdict"].as_str().unwrap());
+    assert_eq!(page.evaluate(ALARMING), json!([]), "the structure");
+    assert_eq!(page.evaluate(RED_PIXELS), json!(0), "the heat map");
+    assert!(!page.evaluate("document.body.textContent").as_str().unwrap().contains("above the limit"));
+
+    // The same page of a structure that is damaged, so that the checks above can fail.
+    for day in 60..63 {
+        post(&service, [4.0, 4.4, 6.0], 20, day).await;
+    }
+    page.wait_for("document.querySelector('.headline').textContent.includes('Alarm')");
+    page.wait_for(&format!("{RED_PIXELS} > 0"));
+    assert_ne!(page.evaluate(ALARMING), json!([]));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_event_is_one_alarm_however_often_the_reference_is_declared() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    let mut ids = Vec::new();
+    for day in 0..4 {
+        ids.push(post(&service, HEALTHY, 20, day).await["batch"].clone());
+    }
+    for version in 1..4 {
+        created(service.post(REFERENCE, &json!({ "batches": ids })).await).await;
+        if version == 1 {
+            for (day, k2) in [(4, 5.0), (5, 5.0), (6, 4.5), (7, 4.5), (8, 4.5)] {
+                post(&service, [4.0, k2, 6.0], 20, day).await;
+            }
+        }
+        let judged = eventually("the batches are judged with the newest reference", async || {
+            let item = overview(&service).await;
+            (item["waiting_batches"] == 0 && item["state"] == "alarming").then_some(item)
+        })
+        .await;
+        let sentence = judged["verdict"].as_str().unwrap();
+        let [change, low, high] = change_in(sentence, "k2");
+        assert!(low < change && change < high, "{sentence}");
+        assert!((low..high).contains(&-10.0), "version {version}: {sentence}");
+    }
+    let alarms = "/v1/structures/three-dof/alarms";
+    let now = service.read(alarms).await["items"].as_array().unwrap().clone();
+    assert_eq!(now.len(), 1, "{now:?}");
+    assert_eq!((&now[0]["state"], &now[0]["undamaged_version"]), (&json!("open"), &json!(3)), "{now:?}");
+    let all = service.read(&format!("{alarms}?superseded=true")).await["items"].as_array().unwrap().clone();
+    let states: Vec<&str> = all.iter().map(|alarm| alarm["state"].as_str().unwrap()).collect();
+    assert_eq!(states, ["open", "superseded", "superseded"], "{all:?}");
+    assert_eq!(now[0]["continues"], all[1]["alarm"], "{all:?}");
+    assert_eq!(all[1]["superseded_by"], 3, "{all:?}");
+    let series = service.read("/v1/structures/three-dof/series").await;
+    assert_eq!(series["alarms"].as_array().unwrap().len(), 1, "{series}");
+
+    let mut page = Page::open();
+    visit(&mut page, &service);
+    page.wait_for("document.querySelectorAll('#alarms > div > ul.alarms > li').length === 1");
+    page.wait_for("document.querySelector('#alarms details summary').textContent.includes('2 alarms of earlier')");
+    let [change, low, high] = change_in(&verdict_on(&mut page), "k2");
+    assert!(low < change && change < high);
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
