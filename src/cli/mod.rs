@@ -17,6 +17,7 @@ mod output;
 mod parameter;
 mod reload;
 mod remote;
+mod report;
 mod reproduce;
 mod retention;
 mod serve;
@@ -68,6 +69,8 @@ enum Command {
     Diagnose(diagnose::DiagnoseArgs),
     /// Diagnose, add the causes to a new version of the structure, and train its model.
     Extend(diagnose::ExtendArgs),
+    /// Write the condition report of a structure, as a page made for print.
+    Report(report::ReportArgs),
     /// Print the configuration.
     Config {
         #[command(subcommand)]
@@ -173,6 +176,7 @@ pub fn run() -> anyhow::Result<()> {
         Command::Restore(args) => block_on(backup::restore(&args)),
         Command::Export(args) => block_on(archive::export(&args)),
         Command::Import(args) => block_on(archive::import(&args)),
+        Command::Report(args) => block_on(report::report(&args)),
         Command::Retention(args) => block_on(retention::retention(&args)),
     }
 }

@@ -4,17 +4,17 @@
 //! while it is sent, so that the memory needed does not depend on its size and no transaction stays open for a slow
 //! reader.
 
-use axum::body::{Body, Bytes};
+use axum::body::Bytes;
 use axum::extract::State;
-use axum::http::{header, HeaderMap};
+use axum::http::HeaderMap;
 use axum::response::{IntoResponse, Response};
 use axum::Json;
-use futures_util::stream::try_unfold;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::cell::{Cell, ColumnKind};
 use super::error::ApiError;
+use super::file_parts::{file, FileParts};
 use super::history::link_next;
 use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
 use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
@@ -128,8 +128,9 @@ pub async fn measurements(
     if format != Format::Json {
         page.limit = if format == Format::Parquet { ROW_GROUP } else { PAGE };
         let writer = Writer::new(format, &active)?;
+        let name = format!("{id}-measurements");
         let export = Export { records, structure: id, page, left: limit, writer };
-        return export.answer(format).await;
+        return file(export, format, &name).await;
     }
     page.limit = limit.unwrap_or(page.limit);
     let found = records.measurements(&id, &page).await?;
@@ -167,31 +168,8 @@ struct Export {
     writer: Writer,
 }
 
-/// A part of the file, and the state for the next part; `None` after the last.
-type Part = (Bytes, Option<Export>);
-
-impl Export {
-    async fn answer(self, format: Format) -> Result<Response, ApiError> {
-        let name = format!("attachment; filename=\"{}-measurements.{}\"", self.structure, format.name());
-        // The first part is made before the status is sent, so that an early error can be answered as a problem.
-        let first = self.part().await?;
-        let parts = try_unfold(Some(first), |part: Option<Part>| async {
-            let Some((bytes, rest)) = part else { return Ok(None) };
-            let next = match rest {
-                Some(rest) => Some(rest.part().await.map_err(|_| std::io::Error::other("the export failed"))?),
-                None => None,
-            };
-            Ok::<_, std::io::Error>(Some((bytes, next)))
-        });
-        let headers = [
-            (header::CONTENT_TYPE, format.content_type()),
-            (header::CONTENT_DISPOSITION, name.as_str()),
-            (header::CACHE_CONTROL, "no-store"),
-        ];
-        Ok((headers, Body::from_stream(parts)).into_response())
-    }
-
-    async fn part(mut self) -> Result<Part, ApiError> {
+impl FileParts for Export {
+    async fn part(mut self) -> Result<(Bytes, Option<Self>), ApiError> {
         self.page.limit = self.left.map_or(self.page.limit, |left| left.min(self.page.limit));
         let found = self.records.measurements(&self.structure, &self.page).await?;
         self.left = self.left.map(|left| left - found.len());

@@ -1,5 +1,6 @@
 //! `/v1/structures/{id}/history` and `/exceedances`: results of the batches over time.
 
+use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::{header, HeaderMap, HeaderValue};
 use axum::response::{IntoResponse, Response};
@@ -8,15 +9,18 @@ use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::answer::{HistoryItem, HISTORY_COLUMNS};
-use super::cell::Cell;
 use super::error::ApiError;
+use super::file_parts::{file, FileParts};
 use super::openapi::{Invalid, NotAcceptable, StructurePath, Unknown};
 use super::request::{page_limit, structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
 use super::table::{Format, TableWriter};
 use crate::monitor::stored::HistoryQuery;
-use crate::monitor::ActiveStructure;
+use crate::monitor::{ActiveStructure, Records};
 use crate::quantity::{StructureId, Timestamp};
+
+/// Number of batches that are read for a part of a file.
+const FILE_PAGE: usize = 500;
 
 /// Query of the history.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -32,7 +36,7 @@ pub struct HistoryParams {
     /// Only this parameter, spring stiffness or group.
     #[param(min_length = 1, example = "k1")]
     parameter: Option<String>,
-    /// Maximum number of batches on the page. Default 100.
+    /// Maximum number of batches on the page, 100 by default, or in the file, all by default.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 1000)]
     limit: Option<String>,
     /// `next` of the previous page.
@@ -117,8 +121,9 @@ struct ExceedanceItem {
 #[utoipa::path(
     get, path = "/v1/structures/{id}/history", tag = "results", operation_id = "read_history",
     summary = "Batches over time",
-    description = "Batches with their current assessments, ordered by the time of their first measurement, in pages; the `Link` \
-                   header has the path of the next page. CSV and Parquet have one row for each batch and parameter.",
+    description = "Batches with their current assessments, ordered by the time of their first measurement. JSON is sent in pages, and the \
+                   `Link` header has the path of the next page; CSV and Parquet are sent as one file for the whole interval, with one row \
+                   for each batch and parameter.",
     params(StructurePath, HistoryParams),
     responses(
         (status = 200, description = "A page", content(
@@ -140,7 +145,7 @@ pub async fn history(
     let window = Window::of(query.from.as_deref(), query.to.as_deref())?;
     let after = query.cursor.as_deref().map(parse_cursor).transpose()?;
     let limit = page_limit(query.limit.as_deref())?;
-    let page = HistoryQuery {
+    let mut page = HistoryQuery {
         from: window.from,
         to: window.to,
         parameter: query.parameter.clone(),
@@ -148,18 +153,18 @@ pub async fn history(
         after: after.map(|(time, batch, _)| (time, batch)),
         after_quantity: None,
     };
+    if format != Format::Json {
+        page.limit = FILE_PAGE;
+        let records = shared.monitor.records().clone();
+        let name = format!("{id}-history");
+        let left = query.limit.as_ref().map(|_| limit);
+        let table = TableWriter::new(format, &HISTORY_COLUMNS)?;
+        return file(HistoryFile { records, structure: id, page, left, table }, format, &name).await;
+    }
     let entries = shared.monitor.records().history(&id, &page).await?;
     let next = (entries.len() == limit).then(|| entries.last().map(|e| cursor(e.measured_from, &e.batch_id))).flatten();
     let items: Vec<HistoryItem> = entries.into_iter().map(HistoryItem::from).collect();
-    let mut response = if format == Format::Json {
-        Json(HistoryPage { structure: id.clone(), items, next: next.clone() }).into_response()
-    } else {
-        let rows: Vec<Vec<Cell>> = items.iter().flat_map(HistoryItem::rows).collect();
-        let mut table = TableWriter::new(format, &HISTORY_COLUMNS)?;
-        let text = table.rows(rows)?;
-        let end = table.end()?;
-        ([(header::CONTENT_TYPE, format.content_type())], [text, end].concat()).into_response()
-    };
+    let mut response = Json(HistoryPage { structure: id.clone(), items, next: next.clone() }).into_response();
     let given = [
         ("from", &query.from),
         ("to", &query.to),
@@ -169,6 +174,36 @@ pub async fn history(
     ];
     link_next(&mut response, &format!("/v1/structures/{id}/history"), &given, next.as_deref());
     Ok(response)
+}
+
+/// The history as a file that is being sent.
+struct HistoryFile {
+    records: Records,
+    structure: StructureId,
+    /// The next page to read.
+    page: HistoryQuery,
+    /// Number of requested batches that are still to be sent; `None` for all.
+    left: Option<usize>,
+    table: TableWriter,
+}
+
+impl FileParts for HistoryFile {
+    async fn part(mut self) -> Result<(Bytes, Option<Self>), ApiError> {
+        self.page.limit = self.left.map_or(FILE_PAGE, |left| left.min(FILE_PAGE));
+        let found = self.records.history(&self.structure, &self.page).await?;
+        self.left = self.left.map(|left| left - found.len());
+        let last = found.len() < self.page.limit || self.left == Some(0);
+        self.page.after = found.last().map(|entry| (entry.measured_from, entry.batch_id.clone())).or(self.page.after);
+        let Self { records, structure, page, left, mut table } = self;
+        // Writing hundreds of rows takes milliseconds, which must not block an async thread.
+        let write = move || {
+            let items: Vec<HistoryItem> = found.into_iter().map(HistoryItem::from).collect();
+            let bytes = table.rows(items.iter().flat_map(HistoryItem::rows).collect())?;
+            Ok::<_, ApiError>(if last { ([bytes, table.end()?].concat(), None) } else { (bytes, Some(table)) })
+        };
+        let (bytes, table) = tokio::task::spawn_blocking(write).await.map_err(|e| ApiError::internal(&e))??;
+        Ok((bytes.into(), table.map(|table| Self { records, structure, page, left, table })))
+    }
 }
 
 /// `GET /v1/structures/{id}/exceedances`: probabilities of damage above the threshold probability, newest first.

@@ -7,6 +7,7 @@ mod audit;
 mod batches;
 mod bulk;
 mod cell;
+mod condition_report;
 mod dashboard;
 mod diagnoses;
 mod docs;
@@ -14,6 +15,7 @@ mod error;
 mod events;
 mod explorer;
 mod export;
+mod file_parts;
 mod history;
 mod observe;
 mod openapi;
@@ -30,6 +32,7 @@ mod series;
 pub mod server;
 mod settings;
 mod shared;
+mod structure_metrics;
 mod structures;
 mod table;
 #[cfg(test)]
@@ -103,6 +106,7 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(diagnoses::read))
         .routes(routes!(diagnoses::report))
         .routes(routes!(diagnoses::extend))
+        .routes(routes!(condition_report::report))
         .routes(routes!(views::overview))
         .routes(routes!(views::jobs))
         .routes(routes!(events::events))
@@ -144,6 +148,7 @@ pub fn router(service: Service, settings: &HttpSettings) -> Router {
         streams: Arc::new(Semaphore::new(events::MOST_STREAMS)),
         series: Arc::new(Semaphore::new(series::MOST_AT_A_TIME)),
         access: access.clone(),
+        metrics_structures: settings.metrics_structures,
     };
     let (operations, mut document) = api().split_for_parts();
     openapi::complete(&mut document);

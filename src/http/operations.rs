@@ -9,9 +9,11 @@ use tracing::error;
 use utoipa::ToSchema;
 
 use super::shared::Shared;
+use super::structure_metrics::{self, StructureState};
+use super::verdict::Judged;
 use crate::baseline::library::Refusal;
 use crate::monitor::stored::schema_version;
-use crate::monitor::Health;
+use crate::monitor::{Error, Health};
 
 /// The process is running.
 #[derive(Debug, Serialize, ToSchema)]
@@ -80,7 +82,8 @@ pub async fn ready(State(shared): State<Shared>) -> Response {
 /// sees it without calling `/readyz`. The route also answers if the database cannot be read.
 #[utoipa::path(
     get, path = "/metrics", tag = "operations", operation_id = "metrics",
-    summary = "Metrics", description = "Metrics in the text format of Prometheus.",
+    summary = "Metrics",
+    description = "Metrics in the text format of Prometheus: of the service, and of each structure with its state, newest values and charts.",
     responses((status = 200, description = "Prometheus text", body = String, content_type = "text/plain"))
 )]
 pub async fn metrics(State(shared): State<Shared>) -> Response {
@@ -90,8 +93,33 @@ pub async fn metrics(State(shared): State<Shared>) -> Response {
     if let Err(failure) = shared.monitor.upkeep().set_gauges().await {
         error!(error = %failure, "Could not count what is stored: {failure}");
     }
-    let text = shared.metrics.render();
+    let mut text = shared.metrics.render();
+    match of_structures(&shared).await {
+        Ok(structures) => text.push_str(&structures),
+        Err(failure) => {
+            error!(error = %failure, "Could not read the values of the structures for the metrics: {failure}");
+        }
+    }
     ([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
+}
+
+/// Metrics of the structures, as many as the settings allow.
+async fn of_structures(shared: &Shared) -> Result<String, Error> {
+    let most = shared.metrics_structures;
+    if most == 0 {
+        return Ok(String::new());
+    }
+    let state = |judged: Judged| StructureState {
+        structure: judged.found.id,
+        condition: judged.verdict.condition,
+        batches: judged.found.batches,
+        waiting_batches: judged.found.waiting,
+        open_alarms: judged.found.open_alarms,
+        last_measured_at: judged.found.last_measured_at,
+    };
+    let states: Vec<StructureState> = Judged::all(&shared.monitor).await?.into_iter().take(most).map(state).collect();
+    let (quantities, points) = shared.monitor.records().latest(most).await?;
+    Ok(structure_metrics::text(&states, &quantities, &points))
 }
 
 /// `GET /version`: versions of the program and of SQLite.

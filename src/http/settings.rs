@@ -22,6 +22,8 @@ pub struct HttpSettings {
     pub drain_s: u64,
     /// Addresses and networks of the proxies whose `X-Forwarded-For` header is trusted.
     pub trusted_proxies: Vec<String>,
+    /// Maximum number of structures with metrics of their own in `GET /metrics`; 0 disables them.
+    pub metrics_structures: usize,
     /// Rate limits of each client.
     pub rate_limit: RateLimitSettings,
 }
@@ -37,6 +39,7 @@ impl Default for HttpSettings {
             max_connections: 1_024,
             drain_s: 30,
             trusted_proxies: Vec::new(),
+            metrics_structures: 100,
             rate_limit: RateLimitSettings::default(),
         }
     }

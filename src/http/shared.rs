@@ -22,4 +22,6 @@ pub struct Shared {
     /// Permits for reading a series.
     pub(super) series: Arc<Semaphore>,
     pub(super) access: AccessControl,
+    /// Maximum number of structures with metrics of their own.
+    pub(super) metrics_structures: usize,
 }

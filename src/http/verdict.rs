@@ -3,13 +3,16 @@
 //! A probability of damage above that of the reference is no verdict: one of twenty healthy batches shows it.
 
 use std::fmt::Write as _;
+use std::sync::Arc;
 
 use serde::Serialize;
 use utoipa::ToSchema;
 
 use crate::alarm::chart::FIT_SERIES;
 use crate::alarm::machine::State as AlarmState;
+use crate::baseline::Baseline;
 use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
+use crate::monitor::{Error, Monitor};
 use crate::process::reference::QuantityChange;
 use crate::quantity::{Digest, Timestamp};
 
@@ -40,6 +43,23 @@ pub(super) enum Condition {
     Normal,
 }
 
+impl Condition {
+    /// Its name in answers and metrics.
+    pub(super) const fn as_str(self) -> &'static str {
+        match self {
+            Self::Alarming => "alarming",
+            Self::Recovering => "recovering",
+            Self::Silent => "silent",
+            Self::NoModel => "no_model",
+            Self::Unassessed => "unassessed",
+            Self::Judging => "judging",
+            Self::NotJudged => "not_judged",
+            Self::Pending => "pending",
+            Self::Normal => "normal",
+        }
+    }
+}
+
 /// The verdict about a structure.
 #[derive(Debug)]
 pub(super) struct Verdict {
@@ -47,12 +67,45 @@ pub(super) struct Verdict {
     pub condition: Condition,
     /// The verdict in one or two sentences: what has changed by how much since when, or why there is no verdict.
     pub sentence: String,
+    /// Opening of the oldest open damage alarm.
+    pub alarm_since: Option<Timestamp>,
+}
+
+/// A structure with its verdict.
+pub(super) struct Judged {
+    pub found: StructureOverview,
+    /// The trained model in use, or why there is none.
+    pub model: Result<Arc<Baseline>, String>,
+    pub verdict: Verdict,
+}
+
+impl Judged {
+    /// All structures, by id.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub(super) async fn all(monitor: &Monitor) -> Result<Vec<Self>, Error> {
+        let mut open = monitor.alarms().open_damage().await?;
+        let now = Timestamp::now();
+        let judged = |found: StructureOverview| {
+            let active = monitor.structure(&found.id).map_err(|refused| refused.to_string());
+            let model = active.and_then(|active| active.baseline.clone());
+            let open = open.remove(&found.id).unwrap_or_default();
+            let verdict = verdict(&found, model.as_ref().ok().map(|model| model.digest()), &open, now);
+            Self { found, model, verdict }
+        };
+        Ok(monitor.records().overview().await?.into_iter().map(judged).collect())
+    }
 }
 
 /// The verdict about a structure at a time: `model` is the digest of the trained model in use, `open` are its open damage alarms.
-pub(super) fn verdict(found: &StructureOverview, model: Option<&Digest>, open: &[Episode], now: Timestamp) -> Verdict {
+fn verdict(found: &StructureOverview, model: Option<&Digest>, open: &[Episode], now: Timestamp) -> Verdict {
     let condition = condition(found, model, now);
-    Verdict { sentence: sentence(found, model, open, condition), condition }
+    Verdict {
+        sentence: sentence(found, model, open, condition),
+        condition,
+        alarm_since: open.iter().map(|episode| episode.opened_at).min(),
+    }
 }
 
 fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) -> Condition {
@@ -344,6 +397,7 @@ mod tests {
         };
         let open = [episode("structure:joint", Some(lasting.clone())), episode("k1", Some(lasting))];
         let alarm = verdict(&found, Some(&digest()), &open, at(21));
+        assert_eq!(alarm.alarm_since, Some(at(15)));
         assert_eq!(
             alarm.sentence,
             "k1 −7.9 % (−8.4 to −7.4 %) since 11 June 2026, beside +0.4 % that weather and seasons explain."

@@ -1,7 +1,5 @@
 //! Views for the dashboard: `/v1/overview`, `/v1/jobs`, `/v1/structures/{id}/batches/{batch}/detail`.
 
-use std::sync::Arc;
-
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use axum::Json;
@@ -12,13 +10,10 @@ use super::error::ApiError;
 use super::openapi::{BatchPath, Busy, Conflict, Invalid, Unknown};
 use super::request::{structure_id, ApiPath};
 use super::shared::Shared;
-use super::verdict::{verdict, Condition, Verdict};
+use super::verdict::{Condition, Judged};
 use crate::access::Grant;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
-use crate::monitor::stored::{
-    DiagnosisTrigger, Episode, JobKind, JobRecord, JobState, LatestAssessment, StructureOverview,
-};
-use crate::monitor::ActiveStructure;
+use crate::monitor::stored::{DiagnosisTrigger, JobKind, JobRecord, JobState, LatestAssessment};
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
 
@@ -160,33 +155,18 @@ struct ModeFrequencies {
     responses((status = 200, description = "The structures by id", body = Overview))
 )]
 pub async fn overview(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
-    let mut open = shared.monitor.alarms().open_damage().await?;
-    let mut item = |found: StructureOverview| {
-        let active = shared.monitor.structure(&found.id).map_err(|refused| refused.to_string());
-        let open = open.remove(&found.id).unwrap_or_default();
-        item(found, active, &open)
-    };
-    let items = shared
-        .monitor
-        .records()
-        .overview()
-        .await?
-        .into_iter()
-        .filter(|found| grant.may_see(&found.id))
-        .map(&mut item)
-        .collect();
+    let judged = Judged::all(&shared.monitor).await?;
+    let items = judged.into_iter().filter(|judged| grant.may_see(&judged.found.id)).map(item).collect();
     let jobs_running = shared.monitor.jobs().running();
     Ok(Json(Overview { items, jobs_running }).into_response())
 }
 
-fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>, open: &[Episode]) -> OverviewItem {
-    let baseline = active.and_then(|active| active.baseline.clone());
-    let (baseline, model_missing) = (baseline.as_ref().ok(), baseline.as_ref().err());
-    let Verdict { condition, sentence } = verdict(&found, baseline.map(|b| b.digest()), open, Timestamp::now());
+fn item(Judged { found, model, verdict }: Judged) -> OverviewItem {
+    let (baseline, model_missing) = (model.as_ref().ok(), model.as_ref().err());
     OverviewItem {
-        state: condition,
-        verdict: sentence,
-        alarm_since: open.iter().map(|episode| episode.opened_at).min(),
+        state: verdict.condition,
+        verdict: verdict.sentence,
+        alarm_since: verdict.alarm_since,
         waiting_batches: found.waiting,
         model_digest: baseline.map(|b| b.digest().to_string()),
         model_missing: model_missing.cloned(),

@@ -9,9 +9,9 @@ use crate::assessment::{detail, draw, Assessment, BatchDetail, BatchState};
 use crate::quantity::{Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
-    BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, MeasurementQuery, QuantitySeries,
-    ReferenceRecord, ReferenceVersion, SeriesWindow, StoredChartPoint, StoredMeasurement, StructureOverview,
-    StructureSummary, TrustMark,
+    BatchRecord, ChartSeries, Exceedance, Extent, HistoryEntry, HistoryQuery, LatestPoint, LatestQuantity,
+    MeasurementQuery, QuantitySeries, ReferenceRecord, ReferenceVersion, SeriesWindow, StoredChartPoint,
+    StoredMeasurement, StructureOverview, StructureSummary, TrustMark,
 };
 
 /// A batch with its results.
@@ -97,6 +97,15 @@ impl Records {
     /// [`Error::Store`].
     pub async fn overview(&self) -> Result<Vec<StructureOverview>, Error> {
         Ok(self.assessor.store.overview().structures().await?)
+    }
+
+    /// For the first `structures` structures by id: the quantities of the latest assessed batch, and the last points of the alarm charts.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn latest(&self, structures: usize) -> Result<(Vec<LatestQuantity>, Vec<LatestPoint>), Error> {
+        let overview = self.assessor.store.overview();
+        Ok((overview.latest_quantities(structures).await?, overview.latest_points(structures).await?))
     }
 
     /// The newest undamaged reference of a structure.

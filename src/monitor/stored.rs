@@ -3,8 +3,8 @@
 pub use crate::store::{
     backup, schema_version, Acknowledgement, AuditEntry, AuditQuery, BatchRecord, ChartMark, ChartSeries, Delivery,
     DeliveryState, DiagnosisRecord, DiagnosisTrigger, Episode, EpisodeDiagnosis, EpisodeQuery, Error, EventFilter,
-    Exceedance, HistoryEntry, HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, MaintenanceWindow,
-    MeasurementPlace, MeasurementQuery, NewAuditEntry, OpenAlarms, PutStructure, QuantityMark, QuantitySeries,
-    QuarantinedMessage, ReferenceRecord, ReferenceVersion, RelativeChange, SeriesWindow, StoredChartPoint,
-    StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
+    Exceedance, HistoryEntry, HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, LatestPoint,
+    LatestQuantity, MaintenanceWindow, MeasurementPlace, MeasurementQuery, NewAuditEntry, OpenAlarms, PutStructure,
+    QuantityMark, QuantitySeries, QuarantinedMessage, ReferenceRecord, ReferenceVersion, RelativeChange, SeriesWindow,
+    StoredChartPoint, StoredMeasurement, StructureOverview, TrustMark, WebhookRecord,
 };

@@ -70,6 +70,7 @@ const TABLE: [(&str, &str, Needs, About); 65] = [
     ("GET", "/v1/jobs", Read, List),
     ("GET", "/v1/events", Read, List),
     ("GET", "/v1/structures/{}/series", Read, Structure),
+    ("GET", "/v1/structures/{}/report", Read, Structure),
     ("GET", "/v1/structures/{}/batches/{}/detail", Read, Structure),
     ("GET", "/v1/structures/{}/measurements", Read, Structure),
     ("GET", "/v1/structures/{}/export", Read, Structure),

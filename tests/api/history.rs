@@ -73,6 +73,22 @@ async fn csv_has_a_row_for_each_batch_and_parameter() {
 }
 
 #[tokio::test]
+async fn a_csv_file_has_the_whole_window_and_not_one_page_of_it() {
+    let (service, _folder) = spawn();
+    for day in 0..120 {
+        service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 1, 86_400 * day)).await;
+    }
+    let file = async |query: &str| {
+        let response = service.get(&format!("{HISTORY}?format=csv{query}")).send().await.unwrap();
+        assert!(response.headers().get("link").is_none());
+        response.text().await.unwrap()
+    };
+    let whole = file("").await;
+    assert_eq!(whole.lines().count(), 1 + 3 * 120);
+    assert_eq!(file("&limit=7").await, whole.lines().take(1 + 3 * 7).map(|l| format!("{l}\n")).collect::<String>());
+}
+
+#[tokio::test]
 async fn exceedances_are_paged_newest_first() {
     let (service, _folder) = with_batches(6).await;
     let all = service.read("/v1/structures/three-dof/exceedances?parameter=k3").await;

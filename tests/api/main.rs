@@ -6,6 +6,7 @@ mod automatic_diagnosis;
 mod bad_input;
 mod batches;
 mod bulk;
+mod condition_report;
 mod diagnosis;
 mod docs;
 mod export;

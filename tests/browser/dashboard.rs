@@ -136,7 +136,18 @@ async fn every_view_is_complete_quiet_and_accessible_in_both_themes_and_on_a_pho
         for figure in ["parameter-k1", "control", "heat", "trust", "tracks", "density-k1", "modes"] {
             page.wait_for(&format!("document.querySelectorAll('[data-figure=\"{figure}\"] canvas').length > 0"));
         }
-        check_view(&mut page, &seen("structure"));
+        for section in ["condition", "tracks", "batch", "model", "diagnosis", "maintenance"] {
+            page.evaluate(&format!("document.querySelector('.jumps [data-section={section}]').click()"));
+            // A chart takes its width when it becomes visible.
+            page.wait_for("document.querySelectorAll('.jumps [aria-current]').length === 1");
+            page.wait_for(
+                "[...document.querySelectorAll('figure .plot')].filter((plot) => plot.offsetParent !== null)
+                 .every((plot) => { const c = plot.querySelector('canvas'); return !c || Math.abs(c.clientWidth - plot.clientWidth) < 2; })",
+            );
+            check_view(&mut page, &seen(&format!("structure, {section}")));
+            let screens = page.evaluate("document.documentElement.scrollHeight / 900").as_f64().unwrap();
+            println!("{}: {screens:.1} screens of 900 px", seen(section));
+        }
 
         // A structure without measurements shows the next step.
         page.visit(&at(&service, "#/structures/rig"));
@@ -237,11 +248,54 @@ async fn everything_is_reached_and_done_by_keyboard() {
     tab_to(&mut page, |f| f["text"] == "Show as table");
     page.press("Enter");
     page.wait_for("document.querySelectorAll('[data-figure=control] .table-wrap tbody tr').length > 0");
+    tab_to(&mut page, |f| f["text"] == "Diagnosis");
+    page.press("Enter");
     tab_to(&mut page, |f| f["text"] == "Diagnose");
     page.press("Enter");
     page.wait_for("document.querySelector('dialog[open]')?.textContent.includes('held out')");
     page.press("Escape");
     page.wait_for("document.querySelector('dialog') === null");
+    assert_eq!(page.complaints(), Vec::<String>::new());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_address_says_what_is_shown_and_shows_it_again() {
+    let Some(_turn) = turn().await else { return };
+    let (service, _folder) = spawn();
+    let mut ids = Vec::new();
+    for day in 0..6 {
+        ids.push(post(&service, UNDAMAGED, day).await);
+    }
+    let mut page = Page::open();
+    page.look("light", 1280);
+    visit_structure(&mut page, &service);
+    assert_eq!(page.evaluate("location.hash"), json!("#/structures/three-dof"));
+    page.evaluate("document.querySelector('.jumps [data-section=batch]').click()");
+    page.evaluate(&format!(
+        "(() => {{ const picker = document.getElementById('batch-picker'); picker.value = '{}'; picker.onchange(); }})()",
+        ids[2]
+    ));
+    page.evaluate(
+        "[...document.querySelectorAll('.spans button')].find((b) => b.textContent === 'From … to …').click()",
+    );
+    page.wait_for("document.querySelector('dialog[open] input[name=from]') !== null");
+    page.evaluate("document.querySelector('input[name=from]').value = '2026-01-02T00:00'");
+    page.evaluate("document.querySelector('input[name=to]').value = '2026-01-05T00:00'");
+    page.evaluate("document.querySelector('dialog .primary').click()");
+    page.wait_for("document.querySelectorAll('#batch-picker option').length === 3");
+    let address = page.evaluate("location.hash").as_str().unwrap().to_owned();
+    for part in ["section=batch", "from=2026-01-0", &format!("batch={}", ids[2])] {
+        assert!(address.contains(part), "{part} is not in {address}");
+    }
+    // Another page, and back by the address alone.
+    page.visit(&at(&service, "#/jobs"));
+    page.wait_for("document.querySelector('[data-page=structure]') === null");
+    page.visit(&at(&service, &address));
+    page.wait_for("document.querySelectorAll('#batch-picker option').length === 3");
+    page.wait_for(&format!("document.getElementById('batch').textContent.includes('{}')", ids[2]));
+    assert_eq!(page.evaluate("document.getElementById('batch').offsetParent !== null"), json!(true));
+    assert_eq!(page.evaluate("document.getElementById('condition').offsetParent"), Value::Null);
+    assert_eq!(page.evaluate("location.hash"), json!(address));
     assert_eq!(page.complaints(), Vec::<String>::new());
 }
 

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use serde_json::Value;
+use serde_json::{json, Value};
 
-use crate::helpers::{measurements, repository, spawn};
+use crate::helpers::{command, created, measurements, repository, spawn, Service};
 
 /// Names of the program's metrics in a text, without the suffixes of histogram series.
 fn names(text: &str) -> BTreeSet<String> {
@@ -19,8 +19,20 @@ fn names(text: &str) -> BTreeSet<String> {
 
 async fn scraped() -> String {
     let (service, _folder) = spawn();
-    service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 0)).await;
+    watched(&service).await;
     service.read("/readyz").await;
+    text_of(&service).await
+}
+
+/// A reference of one batch, and a batch that is compared with it.
+async fn watched(service: &Service) {
+    let first = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 0)).await;
+    let reference = json!({ "batches": [first["batch"]] });
+    created(service.post("/v1/structures/three-dof/reference", &reference).await).await;
+    service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 86_400)).await;
+}
+
+async fn text_of(service: &Service) -> String {
     let response = service.get("/metrics").send().await.unwrap();
     assert_eq!(response.status(), 200);
     response.text().await.unwrap()
@@ -68,8 +80,8 @@ async fn metrics_say_what_the_service_is_and_what_it_holds() {
         let found = text.lines().find_map(|l| l.strip_prefix(line)).unwrap_or_else(|| panic!("no {line} in {text}"));
         found.trim().parse().unwrap()
     };
-    assert!((value("modalwatch_batches_received_total ") - 1.0).abs() < 0.5);
-    assert!((value("modalwatch_measurements_received_total ") - 4.0).abs() < 0.5);
+    assert!((value("modalwatch_batches_received_total ") - 2.0).abs() < 0.5);
+    assert!((value("modalwatch_measurements_received_total ") - 8.0).abs() < 0.5);
     assert!((value("modalwatch_pending_batches ") - 0.0).abs() < 0.5);
     assert!((value("modalwatch_structures ") - 3.0).abs() < 0.5);
     assert!((value("modalwatch_open_alarms{kind=\"damage\"} ") - 0.0).abs() < 0.5);
@@ -80,6 +92,48 @@ async fn metrics_say_what_the_service_is_and_what_it_holds() {
     let nameless: Vec<String> =
         names(&text).into_iter().filter(|name| !text.contains(&format!("# HELP {name} "))).collect();
     assert!(nameless.is_empty(), "metrics without a description: {nameless:?}");
-    // No label grows with the number of structures.
-    assert!(!text.contains("three-dof"), "{text}");
+}
+
+#[tokio::test]
+async fn the_values_of_each_structure_are_those_of_the_api_and_their_number_is_bounded() {
+    let (service, _folder) = spawn();
+    watched(&service).await;
+    let text = text_of(&service).await;
+    let value = |line: &str| -> f64 {
+        let found = text.lines().find_map(|l| l.strip_prefix(line)).unwrap_or_else(|| panic!("no {line} in {text}"));
+        found.trim().parse().unwrap()
+    };
+    let history = service.read("/v1/structures/three-dof/history?limit=1").await;
+    let parameters = history["items"][0]["assessment"]["parameters"].as_array().unwrap();
+    assert_eq!(parameters.len(), 3);
+    for p in parameters {
+        let labels = format!("{{structure=\"three-dof\",parameter={},unit=\"N/m\"}} ", p["name"]);
+        for (metric, key) in [
+            ("mean", "mean"),
+            ("relative_change", "relative_change"),
+            ("probability_of_damage", "probability_of_damage"),
+        ] {
+            let found = value(&format!("modalwatch_parameter_{metric}{labels}"));
+            assert!((found - p[key].as_f64().unwrap()).abs() < 1e-12, "{metric}{labels}");
+        }
+    }
+    let charts = service.read("/v1/structures/three-dof/charts").await;
+    for point in charts["items"].as_array().unwrap() {
+        let line = format!("modalwatch_chart_shift{{structure=\"three-dof\",chart={}}} ", point["chart"]);
+        assert!((value(&line) - point["shift"].as_f64().unwrap()).abs() < 1e-12, "{line}");
+    }
+    let overview = service.read("/v1/overview").await;
+    for item in overview["items"].as_array().unwrap() {
+        let line = format!("modalwatch_structure_state{{structure={},state={}}} ", item["id"], item["state"]);
+        assert!((value(&line) - 1.0).abs() < 1e-12, "{line}");
+    }
+    // As many structures as the settings allow, the first ones by id.
+    for (most, with, without) in [("0", None, "structure="), ("1", Some(&overview["items"][0]["id"]), "three-dof")] {
+        let folder = tempfile::tempdir().unwrap();
+        let service = Service::spawn(command(folder.path()).env("MODALWATCH__HTTP__METRICS_STRUCTURES", most));
+        watched(&service).await;
+        let text = text_of(&service).await;
+        assert!(!text.contains(without), "{most}: {text}");
+        assert!(with.is_none_or(|id| text.contains(&format!("structure={id}"))), "{most}: {text}");
+    }
 }

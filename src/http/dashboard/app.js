@@ -19,7 +19,7 @@ let view = null;
 
 const ROUTES = [
   [/^#?\/?$/, "fleet", () => overview()],
-  [/^#\/structures\/([^/]+)$/, "fleet", (id) => structure(id)],
+  [/^#\/structures\/([^/?]+)(?:\?(.*))?$/, "fleet", (id, query) => structure(id, new URLSearchParams(query))],
   [/^#\/diagnoses\/([^/]+)$/, "fleet", (id) => report(id)],
   [/^#\/jobs$/, "jobs", () => jobs()],
 ];
@@ -46,7 +46,7 @@ async function route() {
     );
     return;
   }
-  const opened = open(...location.hash.match(pattern).slice(1).map(decodeURIComponent));
+  const opened = open(...location.hash.match(pattern).slice(1).map((part) => part && decodeURIComponent(part)));
   view = opened;
   document.title = `${opened.title} – modalwatch`;
   fill(main, h("p", { class: "loading" }, "Loading…"));

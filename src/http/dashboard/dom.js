@@ -131,7 +131,7 @@ export function ask({ title, body, fields = [], confirm, danger = false, cancel 
       body,
       inputs,
       errorBox,
-      h("p", { class: "buttons" }, stop, send),
+      h("p", { class: "buttons" }, cancel !== null && stop, send),
     );
     const dialog = h("dialog", { "aria-labelledby": "dialog-title" }, form);
     form.addEventListener("submit", async (event) => {
@@ -155,6 +155,12 @@ export function ask({ title, body, fields = [], confirm, danger = false, cancel 
     document.body.append(dialog);
     dialog.showModal();
   });
+}
+
+/** A time in seconds as the value of a field for a local time, to the minute. */
+export function fieldTime(time_s) {
+  const time = new Date(1000 * time_s);
+  return new Date(time - 60000 * time.getTimezoneOffset()).toISOString().slice(0, 16);
 }
 
 /** Wraps `work` so that it runs at most once every `wait_ms`; calls in between are merged into one that runs afterwards. */

@@ -80,9 +80,30 @@ export function number(value, digits = 4) {
 
 const SUPERSCRIPT = Object.fromEntries([..."0123456789-"].map((c, i) => [c, "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"[i]]));
 
+const PREFIXES = { "-2": "µ", "-1": "m", 0: "", 1: "k", 2: "M", 3: "G", 4: "T" };
+
+/**
+ * The unit in which numbers of about `size` are easy to read, `{unit, factor}`: 3·10⁷ N/m are 30 MN/m. Only units that begin with newton
+ * or pascal take a prefix.
+ */
+export function scale(unit, size) {
+  const plain = { unit: unit && unit !== "1" ? unit : "", factor: 1 };
+  if (!/^(N|Pa)(\b|·|\/|$)/.test(unit ?? "") || !Number.isFinite(size) || size === 0) return plain;
+  const power = Math.min(4, Math.max(-2, Math.floor(Math.log10(Math.abs(size)) / 3 + 1e-9)));
+  return { unit: `${PREFIXES[power]}${unit}`, factor: 10 ** (-3 * power) };
+}
+
 /** A number with its unit. */
 export function quantity(value, unit, digits) {
-  return unit && unit !== "1" ? `${number(value, digits)} ${unit}` : number(value, digits);
+  if (value === null || value === undefined || !Number.isFinite(value)) return MISSING;
+  const { unit: shown, factor } = scale(unit, value);
+  return shown ? `${number(factor * value, digits)} ${shown}` : number(value, digits);
+}
+
+/** The difference of a value from a reference in per cent of the reference; values of the unit `ln` are logarithms of factors. */
+export function changePercent(value, reference, unit) {
+  if (unit === "ln") return 100 * Math.expm1(value - reference);
+  return 100 * (value / reference - 1);
 }
 
 /** A probability in per cent; values close to 0 or 1 are not rounded to 0 % or 100 %. */

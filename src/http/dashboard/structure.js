@@ -7,13 +7,13 @@ import { heat } from "./charts/heat.js";
 import { parameters } from "./charts/parameters.js";
 import { tracks } from "./charts/tracks.js";
 import { trust } from "./charts/trust.js";
-import { fill, h, icon, throttled } from "./dom.js";
+import { ask, fieldTime, fill, h, icon, throttled } from "./dom.js";
 import { age, count, local, percent, zone } from "./format.js";
 import { alarms } from "./sections/alarms.js";
 import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
 import { maintenance } from "./sections/maintenance.js";
-import { model, postLine } from "./sections/model.js";
+import { declare, model, postLine } from "./sections/model.js";
 import { stateChip } from "./states.js";
 
 const DAY_S = 86400;
@@ -29,8 +29,8 @@ const POINTS = 1000;
 /** Probability of damage of the undamaged reference itself as long as none specifies it. */
 const USUAL_PROBABILITY = 0.05;
 
-const JUMPS = [
-  ["alarms", "Alarms"],
+/** The sections of the page, of which one is shown at a time. */
+const SECTIONS = [
   ["condition", "Condition"],
   ["tracks", "Frequencies"],
   ["batch", "Batch"],
@@ -39,11 +39,19 @@ const JUMPS = [
   ["maintenance", "Maintenance"],
 ];
 
-export function structure(id) {
-  const state = { info: null, item: null, series: null };
+/** Sections that show the time span that is chosen. */
+const OVER_TIME = ["condition", "tracks", "batch"];
+
+/** `query` is the part of the address that says what is shown: `section`, `from`, `to`, `batch`. */
+export function structure(id, query) {
+  const state = { info: null, item: null, series: null, batch: query.get("batch") };
   const headline = h("div", { class: "headline" });
   const group = new TimeGroup(zoom);
-  const select = (chosen) => detail.select(chosen);
+  const select = async (chosen) => {
+    show("batch");
+    await detail.select(chosen);
+    document.getElementById("batch-title")?.focus();
+  };
   const figures = {
     parameters: parameters(group, select),
     heat: heat(group, select),
@@ -51,18 +59,24 @@ export function structure(id) {
     trust: trust(group, select),
     tracks: tracks(group),
   };
-  const detail = batch(id);
+  const detail = batch(id, (chosen) => {
+    state.batch = chosen;
+    writeAddress();
+  });
   const alarmList = alarms(id);
   const windows = maintenance(id, () => refresh.series());
   const diagnoses = diagnosis(id, () => refresh.all());
   const used = model(id, () => refresh.all());
   const spans = h("div", { class: "picker", role: "group", "aria-label": "Time span" });
   const spanText = h("span", { class: "fine" });
+  const asReference = h(
+    "button",
+    { type: "button", onclick: () => declare(id, () => refresh.all(), { period: shownSpan() }) },
+    "Use this time span as undamaged reference",
+  );
   const first = h("div", null);
-  const charts = h(
-    "div",
-    null,
-    section(
+  const sections = {
+    condition: section(
       "condition",
       "Condition",
       figures.parameters.element,
@@ -70,28 +84,36 @@ export function structure(id) {
       figures.heat.element,
       figures.trust.element,
     ),
-    section("tracks", "Frequencies", figures.tracks.element),
-    detail.element,
-  );
+    tracks: section("tracks", "Frequencies", figures.tracks.element),
+    batch: detail.element,
+    model: used.element,
+    diagnosis: h("div", { class: "stack" }, diagnoses.card, diagnoses.element),
+    maintenance: windows.element,
+  };
+  let shown = SECTIONS.some(([name]) => name === query.get("section")) ? query.get("section") : "condition";
+  const printed = h("a", { class: "button", target: "_blank", rel: "noopener" }, "Condition report");
+  const spansRow = h("div", { class: "row spans" }, spans, spanText, asReference, printed);
   const jumps = h(
     "nav",
     { class: "jumps", "aria-label": "Sections" },
-    JUMPS.map(([name, word]) => h("a", { href: `#${name}`, onclick: (event) => jump(event, name) }, word)),
+    SECTIONS.map(([name, word]) =>
+      h(
+        "a",
+        { href: `${address()}?section=${name}`, dataset: { section: name }, onclick: (event) => choose(event, name) },
+        word,
+      ),
+    ),
   );
   const element = h(
     "div",
     { class: "view", dataset: { page: "structure", structure: id } },
     h("p", { class: "crumbs" }, h("a", { href: "#/" }, "Fleet"), ` / ${id}`),
     headline,
-    jumps,
     alarmList.element,
-    diagnoses.card,
+    jumps,
     first,
-    h("div", { class: "row spans" }, spans, spanText),
-    charts,
-    used.element,
-    diagnoses.element,
-    windows.element,
+    spansRow,
+    Object.values(sections),
   );
 
   function section(name, title, ...content) {
@@ -103,14 +125,42 @@ export function structure(id) {
     );
   }
 
-  /** Scrolls to a section and moves the focus there, without changing the address of the page. */
-  function jump(event, name) {
+  function address() {
+    return `#/structures/${encodeURIComponent(id)}`;
+  }
+
+  /** Writes what is shown into the address, so that it can be kept and passed on. */
+  function writeAddress() {
+    const parts = new URLSearchParams();
+    if (shown !== "condition") parts.set("section", shown);
+    if (group.range && length === undefined) {
+      parts.set("from", iso(group.range[0]));
+      parts.set("to", iso(group.range[1]));
+    }
+    if (state.batch) parts.set("batch", state.batch);
+    const text = parts.toString();
+    history.replaceState(null, "", text ? `${address()}?${text}` : address());
+  }
+
+  /** Shows one section. Without any batch, only those that do not need one can be shown. */
+  function show(name) {
+    shown = name;
+    const empty = state.empty ?? false;
+    for (const [own, part] of Object.entries(sections)) {
+      part.hidden = own !== shown || (empty && OVER_TIME.includes(own));
+    }
+    for (const link of jumps.children) {
+      link.hidden = empty && OVER_TIME.includes(link.dataset.section);
+      if (link.dataset.section === shown) link.setAttribute("aria-current", "true");
+      else link.removeAttribute("aria-current");
+    }
+    spansRow.hidden = empty || !OVER_TIME.includes(shown);
+    writeAddress();
+  }
+
+  function choose(event, name) {
     event.preventDefault();
-    const target = document.getElementById(name);
-    target.scrollIntoView({ block: "start" });
-    const heading = target.querySelector("h2");
-    heading.tabIndex = -1;
-    heading.focus({ preventScroll: true });
+    show(name);
   }
 
   /** True once another view has replaced this one. */
@@ -126,6 +176,7 @@ export function structure(id) {
     group.range = range;
     if (range === null) length = null;
     showSpans();
+    writeAddress();
     refresh.series();
   }
 
@@ -135,6 +186,7 @@ export function structure(id) {
       length = span;
       group.range = span === null || !whole ? null : [whole[1] - span, whole[1]];
       showSpans();
+      writeAddress();
       refresh.series();
     };
     fill(
@@ -142,8 +194,33 @@ export function structure(id) {
       SPANS.map(([word, span]) =>
         h("button", { type: "button", "aria-pressed": String(length === span), onclick: press(span) }, word),
       ),
+      h("button", { type: "button", "aria-pressed": String(length === undefined), onclick: choosePeriod }, "From … to …"),
     );
     [...spans.children].find((button) => button.textContent === focused)?.focus();
+  }
+
+  /** Dialog to choose a time span by its ends. */
+  async function choosePeriod() {
+    const ends = shownSpan();
+    const chosen = await ask({
+      title: "Time span",
+      fields: [
+        { name: "from", label: `From (${zone()})`, type: "datetime-local", required: true, value: fieldTime(ends[0]) },
+        { name: "to", label: `To (${zone()})`, type: "datetime-local", required: true, value: fieldTime(ends[1] + 60) },
+      ],
+      confirm: "Show",
+      submit: async ({ from, to }) => {
+        const range = [seconds(from), seconds(to)];
+        if (range[1] > range[0]) return range;
+        throw Object.assign(new Error("The end must be after the beginning."), { title: "No time span" });
+      },
+    });
+    if (chosen) zoom(chosen);
+  }
+
+  /** The time span in view, seconds. */
+  function shownSpan() {
+    return group.range ?? [seconds(state.series.from), seconds(state.series.to)];
   }
 
   async function loadSeries() {
@@ -169,17 +246,17 @@ export function structure(id) {
     const { series, info, item } = state;
     const usual = info.undamaged?.threshold_probability ?? USUAL_PROBABILITY;
     const empty = (item?.batches ?? series.batches) === 0;
-    charts.hidden = empty;
-    for (const link of jumps.children) {
-      link.hidden = empty && ["#condition", "#tracks", "#batch"].includes(link.getAttribute("href"));
-    }
-    spans.parentElement.hidden = empty;
+    state.empty = empty;
+    show(empty && OVER_TIME.includes(shown) ? "model" : shown);
     fill(first, empty ? nothingYet(info) : "");
     if (empty) return;
-    const shown = group.range ?? [seconds(series.from), seconds(series.to)];
+    asReference.hidden = !info.model;
+    const ends = shownSpan();
+    const period = new URLSearchParams({ from: iso(ends[0]), to: iso(ends[1] + 60) });
+    printed.href = `${at(id, "/report")}?${period}`;
     fill(
       spanText,
-      `${local(1000 * shown[0])} to ${local(1000 * shown[1])} (${zone()}), ${count(series.batches, "batch", "batches")}${series.reduced ? ", thinned for display with extremes kept" : ""}`,
+      `${local(1000 * ends[0])} to ${local(1000 * ends[1])} (${zone()}), ${count(series.batches, "batch", "batches")}${series.reduced ? ", thinned for display with extremes kept" : ""}`,
     );
     figures.parameters.update(series, usual);
     figures.heat.update(series);
@@ -232,9 +309,22 @@ export function structure(id) {
     title: id,
     element,
     async load() {
+      const asked = [query.get("from"), query.get("to")].map((time) => seconds(time ?? ""));
+      if (asked.every(Number.isFinite) && asked[0] < asked[1]) {
+        // The ends of the record are known only from a request without a time range.
+        const { from, to } = await read(at(id, "/series?points=10"));
+        if (from && to) {
+          whole = [seconds(from), seconds(to)];
+          group.all = whole;
+        }
+        group.range = asked;
+        length = undefined;
+      }
       showSpans();
       await loadInfo();
       await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load()]);
+      const wanted = query.get("batch");
+      if (wanted && !state.empty) await detail.select(wanted);
     },
     event(name, data) {
       if (data.structure !== id) return;
@@ -271,7 +361,7 @@ function head(id, { info, item }) {
   return [
     h("div", { class: "row" }, h("h1", null, id), item && stateChip(item.state)),
     info.definition.description && h("p", { class: "fine" }, info.definition.description),
-    item && h("p", { class: "lead verdict" }, item.verdict, item.alarm_since && [" Alarm open since ", age(item.alarm_since), "."]),
+    item && h("p", { class: "lead verdict" }, item.verdict, item.alarm_since && [" Alarm raised ", age(item.alarm_since), "."]),
     item &&
       h(
         "p",

@@ -2,7 +2,7 @@
 
 import { h } from "../dom.js";
 import { count, local, number, timeElement, words } from "../format.js";
-import { stateChip, stateWord, urgency } from "../states.js";
+import { stateChip, urgency } from "../states.js";
 import { chart, curve, draw, mark, merged, rule, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
 import { figure } from "./figure.js";
 import { FIT_CHART, JOINT_CHART, alarmSpans } from "./parameters.js";
@@ -15,7 +15,7 @@ const KEYS = [
   { mark: "dash-2", text: "limit for several batches" },
   { mark: "dash", text: "a new undamaged reference begins" },
   { mark: "triangle", text: "alarm or pending" },
-  { mark: "ring", text: "held: chart not updated" },
+  { mark: "ring", text: "chart not updated (rejected batch or maintenance)" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
 ];
@@ -33,6 +33,14 @@ const hint = (c) =>
   c.is_process
     ? "Evidence for a lasting loss that weather and seasons do not explain, in standard deviations. The fast chart finds steps in up to three batches, the slow one small losses over up to 60. The process was learned from the undamaged reference."
     : "Shift towards damage relative to the undamaged reference, in standard errors. In the chart “simulation fit”, 1 means a rejected batch.";
+
+/** States of a chart in words: they say nothing about the structure as a whole. */
+const CHART_STATES = {
+  normal: "inside the limits",
+  pending: "above a limit, not yet an alarm",
+  alarming: "alarm",
+  recovering: "inside the limits again, the alarm has not ended yet",
+};
 
 const isBeyond = (state) => state === "alarming" || state === "pending";
 
@@ -137,7 +145,7 @@ export function control(group, selectBatch) {
     });
     one = chart(frame.plot, options, [filled.times, shift, shiftLimit, ewma, ewmaLimit]);
 
-    const stateOf = (row) => `${stateWord(c.state[row])}${c.held[row] ? ", held" : ""}`;
+    const stateOf = (row) => `${CHART_STATES[c.state[row]] ?? c.state[row]}${c.held[row] ? ", chart not updated" : ""}`;
     function readout(u) {
       const row = filled.origin[u.cursor.idx ?? -1] ?? -1;
       if (row < 0) return "";

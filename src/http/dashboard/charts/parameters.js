@@ -1,7 +1,7 @@
 // For each parameter, the mean with its 90 % interval and the threshold, and below it the probability of damage.
 
 import { h } from "../dom.js";
-import { count, local, number, percent, percentWithin, quantity, timeElement } from "../format.js";
+import { changePercent, count, local, number, percent, percentWithin, scale, timeElement } from "../format.js";
 import {
   band,
   chart,
@@ -87,16 +87,17 @@ export function parameters(group, selectBatch) {
 }
 
 function parameterFigure(group, { name, unit }, selectBatch) {
-  const title = unit && unit !== "1" ? `${name} (${unit})` : name;
-  const frame = figure({ name: `parameter-${name}`, title, level: "h4" });
+  const frame = figure({ name: `parameter-${name}`, title: name, level: "h4" });
   let charts = [];
   const end = () => {
     charts.forEach((c) => c.end());
     charts = [];
   };
 
-  const update = (p, series, usual) => {
+  const update = (given, series, usual) => {
     end();
+    const p = inReadableUnit(given, unit);
+    const title = p.unit ? `${name} (${p.unit})` : name;
     if (p.times.length === 0) return frame.empty("No assessed batch in this time span.");
     frame.empty(null);
     const filled = withGaps(p.times.map(seconds), [
@@ -124,7 +125,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
       select,
       series: [{}, curve("curve-1", { points }), edge(), edge()],
       bands: [band(3, 2, "curve-1", 0.22)],
-      axes: [timeAxis(false), valueAxis(title)],
+      axes: [timeAxis(false), valueAxis(title), changeAxis(p.undamaged_mean, unit)],
       scales: {
         y: {
           range: (u, a, b) => paddedRange(Math.min(a ?? Infinity, ...include), Math.max(b ?? -Infinity, ...include)),
@@ -152,6 +153,8 @@ function parameterFigure(group, { name, unit }, selectBatch) {
       axes: [
         timeAxis(),
         valueAxis("probability (%)", { values: (u, splits) => splits.map((v) => String(Math.round(100 * v))) }),
+        // Keeps the time axes of both charts aligned.
+        changeAxis(null, unit),
       ],
       scales: { y: { range: [-0.04, 1.04] } },
       hooks: {
@@ -181,20 +184,20 @@ function parameterFigure(group, { name, unit }, selectBatch) {
           : `probability of damage ${percentWithin(damage, p.pod_low[row], p.pod_high[row])}`;
       return [
         timeElement(p.times[row]),
-        ` · ${quantity(p.mean[row], unit)} (${number(p.low[row])} to ${number(p.high[row])}) · ${damageText}`,
+        ` · ${number(p.mean[row])} ${p.unit} (${number(p.low[row])} to ${number(p.high[row])})${changeText(p, row)} · ${damageText}`,
       ];
     }
     const last = p.probability_of_damage.at(-1);
     frame.summarise(
-      `${count(p.times.length, "batch", "batches")} to ${local(p.times.at(-1))}. Latest mean ${quantity(p.mean.at(-1), unit)}` +
-        `${p.threshold === null ? "" : `, threshold ${quantity(p.threshold, unit)}`}, probability of damage ` +
+      `${count(p.times.length, "batch", "batches")} to ${local(p.times.at(-1))}. Latest mean ${number(p.mean.at(-1))} ${p.unit}` +
+        `${p.threshold === null ? "" : `, threshold ${number(p.threshold)} ${p.unit}`}${changeText(p, p.times.length - 1)}, probability of damage ` +
         `${last === null || last === undefined ? "not available" : percent(last)}; withheld for ${count(withheld.length, "batch", "batches")}. ` +
         "Use the arrow keys to read the values and Enter to open the batch.",
     );
     frame.tabulate(() => ({
       columns: [
         "Time",
-        `Mean (${unit})`,
+        `Mean${p.unit ? ` (${p.unit})` : ""}`,
         "90 % interval of the mean",
         "Probability of damage",
         "90 % interval of the probability",
@@ -212,7 +215,58 @@ function parameterFigure(group, { name, unit }, selectBatch) {
       ]),
     }));
   };
+  const changeText = (p, row) =>
+    Number.isFinite(p.undamaged_mean) && Number.isFinite(p.mean[row])
+      ? ` · ${signed(changePercent(p.mean[row] / p.factor, p.undamaged_mean / p.factor, unit))} % of the undamaged mean`
+      : "";
   return { element: frame.element, update, end };
+}
+
+const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;
+
+/** The values of a parameter in a unit with a prefix, so that they are easy to read. */
+function inReadableUnit(p, unit) {
+  const { unit: shown, factor } = scale(unit, p.undamaged_mean ?? p.mean.find((v) => v !== null));
+  const times = (value) => (value === null || value === undefined ? value : factor * value);
+  return {
+    ...p,
+    unit: shown,
+    factor,
+    mean: p.mean.map(times),
+    low: p.low.map(times),
+    high: p.high.map(times),
+    threshold: times(p.threshold),
+    undamaged_mean: times(p.undamaged_mean),
+  };
+}
+
+/** Steps of the axis of changes, per cent. */
+const CHANGE_STEPS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500];
+
+/** The second axis of values: their change from the mean of the undamaged reference in per cent. Without a mean it is empty. */
+function changeAxis(reference, unit) {
+  const known = Number.isFinite(reference) && reference !== 0;
+  const valueAt = (change) =>
+    unit === "ln" ? reference + Math.log1p(change / 100) : reference * (1 + change / 100);
+  return valueAxis(null, {
+    scale: "y",
+    side: 1,
+    size: 44,
+    grid: { show: false },
+    splits: (u, axis, low, high) => {
+      if (!known) return [];
+      const ends = [low, high].map((v) => changePercent(v, reference, unit)).sort((a, b) => a - b);
+      const step = CHANGE_STEPS.find((s) => (ends[1] - ends[0]) / s <= 6) ?? 1000;
+      const ticks = [];
+      for (let n = Math.ceil(ends[0] / step); n * step <= ends[1]; n += 1) ticks.push(valueAt(n * step));
+      return ticks;
+    },
+    values: (u, splits) =>
+      splits.map((v) => {
+        const change = changePercent(v, reference, unit);
+        return Math.abs(change) < 1e-6 ? "0 %" : `${signed(change)} %`;
+      }),
+  });
 }
 
 /** Crosses where the probability is withheld. */

@@ -13,7 +13,8 @@ const EFFECTS = {
   note: ["note", "idle", "information"],
 };
 
-export function batch(structure) {
+/** `onChoice(id)` is called with the batch that the user has chosen, or `null` while the newest one is shown. */
+export function batch(structure, onChoice) {
   const picker = h("select", { id: "batch-picker", onchange: () => choose(picker.value) });
   const earlier = h("button", { type: "button", "aria-label": "Earlier batch", onclick: () => step(1) }, icon("left"));
   const later = h("button", { type: "button", "aria-label": "Later batch", onclick: () => step(-1) }, icon("right"));
@@ -41,6 +42,7 @@ export function batch(structure) {
   const choose = (id) => {
     following = id === list[0]?.batch;
     chosen = id;
+    onChoice(following ? null : id);
     return show();
   };
 
@@ -100,15 +102,8 @@ export function batch(structure) {
       }
       if (changed || drawn.hidden) await show();
     },
-    /** Shows the batch that was selected in a chart. */
-    async select(id) {
-      await choose(id);
-      element.scrollIntoView({
-        block: "start",
-        behavior: matchMedia("(prefers-reduced-motion: reduce)").matches ? "auto" : "smooth",
-      });
-      document.getElementById("batch-title")?.focus({ preventScroll: true });
-    },
+    /** Shows a batch, such as one that was selected in a chart. */
+    select: choose,
     again: () => chosen && show(),
   };
 }

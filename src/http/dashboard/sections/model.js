@@ -1,8 +1,8 @@
 // The trained model with its calibration, and the undamaged reference that batches are compared with.
 
 import { at, read, send } from "../api.js";
-import { ask, cell, fill, h, icon, notify } from "../dom.js";
-import { count, digest, local, number, percent, zone } from "../format.js";
+import { ask, cell, fieldTime, fill, h, icon, notify } from "../dom.js";
+import { count, digest, local, number, percent, quantity, zone } from "../format.js";
 
 export function model(structure, changed) {
   const content = h("div", null);
@@ -47,7 +47,7 @@ export function model(structure, changed) {
                 ),
                 info.undamaged && " ",
                 info.undamaged &&
-                  h("button", { type: "button", onclick: () => declare(structure, changed, true) }, "Extend this reference"),
+                  h("button", { type: "button", onclick: () => declare(structure, changed, { extend: true }) }, "Extend this reference"),
               ),
           ),
         ),
@@ -198,9 +198,9 @@ function undamaged(state) {
             "tr",
             null,
             h("th", { scope: "row" }, p.name),
-            cell("Mean", number(p.mean)),
-            cell("Standard deviation", number(p.std, 3)),
-            cell("Threshold δ", p.threshold === null ? "–" : number(p.threshold)),
+            cell("Mean", quantity(p.mean, p.unit)),
+            cell("Standard deviation", quantity(p.std, p.unit, 3)),
+            cell("Threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
           ),
         ),
       ),
@@ -261,8 +261,9 @@ export function postLine(info) {
   return `curl ${location.origin}/v1/structures/${info.id}/batches \\\n  -H 'content-type: application/json' \\\n  -d '${JSON.stringify({ measurements: [measurement] })}'`;
 }
 
-/** Dialog to choose the batches of a new undamaged reference. */
-async function declare(structure, changed, extend = false) {
+/** Dialog to choose the batches of a new undamaged reference, or, with `extend`, of an extension. `period`: begin and end of a proposed
+ * period in seconds. */
+export async function declare(structure, changed, { extend = false, period: proposed = null } = {}) {
   let items;
   try {
     ({ items } = await read(at(structure, "/history?limit=200")));
@@ -308,9 +309,16 @@ async function declare(structure, changed, extend = false) {
         name: "from",
         label: `Instead of batches, a period: from (${zone()})`,
         type: "datetime-local",
+        value: proposed ? fieldTime(proposed[0]) : "",
         hint: "All batches of the period are used. Doubtful ones are left out and named.",
       },
-      { name: "to", label: `to (${zone()})`, type: "datetime-local" },
+      {
+        name: "to",
+        label: `to (${zone()})`,
+        type: "datetime-local",
+        // The minute of the last batch belongs to the period.
+        value: proposed ? fieldTime(proposed[1] + 60) : "",
+      },
       !extend && { name: "p", label: "Share of healthy values below the threshold δ (%)", type: "text", required: true, value: "5" },
       {
         name: "reason",
@@ -335,11 +343,35 @@ async function declare(structure, changed, extend = false) {
     },
   });
   if (done) {
-    const left = done.left_out;
-    const without = left.length > 0 ? ` ${count(left.length, "batch", "batches")} left out; the first: ${left[0].reason}.` : "";
     notify(
-      `Version ${done.version} of the undamaged reference of ${structure} has been declared from ${count(done.batches.length, "batch", "batches")}.${without}`,
+      `Version ${done.version} of the undamaged reference of ${structure} has been declared from ${count(done.batches.length, "batch", "batches")}.`,
     );
     changed();
+    if (done.left_out.length > 0) await showLeftOut(done, new Map(items.map((item) => [item.batch, item.measured_from])));
   }
+}
+
+/** Which batches are not part of a reference that was declared, and why. */
+function showLeftOut(declared, measured) {
+  const { batches, left_out: left } = declared;
+  return ask({
+    title: `${count(left.length, "batch", "batches")} of ${batches.length + left.length} left out`,
+    body: [
+      h(
+        "p",
+        null,
+        `Version ${declared.version} of the undamaged reference has been declared from ${count(batches.length, "batch", "batches")}. These were left out:`,
+      ),
+      h(
+        "ul",
+        { class: "choices", tabindex: 0, "aria-label": "Batches left out" },
+        left.map(({ batch, reason }) =>
+          h("li", null, measured.has(batch) ? local(measured.get(batch)) : h("code", null, batch), `: ${reason}`),
+        ),
+      ),
+    ],
+    confirm: "Close",
+    cancel: null,
+    submit: async () => true,
+  });
 }
