@@ -9,6 +9,7 @@ mod bulk;
 mod diagnosis;
 mod docs;
 mod export;
+mod from_accelerometers;
 mod helpers;
 mod history;
 mod hostile;
