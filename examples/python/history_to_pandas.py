@@ -11,6 +11,7 @@ import argparse
 import io
 import os
 from pathlib import Path
+from urllib.parse import urljoin
 
 import matplotlib
 
@@ -32,28 +33,26 @@ if "MODALWATCH_TOKEN" in os.environ:
     session.headers["Authorization"] = f"Bearer {os.environ['MODALWATCH_TOKEN']}"
 
 
-def get(path, **query):
-    """One request below the structure; an error of the service is shown with its text."""
-    answer = session.get(f"{settings.url}/v1/structures/{settings.structure}/{path}", params=query, timeout=60)
-    if not answer.ok:
-        raise SystemExit(f"{answer.url}: status {answer.status_code}: {answer.text}")
-    return answer
-
-
-def read_all(path, **query):
-    """All items of a paged list."""
-    items, cursor = [], None
-    while True:
-        page = get(path, **query, **({"cursor": cursor} if cursor else {})).json()
-        items += page["items"]
-        cursor = page.get("next")
-        if not cursor:
-            return items
+def pages(path, **query):
+    """The answers to a request below the structure, page by page; an error of the service is shown with its text. Of a JSON list, `next` is the
+    cursor of the next page; of a CSV, the header Link has its address."""
+    start = url = f"{settings.url}/v1/structures/{settings.structure}/{path}"
+    while url:
+        answer = session.get(url, params=query, timeout=60)
+        if not answer.ok:
+            raise SystemExit(f"{answer.url}: status {answer.status_code}: {answer.text}")
+        yield answer
+        if "json" in answer.headers["Content-Type"]:
+            cursor = answer.json().get("next")
+            url, query = cursor and start, {**query, "cursor": cursor}
+        else:
+            link = answer.links.get("next", {}).get("url")
+            url, query = link and urljoin(start, link), {}
 
 
 # %% History: one row for each batch and parameter
 window = {key: value for key, value in (("from", settings.start), ("to", settings.end)) if value}
-history = pd.read_csv(io.StringIO(get("history", format="csv", **window).text))
+history = pd.concat([pd.read_csv(io.StringIO(page.text)) for page in pages("history", format="csv", limit=1000, **window)], ignore_index=True)
 for column in ("measured_from", "measured_to"):
     history[column] = pd.to_datetime(history[column], utc=True)
 if history.empty:
@@ -67,7 +66,7 @@ print("\nchange against the undamaged reference, %, mean of each day:")
 print(change.resample("1D").mean().round(2).tail(12).to_string())
 
 # %% Alarms: one row for each episode
-alarms = pd.json_normalize(read_all("alarms"))
+alarms = pd.json_normalize([alarm for page in pages("alarms") for alarm in page.json()["items"]])
 if alarms.empty:
     print("\nno alarms")
 else:
@@ -77,7 +76,7 @@ else:
         alarms[column] = pd.to_datetime(alarms[column], utc=True)
     print("\nalarms, newest first (parameter NaN: several together, or the structure):")
     for _, alarm in alarms.iterrows():
-        print(f"{alarm['alarm']}: {alarm['kind']}, {alarm['parameter']}, {alarm['state']} since {alarm['opened_at']:%Y-%m-%d %H:%M}: {alarm.get('sentence')}")
+        print(f"{alarm['alarm']}: {alarm['kind']}, {alarm['parameter']}, {alarm['state']} since {alarm['opened_at']:%Y-%m-%d %H:%M}: {alarm.get('sentence') if pd.notna(alarm.get('sentence')) else 'no sentence'}")
 
 # %% Plot: mean with 90 % interval and probability of damage of each parameter; alarms of the parameter as bands
 parameters = list(dict.fromkeys(history["parameter"].dropna()))
