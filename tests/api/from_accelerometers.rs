@@ -49,7 +49,8 @@ fn records(folder: &Path) -> Vec<PathBuf> {
     files.filter(|path| path.extension().is_some_and(|ending| ending == "npz")).collect()
 }
 
-#[tokio::test]
+// Several threads, because the scripts block one: the client must notice that the service closes an idle connection meanwhile.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn accelerations_become_measurements_that_a_second_run_does_not_repeat() {
     let Some(python) = interpreter() else { return };
     let (service, _data) = spawn();
