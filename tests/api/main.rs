@@ -10,6 +10,7 @@ mod condition_report;
 mod diagnosis;
 mod docs;
 mod export;
+mod from_accelerometers;
 mod helpers;
 mod history;
 mod hostile;
