@@ -101,7 +101,7 @@ const TABLE: [(&str, &[&str], bool); 35] = [
         ],
         true,
     ),
-    ("config", &["access", "http", "monitor", "mqtt", "notify", "store", "telemetry"], false),
+    ("config", &["access", "http", "monitor", "mqtt", "notify", "quantity", "store", "telemetry"], false),
     (
         "cli",
         &[
