@@ -240,11 +240,13 @@ impl Config {
 /// The address to listen on: `text` itself, or the port `text` of this machine alone.
 fn listen_address(text: &str) -> Result<String, Error> {
     let text = text.trim();
-    let wrong = || Error::Range {
+    let wrong = || {
+        Error::Range {
         key: "http.listen (--listen)",
         value: shown(text),
         must: "an address and a port from 0 to 65535, such as 127.0.0.1:8080 (this machine only) or 0.0.0.0:8080 (reachable from \
                others), or a port alone, such as 8080, for this machine only",
+    }
     };
     if text.parse::<u16>().is_ok() {
         return Ok(format!("127.0.0.1:{text}"));

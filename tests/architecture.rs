@@ -55,7 +55,8 @@ const TABLE: [(&str, &[&str], bool); 35] = [
     ("emulator", &["stats"], false),
     ("gsa", &["stats"], false),
     ("flow", &["simd", "stats"], false),
-    ("simulator", &["emulator", "physics"], true),
+    // `plot` for the drawing of a structure.
+    ("simulator", &["emulator", "physics", "plot"], true),
     ("updating", &["physics", "simulator"], true),
     ("posterior", &[], true),
     // Uses `physics` only for the error of a simulation.

@@ -250,15 +250,29 @@ fn chart_state(answer: &Value, parameter: &str) -> Option<String> {
 }
 
 fn print_table(report: &Report) {
-    println!("Case 1 of Wang et al. (2025): three masses, k1 to k3 to the ground, {MEASUREMENTS} measurements a batch.");
-    println!("target: the population; realised: the {MEASUREMENTS} stiffnesses drawn from it; updated: estimated from their");
+    println!(
+        "Case 1 of Wang et al. (2025): three masses, k1 to k3 to the ground, {MEASUREMENTS} measurements a batch."
+    );
+    println!(
+        "target: the population; realised: the {MEASUREMENTS} stiffnesses drawn from it; updated: estimated from their"
+    );
     println!("frequencies. The standard deviations of the population are {}, {} and {} N/m.", STD[0], STD[1], STD[2]);
     println!("PoD: probability of damage, of the pooled samples (as in the paper), and of the estimated population");
     println!("with its 90 % interval.\n");
     println!("   ------ mean, N/m ------ -- std, N/m ---- ----------------- PoD, % -----------------");
     println!(
         "{:<3}{:>6}{:>9}{:>8} {:>9}{:>8} {:>6}{:>9}{:>6}{:>7}{:>16} alarm",
-        "", "target", "realised", "updated", "realised", "updated", "target", "realised", "paper", "pooled", "updated (90 %)"
+        "",
+        "target",
+        "realised",
+        "updated",
+        "realised",
+        "updated",
+        "target",
+        "realised",
+        "paper",
+        "pooled",
+        "updated (90 %)"
     );
     let percent = |p: Option<f64>| p.map_or("-".to_owned(), |p| format!("{:.1}", 100.0 * p));
     let interval = |p: Option<f64>, interval: Option<[f64; 2]>| match (p, interval) {
