@@ -104,10 +104,9 @@ pub fn simulate(args: &SimulateArgs) -> anyhow::Result<()> {
     let interval_s = args.interval_s.map_or(args.every, f64::from);
     let count = count(args, interval_s)?;
     let population = population(&simulator, &args.parameters)?;
-    let rehearsed = !(args.covariates.is_empty() && args.effects.is_empty() && args.trends.is_empty())
-        || !args.losses.is_empty()
-        || args.missing > 0.0
-        || args.outliers > 0.0;
+    let still =
+        args.covariates.is_empty() && args.effects.is_empty() && args.trends.is_empty() && args.losses.is_empty();
+    let rehearsed = !still || args.missing > 0.0 || args.outliers > 0.0;
     let measurements = if rehearsed {
         rehearse(args, &simulator, &population, (count, interval_s))?
     } else {

@@ -360,7 +360,7 @@ fn zigzag(from: Place, to: Place, middle: Place) -> Vec<Place> {
         // Straight at both ends.
         let side = if step < 3 || step + 3 > ZIGZAG {
             0.0
-        } else if step % 2 == 0 {
+        } else if step.is_multiple_of(2) {
             ZIGZAG_PX
         } else {
             -ZIGZAG_PX

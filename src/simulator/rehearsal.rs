@@ -151,12 +151,14 @@ impl Rehearsal {
         for ((row, at), covariates) in rows.iter_mut().zip(times).zip(&covariates) {
             self.change(row, (*at, times[0]), covariates);
         }
-        let simulate = |(theta, covariates): (&Vec<f64>, &BTreeMap<String, CovariateValue>)| -> Result<_, SimulationError> {
-            let sizes = simulator.effect_sizes(covariates);
-            let here = if simulator.effects().is_empty() { simulator.clone() } else { simulator.under(&sizes.values) };
-            let failed = |source| SimulationError::Physics { parameters: theta.clone(), source };
-            Ok((here.frequencies_hz(theta).map_err(failed)?, !sizes.beyond.is_empty()))
-        };
+        let simulate =
+            |(theta, covariates): (&Vec<f64>, &BTreeMap<String, CovariateValue>)| -> Result<_, SimulationError> {
+                let sizes = simulator.effect_sizes(covariates);
+                let here =
+                    if simulator.effects().is_empty() { simulator.clone() } else { simulator.under(&sizes.values) };
+                let failed = |source| SimulationError::Physics { parameters: theta.clone(), source };
+                Ok((here.frequencies_hz(theta).map_err(failed)?, !sizes.beyond.is_empty()))
+            };
         let exact = rows.par_iter().zip(&covariates).map(simulate).collect::<Result<Vec<_>, SimulationError>>()?;
         let beyond_effects = exact.iter().filter(|(_, beyond)| *beyond).count();
         let exact: Vec<Vec<f64>> = exact.into_iter().map(|(frequencies, _)| frequencies).collect();

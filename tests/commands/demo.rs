@@ -34,6 +34,14 @@ async fn the_demo_fits_100_columns_prints_its_dashboard_and_has_data_of_the_last
     let client = modalwatch::notify::client_builder().build().unwrap();
     let page = client.get(&dashboard).send().await.unwrap();
     assert!(page.status().is_success() && page.text().await.unwrap().contains("<html"), "{dashboard}");
+    let drawn = |query: &str| client.get(format!("{dashboard}v1/structures/three-dof/drawing.svg{query}")).send();
+    let drawing = drawn("?mode=2").await.unwrap();
+    assert_eq!(drawing.headers()["content-type"], "image/svg+xml");
+    let svg = drawing.text().await.unwrap();
+    assert!(svg.starts_with("<svg") && svg.contains("mode 2, ") && svg.contains("data-name=\"k6\""), "{svg}");
+    for wrong in ["?mode=4", "?mode=0", "?mode=first", "?modes=1"] {
+        assert_eq!(drawn(wrong).await.unwrap().status(), 422, "{wrong}");
+    }
     let history = client.get(format!("{dashboard}v1/structures/three-dof/history?format=csv")).send().await.unwrap();
     let history = history.text().await.unwrap();
     let today = days(&modalwatch::quantity::Timestamp::now().to_string());

@@ -134,13 +134,14 @@ fn measurements_that_are_not_accepted_are_not_taken_for_healthy() {
     let healthy = std::fs::read_to_string(world.path("healthy.csv")).unwrap();
     // Frequencies in rad/s instead of Hz.
     let mut lines = healthy.lines();
-    let mut wrong = lines.next().unwrap().to_owned() + "\n";
+    let mut wrong = vec![lines.next().unwrap().to_owned()];
     for line in lines {
-        let (at, rest) = line.split_once(',').unwrap();
-        let scaled: Vec<String> =
-            rest.split(',').map(|f| (f.parse::<f64>().unwrap() * std::f64::consts::TAU).to_string()).collect();
-        wrong += &format!("{at},{}\n", scaled.join(","));
+        let mut cells = line.split(',');
+        let at = cells.next().unwrap().to_owned();
+        let scaled = cells.map(|f| (f.parse::<f64>().unwrap() * std::f64::consts::TAU).to_string());
+        wrong.push(std::iter::once(at).chain(scaled).collect::<Vec<_>>().join(","));
     }
+    let wrong = wrong.join("\n") + "\n";
     std::fs::write(world.path("wrong.csv"), wrong).unwrap();
     let assess =
         |data: &'static str| ["assess", "--structure", "three-dof", "--reference", "healthy.csv", "--data", data];

@@ -185,14 +185,14 @@ fn chain(definition: &StructureDefinition) -> Option<String> {
         return None;
     }
     let mut left: Vec<&SpringDefinition> = definition.springs.iter().collect();
-    let (mut here, mut line) = ("ground".to_owned(), "ground".to_owned());
+    let (mut here, mut line) = ("ground".to_owned(), vec!["ground".to_owned()]);
     while !left.is_empty() {
         let next: Vec<usize> = (0..left.len()).filter(|i| left[*i].from == here || left[*i].to == here).collect();
         let [only] = next[..] else { return None };
         let spring = left.remove(only);
         let other = if spring.from == here { &spring.to } else { &spring.from };
-        line.push_str(&format!(" ─{}─ [{other}]", spring.name));
+        line.push(format!("─{}─ [{other}]", spring.name));
         here.clone_from(other);
     }
-    Some(line)
+    Some(line.join(" "))
 }
