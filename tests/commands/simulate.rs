@@ -30,10 +30,12 @@ fn a_covariate_follows_the_year_the_day_and_lasting_weather() {
     let calm = columns(&world.run(&[YEAR, &["--covariate", "temperature_c=10,year=12,day=4"]].concat()));
     let calm = &calm["temperature_c"];
     assert_eq!(calm.len(), 8_640);
-    // Hour 3 of 15 January is the coldest, half a year and half a day later is the warmest.
+    // 03:00 on 15 January, give or take the day by which calendar years drift, is the coldest; the warmest is half a year and half a
+    // day later.
     let coldest = (0..calm.len()).min_by(|a, b| calm[*a].total_cmp(&calm[*b])).unwrap();
     let warmest = (0..calm.len()).max_by(|a, b| calm[*a].total_cmp(&calm[*b])).unwrap();
-    assert_eq!((coldest, warmest % 24), (14 * 24 + 3, 15));
+    assert_eq!((coldest % 24, warmest % 24), (3, 15));
+    assert!((13..=15).contains(&(coldest / 24)), "day {}", coldest / 24);
     assert!((195..=198).contains(&(warmest / 24)), "day {}", warmest / 24);
     assert!((calm[coldest] - -6.0).abs() < 0.01 && (calm[warmest] - 26.0).abs() < 0.01);
 
@@ -111,7 +113,7 @@ fn modes_are_missing_and_outliers_occur_as_often_as_wanted_and_seeds_repeat() {
     let found = columns(&text);
     let all: Vec<f64> = ["f1_hz", "f2_hz", "f3_hz", "f4_hz"].iter().flat_map(|mode| found[*mode].clone()).collect();
     let missing = all.iter().filter(|f| f.is_nan()).count() as f64 / all.len() as f64;
-    // 34,560 cells: a share of 0.1 is known to 0.0016, one of 0.05 to 0.0012; four of these.
+    // A share of 0.1 among 34,560 cells is known to 0.0016, and one of 0.05 among 7,776 to 0.0025; four of these.
     assert!((missing - 0.1).abs() < 0.0065, "{missing}");
     let usual = found["f1_hz"].iter().copied().filter(|f| !f.is_nan()).fold(BTreeMap::new(), |mut counts, f| {
         *counts.entry(f.to_bits()).or_insert(0) += 1;
@@ -120,7 +122,7 @@ fn modes_are_missing_and_outliers_occur_as_often_as_wanted_and_seeds_repeat() {
     // Without noise, every frequency that is no outlier is the same number.
     let (same, every) = (*usual.values().max().unwrap(), usual.values().sum::<usize>());
     let outliers = 1.0 - f64::from(u32::try_from(same).unwrap()) / every as f64;
-    assert!((outliers - 0.05).abs() < 0.0105, "{outliers}");
+    assert!((outliers - 0.05).abs() < 0.01, "{outliers}");
 }
 
 #[test]
