@@ -12,6 +12,15 @@ const MARGIN: f64 = 90.0;
 /// Largest displacement of a shape, as a share of the extent of the drawing.
 const SWING: f64 = 0.12;
 
+/// Most points of a line of a shape that are drawn as dots.
+const MOST_DOTS: usize = 12;
+
+/// Farthest that a spring goes aside, px.
+const BEND_PX: f64 = 0.7 * MARGIN;
+
+/// A white edge, so that text can be read on lines.
+const HALO: &str = "paint-order=\"stroke\" stroke=\"#ffffff\" stroke-width=\"3\"";
+
 /// Half the size of a body, px.
 const BODY: f64 = 16.0;
 
@@ -141,9 +150,9 @@ impl Drawing {
             frame.height
         ));
         self.fixed.iter().for_each(|fixed| add(fixed_svg(*fixed, &frame)));
-        self.links.iter().for_each(|link| add(self.link_svg(link, &frame)));
-        self.bodies.iter().for_each(|body| add(body_svg(body, &frame)));
         add(self.shape_svg(&frame));
+        self.links.iter().for_each(|link| add(self.link_svg(link, &frame)));
+        self.bodies.iter().for_each(|body| add(body_svg(body, &frame, self.axis.is_some())));
         add(self.axis_svg(&frame));
         add(self.key_svg(&frame));
         svg.push_str("</svg>\n");
@@ -174,8 +183,9 @@ impl Drawing {
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
         let length = dx.hypot(dy).max(1.0);
         let (nx, ny) = (-dy / length, dx / length);
-        let middle =
-            [0.5 * (from[0] + to[0]) + nx * link.bend * length, 0.5 * (from[1] + to[1]) + ny * link.bend * length];
+        // A positive bend goes upwards, or to the left of what is upright, and stays within the margin.
+        let aside = (link.bend * length).clamp(-BEND_PX, BEND_PX);
+        let middle = [0.5 * (from[0] + to[0]) - nx * aside, 0.5 * (from[1] + to[1]) - ny * aside];
         let points: Vec<Place> = match link.kind {
             LinkKind::Beam => vec![from, to],
             LinkKind::Spring => zigzag(from, to, middle),
@@ -210,7 +220,7 @@ impl Drawing {
         write!(
             svg,
             "<polyline points=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{width}\" stroke-linejoin=\"round\"/>\
-             <text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\" font-weight=\"600\">{name}{change}</text><text x=\"{x:.1}\" \
+             <text {HALO} x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\" font-weight=\"600\">{name}{change}</text><text {HALO} x=\"{x:.1}\" \
              y=\"{:.1}\" text-anchor=\"{anchor}\" font-size=\"11\">{label}</text></g>",
             y + 13.0
         )
@@ -235,7 +245,7 @@ impl Drawing {
             let path: Vec<String> = points.iter().map(|[x, y]| format!("{x:.1},{y:.1}")).collect();
             write!(svg, "<polyline points=\"{}\" stroke-dasharray=\"5 3\"/>", path.join(" "))
                 .expect("writing to memory cannot fail");
-            if points.len() <= 60 {
+            if points.len() <= MOST_DOTS {
                 for [x, y] in points {
                     write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"#009e73\" stroke=\"none\"/>")
                         .expect("writing to memory cannot fail");
@@ -255,7 +265,7 @@ impl Drawing {
     fn axis_svg(&self, frame: &Frame) -> String {
         let Some(unit) = &self.axis else { return String::new() };
         let (first, last) = (frame.low[0], frame.low[0] + (WIDTH - 2.0 * MARGIN) / frame.scale[0].max(1e-12));
-        let y = frame.height - 22.0;
+        let y = frame.height - 42.0;
         let mut svg = format!(
             "<g class=\"axis\" font-size=\"11\" text-anchor=\"middle\"><line x1=\"{MARGIN}\" x2=\"{:.1}\" y1=\"{y:.1}\" y2=\"{y:.1}\" \
              stroke=\"#1a1a1a\"/>",
@@ -284,7 +294,7 @@ impl Drawing {
             return String::new();
         }
         let full = self.full_percent;
-        let y = if self.axis.is_some() { 40.0 } else { frame.height - 14.0 };
+        let y = frame.height - 8.0;
         let one = |(place, percent): (usize, f64)| {
             let x = 12.0 + 92.0 * place as f64;
             format!(
@@ -301,7 +311,8 @@ impl Drawing {
     }
 }
 
-fn body_svg(body: &Body, frame: &Frame) -> String {
+/// A body with its label: beside it, or below it on a beam, whose own label stands beside it.
+fn body_svg(body: &Body, frame: &Frame, on_beam: bool) -> String {
     let [x, y] = frame.at(body.at);
     let name = escaped(&body.name);
     let form = if body.solid {
@@ -312,11 +323,14 @@ fn body_svg(body: &Body, frame: &Frame) -> String {
     } else {
         format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"#1a1a1a\"/>")
     };
-    let (text_y, label_x, label_y, anchor) =
-        if body.solid { (y + 4.0, x - BODY - 6.0, y + 4.0, "end") } else { (y + 18.0, x, y + 31.0, "middle") };
+    let (text_y, label_x, label_y, anchor) = match (body.solid, on_beam) {
+        (true, false) => (y + 4.0, x - BODY - 4.0, y - BODY + 2.0, "end"),
+        (true, true) => (y + 4.0, x - BODY, y + BODY + 14.0, "end"),
+        (false, _) => (y + 18.0, x, y + 31.0, "middle"),
+    };
     format!(
         "<g class=\"body\" data-name=\"{name}\">{form}<text x=\"{x:.1}\" y=\"{text_y:.1}\" text-anchor=\"middle\">{name}</text>\
-         <text x=\"{label_x:.1}\" y=\"{label_y:.1}\" text-anchor=\"{anchor}\" font-size=\"11\">{}</text></g>",
+         <text {HALO} x=\"{label_x:.1}\" y=\"{label_y:.1}\" text-anchor=\"{anchor}\" font-size=\"11\">{}</text></g>",
         escaped(&body.label)
     )
 }
