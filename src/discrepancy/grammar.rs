@@ -1,7 +1,6 @@
 //! The candidates: every combination of a target and a covariate, and the laws that each can follow.
 
 use std::collections::BTreeSet;
-use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -36,18 +35,6 @@ pub enum Class {
     Structure,
     /// The structure has changed with time.
     PossibleDamage,
-}
-
-impl fmt::Display for Class {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Environment => "environment or operation",
-            Self::Instrument => "instrument",
-            Self::SetUp => "set-up of the test",
-            Self::Structure => "simulation of the structure",
-            Self::PossibleDamage => "possible damage",
-        })
-    }
 }
 
 /// A possible cause: a target and the covariate that it depends on. It can follow one of several laws.

@@ -106,7 +106,7 @@ impl ChangeInTime {
             Some(after) => format!("after {time_unit} {after:.1}"),
             None => "steadily with time".to_owned(),
         };
-        format!("{} changes by {:.2} % {when} ({})", self.target, self.size_percent, stats::p_value_text(self.p_value))
+        format!("{} changes by {:.2} % {when} (p = {:.1e})", self.target, self.size_percent, self.p_value)
     }
 }
 
