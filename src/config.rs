@@ -167,6 +167,11 @@ impl Config {
         let admin_file = Env::raw().only(&[ADMIN_TOKEN_FILE]).map(|_| "access.admin_token_file".into());
         figment =
             figment.merge(admin_file).merge(Env::prefixed(ENVIRONMENT).split("__")).merge(Serialized::defaults(flags));
+        // A port alone is a number in a file or in the environment.
+        let port = figment.find_value("http.listen").ok().and_then(|value| value.to_u128());
+        if let Some(port) = port {
+            figment = figment.merge(Serialized::default("http.listen", port.to_string()));
+        }
         let mut config: Self = figment.extract().map_err(|e| Error::Value(Box::new(e)))?;
         config.http.listen = listen_address(&config.http.listen)?;
         config.check()?;
@@ -317,6 +322,10 @@ mod tests {
         ] {
             assert_eq!(read(given).as_deref(), Ok(understood));
         }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("config.toml");
+        std::fs::write(&path, "[http]\nlisten = 8081\n").unwrap();
+        assert_eq!(Config::read(Some(&path), &Flags::default()).unwrap().http.listen, "127.0.0.1:8081");
         for wrong in ["localhost", "", ":8080", "70000", "127.0.0.1:99999", "::1", "http://127.0.0.1:8080", "80 80"] {
             let said = read(wrong).unwrap_err();
             assert!(said.contains(&shown(wrong.trim())) && said.contains("a port alone, such as 8080"), "{said}");
