@@ -15,6 +15,7 @@ use crate::monitor::retention::RetentionSettings;
 use crate::monitor::MonitorSettings;
 use crate::mqtt::MqttSettings;
 use crate::notify::NotifySettings;
+use crate::quantity::shown;
 use crate::store::StoreSettings;
 use crate::telemetry::LogSettings;
 
@@ -119,6 +120,13 @@ pub enum Error {
     /// An invalid setting of the MQTT broker.
     #[error("configuration: {0}")]
     Mqtt(#[from] crate::mqtt::SettingError),
+    /// A `--data-dir` that does not exist.
+    #[error(
+        "--data-dir {} does not exist: correct the path; only `modalwatch serve` and `modalwatch demo` create a data folder (or create an \
+         empty one with mkdir)",
+        .0.display()
+    )]
+    NoFolder(PathBuf),
     /// A value out of range.
     #[error("configuration: {key} is {value}: it must be {must}")]
     Range {
@@ -159,9 +167,27 @@ impl Config {
         let admin_file = Env::raw().only(&[ADMIN_TOKEN_FILE]).map(|_| "access.admin_token_file".into());
         figment =
             figment.merge(admin_file).merge(Env::prefixed(ENVIRONMENT).split("__")).merge(Serialized::defaults(flags));
-        let config: Self = figment.extract().map_err(|e| Error::Value(Box::new(e)))?;
+        // A port alone is a number in a file or in the environment.
+        let port = figment.find_value("http.listen").ok().and_then(|value| value.to_u128());
+        if let Some(port) = port {
+            figment = figment.merge(Serialized::default("http.listen", port.to_string()));
+        }
+        let mut config: Self = figment.extract().map_err(|e| Error::Value(Box::new(e)))?;
+        config.http.listen = listen_address(&config.http.listen)?;
         config.check()?;
         Ok(config)
+    }
+
+    /// [`Self::read`] for a command that uses an existing data folder: a `--data-dir` that does not exist is a typing mistake, not a
+    /// wish for a new folder.
+    ///
+    /// # Errors
+    /// As [`Self::read`], and [`Error::NoFolder`].
+    pub fn read_for_existing(file: Option<&Path>, flags: &Flags) -> Result<Self, Error> {
+        match &flags.data_dir {
+            Some(folder) if !folder.is_dir() => Err(Error::NoFolder(folder.clone())),
+            _ => Self::read(file, flags),
+        }
     }
 
     /// Keys whose values differ from those of `other`, such as `http.listen`.
@@ -216,6 +242,29 @@ impl Config {
     }
 }
 
+/// The address to listen on: `text` itself, or the port `text` of this machine alone.
+fn listen_address(text: &str) -> Result<String, Error> {
+    let text = text.trim();
+    let wrong = || {
+        Error::Range {
+        key: "http.listen (--listen)",
+        value: shown(text),
+        must: "an address and a port from 0 to 65535, such as 127.0.0.1:8080 (this machine only) or 0.0.0.0:8080 (reachable from \
+               others), or a port alone, such as 8080, for this machine only",
+    }
+    };
+    if text.parse::<u16>().is_ok() {
+        return Ok(format!("127.0.0.1:{text}"));
+    }
+    let (host, port) = text.rsplit_once(':').ok_or_else(wrong)?;
+    let bracketed = host.starts_with('[') && host.ends_with(']');
+    let named = !host.is_empty() && !host.contains([':', '/', ' ', '[', ']']);
+    if port.parse::<u16>().is_err() || !(bracketed || named) {
+        return Err(wrong());
+    }
+    Ok(text.to_owned())
+}
+
 /// Collects the leaves of a tree of settings by their keys.
 fn flatten(path: String, value: &serde_json::Value, keys: &mut std::collections::BTreeMap<String, serde_json::Value>) {
     let serde_json::Value::Object(members) = value else {
@@ -256,6 +305,31 @@ mod tests {
         after.retention.measurements_days = 5;
         after.models_dir = Some(PathBuf::from("models"));
         assert_eq!(before.differing_keys(&after), ["log.level", "models_dir", "retention.measurements_days"]);
+    }
+
+    #[test]
+    fn a_port_alone_is_one_of_this_machine_and_a_wrong_address_gets_a_sentence() {
+        let read = |listen: &str| {
+            let flags = Flags { http: HttpFlags { listen: Some(listen.to_owned()) }, ..Flags::default() };
+            Config::read(None, &flags).map(|config| config.http.listen).map_err(|e| e.to_string())
+        };
+        for (given, understood) in [
+            ("8080", "127.0.0.1:8080"),
+            (" 0 ", "127.0.0.1:0"),
+            ("0.0.0.0:80", "0.0.0.0:80"),
+            ("localhost:8080", "localhost:8080"),
+            ("[::1]:8080", "[::1]:8080"),
+        ] {
+            assert_eq!(read(given).as_deref(), Ok(understood));
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("config.toml");
+        std::fs::write(&path, "[http]\nlisten = 8081\n").unwrap();
+        assert_eq!(Config::read(Some(&path), &Flags::default()).unwrap().http.listen, "127.0.0.1:8081");
+        for wrong in ["localhost", "", ":8080", "70000", "127.0.0.1:99999", "::1", "http://127.0.0.1:8080", "80 80"] {
+            let said = read(wrong).unwrap_err();
+            assert!(said.contains(&shown(wrong.trim())) && said.contains("a port alone, such as 8080"), "{said}");
+        }
     }
 
     #[test]

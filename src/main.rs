@@ -32,15 +32,20 @@ fn main() -> ExitCode {
     }
 }
 
-/// Ends the program with the status of a command whose reader has left, as `head` does, instead of a panic of `println!`.
+/// Ends the program when its output cannot be written, instead of a panic of `println!`: silently with the status of a command whose
+/// reader has left, as `head` does, otherwise with the cause, such as a full disk.
 fn end_quietly_without_a_reader() {
     /// 128 + the number of the signal SIGPIPE.
     const READER_LEFT: i32 = 141;
     let usual = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         let text = panic.payload_as_str().unwrap_or_default();
-        if text.starts_with("failed printing to stdout") && text.contains("Broken pipe") {
-            std::process::exit(READER_LEFT);
+        if let Some(cause) = text.strip_prefix("failed printing to stdout: ") {
+            if cause.contains("Broken pipe") {
+                std::process::exit(READER_LEFT);
+            }
+            eprintln!("modalwatch: the output cannot be written: {cause}");
+            std::process::exit(1);
         }
         usual(panic);
     }));

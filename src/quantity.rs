@@ -248,6 +248,37 @@ impl fmt::Display for Digest {
     }
 }
 
+/// A value with about four significant digits and, for a large value, the prefix k, M or G of its unit: `30 MN/m`, `0.7 kg`, `3.2 kN/m`.
+pub fn with_prefix(value: f64, unit: &str) -> String {
+    let prefixes = [("G", 1e9), ("M", 1e6), ("k", 1e3)];
+    // Tonnes are not written as Mg.
+    let prefixed = if unit == "kg" || unit.is_empty() {
+        None
+    } else {
+        prefixes.into_iter().find(|(_, size)| value.abs() >= *size)
+    };
+    let (prefix, scaled) = prefixed.map_or(("", value), |(prefix, size)| (prefix, value / size));
+    format!("{} {prefix}{unit}", significant(scaled)).trim_end().to_owned()
+}
+
+/// A number with four significant digits, without the zeros at its end; with an exponent where it would be too long.
+pub fn significant(value: f64) -> String {
+    if value == 0.0 || !value.is_finite() {
+        return format!("{value}");
+    }
+    let magnitude = value.abs().log10().floor();
+    if !(-4.0..=6.0).contains(&magnitude) {
+        return format!("{value:.3e}");
+    }
+    let decimals = (3.0 - magnitude).max(0.0) as usize;
+    let text = format!("{value:.decimals$}");
+    if text.contains('.') {
+        text.trim_end_matches('0').trim_end_matches('.').to_owned()
+    } else {
+        text
+    }
+}
+
 /// Text from a client as it is shown in a message: in quotation marks, cut to 80 characters, with control characters escaped.
 pub fn shown(text: &str) -> String {
     let mut short: String = text.chars().take(80).flat_map(char::escape_debug).collect();

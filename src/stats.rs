@@ -92,6 +92,17 @@ pub fn quantile(values: &[f64], level: f64) -> f64 {
     below + (position - place as f64) * (above - below)
 }
 
+/// A p-value as text for people: `p = 0.012`, or `p < 0.001` where more digits would say nothing.
+pub fn p_value_text(p: f64) -> String {
+    if p < 0.001 {
+        "p < 0.001".to_owned()
+    } else if p < 0.1 {
+        format!("p = {p:.3}")
+    } else {
+        format!("p = {p:.2}")
+    }
+}
+
 /// Cumulative distribution of the standard normal, Φ(z).
 pub fn normal_cdf(z: f64) -> f64 {
     Normal::standard().cdf(z)
@@ -198,6 +209,12 @@ mod tests {
     use rand::RngCore as _;
 
     use super::*;
+
+    #[test]
+    fn p_values_are_written_without_exponents() {
+        let texts = [0.0, 1e-300, 0.0004, 0.0123, 0.6].map(p_value_text);
+        assert_eq!(texts, ["p < 0.001", "p < 0.001", "p < 0.001", "p = 0.012", "p = 0.60"]);
+    }
 
     #[test]
     fn streams_differ_by_seed_and_by_purpose_and_repeat_by_both() {

@@ -55,7 +55,8 @@ const TABLE: [(&str, &[&str], bool); 35] = [
     ("emulator", &["stats"], false),
     ("gsa", &["stats"], false),
     ("flow", &["simd", "stats"], false),
-    ("simulator", &["emulator", "physics"], true),
+    // `plot` for the drawing of a structure.
+    ("simulator", &["emulator", "physics", "plot"], true),
     ("updating", &["physics", "simulator"], true),
     ("posterior", &[], true),
     // Uses `physics` only for the error of a simulation.
@@ -101,7 +102,7 @@ const TABLE: [(&str, &[&str], bool); 35] = [
         ],
         true,
     ),
-    ("config", &["access", "http", "monitor", "mqtt", "notify", "store", "telemetry"], false),
+    ("config", &["access", "http", "monitor", "mqtt", "notify", "quantity", "store", "telemetry"], false),
     (
         "cli",
         &[

@@ -63,15 +63,12 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     if args.json {
         let report = serde_json::json!({ "undamaged": undamaged, "assessment": assessment });
         println!("{}", serde_json::to_string_pretty(&report)?);
-        return Ok(());
+        return trusted(args, &assessment);
     }
     println!(
         "{} measurements used, of which {} lie outside the prior; {} left out",
         assessment.measurements_used, assessment.measurements_outside, assessment.measurements_left_out
     );
-    if !assessment.trust.accepted() {
-        println!("THE TRUST CHECKS FAILED: no probability of damage is given");
-    }
     for finding in undamaged.doubts.iter().chain(assessment.trust.findings.iter().map(|f| &f.message)) {
         println!("note: {finding}");
     }
@@ -101,6 +98,17 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
             damage.map_or("-", |d| if d.exceeds { "yes" } else { "no" })
         );
     }
+    trusted(args, &assessment)
+}
+
+/// An error for measurements that were not accepted: there is no probability of damage, and a script must not take this for "healthy".
+fn trusted(args: &AssessArgs, assessment: &assessment::Assessment) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        assessment.trust.accepted(),
+        "{} is not accepted, so that no probability of damage is given: {}",
+        args.data.display(),
+        assessment.trust.findings.iter().map(|f| f.message.as_str()).collect::<Vec<_>>().join("; ")
+    );
     Ok(())
 }
 

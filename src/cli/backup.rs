@@ -33,7 +33,7 @@ pub struct RestoreArgs {
     /// Folder of the backup, with modalwatch.sqlite and manifest.json
     #[arg(long)]
     from: PathBuf,
-    /// Folder of the database [default: modalwatch-data]
+    /// Folder for the database; it must exist [default: modalwatch-data]
     #[arg(long)]
     data_dir: Option<PathBuf>,
     /// Configuration file (TOML)
@@ -161,7 +161,7 @@ pub async fn restore(args: &RestoreArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     let flags = crate::config::Flags { data_dir: args.data_dir.clone(), ..crate::config::Flags::default() };
-    let config = Config::read(args.config.as_deref(), &flags)?;
+    let config = Config::read_for_existing(args.config.as_deref(), &flags)?;
     let Restored { manifest, kept_aside } =
         backup::restore(&args.from, &config.data_dir, args.replace, Timestamp::now()).await?;
     print_manifest(&args.from, &manifest);

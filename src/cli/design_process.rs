@@ -1,6 +1,8 @@
 //! `modalwatch design-alarm --batch-correlation`: the losses that the charts of a process will detect, where the parameters follow
 //! unmeasured weather.
 
+use anyhow::Context as _;
+use indicatif::{ProgressBar, ProgressStyle};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use serde::Serialize;
@@ -9,7 +11,7 @@ use crate::parameter::{DamageDirection, Parameter};
 use crate::plot::{table, Line, Plot};
 use crate::process::detectable::Detectable;
 use crate::process::estimate::BatchEstimate;
-use crate::process::fit::{Quantities, FEWEST_BATCHES};
+use crate::process::fit::{Progress, Quantities, FEWEST_BATCHES};
 use crate::process::limits::Limits;
 use crate::process::reference::ReferenceProcess;
 use crate::quantity::Timestamp;
@@ -17,6 +19,9 @@ use crate::stats;
 
 /// Batches of the table that are printed; the page has all.
 const PRINTED: [usize; 5] = [1, 3, 8, 30, 60];
+
+/// Most batches of the simulated reference.
+const MOST_BATCHES: usize = 2_000;
 
 /// Time between batches of the simulated reference; the result does not depend on it.
 const STEP_MICROS: i64 = 86_400_000_000;
@@ -67,19 +72,32 @@ impl Weather {
             "--reference-batches is {}: a process is learned from at least {FEWEST_BATCHES} batches",
             self.reference
         );
+        anyhow::ensure!(
+            self.reference <= MOST_BATCHES,
+            "--reference-batches is {}: at most {MOST_BATCHES} are simulated, because the time of the search grows with their number",
+            self.reference
+        );
         Ok(())
     }
 
     /// Simulates an undamaged reference, learns its process as the service does, and returns its charts.
     pub(super) fn report(&self, parameters: &[Moving]) -> anyhow::Result<ProcessReport> {
         self.check()?;
+        let bar = progress_bar()?;
+        let watch = |progress: Progress| match progress {
+            Progress::Search { evaluations } => {
+                bar.set_message(format!("process of the weather, step {evaluations} of its search"));
+            }
+            Progress::Limits { done, all } => bar.set_message(format!("limits, operation {done} of {all}")),
+        };
         let quantities = Quantities {
             names: parameters.iter().map(|p| p.parameter.name.clone()).collect(),
             units: parameters.iter().map(|p| p.parameter.unit.clone()).collect(),
             directions: parameters.iter().map(|p| p.parameter.damage).collect(),
         };
         let estimates = self.estimates(parameters)?;
-        let found = ReferenceProcess::new(&quantities, &[], estimates, self.mean_run_batches, [1.0; 2])?;
+        let found = ReferenceProcess::watched(&quantities, &[], estimates, (self.mean_run_batches, [1.0; 2]), &watch)?;
+        bar.finish_and_clear();
         let watched = |name: &str| {
             parameters.iter().any(|p| p.parameter.name == name && p.parameter.damage != DamageDirection::None)
         };
@@ -124,6 +142,19 @@ impl Weather {
         }
         Ok(estimates)
     }
+}
+
+/// A line with the time and the step on a terminal. Elsewhere, such as in a log, one line says that it takes a while.
+fn progress_bar() -> anyhow::Result<ProgressBar> {
+    let bar = ProgressBar::new_spinner();
+    bar.set_style(ProgressStyle::with_template("{elapsed} {msg}").context("the template of the progress bar")?);
+    if bar.is_hidden() {
+        eprintln!(
+            "the process of a reference under weather is simulated and learned, which takes seconds to some minutes"
+        );
+    }
+    bar.enable_steady_tick(std::time::Duration::from_millis(200));
+    Ok(bar)
 }
 
 impl ProcessReport {

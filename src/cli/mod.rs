@@ -4,6 +4,7 @@ mod archive;
 mod assess;
 mod backup;
 mod calibrate;
+mod check;
 mod demo;
 mod design_alarm;
 mod design_process;
@@ -12,9 +13,11 @@ mod doctor;
 mod healthcheck;
 mod measurements;
 mod model;
+mod new;
 mod next;
 mod output;
 mod parameter;
+mod rehearsal;
 mod reload;
 mod remote;
 mod report;
@@ -51,13 +54,17 @@ enum Command {
     Serve(ServeArgs),
     /// Start a service, post case 1 of the paper to it and print the results.
     Demo(demo::DemoArgs),
+    /// Write a structure file of masses and springs; asks for what the flags do not give.
+    New(new::NewArgs),
+    /// Show a structure before anything is trained: parts, modes, sensitivities, what its modes can identify, a drawing.
+    Check(check::CheckArgs),
     /// Train the model of a structure.
     Train(train::TrainArgs),
     /// Check the calibration of a trained model: whether its posteriors have the right width.
     Calibrate(calibrate::CalibrateArgs),
     /// Simulate the alarm charts of a structure: false alarms, delay and detectable damage.
     DesignAlarm(design_alarm::DesignAlarmArgs),
-    /// Simulate measurements of a structure as CSV.
+    /// Simulate measurements of a structure, also with seasons, trends, a loss from a date, missing modes and outliers.
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
     Assess(assess::AssessArgs),
@@ -152,6 +159,8 @@ pub fn run() -> anyhow::Result<()> {
             served
         }
         Command::Demo(args) => block_on(demo::demo(args)),
+        Command::New(args) => new::new(&args),
+        Command::Check(args) => check::check(&args),
         Command::Train(args) => train::train(&args),
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),

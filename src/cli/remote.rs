@@ -36,14 +36,14 @@ impl LocationArgs {
     /// The configuration in force.
     ///
     /// # Errors
-    /// An invalid configuration.
+    /// An invalid configuration, or a `--data-dir` that does not exist.
     pub fn read(&self) -> Result<Config, crate::config::Error> {
         let flags = crate::config::Flags {
             data_dir: self.data_dir.clone(),
             models_dir: self.models.clone(),
             ..crate::config::Flags::default()
         };
-        Config::read(self.config.as_deref(), &flags)
+        Config::read_for_existing(self.config.as_deref(), &flags)
     }
 
     /// The service at `--url`, otherwise at the address in the configuration.

@@ -28,8 +28,8 @@ const BUCKETS_SECONDS: [f64; 12] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1
 pub struct Running {
     /// The address it listens on.
     pub address: SocketAddr,
-    /// Completes when the service has stopped.
-    pub task: tokio::task::JoinHandle<()>,
+    /// Completes when the service has stopped; an error if a part of it failed.
+    pub task: tokio::task::JoinHandle<anyhow::Result<()>>,
     /// The monitor of the structures.
     pub monitor: Monitor,
 }
@@ -88,13 +88,17 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
             let _ = stop.send(true);
         };
         server::run(listener, router, &config.http, shutdown).await;
+        let mut failed = 0;
         for task in background {
             if let Err(failure) = task.await {
                 error!(error = %failure, "A background task panicked: {failure}");
+                failed += 1;
             }
         }
         store.close().await;
         info!("Stopped");
+        anyhow::ensure!(failed == 0, "{failed} parts of the service failed while it was running: its log names them");
+        Ok(())
     });
     Ok(Running { address, task, monitor })
 }
@@ -110,7 +114,7 @@ pub async fn serve(config: Config, reloading: Reloading) -> anyhow::Result<()> {
     reloading.follow(hangups, running.monitor.clone(), config);
     supervisor::ready(running.monitor);
     println!("modalwatch listens on http://{}", running.address);
-    running.task.await.context("the service panicked")
+    running.task.await.context("the service panicked")?
 }
 
 /// Completes at the first SIGTERM or SIGINT.

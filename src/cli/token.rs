@@ -73,7 +73,7 @@ pub async fn token(args: TokenArgs) -> anyhow::Result<()> {
         return Ok(());
     }
     let flags = Flags { data_dir: args.data_dir, ..Flags::default() };
-    let config = Config::read(args.config.as_deref(), &flags)?;
+    let config = Config::read_for_existing(args.config.as_deref(), &flags)?;
     let store = Store::open(&config.data_dir).await.map_err(|error| match error {
         store::Error::Locked(folder) => anyhow::anyhow!(
             "the service is running on {}: use its API (POST /v1/tokens, DELETE /v1/tokens/{{id}}, POST \

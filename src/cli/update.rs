@@ -154,6 +154,11 @@ fn by_sensitivity(simulator: &Simulator, measurements: &[ModalMeasurement]) -> a
         notes.push(format!("{left_out} measurements have fewer modes than there are parameters and were left out"));
     }
     let stuck = updates.iter().filter(|u| !u.converged).count();
+    anyhow::ensure!(
+        stuck < updates.len(),
+        "none of the {stuck} iterations converged: the measurements do not belong to this structure, or its prior is wrong; \
+         `modalwatch check` compares measured frequencies with the prior"
+    );
     if stuck > 0 {
         notes.push(format!("{stuck} of {} iterations did not converge", updates.len()));
     }

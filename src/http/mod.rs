@@ -11,6 +11,7 @@ mod condition_report;
 mod dashboard;
 mod diagnoses;
 mod docs;
+mod drawing;
 mod error;
 mod events;
 mod explorer;
@@ -85,6 +86,7 @@ fn api() -> OpenApiRouter<Shared> {
     OpenApiRouter::with_openapi(openapi::Base::openapi())
         .routes(routes!(structures::list))
         .routes(routes!(structures::read, structures::put))
+        .routes(routes!(drawing::drawing))
         .routes(routes!(batches::create))
         .routes(routes!(batches::read))
         .routes(routes!(views::detail))

@@ -2,7 +2,8 @@
 //!
 //! - [`Plot`] and [`Scatter`]: one large plot on a light background;
 //! - [`Panel`] and [`Heat`]: small plots side by side in the light or dark colours of the page;
-//! - [`density`]: densities of samples.
+//! - [`density`]: densities of samples;
+//! - [`structure`]: drawings of structures.
 
 mod chart;
 mod colours;
@@ -12,6 +13,7 @@ mod html;
 mod page;
 mod panel;
 mod strip;
+pub mod structure;
 mod ticks;
 
 pub use chart::{Line, Plot, Points, Scatter};

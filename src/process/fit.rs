@@ -1,5 +1,8 @@
 //! The process that is most probable for the batches of an undamaged reference.
 
+use std::cell::RefCell;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use argmin::core::{CostFunction, Error as SearchError, Executor, Gradient, State as _};
 use argmin::solver::linesearch::MoreThuenteLineSearch;
 use argmin::solver::quasinewton::LBFGS;
@@ -10,7 +13,7 @@ use rayon::prelude::*;
 
 use super::coverage::Coverage;
 use super::estimate::{BatchEstimate, Observation, Scale};
-use super::likelihood::{information, log_posterior};
+use super::likelihood::{information, log_density, log_posterior};
 use super::model::{Process, Sizes};
 use crate::parameter::DamageDirection;
 use crate::stats;
@@ -24,6 +27,9 @@ const MOST_FACTORS: usize = 3;
 /// Steps of the search, and the vectors that it remembers.
 const ITERATIONS: u64 = 300;
 const REMEMBERED: usize = 10;
+
+/// A search ends when a step lowers its cost, minus the log density for each observation, by less than this, nats.
+const LEAST_GAIN: f64 = 1e-11;
 
 /// Cost where the density cannot be computed. The line search needs finite numbers.
 const IMPOSSIBLE: f64 = 1e6;
@@ -84,10 +90,53 @@ pub enum Error {
     Search(String),
 }
 
+/// What a fit has done, for those who wait for it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Progress {
+    /// Evaluations of the density in the search for the most probable process; their number is not known before.
+    Search {
+        /// Evaluations so far.
+        evaluations: usize,
+    },
+    /// Operations that were simulated for the limits.
+    Limits {
+        /// Operations so far.
+        done: usize,
+        /// Operations in total.
+        all: usize,
+    },
+}
+
+/// Is called from several threads while a process is fitted.
+pub type Watch<'a> = &'a (dyn Fn(Progress) + Sync);
+
+/// The density, nats, and its gradient.
+type Density = (f64, Vec<f64>);
+
 /// What the search minimises: minus the log density for each observation, so that its slopes are of the order of 1.
 struct Target<'a> {
     sizes: Sizes,
     observations: &'a [Observation],
+    /// The last point and its density: the search asks for cost and gradient of the same point one after the other.
+    last: RefCell<Option<(Vec<f64>, Option<Density>)>>,
+    evaluations: &'a AtomicUsize,
+    watch: Watch<'a>,
+}
+
+impl Target<'_> {
+    /// The density at some unknowns, with its gradient; `None` where it cannot be computed.
+    fn density(&self, unknowns: &[f64]) -> Option<Density> {
+        if let Some((point, density)) = self.last.borrow().as_ref() {
+            if point == unknowns {
+                return density.clone();
+            }
+        }
+        let found = log_posterior(unknowns, self.sizes, self.observations);
+        *self.last.borrow_mut() = Some((unknowns.to_vec(), found.clone()));
+        let evaluations = self.evaluations.fetch_add(1, Ordering::Relaxed) + 1;
+        (self.watch)(Progress::Search { evaluations });
+        found
+    }
 }
 
 impl CostFunction for Target<'_> {
@@ -95,8 +144,7 @@ impl CostFunction for Target<'_> {
     type Output = f64;
 
     fn cost(&self, unknowns: &Vec<f64>) -> Result<f64, SearchError> {
-        let found = log_posterior(unknowns, self.sizes, self.observations);
-        Ok(found.map_or(IMPOSSIBLE, |(density, _)| -density / self.observations.len() as f64))
+        Ok(self.density(unknowns).map_or(IMPOSSIBLE, |(density, _)| -density / self.observations.len() as f64))
     }
 }
 
@@ -105,8 +153,7 @@ impl Gradient for Target<'_> {
     type Gradient = Vec<f64>;
 
     fn gradient(&self, unknowns: &Vec<f64>) -> Result<Vec<f64>, SearchError> {
-        let found = log_posterior(unknowns, self.sizes, self.observations);
-        let (_, gradient) = found.ok_or_else(|| SearchError::msg("the density cannot be computed"))?;
+        let (_, gradient) = self.density(unknowns).ok_or_else(|| SearchError::msg("the density cannot be computed"))?;
         Ok(gradient.into_iter().map(|slope| -slope / self.observations.len() as f64).collect())
     }
 }
@@ -125,7 +172,12 @@ struct Candidate {
 ///
 /// # Errors
 /// [`Error`], see its variants.
-pub fn fit(quantities: &Quantities, covariates: &[String], estimates: &[BatchEstimate]) -> Result<Process, Error> {
+pub fn fit(
+    quantities: &Quantities,
+    covariates: &[String],
+    estimates: &[BatchEstimate],
+    watch: Watch<'_>,
+) -> Result<Process, Error> {
     let batches = estimates.len();
     if batches < FEWEST_BATCHES {
         return Err(Error::TooFewBatches { batches });
@@ -134,8 +186,13 @@ pub fn fit(quantities: &Quantities, covariates: &[String], estimates: &[BatchEst
     let observations = observations(&process, estimates);
     let d = quantities.names.len();
     let most = if d == 1 { 0 } else { MOST_FACTORS.min(d - 1) };
-    let found: Vec<Result<Candidate, String>> =
-        (0..=most).into_par_iter().map(|factors| candidate(&process, factors, &observations)).collect();
+    let evaluations = AtomicUsize::new(0);
+    let search = |factors: usize| {
+        let sizes = Sizes { factors, ..process.sizes() };
+        let last = RefCell::new(None);
+        candidate(Target { sizes, observations: &observations, last, evaluations: &evaluations, watch })
+    };
+    let found: Vec<Result<Candidate, String>> = (0..=most).into_par_iter().map(search).collect();
     let failure = found.iter().find_map(|c| c.as_ref().err().cloned()).unwrap_or_default();
     let best = found.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
     let best = best.ok_or(Error::Search(failure))?;
@@ -152,8 +209,7 @@ fn draws(best: &Candidate, sizes: Sizes, observations: &[Observation]) -> Vec<Ve
         let mut stream = stats::stream(SEED, &format!("process {place}"));
         let z = DVector::from_fn(best.unknowns.len(), |_, _| stream.sample::<f64, _>(StandardNormal));
         let unknowns = DVector::from_column_slice(&best.unknowns) + &best.factor * &z;
-        let density =
-            log_posterior(unknowns.as_slice(), sizes, observations).map_or(f64::NEG_INFINITY, |found| found.0);
+        let density = log_density(unknowns.as_slice(), sizes, observations).unwrap_or(f64::NEG_INFINITY);
         (unknowns.as_slice().to_vec(), density + 0.5 * z.norm_squared())
     };
     let proposed: Vec<(Vec<f64>, f64)> = (0..PROPOSED).into_par_iter().map(propose).collect();
@@ -239,10 +295,10 @@ fn usual_errors(process: &Process, estimates: &[BatchEstimate]) -> DMatrix<f64> 
     DMatrix::from_fn(d, d, |i, j| if i == j { variance(i) } else { 0.0 })
 }
 
-fn candidate(process: &Process, factors: usize, observations: &[Observation]) -> Result<Candidate, String> {
-    let sizes = Sizes { factors, ..process.sizes() };
-    let target = Target { sizes, observations };
-    let solver = LBFGS::new(MoreThuenteLineSearch::new(), REMEMBERED);
+fn candidate(target: Target<'_>) -> Result<Candidate, String> {
+    let Target { sizes, observations, .. } = target;
+    let solver: LBFGS<_, Vec<f64>, Vec<f64>, f64> = LBFGS::new(MoreThuenteLineSearch::new(), REMEMBERED);
+    let solver = solver.with_tolerance_cost(LEAST_GAIN).map_err(|e| e.to_string())?;
     let executor =
         Executor::new(target, solver).configure(|state| state.param(start(sizes, observations)).max_iters(ITERATIONS));
     let result = executor.run().map_err(|e| e.to_string())?;
@@ -257,7 +313,7 @@ fn candidate(process: &Process, factors: usize, observations: &[Observation]) ->
     }
     let log_det: f64 = values.iter().map(|value| value.ln()).sum();
     let log_evidence = density + 0.5 * (unknowns.len() as f64 * std::f64::consts::TAU.ln() - log_det);
-    Ok(Candidate { factors, unknowns, factor, log_evidence })
+    Ok(Candidate { factors: sizes.factors, unknowns, factor, log_evidence })
 }
 
 /// Start of the search: factors along the principal directions of the estimates, the rest at the means of the priors.

@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use super::estimate::Observation;
 use super::filter::Filter;
 use super::model::{Numbers, Sizes};
-use super::smoother::{smooth, Smoothed};
+use super::smoother::{log_likelihood, smooth, Smoothed};
 
 /// Normal priors in standardised units, mean and standard deviation. They are weak: the standard deviation of the reference is 1.
 const MEAN: [f64; 2] = [0.0, 3.0];
@@ -54,6 +54,16 @@ pub(super) fn log_posterior(unknowns: &[f64], sizes: Sizes, observations: &[Obse
         *slope -= z / std;
     }
     (total.is_finite() && gradient.iter().all(|g| g.is_finite())).then_some((total, gradient))
+}
+
+/// The density of [`log_posterior`] without its gradient, for which the filter is enough.
+pub(super) fn log_density(unknowns: &[f64], sizes: Sizes, observations: &[Observation]) -> Option<f64> {
+    let mut total = log_likelihood(&Filter::exact(Numbers::of(unknowns, sizes)), observations)?;
+    for (value, [mean, std]) in unknowns.iter().zip(priors(sizes)) {
+        let z = (value - mean) / std;
+        total -= 0.5 * z * z + (std * std::f64::consts::TAU.sqrt()).ln();
+    }
+    total.is_finite().then_some(total)
 }
 
 /// Adds the derivatives of E ln N(x̂_t; μ + B c + H s_t, κ V_t) by μ, B, Λ and ln κ.

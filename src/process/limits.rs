@@ -1,5 +1,7 @@
 //! What healthy operation of a process reaches on the charts, from simulation.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
+
 use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
@@ -9,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::change::{of_one, of_several, Evidence, AGES, WINDOW};
 use super::estimate::Observation;
 use super::filter::Filter;
+use super::fit::{Progress, Watch};
 use super::model::{Numbers, Process};
 use crate::stats::{self, Stream};
 
@@ -181,9 +184,15 @@ impl<'a> Operation<'a> {
 /// The charts of single quantities and of all together, fast and slow, alarm equally often. An alarm is counted when it begins: the
 /// evidence of successive batches is correlated, so that one alarm lasts for some of them.
 pub fn limits(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64) -> Option<Limits> {
+    watched(process, signs, mean_run_batches, seed, &|_| {})
+}
+
+/// [`limits`] with its progress.
+pub fn watched(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64, watch: Watch<'_>) -> Option<Limits> {
     let steady = Steady::new(process)?;
     let longest = ((EARLY * mean_run_batches).round() as usize).clamp(1, LONGEST);
     let operations = (BATCHES / longest).clamp(OPERATIONS[0], OPERATIONS[1]);
+    let done = AtomicUsize::new(0);
     let simulated = |operation: usize| {
         let mut stream = stats::stream(seed, &format!("healthy operation {operation} of a process"));
         let mut operation = Operation::new(process, &steady, &mut stream)?;
@@ -192,7 +201,9 @@ pub fn limits(process: &Process, signs: &[f64], mean_run_batches: f64, seed: u64
             let [quantity, joint] = operation.evidence(signs);
             [quantity.fast, quantity.slow, joint.fast, joint.slow].map(|evidence| evidence as f32)
         };
-        Some((0..QUIET + longest).map(|_| next()).collect::<Vec<[f32; CHARTS]>>())
+        let evidence = (0..QUIET + longest).map(|_| next()).collect::<Vec<[f32; CHARTS]>>();
+        watch(Progress::Limits { done: done.fetch_add(1, Ordering::Relaxed) + 1, all: operations });
+        Some(evidence)
     };
     let all: Vec<Vec<[f32; CHARTS]>> = (0..operations).into_par_iter().filter_map(simulated).collect();
     let wanted = 1.0 - (-(longest as f64) / mean_run_batches).exp();

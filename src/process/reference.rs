@@ -9,9 +9,9 @@ use super::change::{change, evidence, score, signs, Evidence, LossEvidence, AGES
 use super::detectable::{detectable, Detectable};
 use super::estimate::BatchEstimate;
 use super::filter::{Filter, Innovation, Known};
-use super::fit::{fit, observations, Error, Quantities};
+use super::fit::{fit, observations, Error, Quantities, Watch};
 use super::followed::{Followed, Memory};
-use super::limits::{limits, Limits};
+use super::limits::{self, Limits};
 use super::model::Process;
 use crate::parameter::DamageDirection;
 use crate::quantity::Timestamp;
@@ -110,14 +110,29 @@ impl ReferenceProcess {
     pub fn new(
         quantities: &Quantities,
         covariates: &[String],
-        mut estimates: Vec<BatchEstimate>,
+        estimates: Vec<BatchEstimate>,
         mean_run_batches: f64,
         usual_misfit: [f64; 2],
     ) -> Result<Self, Error> {
+        Self::watched(quantities, covariates, estimates, (mean_run_batches, usual_misfit), &|_| {})
+    }
+
+    /// [`Self::new`], which takes seconds to minutes, with its progress.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn watched(
+        quantities: &Quantities,
+        covariates: &[String],
+        mut estimates: Vec<BatchEstimate>,
+        (mean_run_batches, usual_misfit): (f64, [f64; 2]),
+        watch: Watch<'_>,
+    ) -> Result<Self, Error> {
         estimates.sort_by_key(|estimate| estimate.at);
-        let process = fit(quantities, covariates, &estimates)?;
+        let process = fit(quantities, covariates, &estimates, watch)?;
         let singular = || Error::Search("a covariance is not positive definite".to_owned());
-        let limits = limits(&process, &signs(&quantities.directions), mean_run_batches, SEED).ok_or_else(singular)?;
+        let limits = limits::watched(&process, &signs(&quantities.directions), mean_run_batches, SEED, watch);
+        let limits = limits.ok_or_else(singular)?;
         let filter = Filter::of(&process);
         let mut known = filter.start();
         for observation in observations(&process, &estimates) {

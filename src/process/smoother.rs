@@ -3,7 +3,7 @@
 use nalgebra::DMatrix;
 
 use super::estimate::Observation;
-use super::filter::{Filter, Known};
+use super::filter::{Filter, Innovation, Known};
 
 /// Smoothed states.
 pub(super) struct Smoothed {
@@ -13,6 +13,25 @@ pub(super) struct Smoothed {
     pub(super) states: Vec<Known>,
     /// Covariance of the states at each time but the first with those before, `[q + d, q + d]`.
     pub(super) with_before: Vec<DMatrix<f64>>,
+}
+
+/// Log-likelihood of the observations, nats; `None` if a covariance is not positive definite.
+pub(super) fn log_likelihood(filter: &Filter, observations: &[Observation]) -> Option<f64> {
+    let (mut known, mut total) = (filter.start(), 0.0);
+    for observation in observations {
+        let (before, decay) = filter.predict(&known, observation.steps);
+        let (after, innovation) = filter.update((&before, decay), observation)?;
+        total += density_of(&innovation);
+        known = after;
+    }
+    Some(total)
+}
+
+/// ln of the normal density of an innovation, nats.
+fn density_of(innovation: &Innovation) -> f64 {
+    let distance = innovation.difference.dot(&(&innovation.precision * &innovation.difference));
+    let constant = innovation.informed.len() as f64 * std::f64::consts::TAU.ln();
+    -0.5 * (distance + innovation.log_det + constant)
 }
 
 /// Smooths the states by the recursion of Rauch, Tung and Striebel. `None` if a covariance is not positive definite.
@@ -31,9 +50,7 @@ pub(super) fn smooth(filter: &Filter, observations: &[Observation]) -> Option<Sm
     for observation in observations {
         let (before, decay) = filter.predict(&known, observation.steps);
         let (after, innovation) = filter.update((&before, decay.clone()), observation)?;
-        let distance = innovation.difference.dot(&(&innovation.precision * &innovation.difference));
-        let constant = innovation.informed.len() as f64 * std::f64::consts::TAU.ln();
-        log_likelihood -= 0.5 * (distance + innovation.log_det + constant);
+        log_likelihood += density_of(&innovation);
         predicted.push((before, decay));
         known = after.clone();
         states.push(after);

@@ -9,7 +9,7 @@ use super::estimate::{BatchEstimate, Observation};
 use super::filter::Filter;
 use super::fit::{fit, observations, Quantities};
 use super::followed::Memory;
-use super::likelihood::log_posterior;
+use super::likelihood::{log_density, log_posterior};
 use super::limits::{limits, Steady};
 use super::model::{Numbers, Process, Sizes};
 use super::reference::{Chain, ReferenceProcess};
@@ -86,7 +86,9 @@ fn the_likelihood_is_the_joint_normal_density_of_all_observations() {
 fn the_gradient_is_that_of_finite_differences() {
     let observations = uneven(20);
     let density = |unknowns: &[f64]| log_posterior(unknowns, SIZES, &observations).unwrap();
-    let (_, gradient) = density(&UNKNOWNS);
+    let (value, gradient) = density(&UNKNOWNS);
+    let without_gradient = log_density(&UNKNOWNS, SIZES, &observations).unwrap();
+    assert!((without_gradient - value).abs() < 1e-9, "{without_gradient}, with its gradient {value}");
     for place in 0..UNKNOWNS.len() {
         let h = 1e-5;
         let at = |step: f64| {
@@ -136,7 +138,7 @@ fn names() -> Quantities {
 }
 
 fn fitted(seed: u64, batches: usize) -> Process {
-    fit(&names(), &[], &world(seed, batches, usize::MAX, [0.0; 3])).unwrap()
+    fit(&names(), &[], &world(seed, batches, usize::MAX, [0.0; 3]), &|_| {}).unwrap()
 }
 
 #[test]
@@ -158,7 +160,7 @@ fn the_fit_finds_the_common_factor_and_its_correlation() {
 #[test]
 fn the_fit_is_the_maximum_of_the_density() {
     let estimates = world(9, 120, usize::MAX, [0.0; 3]);
-    let process = fit(&names(), &[], &estimates).unwrap();
+    let process = fit(&names(), &[], &estimates, &|_| {}).unwrap();
     let (_, gradient) = log_posterior(&process.unknowns, process.sizes(), &observations(&process, &estimates)).unwrap();
     // A slope of 0.01 moves an unknown whose standard deviation is 1 by 0.01 of it.
     assert!(gradient.iter().all(|slope| slope.abs() < 0.01), "{gradient:?}");

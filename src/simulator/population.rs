@@ -81,6 +81,16 @@ impl Population {
         Ok(Self { mean, std })
     }
 
+    /// Draws parameters, `[n][d]`, in their units.
+    pub fn parameters(&self, measurements: usize, seed: u64) -> Vec<Vec<f64>> {
+        let mut stream = stats::stream(seed, "population");
+        let mut one = || -> Vec<f64> {
+            let moments = self.mean.iter().zip(&self.std);
+            moments.map(|(mean, std)| mean + std * stream.sample::<f64, _>(StandardNormal)).collect()
+        };
+        (0..measurements).map(|_| one()).collect()
+    }
+
     /// Draws parameters, `[n, d]`, and simulates their frequencies, Hz, `[n, m]`: n = `measurements` measurements with
     /// `noise_multiple` times the measurement noise of the structure; 0 gives exact frequencies. The draws are not truncated at
     /// the prior, because a damaged population can leave it.
@@ -95,12 +105,7 @@ impl Population {
         noise_multiple: f64,
         seed: u64,
     ) -> Result<SimulatedMeasurements, SimulationError> {
-        let mut stream = stats::stream(seed, "population");
-        let mut one = || -> Vec<f64> {
-            let moments = self.mean.iter().zip(&self.std);
-            moments.map(|(mean, std)| mean + std * stream.sample::<f64, _>(StandardNormal)).collect()
-        };
-        let rows: Vec<Vec<f64>> = (0..measurements).map(|_| one()).collect();
+        let rows = self.parameters(measurements, seed);
         let theta = DMatrix::from_fn(measurements, self.mean.len(), |row, column| rows[row][column]);
         Ok(SimulatedMeasurements { frequencies_hz: simulator.measure(&rows, noise_multiple, seed)?, theta })
     }

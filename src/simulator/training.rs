@@ -125,9 +125,13 @@ impl Simulator {
 
     /// [`Self::measured`] with `noise_multiple` times the measurement noise.
     pub(super) fn measure(&self, rows: &[Vec<f64>], noise_multiple: f64, seed: u64) -> Result<DMatrix<f64>, Error> {
-        let exact = self.exact(rows)?;
+        self.with_noise(&self.exact(rows)?, noise_multiple, seed)
+    }
+
+    /// The frequencies `exact`, Hz, `[n][m]`, with `noise_multiple` times the measurement noise of the structure, Hz, `[n, m]`.
+    pub(super) fn with_noise(&self, exact: &[Vec<f64>], noise_multiple: f64, seed: u64) -> Result<DMatrix<f64>, Error> {
         let mut stream = stats::stream(seed, "measurement noise");
-        let mut noisy = DMatrix::zeros(rows.len(), self.modes());
+        let mut noisy = DMatrix::zeros(exact.len(), self.modes());
         for (row, frequencies) in exact.iter().enumerate() {
             for (mode, &frequency_hz) in frequencies.iter().enumerate() {
                 let std_hz = noise_multiple * self.std_hz(mode, frequency_hz);

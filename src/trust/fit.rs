@@ -9,6 +9,7 @@ use crate::baseline::nearest::{nearest, Nearest};
 use crate::baseline::observation::Observation;
 use crate::physics;
 use crate::simulator::Simulator;
+use crate::stats;
 
 /// Significance level: share of healthy batches that are rejected.
 pub const LEVEL: f64 = 0.01;
@@ -132,9 +133,9 @@ impl Fit {
                 )
             } else {
                 format!(
-                    "the simulation does not fit these measurements: its residuals are {:.2} times the noise (p = {:.1e}){}",
+                    "the simulation does not fit these measurements: its residuals are {:.2} times the noise ({}){}",
                     self.distance.unwrap_or_default(),
-                    self.p_value.unwrap_or_default(),
+                    stats::p_value_text(self.p_value.unwrap_or_default()),
                     self.worst_mode()
                 )
             };

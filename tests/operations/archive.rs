@@ -26,6 +26,7 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
     assert_eq!(online_lines[1..online_lines.len() - 1], offline_lines[1..offline_lines.len() - 1]);
 
     let target = elsewhere.path().join("data");
+    std::fs::create_dir(&target).unwrap();
     let import = ["import", "--from", text(&online), "--data-dir", text(&target), "--json"];
     let done: Value = serde_json::from_str(&run(&import).await).unwrap();
     assert_eq!((&done["batches"], &done["batches_new"]), (&10.into(), &10.into()), "{done}");
@@ -79,6 +80,7 @@ async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
         let file = target.path().join("changed.ndjson");
         std::fs::write(&file, content).unwrap();
         let data_dir = target.path().join("data");
+        std::fs::create_dir(&data_dir).unwrap();
         let said = fails(&["import", "--from", text(&file), "--data-dir", text(&data_dir)]).await;
         let second = Service::start(&data_dir);
         let history = second.read("/v1/structures/three-dof/history").await;

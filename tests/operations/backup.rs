@@ -51,6 +51,7 @@ async fn a_backup_under_ingest_restores_to_the_same_answers() {
 
     let restored = tempfile::tempdir().unwrap();
     let data_dir = restored.path().join("data");
+    std::fs::create_dir(&data_dir).unwrap();
     let backup = folder.path().join("backups/monday");
     run(&["restore", "--from", text(&backup), "--data-dir", text(&data_dir)]).await;
     let second = Service::start(&data_dir);
@@ -72,6 +73,7 @@ async fn a_backup_under_ingest_restores_to_the_same_answers() {
     // No more batches are posted: every answer is identical.
     created(service.post("/v1/backups", &json!({ "name": "tuesday" })).await).await;
     let again = restored.path().join("again");
+    std::fs::create_dir(&again).unwrap();
     let backup = folder.path().join("backups/tuesday");
     run(&["restore", "--from", text(&backup), "--data-dir", text(&again)]).await;
     let third = Service::start(&again);

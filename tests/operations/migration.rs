@@ -237,6 +237,7 @@ async fn a_backup_of_an_earlier_schema_restores_and_one_of_a_later_one_is_refuse
     // The database is copied unchanged: a backup made before an upgrade must be usable by the earlier version.
     assert_eq!(record["schema_version"], 1, "{record}");
     let data_dir = target.path().join("data");
+    std::fs::create_dir(&data_dir).unwrap();
     run(&["restore", "--from", text(&backup), "--data-dir", text(&data_dir)]).await;
     let service = Service::start(&data_dir);
     service.read(&format!("/v1/structures/three-dof/batches/{BATCH}")).await;

@@ -1,0 +1,66 @@
+//! `/v1/structures/{id}/drawing.svg`: the drawing of a structure.
+
+use axum::extract::State;
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+use utoipa::IntoParams;
+
+use super::error::ApiError;
+use super::openapi::{Invalid, StructurePath, Unknown};
+use super::request::{structure_id, ApiPath, ApiQuery};
+use super::shared::Shared;
+use crate::quantity::shown;
+use crate::simulator::drawing::{Error, Marks};
+
+/// Nothing is loaded or run by a drawing.
+const POLICY: &str = "default-src 'none'";
+
+/// Query of a drawing.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct DrawingQuery {
+    /// Measured mode, counted from 1, whose shape at the nominal parameters is drawn too.
+    #[param(value_type = Option<u32>, minimum = 1, maximum = 2000)]
+    mode: Option<String>,
+}
+
+/// `GET /v1/structures/{id}/drawing.svg`: masses, springs, beams and supports with their names.
+///
+/// # Errors
+/// 404 for the structure; 422 for a mode that is not measured, and for a table of finite-element runs, which has no geometry.
+#[utoipa::path(
+    get, path = "/v1/structures/{id}/drawing.svg", tag = "structures", operation_id = "draw_structure",
+    summary = "Drawing of a structure",
+    description = "Masses, springs, beams and supports with their names, as SVG: beams along their axis in metres, masses as many storeys \
+                   above the ground as springs lead there. A table of finite-element runs has no geometry and is answered 422.",
+    params(StructurePath, DrawingQuery),
+    responses((status = 200, description = "The drawing", body = String, content_type = "image/svg+xml"), Unknown, Invalid)
+)]
+pub async fn drawing(
+    State(shared): State<Shared>,
+    ApiPath(id): ApiPath<String>,
+    ApiQuery(query): ApiQuery<DrawingQuery>,
+) -> Result<Response, ApiError> {
+    let id = structure_id(&id)?;
+    let simulator = shared.monitor.structure(&id)?.simulator.clone();
+    let wrong = |text: &str| {
+        let message = format!("{} is not a mode from 1 to {}", shown(text), simulator.modes());
+        ApiError::invalid_field("query/mode", message)
+    };
+    let mode = query.mode.as_deref().map(|text| text.parse::<usize>().map_err(|_| wrong(text))).transpose()?;
+    // The shape needs an eigenproblem, which takes time for large structures.
+    let draw = move || {
+        let nominal = simulator.nominal_parameters();
+        simulator.drawing(&Marks::default(), mode.map(|mode| (mode, nominal.as_slice())))
+    };
+    let drawn = tokio::task::spawn_blocking(draw).await.map_err(|e| ApiError::internal(&e))?;
+    let drawing = drawn.map_err(|error| match error {
+        Error::NoMode { .. } => ApiError::invalid_field("query/mode", error.to_string()),
+        Error::NoGeometry => ApiError::invalid_field("path/id", error.to_string()),
+        Error::Physics(cause) => ApiError::internal(&cause),
+    })?;
+    let headers = [(header::CONTENT_TYPE, "image/svg+xml"), (header::CONTENT_SECURITY_POLICY, POLICY)];
+    Ok((headers, drawing.svg()).into_response())
+}

@@ -1,0 +1,26 @@
+//! The parameters at which a structure has its nominal stiffnesses.
+
+use super::definition::Law;
+use super::model::Binding;
+use super::simulate::Simulator;
+
+impl Simulator {
+    /// Parameters at the nominal stiffnesses, `[d]`, in the units of the parameters: the value at which the first stiffness that a
+    /// parameter sets has the value that the structure file gives it. A parameter that sets nothing, as in a table, or whose law never
+    /// reaches the nominal stiffness, is in the middle of its prior.
+    pub fn nominal_parameters(&self) -> Vec<f64> {
+        let one = |(column, parameter): (usize, &crate::parameter::Parameter)| {
+            let binding = self.bindings().iter().find(|b| b.parameter == column);
+            let nominal = binding.and_then(|b| at_stiffness(b, self.structure()?.springs()[b.spring].n_per_m));
+            nominal.unwrap_or_else(|| parameter.from_unit(0.5))
+        };
+        self.space().iter().enumerate().map(one).collect()
+    }
+}
+
+/// The parameter at which a binding gives the stiffness k, N/m: p = ln((k − c)/a)/b for the exponential law.
+fn at_stiffness(binding: &Binding, n_per_m: f64) -> Option<f64> {
+    let Some(Law::Exponential(e)) = binding.law else { return Some(n_per_m) };
+    let p = ((n_per_m - e.c) / e.a).ln() / e.b;
+    p.is_finite().then_some(p)
+}

@@ -1,0 +1,130 @@
+//! `modalwatch check`.
+
+use serde_json::Value;
+
+use crate::world::{World, TOWER};
+
+fn figures(world: &World, arguments: &[&str]) -> Value {
+    serde_json::from_str(&world.run(&[&["check"], arguments, &["--json"]].concat())).unwrap()
+}
+
+#[test]
+fn frequencies_scale_with_stiffness_and_bound_the_prior() {
+    let world = World::new();
+    let found = figures(&world, &["tower.toml"]);
+    for mode in found["modes"].as_array().unwrap() {
+        // With k4 known, the relative sensitivities to k1, k2 and k3 sum to less than ½, that of all stiffnesses together.
+        let sensitivity: Vec<f64> = serde_json::from_value(mode["sensitivity"].clone()).unwrap();
+        let sum: f64 = sensitivity.iter().sum();
+        assert!(sensitivity.iter().all(|s| *s > 0.0) && sum < 0.5, "{sensitivity:?}");
+        let prior: [f64; 2] = serde_json::from_value(mode["prior_hz"].clone()).unwrap();
+        let nominal = mode["nominal_hz"].as_f64().unwrap();
+        assert!(prior[0] < nominal && nominal < prior[1], "{mode}");
+    }
+    // With all springs unknown, each row sums to ½, because frequencies grow with the root of a common factor.
+    let all = TOWER.replace(
+        "parameter = [",
+        "parameter = [\n    { name = \"k4\", prior = { uniform = [1.25e7, 3.75e7] }, sets = { spring = \"k4\" } },",
+    );
+    std::fs::write(world.path("all.toml"), all).unwrap();
+    for mode in figures(&world, &["all.toml"])["modes"].as_array().unwrap() {
+        let sum: f64 = mode["sensitivity"].as_array().unwrap().iter().map(|s| s.as_f64().unwrap()).sum();
+        assert!((sum - 0.5).abs() < 1e-9, "{mode}");
+    }
+}
+
+#[test]
+fn measured_frequencies_are_compared_with_the_prior() {
+    let world = World::new();
+    let nominal: Vec<f64> = figures(&world, &["tower.toml"])["modes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|m| m["nominal_hz"].as_f64().unwrap())
+        .collect();
+    let text = |factor: f64| nominal.iter().map(|f| (f * factor).to_string()).collect::<Vec<_>>().join(",");
+    assert!(world.run(&["check", "tower.toml", "--measured", &text(1.0)]).contains("inside"));
+    let (_, said) = world.fails(&["check", "tower.toml", "--measured", &text(2.0)]);
+    assert!(
+        said.contains("mode 1:") && said.contains("outside the prior's range") && !said.contains("may be"),
+        "{said}"
+    );
+
+    // A prior that is a factor, with and without a nominal stiffness that shows it.
+    let factors = TOWER
+        .replace("[1.5e7, 4.5e7]", "[0.5, 1.5]")
+        .replace("[1.25e7, 3.75e7]", "[0.5, 1.5]")
+        .replace("n_per_m = 2.5e7 },\n]", "n_per_m = 1.0 },\n]");
+    std::fs::write(world.path("factors.toml"), &factors).unwrap();
+    let (_, said) = world.fails(&["check", "factors.toml"]);
+    assert!(
+        said.contains("the prior of k1 is 0.5 to 1.5 N/m, but the nominal stiffness is 30 MN/m")
+            && said.contains("[1.5e7, 4.5e7]"),
+        "{said}"
+    );
+    std::fs::write(world.path("bare.toml"), factors.replace(", n_per_m = 3e7", "").replace(", n_per_m = 2.5e7", ""))
+        .unwrap();
+    assert!(world.run(&["check", "bare.toml"]).contains("modes at the nominal parameters"));
+    let (_, said) = world.fails(&["check", "bare.toml", "--measured", &text(1.0)]);
+    assert!(said.contains("may be factors, such as 0.5 to 1.5"), "{said}");
+}
+
+#[test]
+fn parameters_that_the_modes_cannot_tell_apart_are_named() {
+    let world = World::new();
+    // Two springs beside each other, of which only the sum matters.
+    let twins = TOWER
+        .replace("spring = [", "spring = [\n    { name = \"k0\", from = \"ground\", to = \"m1\", n_per_m = 3e7 },")
+        .replace(
+            "parameter = [",
+            "parameter = [\n    { name = \"k0\", prior = { uniform = [1.5e7, 4.5e7] }, sets = { spring = \"k0\" } },",
+        );
+    std::fs::write(world.path("twins.toml"), twins).unwrap();
+    let found = figures(&world, &["twins.toml"]);
+    let together: Vec<(String, String, f64)> = serde_json::from_value(found["together"].clone()).unwrap();
+    assert!(
+        together.len() == 1 && together[0].0 == "k0" && together[0].1 == "k1" && together[0].2 < -0.95,
+        "{together:?}"
+    );
+    assert!(found["condition"].is_null() || found["condition"].as_f64().unwrap() > 1e6, "{found}");
+    let alone = figures(&world, &["tower.toml"]);
+    assert!(
+        alone["together"].as_array().unwrap().is_empty() && alone["condition"].as_f64().unwrap() < 100.0,
+        "{alone}"
+    );
+}
+
+#[test]
+fn towers_beams_and_frames_are_drawn_with_all_their_parts() {
+    let world = World::new();
+    let beam = r#"
+        id = "footbridge"
+        simulation = "beam"
+        modes = 2
+        measurement_noise = { relative = 0.002 }
+        node = [{ name = "a", x_m = 0, support = "pinned" }, { name = "b", x_m = 20 }, { name = "c", x_m = 45, support = "clamped" }]
+        beam = [
+            { name = "west", from = "a", to = "b", bending_stiffness_n_m2 = 4e8, mass_kg_per_m = 900 },
+            { name = "east", from = "b", to = "c", bending_stiffness_n_m2 = 4e8, mass_kg_per_m = 900 },
+        ]
+        mass = [{ name = "crane", kg = 2000, at = "b" }]
+        spring = [{ name = "pier", from = "ground", to = "b", n_per_m = 1e6 }, { name = "joint", from = "ground", to = "a", n_m_per_rad = 1e6 }]
+        parameter = [{ name = "west_ei", prior = { uniform = [2e8, 6e8] }, sets = { beam = "west" } }]
+    "#;
+    std::fs::write(world.path("footbridge.toml"), beam).unwrap();
+    for (structure, parts) in [
+        ("tower.toml", vec!["m1", "m2", "m3", "m4", "k1", "k2", "k3", "k4"]),
+        ("footbridge.toml", vec!["a", "b", "c", "west", "east", "pier", "joint"]),
+        ("three-dof", vec!["m1", "m2", "m3", "k1", "k2", "k3", "k4", "k5", "k6"]),
+    ] {
+        for mode in ["1", "2"] {
+            world.run(&["check", structure, "--svg", "drawing.svg", "--mode", mode]);
+            let svg = std::fs::read_to_string(world.path("drawing.svg")).unwrap();
+            for part in &parts {
+                assert!(svg.contains(&format!("data-name=\"{part}\"")), "{structure}: {part}");
+            }
+            assert!(svg.contains(&format!("mode {mode}, ")) && svg.contains("class=\"shape\""), "{structure}: {svg}");
+            assert!(!svg.contains("NaN") && !svg.contains("inf"), "{structure}");
+        }
+    }
+}

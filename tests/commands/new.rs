@@ -1,0 +1,70 @@
+//! `modalwatch new`.
+
+use crate::world::World;
+
+const BY_FLAGS: &[&str] = &[
+    "new",
+    "--id",
+    "mast",
+    "--mass",
+    "m1=1e5",
+    "--mass",
+    "m2=8e4",
+    "--spring",
+    "k1=ground,m1,3e7",
+    "--spring",
+    "k2=m1,m2,2.5e7",
+    "--parameter",
+    "k1=0.5..1.5",
+    "--noise",
+    "0.2%",
+    "--covariate",
+    "temperature_c",
+];
+
+#[test]
+fn flags_and_answers_write_the_same_file_which_check_accepts() {
+    let world = World::new();
+    let said = world.run(&[BY_FLAGS, &["--out", "flags.toml"]].concat());
+    assert!(said.contains("modalwatch check flags.toml"), "{said}");
+    // Each wrong answer is asked again.
+    let answers = "No Id\nmast\nm1\nm1=1e5\nm2=8e4\n\nk1=ground,m1,3e7\nk2=m1,m2,2.5e7\n\nk1=3e7..4e7\nk1=0.5..1.5\n\n3\n2\n0.2\ntemperature_c\n";
+    let output = world.run_with_input(&["new", "--out", "answers.toml"], answers);
+    let asked = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{asked}");
+    assert!(asked.contains("not a factor of the nominal stiffness") && asked.contains("from 1 to 2"), "{asked}");
+    let [flags, answers] =
+        ["flags.toml", "answers.toml"].map(|name| std::fs::read_to_string(world.path(name)).unwrap());
+    assert_eq!(flags, answers);
+    assert!(flags.contains("uniform = [15000000.0, 45000000.0]"), "{flags}");
+    let checked = world.run(&["check", "flags.toml"]);
+    assert!(checked.contains("ground ─k1─ [m1] ─k2─ [m2]"), "{checked}");
+}
+
+#[test]
+fn a_file_is_not_replaced_and_a_mechanism_is_not_written() {
+    let world = World::new();
+    world.run(BY_FLAGS);
+    let (status, said) = world.fails(BY_FLAGS);
+    assert!(status == 1 && said.contains("mast.toml exists"), "{said}");
+    world.run(&[BY_FLAGS, &["--replace"]].concat());
+    let loose = [
+        "new",
+        "--id",
+        "loose",
+        "--mass",
+        "m1=1",
+        "--mass",
+        "m2=1",
+        "--spring",
+        "k1=ground,m1,10",
+        "--parameter",
+        "k1=0.5..1.5",
+        "--noise",
+        "1%",
+    ];
+    let (_, said) = world.fails(&loose);
+    assert!(said.contains("m2") && !world.path("loose.toml").exists(), "{said}");
+    let (_, said) = world.fails(&[BY_FLAGS, &["--replace", "--parameter", "k7=0.5..1.5"]].concat());
+    assert!(said.contains("there is no spring of this name"), "{said}");
+}
