@@ -15,6 +15,7 @@ mod model;
 mod next;
 mod output;
 mod parameter;
+mod post;
 mod reload;
 mod remote;
 mod reproduce;
@@ -60,6 +61,8 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
     Assess(assess::AssessArgs),
+    /// Post a table of measurements to a running service, which cuts it into batches by day, hour or pause.
+    Post(post::PostArgs),
     /// Estimate mean and standard deviation of the parameters from measurements, by one of three methods.
     Update(update::UpdateArgs),
     /// Run both cases of the paper by all methods and write a report that compares the results with its figures.
@@ -152,6 +155,7 @@ pub fn run() -> anyhow::Result<()> {
         Command::Train(args) => train::train(&args),
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),
+        Command::Post(args) => block_on(post::post(&args)),
         Command::Update(args) => update::update(&args),
         Command::Reproduce(args) => reproduce::reproduce(&args),
         Command::Diagnose(args) => diagnose::diagnose(&args),

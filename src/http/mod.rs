@@ -32,11 +32,13 @@ mod settings;
 mod shared;
 mod structures;
 mod table;
+mod tables;
 #[cfg(test)]
 mod tests;
 mod tokens;
 #[cfg(feature = "otel")]
 mod traceparent;
+mod upload;
 mod views;
 mod webhooks;
 
@@ -82,6 +84,7 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(structures::list))
         .routes(routes!(structures::read, structures::put))
         .routes(routes!(batches::create))
+        .routes(routes!(tables::preview))
         .routes(routes!(batches::read))
         .routes(routes!(views::detail))
         .routes(routes!(export::measurements))

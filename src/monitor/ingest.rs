@@ -23,7 +23,7 @@ use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{BatchRecord, InsertBatch};
 
 /// Source of a batch whose sender does not name one.
-const DEFAULT_SOURCE: &str = "default";
+pub const DEFAULT_SOURCE: &str = "default";
 
 /// Largest number of missing covariates that are reported.
 const MOST_MISSING: usize = 20;

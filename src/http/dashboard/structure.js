@@ -14,6 +14,7 @@ import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
 import { maintenance } from "./sections/maintenance.js";
 import { model, postLine } from "./sections/model.js";
+import { upload } from "./sections/upload.js";
 import { stateChip, stateText } from "./states.js";
 
 const DAY_S = 86400;
@@ -89,6 +90,7 @@ export function structure(id) {
     first,
     h("div", { class: "row spans" }, spans, spanText),
     charts,
+    upload(id, () => refresh.all()).element,
     used.element,
     diagnoses.element,
     windows.element,

@@ -195,12 +195,7 @@ fn known(name: &str, layout: &Layout<'_>) -> Option<Meaning> {
 }
 
 /// A column that the sender assigned to a target.
-fn by_target(
-    name: &str,
-    target: &str,
-    layout: &Layout<'_>,
-    options: &TableOptions,
-) -> Result<HeaderColumn, String> {
+fn by_target(name: &str, target: &str, layout: &Layout<'_>, options: &TableOptions) -> Result<HeaderColumn, String> {
     let said = format!("read as {target}, as asked");
     let clock = match target.to_ascii_lowercase().as_str() {
         "time" | "measured_at" => Some(ClockColumn::Time),
@@ -298,7 +293,8 @@ fn frequency(
 
 /// Sets the conversion of frequencies to Hz, and says in which unit they are read.
 fn with_unit(column: &mut HeaderColumn, unit: Option<&str>, options: &TableOptions) -> Result<(), String> {
-    let stated = unit.map(FrequencyUnit::parse).transpose().map_err(|e| format!("column {}: {e}", shown(&column.name)))?;
+    let stated =
+        unit.map(FrequencyUnit::parse).transpose().map_err(|e| format!("column {}: {e}", shown(&column.name)))?;
     let (unit, why) = match (stated, options.unit) {
         (Some(stated), _) => (stated, "as the header says"),
         (None, Some(unit)) => (unit, "as asked"),
@@ -310,12 +306,7 @@ fn with_unit(column: &mut HeaderColumn, unit: Option<&str>, options: &TableOptio
 }
 
 /// A declared covariate whose name is that of the header with the unit at its end.
-fn covariate(
-    name: &str,
-    base: &str,
-    unit: Option<&str>,
-    layout: &Layout<'_>,
-) -> Result<Option<HeaderColumn>, String> {
+fn covariate(name: &str, base: &str, unit: Option<&str>, layout: &Layout<'_>) -> Result<Option<HeaderColumn>, String> {
     let base = base.replace(' ', "_");
     let stem = |covariate: &Covariate| {
         let lower = covariate.name.to_lowercase();

@@ -13,19 +13,21 @@
 //! | `0,41` in a table with `;` or tabs | 0.41; a table with both signs is asked about |
 
 pub mod clock;
-pub mod header;
+mod header;
 pub mod options;
 pub mod plan;
-pub mod split;
 mod scan;
+pub mod split;
 pub mod understood;
 pub mod unit;
 pub mod zone;
 
 use std::collections::BTreeSet;
 
+pub use self::header::Layout;
+
 use self::clock::{Clock, Written};
-use self::header::{absent, recognise, ClockColumn, HeaderColumn, Layout, Meaning};
+use self::header::{absent, recognise, ClockColumn, HeaderColumn, Meaning};
 use self::options::TableOptions;
 use self::scan::{is_missing, Scan, Text};
 use self::understood::{ColumnRole, Need, Understood, UnderstoodColumn};
@@ -193,7 +195,10 @@ impl Findings {
             let message = if first.name.eq_ignore_ascii_case(&column.name) {
                 format!("column {name} appears twice: remove one, or write ignore=#{}", before.len() + 1)
             } else {
-                format!("columns {} and {name} both mean {target}: write ignore=NAME for one of them", shown(&first.name))
+                format!(
+                    "columns {} and {name} both mean {target}: write ignore=NAME for one of them",
+                    shown(&first.name)
+                )
             };
             self.add(Some(Need::Columns), message);
         }
@@ -215,7 +220,8 @@ impl Findings {
             Meaning::Value(_, Column::Frequency(mode) | Column::Std(mode) | Column::Shape(mode, _))
                 if *mode >= layout.modes =>
             {
-                let message = format!("column {name}: the structure has {} modes; write ignore= to leave it out", layout.modes);
+                let message =
+                    format!("column {name}: the structure has {} modes; write ignore= to leave it out", layout.modes);
                 self.add(Some(Need::Columns), message);
             }
             Meaning::Value(_, Column::ShapeElsewhere(point)) => {
@@ -259,18 +265,23 @@ impl Findings {
         let clocks: Vec<(ClockColumn, &HeaderColumn)> = clocks.collect();
         let kinds: Vec<ClockColumn> = clocks.iter().map(|(clock, _)| *clock).collect();
         if kinds.is_empty() {
-            let message = "missing column measured_at, time or date: the time of each row, such as 2026-03-01T12:00:00Z; \
+            let message =
+                "missing column measured_at, time or date: the time of each row, such as 2026-03-01T12:00:00Z; \
                            columns=time=NAME says which column it is";
             self.add(Some(Need::Columns), message.to_owned());
         } else if kinds.contains(&ClockColumn::Time) && kinds.len() > 1 {
             let names: Vec<String> = clocks.iter().map(|(_, column)| shown(&column.name)).collect();
-            let message = format!("columns {} could all be the time: write ignore=NAME for the others", names.join(", "));
+            let message =
+                format!("columns {} could all be the time: write ignore=NAME for the others", names.join(", "));
             self.add(Some(Need::Columns), message);
         }
         let mut clock = Clock { zone: options.zone.clone(), order: options.date_order, unit: options.time_unit };
         if clocks.iter().any(|(_, column)| column.utc) {
             if clock.zone.as_ref().is_some_and(|zone| *zone != Zone::utc()) {
-                self.add(None, "the header says that times are UTC, and zone names another zone: leave zone out".to_owned());
+                self.add(
+                    None,
+                    "the header says that times are UTC, and zone names another zone: leave zone out".to_owned(),
+                );
             }
             clock.zone = Some(Zone::utc());
         }
@@ -286,15 +297,18 @@ impl Findings {
                            zone=UTC, or times with an offset such as 2026-03-01T12:00:00+01:00";
             ask(Need::Zone, first, message);
         }
-        if let (Some(first), None, false) = (&times.number, clock.unit, times.with_zone || times.without_zone.is_some()) {
-            let message = "is a number: write time_unit=seconds (Unix time), milliseconds, serial-days (of a spreadsheet) or \
+        if let (Some(first), None, false) = (&times.number, clock.unit, times.with_zone || times.without_zone.is_some())
+        {
+            let message =
+                "is a number: write time_unit=seconds (Unix time), milliseconds, serial-days (of a spreadsheet) or \
                            decimal-year, or times in RFC 3339 with an offset";
             ask(Need::TimeUnit, first, message);
         }
         if clock.order.is_none() {
             clock.order = times.order();
             if let (Some(first), None) = (&times.unordered, clock.order) {
-                let message = "may begin with the day or the month: write date_order=dmy for 31/12/2026 or date_order=mdy for \
+                let message =
+                    "may begin with the day or the month: write date_order=dmy for 31/12/2026 or date_order=mdy for \
                                12/31/2026";
                 ask(Need::DateOrder, first, message);
             }

@@ -41,7 +41,8 @@ impl<'a> Text<'a> {
     /// Text that is not UTF-8, a workbook, or a table without a header.
     pub fn of(bytes: &'a [u8]) -> Result<Self, Problem> {
         if bytes.starts_with(WORKBOOK) {
-            let message = "this is a workbook and not a table of text: save its sheet as CSV (UTF-8), and send that file";
+            let message =
+                "this is a workbook and not a table of text: save its sheet as CSV (UTF-8), and send that file";
             return Err(Problem::new("line 1", message));
         }
         let text = csv::text(bytes).map_err(|mut problems| problems.remove(0))?;
