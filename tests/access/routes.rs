@@ -31,11 +31,12 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 65] = [
+const TABLE: [(&str, &str, Needs, About); 66] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
     ("POST", "/v1/structures/{}/batches", Ingest, Structure),
+    ("POST", "/v1/structures/{}/tables/preview", Ingest, Structure),
     ("GET", "/v1/structures/{}/batches/{}", Read, Structure),
     ("GET", "/v1/structures/{}/history", Read, Structure),
     ("PUT", "/v1/structures/{}/reference", Admin, Structure),

@@ -23,5 +23,6 @@ mod reference_extension;
 mod restart;
 mod ruler_frame;
 mod tables;
+mod uploads;
 mod views;
 mod z24;

@@ -16,3 +16,4 @@ mod helpers;
 mod needs;
 mod rejected;
 mod sign_in;
+mod upload;
