@@ -1,5 +1,6 @@
 //! Tables posted by HTTP and by `modalwatch post`: cut into batches, previewed, sent as a form, posted twice.
 
+use std::fmt::Write as _;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -19,7 +20,7 @@ fn german(days: usize) -> String {
         let time = row["measured_at"].as_str().unwrap();
         let date = [&time[8..10], &time[5..7], &time[..4]].join(".");
         let f: Vec<String> = row["frequencies_hz"].as_array().unwrap().iter().map(Value::to_string).collect();
-        table += &format!("{date};{};{};ok\r\n", &time[11..16], f.join(";").replace('.', ","));
+        write!(table, "{date};{};{};ok\r\n", &time[11..16], f.join(";").replace('.', ",")).unwrap();
     }
     table
 }
@@ -99,8 +100,8 @@ async fn a_table_of_more_than_two_days_is_refused_without_a_rule_and_nothing_is_
 async fn rows_that_cannot_be_used_are_left_out_and_listed_or_refuse_the_table() {
     let (service, _folder) = spawn();
     let mut table = german(3);
-    for hour in 0..150 {
-        table += &format!("05.01.2026;{:02}:{:02};0,4;abc;0,9;ok\r\n", hour / 60, hour % 60);
+    for minute in 0..150 {
+        write!(table, "05.01.2026;{:02}:{:02};0,4;abc;0,9;ok\r\n", minute / 60, minute % 60).unwrap();
     }
     let path = format!("{BATCHES}?split=1d&strict=true&{GERMAN}");
     let strict = problem(service.post_text(&path, "text/csv", table.clone()).await, 422, "invalid").await;

@@ -207,10 +207,8 @@ pub struct Evidence {
     pub number: Option<(u64, String)>,
     /// Line and text of the first date whose order of day and month is not clear by itself.
     pub unordered: Option<(u64, String)>,
-    /// Whether a date can only begin with the day.
-    pub day_first: bool,
-    /// Whether a date can only begin with the month.
-    pub month_first: bool,
+    /// Whether a date can only begin with the day, and whether one can only begin with the month.
+    pub certain: (bool, bool),
     /// Whether some time states its zone.
     pub with_zone: bool,
     /// Whether dates are written with dots.
@@ -233,8 +231,8 @@ impl Evidence {
                 if let Some(WrittenDate::Ordered { numbers: (first, second), dotted, .. }) = date {
                     self.dotted |= dotted;
                     if !dotted {
-                        self.day_first |= *first > 12;
-                        self.month_first |= *second > 12;
+                        self.certain.0 |= *first > 12;
+                        self.certain.1 |= *second > 12;
                         if first != second {
                             self.unordered = self.unordered.take().or_else(here);
                         }
@@ -246,7 +244,7 @@ impl Evidence {
 
     /// The order of day and month that the dates without dots have, if they all agree with one of them alone.
     pub fn order(&self) -> Option<DateOrder> {
-        match (self.day_first, self.month_first) {
+        match self.certain {
             (true, false) => Some(DateOrder::DayMonthYear),
             (false, true) => Some(DateOrder::MonthDayYear),
             _ => None,

@@ -101,6 +101,11 @@ impl HeaderColumn {
         Self::new(name, Meaning::Unknown, "")
     }
 
+    fn add_reason(&mut self, more: &str) {
+        self.reason.push_str("; ");
+        self.reason.push_str(more);
+    }
+
     /// Whether its cells are numbers of the table.
     pub fn is_numeric(&self) -> bool {
         match &self.meaning {
@@ -164,7 +169,7 @@ pub fn recognise(
         let mut column = HeaderColumn::new(name, Meaning::Clock(clock), "its name is that of a time");
         if utc {
             column.utc = true;
-            column.reason += ", in UTC as its header says";
+            column.add_reason("in UTC, as the header says");
         }
         return Ok(column);
     }
@@ -301,7 +306,7 @@ fn with_unit(column: &mut HeaderColumn, unit: Option<&str>, options: &TableOptio
         (None, None) => (FrequencyUnit::Hertz, "because the header names no unit"),
     };
     column.conversion = unit.conversion();
-    column.reason += &format!("; in {}, {why}", unit.symbol());
+    column.add_reason(&format!("in {}, {why}", unit.symbol()));
     Ok(())
 }
 
@@ -323,12 +328,12 @@ fn covariate(name: &str, base: &str, unit: Option<&str>, layout: &Layout<'_>) ->
 /// Sets the conversion of a covariate from the unit in the header to the one in its name.
 fn convert(column: &mut HeaderColumn, covariate: &str, unit: Option<&str>) -> Result<(), String> {
     let Some(unit) = unit else {
-        column.reason += "; in the unit of the covariate, because the header names none";
+        column.add_reason("in the unit of the covariate, because the header names none");
         return Ok(());
     };
     let (stated, lower) = (suffix(unit), covariate.to_lowercase());
     if lower.ends_with(&format!("_{stated}")) {
-        column.reason += &format!("; in {unit}, as the header says");
+        column.add_reason(&format!("in {unit}, as the header says"));
         return Ok(());
     }
     let own = lower.rsplit_once('_').map_or("", |(_, own)| own);
@@ -341,6 +346,6 @@ fn convert(column: &mut HeaderColumn, covariate: &str, unit: Option<&str>) -> Re
         ));
     };
     column.conversion = conversion;
-    column.reason += &format!("; converted from {unit}");
+    column.add_reason(&format!("converted from {unit}"));
     Ok(())
 }
