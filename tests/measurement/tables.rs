@@ -96,9 +96,7 @@ fn the_same_measurements_in_many_dialects_are_bit_identical() {
             PLAIN.replace("temperature_c", "Temperature [K]").replace("4.5\n", "277.65\n").replace(",-5", ",268.15"),
             "",
         ),
-        ("quotes", format!("\"{}\"", PLAIN.trim_end().replace(',', "\",\"").replace('
-', "\"
-\"")), ""),
+        ("quotes", format!("\"{}\"", PLAIN.trim_end().replace(',', "\",\"").replace('\n', "\"\n\"")), ""),
         ("other columns ignored", PLAIN.replace(",f1_hz", ",lab,f1_hz").replace("Z,", "Z,xy,"), "ignore=lab"),
         ("named columns", PLAIN.replace("f1_hz,f2_hz", "Erste Biegung,Zweite"), "columns=f1=Erste Biegung,f2=#3"),
         ("Unix time", unix(PLAIN), "time_unit=seconds"),
