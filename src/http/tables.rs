@@ -1,6 +1,7 @@
 //! Tables (CSV) posted as one batch or cut into many, and `/v1/structures/{id}/tables/preview`, which stores nothing.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use axum::extract::State;
@@ -255,7 +256,7 @@ pub async fn create(shared: &Shared, client: &Client, posted: Posted) -> Result<
     let mut answer = BulkAnswer { table: Some(Box::new(understood)), ..BulkAnswer::default() };
     for (line, batch) in batches {
         let (count, (from, to)) = (batch.measurements.len(), batch.time_span());
-        let taken = match shared.access.take_measurements(client, count) {
+        let taken = match within_rate(shared, client, count).await {
             Ok(()) => shared.monitor.ingest().take_within(batch, PATIENCE).await.map_err(ApiError::from),
             Err(error) => Err(error),
         };
@@ -271,6 +272,20 @@ pub async fn create(shared: &Shared, client: &Client, posted: Posted) -> Result<
         }
     }
     Ok((StatusCode::OK, Json(answer)).into_response())
+}
+
+/// Waits until the rate limit of measurements allows the next batch, at most as long as for a place in the queue. A table cannot be
+/// continued where it was refused, and one of a year has more measurements than the limit of a second.
+async fn within_rate(shared: &Shared, client: &Client, count: usize) -> Result<(), ApiError> {
+    let until = tokio::time::Instant::now() + PATIENCE;
+    loop {
+        let Err(error) = shared.access.take_measurements(client, count) else { return Ok(()) };
+        let pause = Duration::from_secs(error.retry_after_s().unwrap_or(1).into());
+        if tokio::time::Instant::now() + pause > until {
+            return Err(error);
+        }
+        tokio::time::sleep(pause).await;
+    }
 }
 
 /// Runs the reading of a table on a blocking thread, after that of others.

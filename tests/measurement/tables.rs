@@ -164,7 +164,7 @@ fn what_cannot_be_read_is_named_with_what_to_write() {
         (row("date,f1", "2026-03-01T12:00Z,1"), "", "line 1", "missing column f2_hz: the structure has 2 modes; columns=f2=NAME says which column it is", Some(Need::Columns)),
         (row("date,f1,f2,f3", "2026-03-01T12:00Z,1,2,3"), "", "line 1", "column \"f3\": the structure has 2 modes; write ignore= to leave it out", Some(Need::Columns)),
         (row("date,f1,Mode 1,f2", "2026-03-01T12:00Z,1,2,3"), "", "line 1", "columns \"f1\" and \"Mode 1\" both mean f1_hz: write ignore=NAME for one of them", Some(Need::Columns)),
-        (row("date,timestamp,f1,f2", "2026-03-01T12:00Z,1,1,2"), "", "line 1", "columns \"date\", \"timestamp\" could all be the time: write ignore=NAME for the others", Some(Need::Columns)),
+        (row("date,timestamp,f1,f2", "2026-03-01T12:00Z,2026-03-01T12:00Z,1,2"), "", "line 1", "columns \"date\", \"timestamp\" could all be the time: write ignore=NAME for the others", Some(Need::Columns)),
         (row("f1,f2", "1,2"), "", "line 1", "missing column measured_at, time or date: the time of each row, such as 2026-03-01T12:00:00Z; columns=time=NAME says which column it is", Some(Need::Columns)),
         (row("date,f1 (rpm),f2", "2026-03-01T12:00Z,1,2"), "", "line 1", "column \"f1 (rpm)\": \"rpm\" is not a unit of frequency: Hz, mHz, kHz and rad/s are known", Some(Need::Columns)),
         (row("date,f1,f2,Wind (km/h)", "2026-03-01T12:00Z,1,2,3"), "", "line 1", "column \"Wind (km/h)\": its unit \"km/h\" is not that of the covariate wind_m_per_s; convert the column, or name it without a unit if the numbers are right", Some(Need::Columns)),

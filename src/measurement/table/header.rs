@@ -23,6 +23,11 @@ const FREQUENCIES: [&str; 11] = [
 ];
 /// Names of a standard deviation before the frequency.
 const STANDARD_DEVIATIONS: [&str; 4] = ["std", "sd", "sigma", "standard deviation of"];
+/// Ends of the names of covariates that are units: `Temperature` may be `temperature_c`, and not `temperature_deck`.
+const UNITS: [&str; 24] = [
+    "c", "k", "f", "percent", "m_per_s", "m_s", "mps", "km_per_h", "km_h", "pa", "hpa", "kpa", "mbar", "bar", "n",
+    "kn", "kg", "t", "mm", "cm", "m", "deg", "per_s", "w_per_m2",
+];
 const TIMES: [&str; 10] = [
     "measured at",
     "datetime",
@@ -315,7 +320,8 @@ fn covariate(name: &str, base: &str, unit: Option<&str>, layout: &Layout<'_>) ->
     let base = base.replace(' ', "_");
     let stem = |covariate: &Covariate| {
         let lower = covariate.name.to_lowercase();
-        lower == base || lower.rsplit_once('_').is_some_and(|(stem, _)| stem == base)
+        let unit = lower.strip_prefix(&base).and_then(|rest| rest.strip_prefix('_'));
+        lower == base || unit.is_some_and(|unit| UNITS.contains(&unit))
     };
     let mut found = layout.covariates.iter().filter(|c| stem(c));
     let (Some(covariate), None) = (found.next(), found.next()) else { return Ok(None) };
