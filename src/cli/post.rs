@@ -129,7 +129,7 @@ pub async fn post(args: &PostArgs) -> anyhow::Result<()> {
         format!("  batch from {} (line {}): {}", text(&item["from"]), item["line"], text(&item["problem"]["detail"]))
     });
     let lines: Vec<String> = lines.collect();
-    anyhow::ensure!(refused.is_empty(), "{} batches are refused:\n{}", refused.len(), lines.join("\n"));
+    anyhow::ensure!(refused.is_empty(), "batches refused: {}\n{}", refused.len(), lines.join("\n"));
     Ok(())
 }
 

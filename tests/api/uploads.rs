@@ -264,7 +264,7 @@ async fn the_command_line_posts_a_table_says_what_it_understood_and_stores_once(
     // Other rows at times that are stored: the exit status says so.
     std::fs::write(&file, german(1).replacen("0,4", "0,5", 1)).unwrap();
     let (done, _, err) = run(&["--zone", "UTC", "--ignore", "Bemerkung", "--split", "1d"]);
-    assert!(!done && err.contains("1 batches are refused:") && err.contains("line 2"), "{err}");
+    assert!(!done && err.contains("batches refused: 1\n") && err.contains("line 2"), "{err}");
     let nowhere = post(&service, Path::new("no-such-file.csv"), &[]);
     assert!(
         !nowhere.status.success() && String::from_utf8_lossy(&nowhere.stderr).contains("cannot read no-such-file.csv")

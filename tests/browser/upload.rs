@@ -58,7 +58,7 @@ async fn a_german_spreadsheet_file_is_dragged_checked_and_stored_as_days() {
     );
     page.wait_for(&format!("{status}.includes('span more than 48 hours')"));
     set(&mut page, "upload-split", "1d");
-    page.wait_for(&format!("{status}.includes('13 rows, of which 12 are taken and 1 are refused, in 3 batches')"));
+    page.wait_for(&format!("{status}.includes('13 rows: 12 taken, 1 refused, in 3 batches')"));
     let shown = page.evaluate("document.querySelector('dialog').textContent");
     for words in
         ["decimal comma", "times in Europe/Berlin", "Line 14: all modes are missing", "3 batches would be made"]

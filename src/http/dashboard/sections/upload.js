@@ -235,7 +235,7 @@ async function check(structure, file, changed) {
     const sentence =
       problems.length > 0
         ? `${count(rows, "row")}. The table cannot be stored yet:`
-        : `${count(rows, "row")}, of which ${accepted} are taken${refused > 0 ? ` and ${refused} are refused` : ""}, in ${count(understood.batches, "batch", "batches")}.`;
+        : `${count(rows, "row")}: ${accepted} taken${refused > 0 ? `, ${refused} refused` : ""}, in ${count(understood.batches, "batch", "batches")}.`;
     const signs = { ",": "commas", ";": "semicolons", "\t": "tabs" };
     const facts = [
       `separated by ${signs[understood.separator] ?? understood.separator}`,
