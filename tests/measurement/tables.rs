@@ -155,6 +155,7 @@ fn what_cannot_be_read_is_named_with_what_to_write() {
     let cases: Vec<(String, &str, &str, &str, Option<Need>)> = vec![
         (String::new(), "", "line 1", "the table is empty: its first line must name the columns", None),
         ("PK\u{3}\u{4}xx".to_owned(), "", "line 1", "this is a workbook and not a table of text: save its sheet as CSV (UTF-8), and send that file", None),
+        (",".repeat(1_000), "", "line 1", "the header has 1001 columns: at most 1000 are read", None),
         (two("2026-03-01 12:00:00"), "", "line 2, column date", "\"2026-03-01 12:00:00\" has no zone: write zone=Europe/Berlin or another zone of the IANA database (--zone on the command line), zone=UTC, or times with an offset such as 2026-03-01T12:00:00+01:00", Some(Need::Zone)),
         (two("2026-03-01"), "", "line 2, column date", "\"2026-03-01\" has no zone: write zone=", Some(Need::Zone)),
         (two("03/04/2026 12:00"), "zone=UTC", "line 2, column date", "\"03/04/2026 12:00\" may begin with the day or the month: write date_order=dmy for 31/12/2026 or date_order=mdy for 12/31/2026", Some(Need::DateOrder)),

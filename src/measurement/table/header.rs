@@ -7,6 +7,10 @@ use crate::measurement::csv::{column, Column, CsvOptions};
 use crate::measurement::{Covariate, CovariateKind};
 use crate::quantity::shown;
 
+/// Longest name of a column that is kept, and longest one that a message repeats as an option, characters.
+const LONGEST_NAME: usize = 80;
+const LONGEST_REFERENCE: usize = 40;
+
 /// Names of a frequency before its number.
 const FREQUENCIES: [&str; 11] = [
     "f",
@@ -72,7 +76,7 @@ pub enum ClockColumn {
 /// A column of a table.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeaderColumn {
-    /// Text in the header.
+    /// Text in the header, without control characters and cut to 80 characters.
     pub name: String,
     /// What its cells are.
     pub meaning: Meaning,
@@ -97,13 +101,24 @@ pub struct Layout<'a> {
 
 impl HeaderColumn {
     fn new(name: &str, meaning: Meaning, reason: impl Into<String>) -> Self {
-        let (name, reason) = (name.to_owned(), reason.into());
+        let name = name.chars().filter(|c| !c.is_control()).take(LONGEST_NAME).collect();
+        let reason = reason.into();
         Self { name, meaning, conversion: Conversion::None, utc: false, reason }
     }
 
     /// A column of which the mistake has been named.
     pub fn unknown(name: &str) -> Self {
         Self::new(name, Meaning::Unknown, "")
+    }
+
+    /// How an option names the column, whose number is given: by its name where that is short and plain.
+    pub fn reference(&self, number: usize) -> String {
+        let plain = !self.name.contains([',', '=']) && self.name.chars().count() <= LONGEST_REFERENCE;
+        if plain {
+            self.name.clone()
+        } else {
+            format!("#{number}")
+        }
     }
 
     fn add_reason(&mut self, more: &str) {

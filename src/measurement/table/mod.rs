@@ -191,7 +191,9 @@ impl Findings {
     /// Checks a column against those before it.
     fn check_column(&mut self, column: &HeaderColumn, before: &[HeaderColumn], layout: &Layout<'_>) {
         let name = shown(&column.name);
-        if let (Some(target), Some(first)) = (column.target(), before.iter().find(|c| c.target() == column.target())) {
+        let same = |target: &String| before.iter().find(|c| c.target().as_ref() == Some(target));
+        let twice = column.target().and_then(|target| Some((same(&target)?, target)));
+        if let Some((first, target)) = twice {
             let message = if first.name.eq_ignore_ascii_case(&column.name) {
                 format!("column {name} appears twice: remove one, or write ignore=#{}", before.len() + 1)
             } else {
@@ -212,7 +214,7 @@ impl Findings {
                 let message = format!(
                     "unknown column {name}: write ignore={0} to leave it out, or columns=TARGET={0} to say what it is: time, f1_hz \
                      to f{1}_hz, std_f1_hz to std_f{1}_hz, set_<parameter>{covariates}; a covariate is declared in the structure file",
-                    if column.name.contains([',', '=']) { format!("#{}", before.len() + 1) } else { column.name.clone() },
+                    column.reference(before.len() + 1),
                     layout.modes
                 );
                 self.add(Some(Need::Columns), message);

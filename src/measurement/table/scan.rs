@@ -13,6 +13,9 @@ const MISSING: [&str; 14] =
 const EXAMPLES: usize = 3;
 const LONGEST_EXAMPLE: usize = 40;
 
+/// Largest number of columns: each is described in the answer.
+const MOST_COLUMNS: usize = 1_000;
+
 /// Beginning of a workbook, which is a ZIP archive.
 const WORKBOOK: &[u8] = b"PK\x03\x04";
 
@@ -55,6 +58,10 @@ impl<'a> Text<'a> {
             None => return Err(Problem::new("line 1", "the table is empty: its first line must name the columns")),
         };
         let header_line = csv::line_of(text, &header);
+        if header.len() > MOST_COLUMNS {
+            let message = format!("the header has {} columns: at most {MOST_COLUMNS} are read", header.len());
+            return Err(Problem::new(format!("line {header_line}"), message));
+        }
         Ok(Self { text, separator, header, header_line, before: named + 1 })
     }
 
