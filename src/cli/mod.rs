@@ -18,6 +18,7 @@ mod next;
 mod output;
 mod parameter;
 mod rehearsal;
+mod post;
 mod reload;
 mod remote;
 mod report;
@@ -68,6 +69,8 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     /// Assess measurements without a service.
     Assess(assess::AssessArgs),
+    /// Post a table of measurements to a running service, which cuts it into batches by day, hour or pause.
+    Post(post::PostArgs),
     /// Estimate mean and standard deviation of the parameters from measurements, by one of three methods.
     Update(update::UpdateArgs),
     /// Run both cases of the paper by all methods and write a report that compares the results with its figures.
@@ -164,6 +167,7 @@ pub fn run() -> anyhow::Result<()> {
         Command::Train(args) => train::train(&args),
         Command::Simulate(args) => simulate::simulate(&args),
         Command::Assess(args) => assess::assess(&args),
+        Command::Post(args) => block_on(post::post(&args)),
         Command::Update(args) => update::update(&args),
         Command::Reproduce(args) => reproduce::reproduce(&args),
         Command::Diagnose(args) => diagnose::diagnose(&args),

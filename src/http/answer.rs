@@ -6,6 +6,7 @@ use utoipa::ToSchema;
 use super::cell::{Cell, ColumnKind};
 use crate::assessment::{Assessment, BatchState};
 use crate::damage::{Correlation, JointDamage, JointReference, QuantityAssessment, QuantityKind};
+use crate::measurement::table::understood::Understood;
 use crate::measurement::ModalMeasurement;
 use crate::monitor::stored::{BatchRecord, HistoryEntry, ReferenceRecord, StoredChartPoint};
 use crate::monitor::{BatchView, Missing};
@@ -34,6 +35,9 @@ pub struct Batch {
     charts: Vec<ChartBody>,
     #[serde(skip_serializing_if = "Option::is_none")]
     measurements: Option<Vec<ModalMeasurement>>,
+    /// Only for a table that was posted: what was understood of it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    table: Option<Box<Understood>>,
 }
 
 impl Batch {
@@ -57,7 +61,13 @@ impl Batch {
             assessment: assessment.map(AssessmentBody::from),
             charts: charts.into_iter().map(ChartBody::from).collect(),
             measurements: with_measurements.then_some(record.batch.measurements),
+            table: None,
         }
+    }
+
+    /// Adds what was understood of the table with which the batch was posted.
+    pub fn of_table(self, table: Option<Understood>) -> Self {
+        Self { table: table.map(Box::new), ..self }
     }
 }
 

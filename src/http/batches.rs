@@ -1,11 +1,10 @@
 //! `/v1/structures/{id}/batches`: posts and reads batches. [`super::bulk`] takes many batches at once.
 
-use axum::body::{Body, Bytes};
+use axum::body::Body;
 use axum::extract::State;
 use axum::http::{header, HeaderMap, HeaderName, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::Json;
-use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::access::Client;
@@ -16,41 +15,21 @@ use super::openapi::{BatchPath, BodyRefused, Busy, Invalid, StructurePath, Unkno
 use super::problem::BulkAnswer;
 use super::request::{media_type, read_body, structure_id, unsupported_media_type, ApiPath, ApiQuery, IDEMPOTENCY_KEY};
 use super::shared::Shared;
+use super::tables::{self, PostQuery, Posted, PARSED_HERE_BYTES};
+use super::upload::{TableForm, FORM};
 use crate::measurement::body::{MessageBody, PostBody, RawBatch};
-use crate::measurement::check::{check_idempotency_key, check_source};
-use crate::measurement::csv::{self, CsvOptions, Times};
-use crate::measurement::times::read_dates;
-use crate::measurement::MeasurementBatch;
-use crate::monitor::{ActiveStructure, Monitor};
+use crate::measurement::check::check_idempotency_key;
 
 /// Header that marks a batch as already stored.
 const IDEMPOTENCY_REPLAYED: HeaderName = HeaderName::from_static("idempotency-replayed");
-
-/// Larger bodies are parsed on a blocking thread: thousands of measurements take milliseconds. A body of this size
-/// takes about 0.1 ms.
-const PARSED_HERE_BYTES: usize = 16 * 1024;
-
-/// Query of a post. CSV and NDJSON have no field for a common source.
-#[derive(Debug, Deserialize, IntoParams)]
-#[serde(deny_unknown_fields)]
-#[into_params(parameter_in = Query)]
-pub struct PostQuery {
-    /// Instrument, gateway or campaign; used where the body does not name one.
-    #[param(min_length = 1, max_length = 64, pattern = "^[A-Za-z0-9_.:-]+$")]
-    source: Option<String>,
-    /// CSV columns to ignore, separated by commas.
-    ignore: Option<String>,
-    /// Unit of the times of a CSV that are numbers: Unix `seconds` or `milliseconds`, `serial-days` of a spreadsheet, or `decimal-year`.
-    #[param(pattern = "^(seconds|milliseconds|serial-days|decimal-year)$")]
-    time_unit: Option<String>,
-}
 
 /// Headers of a post.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Header)]
 #[expect(dead_code, reason = "only its description is used")]
 struct PostHeaders {
-    /// Key that the client chose for the batch. Not allowed with NDJSON, where each line has its own.
+    /// Key that the client chose for the batch. Not allowed with NDJSON, where each line has its own. With `split`, the key of each
+    /// batch is derived from it.
     #[param(rename = "Idempotency-Key", min_length = 1, max_length = 128, pattern = "^[!-~]+$")]
     idempotency_key: Option<String>,
 }
@@ -64,13 +43,15 @@ struct PostHeaders {
     post, path = "/v1/structures/{id}/batches", tag = "batches", operation_id = "post_batches",
     summary = "Post measurements",
     description = "One batch as JSON or CSV: it is written to disk before it is assessed, and the answer contains the assessment. \
-                   Many batches as NDJSON with one batch per line: each line is stored independently, a refused line does not stop \
-                   the others, and the answer (200) lists the outcome of every line. Repeating a post is safe: a batch is \
+                   Many batches as NDJSON with one batch per line, or as a CSV that `split` cuts by time: each is stored \
+                   independently, a refused one does not stop the others, and the answer (200) lists the outcome of every one. Repeating a post is safe: a batch is \
                    recognised by `Idempotency-Key`, a measurement by structure, source and time.",
     params(StructurePath, PostQuery, PostHeaders),
     request_body(
         description = "CSV: a header with `measured_at`, `f1_hz` …, optionally `std_f1_hz` …, covariates by name and \
-                       `set_<parameter>`; separator `,`, `;` or tab, decimal comma with the last two. Mode shapes can be sent as JSON only.",
+                       `set_<parameter>`; separator `,`, `;` or tab, decimal comma with the last two. Headers such as `date` and \
+                       `Mode 1 (Hz)` and times such as `01.03.2026 12:00` are read too, and `table` in the answer says how. A CSV \
+                       that spans more than 48 h needs `split`.",
         content(
             (PostBody = "application/json", example = json!({"source": "tower-1", "measurements": [
                 {"measured_at": "2026-03-01T12:00:00Z", "frequencies_hz": [0.4949, 0.9250, 1.2434]}]})),
@@ -78,11 +59,12 @@ struct PostHeaders {
                 "{\"source\":\"tower-1\",\"measurements\":[{\"measured_at\":\"2026-03-01T12:20:00Z\",\
                  \"frequencies_hz\":[0.4949,0.9250,1.2434]}]}\n")),
             (String = "text/csv", example = json!(
-                "measured_at,f1_hz,f2_hz,f3_hz\n2026-03-01T12:10:00Z,0.4949,0.9250,1.2434\n"))
+                "measured_at,f1_hz,f2_hz,f3_hz\n2026-03-01T12:10:00Z,0.4949,0.9250,1.2434\n")),
+            (TableForm = "multipart/form-data", example = json!({"file": "date,f1,f2,f3\n2026-03-01T12:40:00Z,0.4949,0.9250,1.2434\n"}))
         )
     ),
     responses(
-        (status = 200, description = "NDJSON: the outcome of each line", body = BulkAnswer),
+        (status = 200, description = "NDJSON, or a CSV with `split`: the outcome of each batch", body = BulkAnswer),
         (status = 201, description = "The batch with its assessment", body = answer::Batch, headers(
             ("Location" = String, description = "Path of the batch"),
             ("Idempotency-Replayed" = String, description = "`true` if the batch was already stored")
@@ -100,31 +82,44 @@ pub async fn create(
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let active = shared.monitor.structure(&id)?;
-    if let Some(source) = &query.source {
-        let in_query = |problem| ApiError::invalid_input(vec![problem]).at("query/source");
-        check_source(source).map_err(in_query)?;
-    }
+    query.check_source()?;
     let kind = media_type(&headers);
     if kind.as_deref() == Some("application/x-ndjson") {
         return bulk::create(&shared, &client, (id, query.source), &headers, body).await;
     }
     let key = idempotency_key(&headers)?;
-    let bytes = read_body(body, &headers, shared.limits).await?;
     let monitor = shared.monitor.clone();
-    let small = bytes.len() <= PARSED_HERE_BYTES;
-    let parse = move || parse_batch(&monitor, &active, key, kind.as_deref(), &bytes, query);
-    let batch = if small {
-        // Without an await before the batch is stored, it is stored even if the client disconnects right after sending
-        // it.
-        parse()?
-    } else {
-        tokio::task::spawn_blocking(parse).await.map_err(|e| ApiError::internal(&e))??
+    let (batch, table) = match kind.as_deref() {
+        Some("text/csv" | FORM) => {
+            let posted = Posted::receive(active, query, key, (&headers, body), shared.limits).await?;
+            if posted.is_cut() {
+                return tables::create(&shared, &client, posted).await;
+            }
+            let small = posted.is_small();
+            let (batch, table) = here_or_aside(small, move || posted.one_batch(&monitor)).await?;
+            (batch, Some(table))
+        }
+        Some("application/json") => {
+            let bytes = read_body(body, &headers, shared.limits).await?;
+            let small = bytes.len() <= PARSED_HERE_BYTES;
+            let parse = move || {
+                let mut raw = RawBatch::of_post(&bytes, key)?;
+                raw.source = raw.source.or(query.source);
+                monitor.ingest().check(&active, raw).map_err(ApiError::invalid_input)
+            };
+            (here_or_aside(small, parse).await?, None)
+        }
+        other => {
+            read_body(body, &headers, shared.limits).await?;
+            let allowed = "application/json, text/csv, multipart/form-data or application/x-ndjson";
+            return Err(unsupported_media_type(other, allowed));
+        }
     };
     shared.access.take_measurements(&client, batch.measurements.len())?;
     let ingested = shared.monitor.ingest().take(batch).await?;
 
     let location = answer::location(&ingested.view.record);
-    let body = answer::Batch::new(ingested.view, false);
+    let body = answer::Batch::new(ingested.view, false).of_table(table);
     let mut response = (StatusCode::CREATED, [(header::LOCATION, location)], Json(body)).into_response();
     if ingested.replayed {
         response.headers_mut().insert(IDEMPOTENCY_REPLAYED, header::HeaderValue::from_static("true"));
@@ -159,33 +154,14 @@ fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, ApiError> {
     Ok(Some(key))
 }
 
-fn parse_batch(
-    monitor: &Monitor,
-    active: &ActiveStructure,
-    idempotency_key: Option<String>,
-    kind: Option<&str>,
-    bytes: &Bytes,
-    query: PostQuery,
-) -> Result<MeasurementBatch, ApiError> {
-    let mut raw = match kind {
-        Some("application/json") => RawBatch::of_post(bytes, idempotency_key)?,
-        Some("text/csv") => {
-            let ignore = query.ignore.as_deref().unwrap_or_default().split(',').map(|c| c.trim().to_owned());
-            let ignore = ignore.filter(|column| !column.is_empty()).collect();
-            let simulator = &active.simulator;
-            let points = simulator.instrumented_points().map_or_else(Vec::new, |points| points.names.clone());
-            let options = CsvOptions { times: Times::Required, ignore, points, ..CsvOptions::default() };
-            let read = csv::read(bytes, simulator.modes(), simulator.covariates(), &options);
-            let mut measurements = read.map_err(ApiError::invalid_input)?;
-            if let Some(unit) = query.time_unit {
-                let unit =
-                    unit.parse().map_err(|message: String| ApiError::invalid_field("query/time_unit", message))?;
-                read_dates(&mut measurements, unit).map_err(ApiError::invalid_input)?;
-            }
-            RawBatch { source: None, idempotency_key, measurements }
-        }
-        other => return Err(unsupported_media_type(other, "application/json, text/csv or application/x-ndjson")),
-    };
-    raw.source = raw.source.or(query.source);
-    monitor.ingest().check(active, raw).map_err(ApiError::invalid_input)
+/// Parses a small body at once, and a large one on a blocking thread. Without an await before the batch is stored, a small one is
+/// stored even if the client disconnects right after sending it.
+async fn here_or_aside<T: Send + 'static>(
+    small: bool,
+    parse: impl FnOnce() -> Result<T, ApiError> + Send + 'static,
+) -> Result<T, ApiError> {
+    if small {
+        return parse();
+    }
+    tokio::task::spawn_blocking(parse).await.map_err(|e| ApiError::internal(&e))?
 }

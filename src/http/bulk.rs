@@ -33,7 +33,7 @@ const MOST_LINES: usize = 10_000;
 const DRAINED_LIMITS: usize = 2;
 
 /// Maximum time that a line waits for a free slot in the queue.
-const PATIENCE: Duration = Duration::from_secs(30);
+pub const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Stores the batches of an NDJSON body. `source` applies to lines that do not name one.
 ///
@@ -120,7 +120,8 @@ fn parse(
 }
 
 impl BulkAnswer {
-    fn add(&mut self, line: usize, taken: Result<Ingested, ApiError>) {
+    /// Adds the outcome of the batch at a line.
+    pub fn add(&mut self, line: usize, taken: Result<Ingested, ApiError>) {
         let item = match taken {
             Ok(Ingested { view, replayed }) => {
                 *(if replayed { &mut self.replayed } else { &mut self.stored }) += 1;
@@ -133,6 +134,9 @@ impl BulkAnswer {
                     state: Some(state),
                     replayed: Some(replayed),
                     location: Some(location),
+                    from: None,
+                    to: None,
+                    measurements: None,
                     problem: None,
                 }
             }
@@ -145,6 +149,9 @@ impl BulkAnswer {
                     state: None,
                     replayed: None,
                     location: None,
+                    from: None,
+                    to: None,
+                    measurements: None,
                     problem: Some(Box::new(error.into_body())),
                 }
             }

@@ -74,6 +74,11 @@ impl ApiError {
         Self { done: Some(Box::new(done)), ..self }
     }
 
+    /// Value of `Retry-After`, seconds.
+    pub const fn retry_after_s(&self) -> Option<u32> {
+        self.retry_after_s
+    }
+
     /// HTTP status of the answer.
     pub const fn status(&self) -> StatusCode {
         self.status

@@ -36,12 +36,14 @@ mod shared;
 mod structure_metrics;
 mod structures;
 mod table;
+mod tables;
 #[cfg(test)]
 mod tests;
 mod tokens;
 #[cfg(feature = "otel")]
 mod traceparent;
 mod verdict;
+mod upload;
 mod views;
 mod webhooks;
 
@@ -88,6 +90,7 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(structures::read, structures::put))
         .routes(routes!(drawing::drawing))
         .routes(routes!(batches::create))
+        .routes(routes!(tables::preview))
         .routes(routes!(batches::read))
         .routes(routes!(views::detail))
         .routes(routes!(export::measurements))

@@ -7,6 +7,8 @@ use utoipa::ToSchema;
 
 use crate::assessment::BatchState;
 use crate::measurement::check::Problem;
+use crate::measurement::table::understood::Understood;
+use crate::quantity::Timestamp;
 
 /// Media type of every answer that reports a problem.
 pub const PROBLEM_JSON: &str = "application/problem+json";
@@ -128,10 +130,10 @@ pub struct ProblemBody {
     pub(super) done: Option<Box<BulkAnswer>>,
 }
 
-/// Outcome of each line of a request with many batches.
+/// Outcome of each batch of a request with many: the lines of NDJSON, or the parts of a table.
 #[derive(Debug, Default, Serialize, ToSchema)]
 pub struct BulkAnswer {
-    /// One entry for each non-blank line, in order.
+    /// One entry for each non-blank line, or for each batch of a table, in order.
     pub(super) items: Vec<BulkItem>,
     /// Number of lines whose batch was stored by this request.
     pub(super) stored: usize,
@@ -139,12 +141,15 @@ pub struct BulkAnswer {
     pub(super) replayed: usize,
     /// Number of lines that were refused.
     pub(super) refused: usize,
+    /// Only for a table: what was understood of it, and the rows that were left out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) table: Option<Box<Understood>>,
 }
 
-/// Outcome of one line.
+/// Outcome of one line, or of one batch of a table.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct BulkItem {
-    /// Line number in the body, starting at 1.
+    /// Line number in the body, starting at 1; for a batch of a table, that of its first measurement.
     pub(super) line: usize,
     /// Status with which this batch alone would have been answered.
     pub(super) status: u16,
@@ -160,6 +165,15 @@ pub struct BulkItem {
     /// Path of the batch.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) location: Option<String>,
+    /// Only for a table: earliest time of the batch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) from: Option<Timestamp>,
+    /// Only for a table: latest time of the batch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) to: Option<Timestamp>,
+    /// Only for a table: number of measurements.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) measurements: Option<usize>,
     /// Why the line was refused.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(no_recursion)]

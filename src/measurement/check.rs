@@ -10,7 +10,7 @@ use crate::parameter::ParameterSpace;
 use crate::quantity::{shown, Hertz, Timestamp};
 
 /// Largest number of problems reported for one batch: a table with the wrong separator would have thousands.
-pub(super) const MOST_PROBLEMS: usize = 20;
+const MOST_PROBLEMS: usize = 20;
 
 /// A client's clock may be ahead of the clock of the service by this much, µs.
 const CLOCK_SKEW_MICROS: i64 = 5 * 60 * 1_000_000;

@@ -133,7 +133,7 @@ pub fn offered(
     Ok(unknown.iter().enumerate().filter_map(offer).collect())
 }
 
-fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
+pub(super) fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
     let text = std::str::from_utf8(bytes).map_err(|e| {
         let line = bytes[..e.valid_up_to()].split(|b| *b == b'\n').count();
         vec![Problem::new(format!("line {line}"), "not UTF-8: save the table as UTF-8")]
@@ -142,7 +142,7 @@ fn text(bytes: &[u8]) -> Result<&str, Vec<Problem>> {
 }
 
 /// The separator in a first line such as `sep=;`, which some spreadsheets write.
-fn named_separator(text: &str) -> Option<u8> {
+pub(super) fn named_separator(text: &str) -> Option<u8> {
     let line = text.lines().next()?.trim_matches('"');
     let separator = line.get(..4).filter(|start| start.eq_ignore_ascii_case("sep=")).and(line.get(4..))?;
     [b',', b';', b'\t'].into_iter().find(|s| separator.as_bytes() == [*s])
@@ -150,14 +150,14 @@ fn named_separator(text: &str) -> Option<u8> {
 
 /// Line of a record in the file, from 1. The position of the reader is where it started to look for the record, before line ends
 /// and empty lines that precede it.
-fn line_of(text: &str, record: &csv::StringRecord) -> u64 {
+pub(super) fn line_of(text: &str, record: &csv::StringRecord) -> u64 {
     let Some(position) = record.position() else { return 1 };
     let rest = text.as_bytes().get(position.byte() as usize..).unwrap_or_default();
     let passed = rest.iter().take_while(|b| b"\r\n".contains(b)).filter(|b| **b == b'\n').count();
     position.line() + passed as u64
 }
 
-fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
+pub(super) fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
     csv::ReaderBuilder::new()
         .delimiter(separator)
         .has_headers(false)
@@ -168,7 +168,7 @@ fn reader(text: &str, separator: u8) -> csv::Reader<&[u8]> {
 
 /// Meaning of a column.
 #[derive(Debug, Clone, PartialEq)]
-enum Column {
+pub(super) enum Column {
     Ignored,
     /// A column without a name, which spreadsheets append. It must not have values.
     Unnamed,
@@ -240,7 +240,7 @@ pub fn read_rows(
 }
 
 /// The separator that the table specifies, or else the most frequent one in its header.
-fn separator(text: &str) -> u8 {
+pub(super) fn separator(text: &str) -> u8 {
     if let Some(named) = named_separator(text) {
         return named;
     }
@@ -321,7 +321,7 @@ fn columns(
     }
 }
 
-fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<Column> {
+pub(super) fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<Column> {
     let lower = name.to_ascii_lowercase();
     let mode = |text: &str| {
         let number: usize = text.strip_prefix('f')?.strip_suffix("_hz")?.parse().ok()?;
@@ -359,7 +359,7 @@ fn column(name: &str, covariates: &[Covariate], options: &CsvOptions) -> Option<
     Some(place.map_or_else(|| Column::ShapeElsewhere(point.to_owned()), |place| Column::Shape(mode, place)))
 }
 
-fn row(
+pub(super) fn row(
     record: &csv::StringRecord,
     line: u64,
     columns: &[Column],
@@ -456,7 +456,7 @@ fn whole_shapes(shapes: Vec<Vec<Option<f64>>>) -> Result<Option<Vec<Option<Vec<f
     Ok(whole.iter().any(Option::is_some).then_some(whole))
 }
 
-fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {
+pub(super) fn number(cell: &str, decimal_comma: bool) -> Result<f64, String> {
     let text = if decimal_comma { cell.replace(',', ".") } else { cell.to_owned() };
     match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),

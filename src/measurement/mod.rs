@@ -1,6 +1,6 @@
 //! Measured natural frequencies. Values of these types have been checked.
 //!
-//! [`body`] reads raw measurements from JSON, [`csv`] reads them as tables, [`csv_output`] writes such tables, and [`check`] checks them. [`times`] are
+//! [`body`] reads raw measurements from JSON, [`csv`] reads them as tables, [`table`] reads tables as people export them, [`csv_output`] writes such tables, and [`check`] checks them. [`times`] are
 //! those that a table gives as numbers, and [`order`] is that of the modes.
 
 pub mod body;
@@ -10,6 +10,7 @@ pub mod csv_output;
 pub mod json;
 pub mod order;
 pub mod shape;
+pub mod table;
 pub mod times;
 
 use std::collections::BTreeMap;

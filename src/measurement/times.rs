@@ -6,7 +6,6 @@
 use std::fmt;
 use std::str::FromStr;
 
-use super::check::{Problem, RawMeasurement, MOST_PROBLEMS};
 use crate::quantity::{shown, Timestamp};
 use crate::stats;
 
@@ -109,31 +108,6 @@ pub struct TimeReading {
     origin: Origin,
     /// Other units in which the column is as plausible.
     alternatives: Vec<TimeUnit>,
-}
-
-/// Replaces the times of rows that are numbers by the dates that they mean in `unit`.
-///
-/// # Errors
-/// The numbers that are outside the calendar; one problem for days, which have no date.
-pub fn read_dates(rows: &mut [RawMeasurement], unit: TimeUnit) -> Result<(), Vec<Problem>> {
-    let Some(reading) = TimeReading::dates(unit) else {
-        let message = "days do not say when they begin: use seconds, milliseconds, serial-days or decimal-year";
-        return Err(vec![Problem::new("query/time_unit", message)]);
-    };
-    let mut problems = Vec::new();
-    for row in rows {
-        let Some(value) = row.measured_at.as_deref().and_then(number) else { continue };
-        match reading.time(value) {
-            Ok(time) => row.measured_at = Some(time.to_string()),
-            Err(message) => problems.push(Problem::new(row.path.of_time(), message)),
-        }
-    }
-    problems.truncate(MOST_PROBLEMS);
-    if problems.is_empty() {
-        Ok(())
-    } else {
-        Err(problems)
-    }
 }
 
 /// A number in a cell; `None` for text, and for a number that is not finite.

@@ -15,13 +15,15 @@ use super::settings::MissingCovariate;
 use super::structures::ActiveStructure;
 use crate::assessment::BatchState;
 use crate::measurement::body::RawBatch;
-use crate::measurement::check::{check_idempotency_key, check_measurements, check_source, FieldPath, Problem};
+use crate::measurement::check::{
+    check_each, check_idempotency_key, check_measurements, check_source, FieldPath, Problem, RawMeasurement,
+};
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::store::{BatchRecord, InsertBatch};
 
 /// Source of a batch whose sender does not name one.
-const DEFAULT_SOURCE: &str = "default";
+pub const DEFAULT_SOURCE: &str = "default";
 
 /// Largest number of missing covariates that are reported.
 const MOST_MISSING: usize = 20;
@@ -75,6 +77,29 @@ impl Ingest {
         }
         let structure = active.simulator.id().clone();
         Ok(MeasurementBatch { structure, source, idempotency_key, measurements })
+    }
+
+    /// Checks the rows of a table one by one: each of them, or its first mistake. As [`Self::check`], it should not run on an async
+    /// thread.
+    pub fn check_rows(
+        &self,
+        active: &ActiveStructure,
+        raw: Vec<RawMeasurement>,
+    ) -> Vec<Result<ModalMeasurement, Problem>> {
+        let paths: Vec<FieldPath> = raw.iter().map(|r| r.path).collect();
+        let refuses = self.assessor.settings.missing_covariate == MissingCovariate::Refuse;
+        let complete = |(checked, path): (Result<ModalMeasurement, Problem>, FieldPath)| {
+            let measurement = checked?;
+            let missing = if refuses { missing_covariates(active, &measurement, path) } else { Vec::new() };
+            missing.into_iter().next().map_or(Ok(measurement), Err)
+        };
+        let expectation = active.simulator.expectation(Timestamp::now(), usize::MAX);
+        check_each(raw, &expectation).into_iter().zip(paths).map(complete).collect()
+    }
+
+    /// Largest number of measurements in a batch.
+    pub fn max_measurements(&self) -> usize {
+        self.assessor.settings.max_measurements
     }
 
     /// Stores a batch, assesses it and stores the result; refuses it at once when the queue is full.

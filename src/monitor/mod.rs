@@ -54,7 +54,7 @@ pub use self::backups::Backups;
 use self::compute::Compute;
 pub use self::error::{BackupError, DeclareError, Error, IngestError, JobError, LeftOutBatch, ReloadError};
 use self::events::Events;
-pub use self::ingest::{Ingest, Ingested};
+pub use self::ingest::{Ingest, Ingested, DEFAULT_SOURCE};
 pub use self::jobs::{DiagnosisRequest, ExtensionResult, ExtensionTraining, Jobs};
 pub use self::metrics::declare_metrics;
 pub use self::models::{Models, Reloaded};

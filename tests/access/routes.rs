@@ -37,6 +37,7 @@ const TABLE: [(&str, &str, Needs, About); 66] = [
     ("PUT", "/v1/structures/{}", Admin, Structure),
     ("GET", "/v1/structures/{}/drawing.svg", Read, Structure),
     ("POST", "/v1/structures/{}/batches", Ingest, Structure),
+    ("POST", "/v1/structures/{}/tables/preview", Ingest, Structure),
     ("GET", "/v1/structures/{}/batches/{}", Read, Structure),
     ("GET", "/v1/structures/{}/history", Read, Structure),
     ("PUT", "/v1/structures/{}/reference", Admin, Structure),

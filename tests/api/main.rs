@@ -25,5 +25,6 @@ mod reference_extension;
 mod restart;
 mod ruler_frame;
 mod tables;
+mod uploads;
 mod views;
 mod z24;

@@ -240,14 +240,21 @@ async fn examples_are_valid() {
     // The service accepts the examples of a batch and of a structure in every content type.
     for (path, method, at) in [
         ("/v1/structures/{id}/batches", "post", "/v1/structures/three-dof/batches"),
+        ("/v1/structures/{id}/tables/preview", "post", "/v1/structures/three-dof/tables/preview"),
         ("/v1/structures/{id}", "put", "/v1/structures/one-mass"),
     ] {
         let content = document["paths"][path][method]["requestBody"]["content"].as_object().unwrap();
         for (content_type, content) in content {
             let example = &content["example"];
-            let body = example.as_str().map_or_else(|| example.to_string(), str::to_owned);
+            let mut body = example.as_str().map_or_else(|| example.to_string(), str::to_owned);
+            let mut sent_as = content_type.clone();
+            if content_type == "multipart/form-data" {
+                let part = "Content-Disposition: form-data; name=\"file\"; filename=\"table.csv\"";
+                body = format!("--x\r\n{part}\r\n\r\n{}\r\n--x--\r\n", example["file"].as_str().unwrap());
+                sent_as += "; boundary=x";
+            }
             let method = reqwest::Method::from_bytes(method.to_uppercase().as_bytes()).unwrap();
-            let request = service.request(method, at).header("content-type", content_type).body(body);
+            let request = service.request(method, at).header("content-type", sent_as).body(body);
             let answer = request.send().await.unwrap();
             assert!(answer.status().is_success(), "{content_type}: {}", answer.text().await.unwrap());
             if content_type == "application/x-ndjson" {

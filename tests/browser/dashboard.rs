@@ -85,7 +85,7 @@ const FIGURES_WITHOUT_TEXT: &str = "
     }).map((figure) => figure.dataset.figure)";
 
 /// Serious and critical findings of axe-core; `None` where it is not installed.
-fn axe_findings(page: &mut Page) -> Option<Value> {
+pub fn axe_findings(page: &mut Page) -> Option<Value> {
     let file = repository("target/browser/node_modules/axe-core/axe.min.js");
     let source = needs::installed(&file).then(|| std::fs::read_to_string(file).unwrap())?;
     page.evaluate(&format!("{source}; undefined"));

@@ -17,3 +17,4 @@ mod needs;
 mod rejected;
 mod sign_in;
 mod verdict;
+mod upload;

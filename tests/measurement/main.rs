@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod tables;
+
 use std::collections::BTreeMap;
 
 use modalwatch::measurement::body::RawBatch;

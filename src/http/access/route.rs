@@ -11,8 +11,8 @@ const OPEN: [&str; 6] = ["/", "/healthz", "/readyz", "/version", "/openapi.json"
 const OPEN_FOLDERS: [&str; 2] = ["/assets/", "/docs/"];
 /// Methods that change something.
 const CHANGES: [Method; 4] = [Method::POST, Method::PUT, Method::PATCH, Method::DELETE];
-/// Routes that accept batches.
-const INGEST: [&str; 1] = ["/v1/structures/{id}/batches"];
+/// Routes that accept batches, and the preview of a table of batches.
+const INGEST: [&str; 2] = ["/v1/structures/{id}/batches", "/v1/structures/{id}/tables/preview"];
 /// Collections below `/v1` that concern the service itself. Reading them needs the scope admin too.
 const SERVICE: [&str; 6] = ["tokens", "audit", "webhooks", "backups", "quarantine", "retention"];
 /// Lists over all structures. Their handlers omit what the token may not see.

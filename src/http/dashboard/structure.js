@@ -14,6 +14,7 @@ import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
 import { maintenance } from "./sections/maintenance.js";
 import { declare, model, postLine } from "./sections/model.js";
+import { upload } from "./sections/upload.js";
 import { stateChip } from "./states.js";
 
 const DAY_S = 86400;
@@ -34,6 +35,7 @@ const SECTIONS = [
   ["condition", "Condition"],
   ["tracks", "Frequencies"],
   ["batch", "Batch"],
+  ["upload", "Upload"],
   ["model", "Model"],
   ["diagnosis", "Diagnosis"],
   ["maintenance", "Maintenance"],
@@ -86,6 +88,7 @@ export function structure(id, query) {
     ),
     tracks: section("tracks", "Frequencies", figures.tracks.element),
     batch: detail.element,
+    upload: upload(id, () => refresh.all()).element,
     model: used.element,
     diagnosis: h("div", { class: "stack" }, diagnoses.card, diagnoses.element),
     maintenance: windows.element,
@@ -247,7 +250,7 @@ export function structure(id, query) {
     const usual = info.undamaged?.threshold_probability ?? USUAL_PROBABILITY;
     const empty = (item?.batches ?? series.batches) === 0;
     state.empty = empty;
-    show(empty && OVER_TIME.includes(shown) ? "model" : shown);
+    show(empty && OVER_TIME.includes(shown) ? "upload" : shown);
     fill(first, empty ? nothingYet(info) : "");
     if (empty) return;
     asReference.hidden = !info.model;
