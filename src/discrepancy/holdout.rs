@@ -3,14 +3,16 @@
 use serde::{Deserialize, Serialize};
 
 use super::data::{Data, Values};
-use crate::quantity::shown;
+use crate::quantity::{shown, Timestamp};
 
-/// Which rows are held out for measuring the gain; written `last:0.25` or `where:lab=de`.
+/// Which rows are held out for measuring the gain; written `last:0.25`, `since:2025-08-07` or `where:lab=de`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Holdout {
     /// The last share of the rows in time.
     Last(f64),
+    /// The rows from a time on.
+    Since(Timestamp),
     /// The rows in which a covariate has a given category.
     Where {
         /// Name of the covariate.
@@ -24,12 +26,14 @@ impl std::str::FromStr for Holdout {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("{} must read last:0.25, a share below 1, or where:lab=de", shown(text));
+        let wrong =
+            || format!("{} must read last:0.25, a share below 1, since:2025-08-07, or where:lab=de", shown(text));
         match text.split_once(':') {
             Some(("last", share)) => {
                 let share: f64 = share.parse().map_err(|_| wrong())?;
                 (0.0..1.0).contains(&share).then_some(Self::Last(share)).ok_or_else(wrong)
             }
+            Some(("since", time)) => Timestamp::parse_day_or_time(time).map(Self::Since).map_err(|_| wrong()),
             Some(("where", rest)) => {
                 let (covariate, level) = rest.split_once('=').ok_or_else(wrong)?;
                 Ok(Self::Where { covariate: covariate.to_owned(), level: level.to_owned() })
@@ -63,6 +67,13 @@ impl Holdout {
                 }
                 let first = all.len() - (share * all.len() as f64).round() as usize;
                 Ok((all[..first].to_vec(), all[first..].to_vec()))
+            }
+            Self::Since(from) => {
+                if data.measured_at.is_empty() {
+                    return Err(format!("since:{from} needs the time of each row, and these rows have none"));
+                }
+                let (held, searched) = all.into_iter().partition(|row| data.measured_at[*row] >= *from);
+                Ok((searched, held))
             }
             Self::Where { covariate, level } => {
                 let column = data.column(covariate).ok_or_else(|| {
