@@ -84,13 +84,12 @@ pub(super) fn gain_in_words(gain: &Gain, with: &str) -> Option<String> {
     } else {
         String::new()
     };
+    let pronoun = if with == "With them" { "them" } else { "it" };
     let alarms = gain.false_alarms_per_1000.as_ref().map_or_else(String::new, |alarms| {
         format!(
-            " Of 1000 batches of ten of these rows, {:.0} are beyond an alarm limit without {} and {:.0} with {}; {}.",
+            " Of 1000 batches of ten of these rows, {:.0} are beyond an alarm limit without {pronoun} and {:.0} with {pronoun}; {}.",
             alarms.before,
-            if with.ends_with("it") { "it" } else { "them" },
             alarms.after,
-            if with.ends_with("it") { "it" } else { "them" },
             gain.condition()
         )
     });

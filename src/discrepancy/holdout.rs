@@ -92,3 +92,24 @@ impl Holdout {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_day_is_its_midnight_in_utc_and_a_time_is_itself() {
+        let since = |text: &str| match text.parse::<Holdout>() {
+            Ok(Holdout::Since(time)) => time.to_string(),
+            other => panic!("{text} is read as {other:?}"),
+        };
+        assert_eq!(since("since:2025-08-07"), "2025-08-07T00:00:00Z");
+        assert_eq!(since("since:2025-08-07T12:00:00+02:00"), "2025-08-07T10:00:00Z");
+        for wrong in
+            ["since:", "since:7.8.2025", "since:2025-08-07T12:00:00", "since:2025-02-30", "last:1", "first:0.2"]
+        {
+            let message = wrong.parse::<Holdout>().unwrap_err();
+            assert!(message.contains("since:2025-08-07"), "{wrong}: {message}");
+        }
+    }
+}

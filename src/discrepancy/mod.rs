@@ -247,7 +247,10 @@ fn search(
     let selection = select(&asked.training)?;
     progress(Step::Comparing);
     let rows: Vec<usize> = (0..data.rows()).filter(|row| !data.further[*row]).collect();
-    let mut change = match lasting::examine(study, &rows, &selection.fit)? {
+    // Under the causes found, the frequencies may not exist in rows that were held out.
+    let examined =
+        lasting::examine(study, &rows, &selection.fit).unwrap_or_else(|| Examined::Untested(NO_STEP.to_owned()));
+    let mut change = match examined {
         Examined::Changed(change) => change,
         Examined::Unchanged => return Some(Searched { selection, change: None, untested: None, split: asked }),
         Examined::Untested(why) => {
@@ -385,6 +388,9 @@ fn verdict(causes: usize, ambiguous: bool, remainder: bool, scatter: bool) -> Di
         _ => DiagnosisVerdict::Several,
     }
 }
+
+/// Why a lasting change is not looked for under causes that cannot be extrapolated.
+const NO_STEP: &str = "with the causes found, a stiffness or mass would not be positive in some of them";
 
 /// The note where no rows are left to measure the gain on.
 const NO_ROWS: &str =

@@ -12,6 +12,7 @@ mod export;
 mod helpers;
 mod history;
 mod hostile;
+mod lasting_change;
 mod learned;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]

@@ -3,11 +3,13 @@
 //! Successive rows are correlated. The variance that counts for the mean of many rows,
 //!
 //! ```text
-//!  ω² = max( Σ_b (Σ_{j∈b} v_j)²/(n − trace),    s²(1 + ρ)/(1 − ρ) ),    ν = (n − trace)/L
+//!  ω² = max( Σ_b (Σ_{j∈b} v_j)²/(n − trace),    c₀(1 + ρ)/(1 − ρ),    c₀ + 2c₁/(1 − φ) ),    φ = (c₂ + c₃ + c₄)/(c₁ + c₂ + c₃)
+//!  ν = (n − trace)/L
 //! ```
 //!
 //! is estimated from the sums of the residuals v in 20 successive blocks of L = n/20 rows, whose expectation the regressors reduce by a
-//! trace that is known, and from the correlation ρ of successive residuals; the larger one is used. The step that is tested is
+//! trace that is known; from the correlation ρ = c₁/c₀ of successive residuals; and for a persistent part with white noise, from the
+//! covariances c_k of residuals k rows apart, corrected for what the fitted numbers take of them. The largest is used. The step that is tested is
 //! among the regressors, so that a true step does not become a part of ω².
 //!
 //! Source: W. K. Newey, K. D. West (1987), Econometrica 55, for variances of correlated residuals; B. E. Hansen (1992),
@@ -174,11 +176,8 @@ impl Tested {
         let left = n as f64 - trace;
         let degrees = left / (n as f64 / BLOCKS as f64);
         let of_blocks = squares / left.max(f64::MIN_POSITIVE);
-        let sum: f64 = dot(residual, residual);
-        let within = sum / (n as f64 - self.competitors.len() as f64 - 1.0).max(1.0);
-        let successive: f64 = residual.windows(2).map(|w| w[0] * w[1]).sum();
-        let correlation = (successive / sum.max(f64::MIN_POSITIVE)).clamp(0.0, MOST_CORRELATION);
-        (of_blocks.max(within * (1.0 + correlation) / (1.0 - correlation)), degrees)
+        let numbers = self.competitors.len() as f64 + 1.0;
+        (of_blocks.max(process_variance(residual, numbers, of_blocks)), degrees)
     }
 
     /// The onset of the step that was found, with ω² from there:
@@ -218,6 +217,25 @@ impl Tested {
     pub fn place_of(&self, bin: usize) -> usize {
         self.known.partition_point(|known| *known < bin)
     }
+}
+
+/// ω² of a process with a persistent part and white noise, from the covariances c of successive residuals. `numbers`: fitted numbers, which
+/// reduce each covariance by about ω²/n; `least`: another estimate of ω².
+fn process_variance(residual: &[f64], numbers: f64, least: f64) -> f64 {
+    let n = residual.len() as f64;
+    let covariance = |lag: usize| dot(&residual[lag..], &residual[..residual.len() - lag]) / (n - numbers).max(1.0);
+    let c: [f64; 5] = std::array::from_fn(covariance);
+    let correlation = (c[1] / c[0].max(f64::MIN_POSITIVE)).clamp(0.0, MOST_CORRELATION);
+    let of_pairs = c[0] * (1.0 + correlation) / (1.0 - correlation);
+    let persistent = |c: &[f64; 5]| {
+        if c[1] < 2.0 / n.sqrt() * c[0] {
+            return c[0];
+        }
+        let decay = ((c[2] + c[3] + c[4]) / (c[1] + c[2] + c[3])).clamp(0.0, MOST_CORRELATION);
+        c[0] + 2.0 * c[1] / (1.0 - decay)
+    };
+    let largest = least.max(of_pairs).max(persistent(&c));
+    largest.max(persistent(&c.map(|c| c + numbers / n * largest)))
 }
 
 fn dot(a: &[f64], b: &[f64]) -> f64 {
