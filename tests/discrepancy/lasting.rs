@@ -240,7 +240,7 @@ fn without_damage_a_change_is_found_as_rarely_as_stated() {
 /// The figures of the documentation; 8 minutes on two cores.
 #[test]
 #[ignore = "300 years"]
-fn false_findings_of_three_hundred_years_and_losses_of_several_sizes() {
+fn false_findings_of_three_hundred_years() {
     for persistence in [0.0, 0.7, 0.9] {
         let found = false_findings(100, persistence);
         println!("persistence {persistence}: a change in {} of 100 years without one", found.len());
