@@ -127,6 +127,35 @@ impl Timestamp {
         self.0.to_zoned(jiff::tz::TimeZone::UTC).month().unsigned_abs()
     }
 
+    /// Its day in UTC in words: `7 August 2025`.
+    pub fn day_in_words(self) -> String {
+        self.0.strftime("%-d %B %Y").to_string()
+    }
+
+    /// Its minute in UTC in words: `7 August 2025, 14:05 UTC`.
+    pub fn minute_in_words(self) -> String {
+        self.0.strftime("%-d %B %Y, %H:%M UTC").to_string()
+    }
+
+    /// Reads a day such as `2025-08-07`, which stands for its midnight in UTC, or a time in RFC 3339 with an offset.
+    ///
+    /// # Errors
+    /// [`OutOfRange`] if the text is neither.
+    pub fn parse_day_or_time(text: &str) -> Result<Self, OutOfRange> {
+        let day: Result<jiff::civil::Date, _> = text.trim().parse();
+        // A time with an offset can be read as a civil date as well: only the length tells a day.
+        if let (Ok(day), true) = (day, text.trim().len() <= "2025-08-07".len()) {
+            let midnight = day.to_zoned(jiff::tz::TimeZone::UTC).map(|zoned| zoned.timestamp().as_microsecond());
+            return Self::from_micros(midnight.unwrap_or(i64::MAX));
+        }
+        Self::parse(text).map_err(|_| OutOfRange {
+            quantity: "time",
+            unit: "",
+            value: shown(text),
+            must: "a day such as 2025-08-07, or RFC 3339 with an offset, such as 2026-03-01T12:00:00Z",
+        })
+    }
+
     /// Microseconds since 1970-01-01T00:00:00Z.
     pub fn micros(self) -> i64 {
         self.0.as_microsecond()

@@ -9,16 +9,18 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::model::present_model;
 use super::next::join;
 use super::output::write_whole;
-use super::tables::{read_tables, TableArgs};
+use super::tables::{read_tables, TableArgs, Tables};
 use super::training::{print_record, train_extension_into};
 use crate::baseline::extension::ExtensionPlan;
 use crate::baseline::library::find_structure;
+use crate::discrepancy::chance::{cases, times_less};
 use crate::discrepancy::data::Data;
 use crate::discrepancy::extend::extend as extend_structure;
-use crate::discrepancy::gain::GainMethod;
+use crate::discrepancy::gain::{Gain, GainMethod};
 use crate::discrepancy::learned::extension::{extend_learned, offer_anyway};
 use crate::discrepancy::{diagnose as run, report, Diagnosis, Holdout, Outcome, Step};
 use crate::measurement::times::TimeUnit;
+use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 
 /// The structure and the data of a diagnosis.
@@ -30,7 +32,13 @@ pub struct StudyArgs {
     /// CSV file of measurements; several files are joined in the order given
     #[arg(long, required = true)]
     data: Vec<PathBuf>,
-    /// Rows held out for measuring the gain: last:SHARE, or where:COLUMN=CATEGORY
+    /// Only rows from this time on: a day (2025-08-07, midnight in UTC) or RFC 3339
+    #[arg(long, value_parser = Timestamp::parse_day_or_time, conflicts_with = "next")]
+    from: Option<Timestamp>,
+    /// Only rows before this time, in the same form
+    #[arg(long, value_parser = Timestamp::parse_day_or_time, conflicts_with = "next")]
+    to: Option<Timestamp>,
+    /// Rows held out for measuring the gain: last:SHARE, since:DAY, or where:COLUMN=CATEGORY
     #[arg(long, default_value = "last:0.25")]
     holdout: Holdout,
     /// Column that holds the time: RFC 3339, or numbers, whose unit is found from the whole column [default: measured_at, or the
@@ -120,7 +128,8 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
         let joined = join(&simulator, path, (&args.data, &args.further), &how)?;
         (joined.data, joined.notes, Some(joined.earlier))
     } else {
-        let tables = read_tables(&simulator, &args.data, &how)?;
+        let mut tables = read_tables(&simulator, &args.data, &how)?;
+        restrict(&mut tables, args.from, args.to)?;
         let data = Data::new(&simulator, &tables.measurements);
         (if tables.timed { data } else { data.by_order() }, tables.notes, None)
     };
@@ -136,6 +145,24 @@ fn studied(args: &StudyArgs) -> anyhow::Result<Study> {
     }
     outcome.diagnosis.notes.splice(0..0, notes);
     Ok(Study { simulator, data, outcome })
+}
+
+/// Leaves out the rows outside a period, with a note.
+fn restrict(tables: &mut Tables, from: Option<Timestamp>, to: Option<Timestamp>) -> anyhow::Result<()> {
+    if from.is_none() && to.is_none() {
+        return Ok(());
+    }
+    anyhow::ensure!(tables.timed, "--from and --to need a column with the time of each row; --time names it");
+    if let (Some(from), Some(to)) = (from, to) {
+        anyhow::ensure!(from < to, "--to {to} must be after --from {from}");
+    }
+    let all = tables.measurements.len();
+    let within = |at: Timestamp| from.is_none_or(|from| at >= from) && to.is_none_or(|to| at < to);
+    tables.measurements.retain(|measurement| within(measurement.measured_at));
+    let edge = |word: &str, time: Option<Timestamp>| time.map_or_else(String::new, |time| format!(" {word} {time}"));
+    let used = tables.measurements.len();
+    tables.notes.push(format!("only the {used} of {all} rows{}{} are used", edge("from", from), edge("before", to)));
+    Ok(())
 }
 
 /// Diagnose, add the causes to a new version of the structure, and train its model.
@@ -220,16 +247,20 @@ fn print(d: &Diagnosis) {
     println!("{}", d.summary);
     println!();
     for cause in &d.causes {
-        println!("cause ({:?}, probability {:.3}): {}", cause.class, cause.probability, cause.sentence);
+        let kind = cause.class.in_words();
+        println!("cause ({kind}, probability {}): {}", shown_probability(cause.probability), cause.sentence);
         for n in &cause.parameters {
-            let name = if n.name == "swing" { "effect range" } else { &n.name };
-            println!("    {name:>24} {:>12.5} ({:.5} … {:.5}) {}", n.value, n.interval90[0], n.interval90[1], n.unit);
+            let [name, value, interval] = n.in_words(cause);
+            println!("    {name}: {value} (90 % interval: {interval})");
         }
     }
     for a in d.alternatives.iter().take(5) {
         println!(
-            "instead of cause {}: {} ({:+.1} nats); distinguished by {}",
-            a.instead_of, a.cause.sentence, a.log_evidence_difference, a.discriminating_measurement
+            "instead of cause {}: {} ({} than it); distinguished by {}",
+            a.instead_of,
+            a.cause.sentence,
+            times_less(a.log_evidence_difference),
+            a.discriminating_measurement
         );
     }
     for m in d.next_measurements.iter().take(5) {
@@ -238,34 +269,49 @@ fn print(d: &Diagnosis) {
     for m in d.misfit.iter().take(8) {
         let what = m.mode.map_or_else(|| m.parameter.clone().unwrap_or_default(), |mode| format!("mode {mode}"));
         let covariate = m.covariate.as_ref().map_or_else(|| "constant".to_owned(), |c| format!("depends on {c}"));
-        println!("misfit: {what}, {covariate}: {:.3} %, p = {:.1e}", m.size_percent, m.p_value);
+        println!("misfit: {what}, {covariate}: {:.3} %; by chance in {} cases", m.size_percent, cases(m.p_value));
     }
     if let Some(r) = &d.remainder {
-        println!("unexplained: residuals depend on {} (p = {:.1e})", r.function, r.p_value);
+        println!("unexplained: residuals depend on {}; by chance in {} cases", r.function, cases(r.p_value));
     }
-    if let Some(g) = &d.gain {
-        let rows = match g.method {
-            GainMethod::HeldOut => format!("on {} rows held out:", g.holdout_rows),
-            GainMethod::CrossValidation => format!("by cross-validation, {} rows:", g.holdout_rows),
-        };
-        println!("{rows:<32} before      after");
-        for (mode, (a, b)) in g.rms_error_percent.before.iter().zip(&g.rms_error_percent.after).enumerate() {
-            println!("  error of mode {:<2} (%)        {a:>10.4} {b:>10.4}", mode + 1);
-        }
-        let l = &g.log_density_per_row;
-        println!(
-            "  log density per row (nats) {:>10.3} {:>10.3}   gain {:.3} ± {:.3}",
-            l.before, l.after, l.difference, l.standard_error
-        );
-        println!("  inside 90 % intervals      {:>10.3} {:>10.3}", g.coverage90.before, g.coverage90.after);
-        if let Some(f) = &g.false_alarms_per_1000 {
-            println!("  false alarms per 1000      {:>10.0} {:>10.0}", f.before, f.after);
-        }
-        if let Some(s) = &g.smallest_detectable_loss_percent {
-            println!("  smallest detectable loss % {:>10.1} {:>10.1}", s.before, s.after);
-        }
+    if let Some(gain) = &d.gain {
+        print_gain(gain);
     }
     for note in &d.notes {
         println!("note: {note}");
+    }
+}
+
+fn shown_probability(probability: f64) -> String {
+    if probability > 0.9995 {
+        "above 0.999".to_owned()
+    } else {
+        format!("{probability:.3}")
+    }
+}
+
+/// The gain as a table.
+fn print_gain(g: &Gain) {
+    let rows = match g.method {
+        GainMethod::HeldOut => format!("on {} rows held out:", g.holdout_rows),
+        GainMethod::CrossValidation => format!("by cross-validation, {} rows:", g.holdout_rows),
+    };
+    println!("{rows:<44} before      after");
+    for (mode, (a, b)) in g.rms_error_percent.before.iter().zip(&g.rms_error_percent.after).enumerate() {
+        println!("  {:<38} {a:>10.4} {b:>10.4}", format!("error of mode {}, %", mode + 1));
+    }
+    let l = &g.log_density_per_row;
+    println!(
+        "  {:<38} {:>10.3} {:>10.3}   gain {:.3} ± {:.3}; +1: rows are 2.7 times as probable",
+        "log of the probability of a row", l.before, l.after, l.difference, l.standard_error
+    );
+    let name = "share inside 90 % intervals";
+    println!("  {name:<38} {:>10.3} {:>10.3}   it should be 0.9", g.coverage90.before, g.coverage90.after);
+    if let Some(f) = &g.false_alarms_per_1000 {
+        let name = "of 1000 batches, beyond an alarm limit";
+        println!("  {name:<38} {:>10.0} {:>10.0}   {}", f.before, f.after, g.condition());
+    }
+    if let Some(s) = &g.smallest_detectable_loss_percent {
+        println!("  {:<38} {:>10.1} {:>10.1}", "smallest loss that ten rows show, %", s.before, s.after);
     }
 }

@@ -1,11 +1,11 @@
 //! Measurements in the form that a diagnosis uses: rows in order of time, logarithms of frequencies, covariates, settings.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::declared::{declared, is_marked, Declared, Weighing, SECOND_INSTRUMENT};
 use super::shapes::MeasuredShapes;
 use crate::measurement::{CovariateValue, ModalMeasurement};
-use crate::quantity::{Digest, Hertz};
+use crate::quantity::{Digest, Hertz, Timestamp};
 use crate::simulator::law::{lagged, Input, Law, LawKind};
 use crate::simulator::Simulator;
 use crate::stats;
@@ -26,6 +26,12 @@ const MOST_FACTORS: usize = 6;
 pub const MOST_LEVELS: usize = 12;
 
 const MICROS_A_DAY: f64 = 86_400e6;
+
+/// Times before this one count from an unknown start: 1980-01-01.
+const EARLIEST_DATE_MICROS: i64 = 315_532_800_000_000;
+
+/// Data that cover at most this many days are described by the minute.
+const SHORT_DAYS: f64 = 20.0;
 
 /// Values of a covariate.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,6 +73,11 @@ pub struct Data {
     pub times_days: Vec<f64>,
     /// `day`, or `row` if no times are known.
     pub time_unit: &'static str,
+    /// Time of each row, `[n]`; empty if no times are known.
+    pub measured_at: Vec<Timestamp>,
+    /// Whether a row is part of the declared undamaged reference, `[n]`. Of all others it is not known whether the structure was
+    /// undamaged.
+    pub declared_undamaged: Vec<bool>,
     /// ln f, `[n][m]`, f in Hz; NaN if a mode is missing.
     pub log_frequencies: Vec<Vec<f64>>,
     /// Relative standard deviation of each frequency as stated by the row or by the structure, with the error of an emulator,
@@ -170,6 +181,8 @@ impl Data {
             weighings,
             further,
             digest: Digest::of(&[&content]),
+            measured_at: sorted.iter().map(|m| m.measured_at).collect(),
+            declared_undamaged: vec![false; sorted.len()],
             times_days,
             time_unit: "day",
             log_frequencies,
@@ -182,12 +195,32 @@ impl Data {
     /// The same data with the index of each row as its time, for tables without times.
     #[must_use]
     pub fn by_order(mut self) -> Self {
+        self.measured_at.clear();
         self.times_days = (0..self.rows()).map(|row| row as f64).collect();
         self.time_unit = "row";
         if let Some(time) = self.columns.iter_mut().find(|c| c.name == TIME) {
             time.values = Values::Numbers(self.times_days.clone());
         }
         self
+    }
+
+    /// The same data, in which the rows at these times are part of the declared undamaged reference.
+    #[must_use]
+    pub fn with_undamaged(mut self, times: &BTreeSet<Timestamp>) -> Self {
+        self.declared_undamaged = self.measured_at.iter().map(|at| times.contains(at)).collect();
+        self
+    }
+
+    /// Time of a row in words, as the object of "since", "until" or "between": a date, or the day of the data if their dates are
+    /// not known. Within a few days the time of the day is stated as well.
+    pub fn time_in_words(&self, row: usize) -> String {
+        let dated = self.measured_at.first().is_some_and(|first| first.micros() > EARLIEST_DATE_MICROS);
+        let span = self.times_days.last().copied().unwrap_or(0.0);
+        match self.measured_at.get(row) {
+            Some(at) if dated && span > SHORT_DAYS => at.day_in_words(),
+            Some(at) if dated => at.minute_in_words(),
+            _ => format!("{} {} of the data", self.time_unit, shown_time(self.times_days[row])),
+        }
     }
 
     /// Number of rows n.
@@ -234,6 +267,15 @@ impl Data {
                 indices.iter().map(|i| i.map_or(Input::Missing, |i| Input::Level(place(i)))).collect()
             }
         }
+    }
+}
+
+/// A number of days or rows: one decimal, none if it is whole.
+fn shown_time(value: f64) -> String {
+    if value.fract().abs() < 0.05 {
+        format!("{value:.0}")
+    } else {
+        format!("{value:.1}")
     }
 }
 

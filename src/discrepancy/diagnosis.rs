@@ -4,8 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::describe::Cause;
 use super::fit::Fit;
-use super::gain::{Gain, GainMethod};
+use super::gain::Gain;
+use super::gain_words::gain_in_words;
 use super::grammar::Class;
+use super::lasting::found::LastingChange;
 use super::learned::offer::{LearnedOffer, Offered};
 use super::misfit::{Misfit, Remainder};
 use super::mode_numbers::{self, ModeNumber};
@@ -60,6 +62,9 @@ pub struct Diagnosis {
     pub verdict: DiagnosisVerdict,
     /// The answer in one or a few sentences.
     pub summary: String,
+    /// A change in time that neither the causes nor the recorded quantities nor the seasons explain; `null` if none was found.
+    #[serde(default)]
+    pub lasting_change: Option<LastingChange>,
     /// Parameters of which settings lie outside the prior, or outside the runs of a table.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub settings_outside: Vec<OutsideSetting>,
@@ -92,6 +97,9 @@ pub struct Diagnosis {
     pub training_rows: usize,
     /// Rows held out.
     pub holdout_rows: usize,
+    /// Rows since a lasting change, which were neither searched nor held out.
+    #[serde(default)]
+    pub set_aside_rows: usize,
     /// Combinations of target, law and covariate that were considered.
     pub candidates: usize,
     /// Effective number of independent rows as a share of all rows.
@@ -121,6 +129,8 @@ pub struct Outcome {
     pub holdout: Vec<usize>,
     /// Rows that were searched for causes.
     pub training: Vec<usize>,
+    /// Rows since a lasting change, which are used for neither.
+    pub set_aside: Vec<usize>,
     /// The discrepancy that could be learned.
     pub offered: Option<Offered>,
 }
@@ -143,9 +153,14 @@ impl Diagnosis {
 
     /// The answer in words.
     pub(super) fn in_words(&self) -> String {
-        let mut text = self.settings_outside.iter().map(|s| capitalised(&s.sentence()) + ". ").collect::<String>();
+        let mut text = self.lasting_change.as_ref().map_or_else(String::new, |change| format!("{} ", change.sentence));
+        text += &self.settings_outside.iter().map(|s| capitalised(&s.sentence()) + ". ").collect::<String>();
         if !self.mode_numbers.is_empty() {
             text += &(capitalised(&mode_numbers::sentence(&self.mode_numbers)) + ". ");
+        }
+        if self.set_aside_rows > 0 {
+            let rows = self.training_rows + self.holdout_rows;
+            text += &format!("In the {rows} measurements before: ");
         }
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {
@@ -232,41 +247,4 @@ impl Diagnosis {
 pub(super) fn capitalised(text: &str) -> String {
     let mut rest = text.chars();
     rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
-}
-
-/// The gain in words: change of the error of the mode that changes most in the direction of the whole, whether the whole is better,
-/// and change of the false alarms. `None` if no mode was measured in the rows held out.
-fn gain_in_words(gain: &Gain, with: &str) -> Option<String> {
-    let rms = &gain.rms_error_percent;
-    let density = &gain.log_density_per_row;
-    let (low, high) =
-        (density.difference - 2.0 * density.standard_error, density.difference + 2.0 * density.standard_error);
-    let worse = high < 0.0;
-    let finite = |m: &usize| rms.before[*m].is_finite() && rms.after[*m].is_finite();
-    let mode = (0..rms.before.len()).filter(finite).max_by(|a, b| {
-        let gained = |m: usize| if worse { rms.after[m] - rms.before[m] } else { rms.before[m] - rms.after[m] };
-        gained(*a).total_cmp(&gained(*b))
-    })?;
-    let (before, after) = (rms.before[mode], rms.after[mode]);
-    let moved = if after < before { "falls" } else { "rises" };
-    let rows = match gain.method {
-        GainMethod::HeldOut => format!("on the {} rows held out", gain.holdout_rows),
-        GainMethod::CrossValidation => format!("in cross-validation over {} rows", gain.holdout_rows),
-    };
-    let alarms = gain.false_alarms_per_1000.as_ref().map_or_else(String::new, |alarms| {
-        let (before, after) = (alarms.before, alarms.after);
-        format!(", and the false alarms change from {before:.0} to {after:.0} per 1000 undamaged batches")
-    });
-    let all_modes = format!("{:+.2} ± {:.2} nats per row in log density", density.difference, density.standard_error);
-    let whole = if worse {
-        format!(" Over all modes these rows are predicted worse ({all_modes}): what was found in the other rows does not hold there.")
-    } else if low <= 0.0 {
-        format!(" Over all modes the prediction is not clearly better ({all_modes}).")
-    } else {
-        String::new()
-    };
-    Some(format!(
-        " {with} in the simulation, the prediction error of mode {} {rows} {moved} from {before:.2} % to {after:.2} %{alarms}.{whole}",
-        mode + 1
-    ))
 }

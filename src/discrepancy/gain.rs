@@ -75,12 +75,35 @@ pub struct Gain {
     pub coverage90: Change<f64>,
     /// Standard deviation of each parameter between batches of ten rows, per cent of the stiffness that it sets.
     pub spread_of_parameters_percent: Change<BTreeMap<String, f64>>,
-    /// Batches of ten rows held out, assumed undamaged, that exceed a control limit for 1 false alarm in 1000; the limit is set
-    /// from the first quarter of the other rows as the reference. `null` for fewer than 20 rows.
+    /// Rows among them that are part of the declared undamaged reference. Of all others it is not known whether the structure was
+    /// undamaged.
+    #[serde(default)]
+    pub undamaged_rows: usize,
+    /// Of 1000 batches of ten of these rows, those beyond a control limit that 1 in 1000 should exceed; the limit is set from the first
+    /// quarter of the other rows. They are false alarms only where the structure was undamaged: see `undamaged_rows`. `null` for
+    /// fewer than 20 rows.
     pub false_alarms_per_1000: Option<Change<f64>>,
     /// Smallest loss of the stiffness that is identified worst which one batch of ten rows detects with a probability of 90 %, at
-    /// a limit that 999 of 1000 undamaged batches do not exceed. `null` for fewer than 20 rows.
+    /// a limit that 1 in 1000 should exceed without a loss. `null` for fewer than 20 rows.
     pub smallest_detectable_loss_percent: Option<Change<f64>>,
+}
+
+impl Gain {
+    /// What is known about the condition of the structure in its rows, as a clause.
+    pub fn condition(&self) -> String {
+        match self.undamaged_rows {
+            rows if rows == self.holdout_rows => {
+                "all of them are in the declared undamaged reference, so that these would be false alarms".to_owned()
+            }
+            0 => "whether the structure was undamaged in these rows is not known, so that they may be false alarms or right ones"
+                .to_owned(),
+            rows => format!(
+                "{rows} of these {} rows are in the declared undamaged reference; of the others it is not known whether the structure \
+                 was undamaged",
+                self.holdout_rows
+            ),
+        }
+    }
 }
 
 /// The figures of one fit.
@@ -92,6 +115,8 @@ struct FitFigures {
     false_alarms: f64,
     detectable: f64,
     errors: Vec<Vec<f64>>,
+    /// Rows in the declared undamaged reference.
+    undamaged: usize,
 }
 
 /// What a gain is measured on.
@@ -168,6 +193,7 @@ pub(super) fn gain(
         coverage90: Change { before: a.coverage, after: b.coverage },
         spread_of_parameters_percent: Change { before: a.spread, after: b.spread },
         false_alarms_per_1000: enough.then_some(Change { before: a.false_alarms, after: b.false_alarms }),
+        undamaged_rows: a.undamaged,
         smallest_detectable_loss_percent: enough.then_some(Change { before: a.detectable, after: b.detectable }),
     })
 }
@@ -242,6 +268,7 @@ fn figures_of(study: &Study<'_>, training: &[usize], views: &[RowView], fit: &Fi
         false_alarms: 1000.0 * alarms as f64 / shifts.len().max(1) as f64,
         detectable,
         errors,
+        undamaged: views.iter().filter(|view| study.data.declared_undamaged[view.row]).count(),
     })
 }
 

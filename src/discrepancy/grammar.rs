@@ -37,6 +37,19 @@ pub enum Class {
     PossibleDamage,
 }
 
+impl Class {
+    /// Its name in words.
+    pub const fn in_words(self) -> &'static str {
+        match self {
+            Self::Environment => "environment",
+            Self::Instrument => "instrument",
+            Self::SetUp => "set-up",
+            Self::Structure => "structure",
+            Self::PossibleDamage => "possible damage",
+        }
+    }
+}
+
 /// A possible cause: a target and the covariate that it depends on. It can follow one of several laws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {

@@ -11,8 +11,9 @@
 //! - [`outside`]: settings outside their priors; `setting_candidates`, `setting_starts` and `corrected`: corrections of settings;
 //! - [`misfit`]: deviations before and after; [`scatter`]: modes that scatter more than stated; [`mode_numbers`]: modes whose shapes
 //!   are those of other modes;
-//! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`);
-//! - [`diagnosis`]: the result; [`describe`], `naming` and `notes`: its text; [`report`]: the HTML page;
+//! - [`lasting`]: the test of all rows for a lasting change, and which rows may be used nevertheless;
+//! - [`gain`]: errors before and after on rows held out, or left out in turn (`blocks`); `gain_words`: the same in sentences;
+//! - [`diagnosis`]: the result; [`describe`], `naming`, `notes` and [`chance`]: its text; [`report`]: the HTML page;
 //! - [`next`]: the measurement that would decide between candidates; [`declared`] and `weighing`: what was done for it, as data;
 //! - [`extend`]: a new version of the structure with the causes as effects;
 //! - [`learned`]: a discrepancy learned from the data, where no cause explains the deviation.
@@ -35,6 +36,7 @@
 //! mass or frequency. A fit that needs them there returns `None`.
 
 mod blocks;
+pub mod chance;
 mod corrected;
 pub mod data;
 pub mod declared;
@@ -44,8 +46,10 @@ pub mod effect;
 pub mod extend;
 pub mod fit;
 pub mod gain;
+mod gain_words;
 pub mod grammar;
 pub mod holdout;
+pub mod lasting;
 pub mod learned;
 pub mod misfit;
 pub mod mode_numbers;
@@ -53,6 +57,7 @@ pub mod model;
 mod naming;
 pub mod next;
 mod notes;
+mod number_words;
 pub mod outside;
 mod problem;
 pub mod progress;
@@ -77,18 +82,21 @@ pub use progress::{Progress, Step};
 
 use crate::simulator::Simulator;
 use blocks::Blocks;
-use data::Data;
+use data::{Data, TIME};
 use effect::FittedEffect;
 use fit::Fit;
 use gain::Unseen;
 use grammar::candidates;
+use lasting::found::LastingChange;
+use lasting::usable::{Held, Split};
+use lasting::Examined;
 use learned::offer::Offered;
 use misfit::{misfits, remainder};
 use mode_numbers::mode_numbers;
 use naming::{name, Named};
 use outside::outside_settings;
 use scatter::excess_scatter;
-use select::select;
+use select::{select, Selection, Slot};
 use study::Study;
 
 /// Smallest number of rows that a verdict can be based on.
@@ -135,6 +143,9 @@ pub enum Error {
 /// each step.
 ///
 /// If fewer than 30 rows would remain beside those held out, all rows are searched and the gain is measured by cross-validation.
+///
+/// All rows are tested for a lasting change in time that neither the causes found nor the recorded covariates nor the seasons explain
+/// ([`lasting`]). The rows since then are used neither for causes nor for the gain, unless a change in time is among the causes.
 ///
 /// # Errors
 /// Fewer than 8 rows; a hold-out that names a column or category that the data do not have; natural frequencies
@@ -210,23 +221,58 @@ pub fn diagnose(
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| Error::Threads(e.to_string()))?;
-    pool.install(|| run(simulator, data, training, held, seed, progress))
+    pool.install(|| run(simulator, data, Split::as_asked(training, held), seed, progress))
 }
 
-fn run(
+/// The search for causes, and the rows that it used.
+struct Searched {
+    selection: Selection,
+    /// The lasting change; with `None`, why it was not looked for, if it was not.
+    change: Option<LastingChange>,
+    untested: Option<String>,
+    split: Split,
+}
+
+/// Searches for causes, tests all rows for a lasting change, and searches again before it where rows after it were searched. `None`
+/// if the frequencies cannot be computed.
+fn search(
     simulator: &Simulator,
-    data: &Data,
-    training: Vec<usize>,
-    holdout: Vec<usize>,
-    seed: u64,
+    study: &Study<'_>,
+    known: &[FittedEffect],
+    asked: Split,
     progress: &Progress<'_>,
-) -> Result<Outcome, Error> {
+) -> Option<Searched> {
+    let data = study.data;
+    let select = |rows: &[usize]| select(study, rows, known, &candidates(simulator, data, rows), progress);
+    let selection = select(&asked.training)?;
+    progress(Step::Comparing);
+    let rows: Vec<usize> = (0..data.rows()).filter(|row| !data.further[*row]).collect();
+    // Under the causes found, the frequencies may not exist in rows that were held out.
+    let examined =
+        lasting::examine(study, &rows, &selection.fit).unwrap_or_else(|| Examined::Untested(NO_STEP.to_owned()));
+    let mut change = match examined {
+        Examined::Changed(change) => change,
+        Examined::Unchanged => return Some(Searched { selection, change: None, untested: None, split: asked }),
+        Examined::Untested(why) => {
+            return Some(Searched { selection, change: None, untested: Some(why), split: asked });
+        }
+    };
+    let in_time = |slot: &Slot| slot.ranked[0].candidate.covariate.as_deref() == Some(TIME);
+    let explained = selection.slots.iter().any(in_time);
+    let split = asked.before(&change, explained, data);
+    change.describe(data, &split.in_words(&change, explained));
+    let selection = if split.training == asked.training { selection } else { select(&split.training)? };
+    Some(Searched { selection, change: Some(*change), untested: None, split })
+}
+
+fn run(simulator: &Simulator, data: &Data, asked: Split, seed: u64, progress: &Progress<'_>) -> Result<Outcome, Error> {
     let bare = simulator.without_effects();
     let known = known_effects(simulator, data);
     let study = Study::new(&bare, data);
     progress(Step::Showing);
-    let candidates = candidates(simulator, data, &training);
-    let selection = select(&study, &training, &known, &candidates, progress).ok_or(Error::NoFit)?;
+    let searched = search(simulator, &study, &known, asked, progress).ok_or(Error::NoFit)?;
+    let Searched { selection, change, untested, split } = searched;
+    let Split { training, holdout, set_aside, held } = split;
     let mut misfit = misfits(&study, &training, &selection.base).ok_or(Error::NoFit)?;
     misfit.retain(|m| m.p_value < MISFIT_SHOWN);
     let share = selection.independent_share;
@@ -241,15 +287,9 @@ fn run(
     let Named { causes, alternatives, ambiguous, maybe_damage, next_measurements } =
         name(simulator, &study, &training, &selection, known.len());
     progress(Step::Measuring);
-    let found = !selection.slots.is_empty();
-    let blocks = Blocks::new(data, &training);
-    let unseen = if holdout.len() >= 2 { Unseen::HeldOut(&holdout) } else { Unseen::LeftOut(&blocks) };
-    let fits = (&selection.base, &selection.fit);
-    let gain = if found { gain::gain(&study, &training, &unseen, fits, seed) } else { None };
-    let mut notes = notes::notes(simulator, data, &training, &selection.fit, share);
-    if found && gain.is_none() {
-        notes.push(NO_GAIN.to_owned());
-    }
+    let mut notes = notes::of_change(change.as_ref(), untested);
+    notes.extend(notes::notes(simulator, data, &training, &selection.fit, share));
+    let gain = measured_gain(&study, (&training, &holdout, held), &selection, seed, &mut notes);
     let unexplained = left.is_some() || many_outside;
     let verdict = verdict(selection.slots.len(), ambiguous, unexplained, !scatter.is_empty());
     let unexplained = verdict == DiagnosisVerdict::NoneOfThese;
@@ -258,6 +298,7 @@ fn run(
         structure: simulator.id().to_string(),
         verdict,
         summary: String::new(),
+        lasting_change: change,
         settings_outside,
         mode_numbers: mode_numbers(&study, &selection.fit),
         scatter,
@@ -271,6 +312,7 @@ fn run(
         notes,
         training_rows: training.len(),
         holdout_rows: holdout.len(),
+        set_aside_rows: set_aside.len(),
         candidates: selection.tried,
         independent_share: share,
         seed,
@@ -287,8 +329,34 @@ fn run(
         maybe_damage,
         holdout,
         training,
+        set_aside,
         offered,
     })
+}
+
+/// The gain of the causes; `None` without a cause, or, with a note, where it cannot be measured.
+fn measured_gain(
+    study: &Study<'_>,
+    (training, holdout, held): (&[usize], &[usize], Held),
+    selection: &Selection,
+    seed: u64,
+    notes: &mut Vec<String>,
+) -> Option<gain::Gain> {
+    if selection.slots.is_empty() {
+        return None;
+    }
+    if held == Held::Nothing {
+        notes.push(NO_ROWS.to_owned());
+        return None;
+    }
+    let blocks = Blocks::new(study.data, training);
+    let unseen = if holdout.len() >= 2 { Unseen::HeldOut(holdout) } else { Unseen::LeftOut(&blocks) };
+    let gain = gain::gain(study, training, &unseen, (&selection.base, &selection.fit), seed);
+    match &gain {
+        Some(gain) => notes.extend(gain_words::notes(gain)),
+        None => notes.push(NO_GAIN.to_owned()),
+    }
+    gain
 }
 
 /// The discrepancy that could be learned; `None`, with a note, if none can.
@@ -320,6 +388,13 @@ fn verdict(causes: usize, ambiguous: bool, remainder: bool, scatter: bool) -> Di
         _ => DiagnosisVerdict::Several,
     }
 }
+
+/// Why a lasting change is not looked for under causes that cannot be extrapolated.
+const NO_STEP: &str = "with the causes found, a stiffness or mass would not be positive in some of them";
+
+/// The note where no rows are left to measure the gain on.
+const NO_ROWS: &str =
+    "too few rows lie before the change in time to measure the gain on: what was found may be a part of that change";
 
 /// The note that says why the gain was not measured.
 const NO_GAIN: &str = "the causes cannot be extrapolated to the rows they were not fitted to, because at their covariates a stiffness or mass \

@@ -3,6 +3,7 @@
 use super::data::{Column, Data, Origin, Values, MOST_LEVELS};
 use super::fit::Fit;
 use super::grammar::spread;
+use super::lasting::found::LastingChange;
 use crate::simulator::Simulator;
 use crate::stats;
 
@@ -61,6 +62,12 @@ pub(super) fn notes(
         notes.push(format!("{} rows are few: small effects cannot be detected", rows.len()));
     }
     notes
+}
+
+/// Notes on a lasting change: how sure it is, or why it was not looked for.
+pub(super) fn of_change(change: Option<&LastingChange>, untested: Option<String>) -> Vec<String> {
+    let untested = untested.map(|why| format!("these rows were not tested for a lasting change in time: {why}"));
+    change.map(LastingChange::reliability).into_iter().chain(untested).collect()
 }
 
 /// Notes on mode shapes: in how many rows they were measured, their order and their noise.

@@ -19,6 +19,8 @@ pub enum Step {
         /// Causes found.
         of: usize,
     },
+    /// All rows are tested for a lasting change in time.
+    Comparing,
     /// The gain on the rows held out is measured.
     Measuring,
 }
@@ -29,6 +31,7 @@ impl std::fmt::Display for Step {
             Self::Showing => f.write_str("fitting the simulation without further causes"),
             Self::Searching { cause, of } => write!(f, "searching for cause {cause} of at most {of}"),
             Self::LookingAgain { cause, of } => write!(f, "searching again for cause {cause} of {of}"),
+            Self::Comparing => f.write_str("testing for a lasting change in time"),
             Self::Measuring => f.write_str("measuring the gain on the rows held out"),
         }
     }

@@ -29,8 +29,18 @@ const LISTED: usize = 100;
 struct DiagnosisBody {
     /// Ids of batches. Default: all.
     batches: Vec<String>,
-    /// Measurements that are held out to evaluate the gain. Default `last:0.25`.
-    #[schema(pattern = r"^(last:0?\.[0-9]{1,6}|where:[^=]+=.+)$", examples("last:0.25", "where:operator=anna"))]
+    /// Only measurements from this time on: RFC 3339, or a day, which stands for its midnight in UTC. Default: from the first.
+    #[schema(examples("2025-01-01", "2025-01-01T00:00:00Z"))]
+    from: Option<String>,
+    /// Only measurements before this time, in the same form. Default: to the last.
+    #[schema(examples("2026-01-01", "2026-01-01T00:00:00Z"))]
+    to: Option<String>,
+    /// Measurements that are held out to evaluate the gain: the last share, those since a day or time, or those with a category.
+    /// Default `last:0.25`.
+    #[schema(
+        pattern = r"^(last:0(\.[0-9]{1,6})?|last:\.[0-9]{1,6}|since:[0-9]{4}-.+|where:[^=]+=.+)$",
+        examples("last:0.25", "since:2025-08-07", "where:operator=anna")
+    )]
     holdout: Option<String>,
     /// Seed of the bootstrap. Default 1.
     #[serde(deserialize_with = "whole_number")]
@@ -157,14 +167,31 @@ fn answer(record: DiagnosisRecord, progress: Option<String>) -> Result<Diagnosis
     })
 }
 
+/// The ends of a period.
+fn period(from: Option<&str>, to: Option<&str>) -> Result<[Option<Timestamp>; 2], ApiError> {
+    let read = |pointer: &str, text: Option<&str>| {
+        let time = text.map(Timestamp::parse_day_or_time).transpose();
+        time.map_err(|e| ApiError::invalid_field(pointer, e.to_string()))
+    };
+    let (first, end) = (read("/from", from)?, read("/to", to)?);
+    if let (Some(first), Some(end)) = (first, end) {
+        if end <= first {
+            return Err(ApiError::invalid_field("/to", format!("{end} must be after \"from\", which is {first}")));
+        }
+    }
+    Ok([first, end])
+}
+
 /// `POST /v1/structures/{id}/diagnoses`: 202, starts a background job.
 ///
 /// # Errors
-/// 404 for structure and batches, 422 for the hold-out.
+/// 404 for structure and batches, 422 for the hold-out and the period.
 #[utoipa::path(
     post, path = "/v1/structures/{id}/diagnoses", tag = "diagnoses", operation_id = "start_diagnosis",
     summary = "Diagnose the simulation",
-    description = "Starts a background job that looks for systematic errors of the simulation in stored batches.",
+    description = "Starts a background job that looks for systematic errors of the simulation in stored batches. All measurements, those held out as well, \
+                   are tested for a lasting change in time, which may be damage (`lasting_change`); what was measured since then is used neither \
+                   to find causes nor to measure their gain.",
     params(StructurePath),
     request_body(content = DiagnosisBody, example = json!({"holdout": "last:0.25"})),
     responses(
@@ -184,8 +211,11 @@ pub async fn create(
     let all = DiagnosisRequest::default();
     let holdout = body.holdout.as_deref().map(str::parse).transpose();
     let holdout = holdout.map_err(|message: String| ApiError::invalid_field("/holdout", message))?;
+    let [from, to] = period(body.from.as_deref(), body.to.as_deref())?;
     let request = DiagnosisRequest {
         batches: body.batches,
+        from,
+        to,
         holdout: holdout.unwrap_or(all.holdout),
         seed: body.seed.unwrap_or(all.seed),
     };

@@ -130,6 +130,16 @@ async fn a_seasons_false_alarms_end_with_the_extension_and_a_real_loss_is_found_
     let page = service.get(&format!("/v1/diagnoses/{id}/report")).send().await.unwrap().text().await.unwrap();
     assert!(page.contains("<svg") && page.contains("k2"));
 
+    // The rows held out are not in the reference: nothing says that they are undamaged. Of its own rows the reference says so.
+    let gain = &diagnosis["result"]["gain"];
+    assert_eq!(gain["undamaged_rows"], 0, "{gain}");
+    assert!(diagnosis["result"]["summary"].as_str().unwrap().contains("is not known"), "{diagnosis}");
+    let asked =
+        service.post("/v1/structures/soft/diagnoses", &json!({ "batches": undamaged, "holdout": "last:0.2" })).await;
+    let own = asked.json::<Value>().await.unwrap()["diagnosis"].as_str().unwrap().to_owned();
+    let gain = finished(&service, &own, "/state").await["result"]["gain"].clone();
+    assert_eq!((&gain["undamaged_rows"], &gain["holdout_rows"]), (&json!(34), &json!(34)), "{gain}");
+
     // The extension.
     let asked = service.post(&format!("/v1/diagnoses/{id}/extension"), &json!({})).await;
     assert_eq!(asked.status(), 202);

@@ -14,6 +14,7 @@ mod from_accelerometers;
 mod helpers;
 mod history;
 mod hostile;
+mod lasting_change;
 mod learned;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]

@@ -77,12 +77,20 @@ async fn extension_ended(service: &Service) -> Value {
 
 /// Presses a button of a section and confirms what the dialog asks.
 fn press_and_confirm(page: &mut Page, section: &str, button: &str) {
+    press_and_fill(page, section, button, &[]);
+}
+
+/// Presses a button of a section, fills fields of the dialog and confirms it.
+fn press_and_fill(page: &mut Page, section: &str, button: &str, fields: &[(&str, &str)]) {
     let find = format!(
         "[...document.querySelectorAll('#{section} button')].find((b) => b.textContent === '{button}' && !b.hidden)"
     );
     page.wait_for(&format!("Boolean({find})"));
     page.evaluate(&format!("{find}.click()"));
     page.wait_for("document.querySelector('dialog[open]') !== null");
+    for (field, value) in fields {
+        page.evaluate(&format!("document.getElementById('field-{field}').value = '{value}'"));
+    }
     page.evaluate("document.querySelector('dialog button[type=submit]').click()");
     page.wait_for("document.querySelector('dialog') === null");
 }
@@ -105,14 +113,28 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_
     let mut page = Page::open();
     page.visit(&at(&service, "#/structures/tiny"));
     page.evaluate("window.sameLoad = true");
-    press_and_confirm(&mut page, "diagnosis", "Diagnose");
+    // The dialog offers period and hold-out: 12 July is day 192 of the year, and 32 batches were measured before it.
+    let fields = [("from", "2026-01-01"), ("to", "2026-07-11"), ("share", "30")];
+    press_and_fill(&mut page, "diagnosis", "Diagnose", &fields);
     page.wait_for("document.querySelector('#diagnosis li')?.textContent.includes('k2 falls by')");
     // The card says what was found, how sure this is, what is gained, and why the diagnosis ran.
     let card = page.wait_for("document.querySelector('#latest-diagnosis:not([hidden])')?.textContent");
     let card = card.as_str().unwrap();
-    for part in ["The cause is found", "k2 falls by", "> 99.9 %", " % → ", "held-out measurements", "on request"] {
+    for part in [
+        "The cause is found",
+        "k2 falls by",
+        "> 99.9 %",
+        " % → ",
+        "held-out measurements",
+        "clearly better",
+        "on request",
+    ] {
         assert!(card.contains(part), "{part} is not in the card: {card}");
     }
+    let listed = service.read("/v1/structures/tiny/diagnoses").await;
+    let newest = listed["items"][0]["diagnosis"].as_str().unwrap();
+    let result = service.read(&format!("/v1/diagnoses/{newest}")).await["result"].clone();
+    assert_eq!((&result["training_rows"], &result["holdout_rows"]), (&json!(224), &json!(96)), "{result}");
     press_and_confirm(&mut page, "latest-diagnosis", "Extend the model");
 
     // The progress bar of the job grows while the page is shown.

@@ -6,6 +6,7 @@ use super::change::ChangeInTime;
 use super::gain::{held_out_gain, left_out_gain, LearnedGain};
 use super::input::{choose, standardised, Chosen};
 use super::learn::{learn, Learned, WhyNot};
+use crate::discrepancy::chance::chance;
 use crate::discrepancy::fit::Fit;
 use crate::discrepancy::model::RowView;
 use crate::discrepancy::study::Study;
@@ -106,7 +107,7 @@ impl ChangeInTime {
             Some(after) => format!("after {time_unit} {after:.1}"),
             None => "steadily with time".to_owned(),
         };
-        format!("{} changes by {:.2} % {when} (p = {:.1e})", self.target, self.size_percent, self.p_value)
+        format!("{} changes by {:.2} % {when} ({})", self.target, self.size_percent, chance(self.p_value))
     }
 }
 
@@ -122,7 +123,7 @@ fn in_words(inputs: &[String], change: Option<&ChangeInTime>, gain: &LearnedGain
         let most = known.max_by(|a, b| gained(*a).total_cmp(&gained(*b))).unwrap_or(0);
         format!(
             "It is not understood, but predictable: a discrepancy learned from {of} raises the log density of {rows} rows it has not \
-             seen by {difference:.2} ± {error:.2} nats per row, and the prediction error of mode {} falls from {:.2} % to {:.2} %.",
+             seen by {difference:.2} ± {error:.2} per row (1 is a factor of 2.7 in probability), and the prediction error of mode {} falls from {:.2} % to {:.2} %.",
             most + 1,
             rms.before[most],
             rms.after[most]
@@ -130,7 +131,7 @@ fn in_words(inputs: &[String], change: Option<&ChangeInTime>, gain: &LearnedGain
     } else {
         format!(
             "A discrepancy learned from {of} does not predict rows better that it has not seen (log density {difference:+.2} ± \
-             {error:.2} nats per row)."
+             {error:.2} per row)."
         )
     };
     if let Some(change) = change {

@@ -32,19 +32,3 @@ pub(super) fn probability(p: f64) -> String {
         p => format!("{p:.3}"),
     }
 }
-
-/// A p-value, as HTML.
-pub(super) fn p_value(p: f64) -> String {
-    match p {
-        p if p < 1e-12 => "&lt; 1e-12".to_owned(),
-        p if p < 1e-3 => format!("{p:.0e}"),
-        p => format!("{p:.3}"),
-    }
-}
-
-/// A p-value after the letter p, as HTML.
-pub(super) fn p_compared(p: f64) -> String {
-    let text = p_value(p);
-    let text = if text.starts_with('&') { text } else { format!("= {text}") };
-    text.replace('-', "\u{2011}")
-}

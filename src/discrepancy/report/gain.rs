@@ -2,7 +2,9 @@
 
 use super::figures::{digits, plus, signed};
 use crate::discrepancy::describe::rounded;
+use crate::discrepancy::diagnosis::capitalised;
 use crate::discrepancy::gain::{Change, Gain, GainMethod};
+use crate::discrepancy::gain_words::Modes;
 use crate::plot::{escaped, table_of_html};
 
 /// The table of the gain: each figure without and with the causes, its change and its meaning.
@@ -26,11 +28,11 @@ pub(super) fn gain(g: &Gain) -> String {
     let l = &g.log_density_per_row;
     let change = rounded(l.difference, l.standard_error);
     add(
-        "log density per row, nats".to_owned(),
+        "log density of a row".to_owned(),
         [format!("{:.2}", l.before), format!("{:.2}", l.after), format!("{} ± {}", signed(&change.0), change.1)]
             .map(|v| signed(&v)),
         "Logarithm of the probability density that the simulation predicts for the measurements; ± one standard error. \
-         Larger is better.",
+         Larger is better; 1 more means 2.7 times as probable.",
     );
     let mut simple = |name: String, c: &Change<f64>, meaning: &str| {
         add(name, [digits(c.before), digits(c.after), plus(c.after - c.before)], meaning);
@@ -48,10 +50,13 @@ pub(super) fn gain(g: &Gain) -> String {
         };
         simple(format!("spread of {name}, %"), &Change { before: *before, after }, meaning);
     }
-    let alarms = "Batches of ten rows that exceed a limit set for 1 false alarm in 1000, assuming that the structure is undamaged in \
-                  these rows.";
+    let alarms = format!(
+        "Batches of ten of these rows beyond a limit that 1 in 1000 should exceed; the limit is set from the first quarter of the rows \
+         searched. {}.",
+        capitalised(&g.condition())
+    );
     if let Some(change) = &g.false_alarms_per_1000 {
-        simple("false alarms per 1000 batches".to_owned(), change, alarms);
+        simple("of 1000 batches, beyond an alarm limit".to_owned(), change, &alarms);
     }
     let loss =
         "Smallest loss of the parameter that is identified worst which one batch of ten rows detects with a probability of \
@@ -76,5 +81,5 @@ pub(super) fn gain(g: &Gain) -> String {
             g.holdout_rows
         ),
     };
-    table_of_html(&caption, &header, &rows)
+    format!("<p>{}.</p>{}", escaped(&Modes::of(g).sentence()), table_of_html(&caption, &header, &rows))
 }

@@ -111,7 +111,7 @@ fn gain(offered: &Offered) -> String {
         })
         .collect();
     rows.push(vec![
-        "log density per row, nats".to_owned(),
+        "log density of a row".to_owned(),
         signed(&format!("{:.2}", density.before)),
         signed(&format!("{:.2}", density.after)),
     ]);

@@ -2,12 +2,14 @@
 
 mod figures;
 mod gain;
+mod lasting;
 mod learned;
 mod next;
 mod residuals;
 
+use super::chance::{cases, chance, times_less};
 use super::data::{Data, TIME};
-use super::describe::{rounded, Cause, NamedNumber};
+use super::describe::Cause;
 use super::diagnosis::{capitalised, Diagnosis, DiagnosisVerdict, Outcome, SURE};
 use super::grammar::Class;
 use super::misfit::{Misfit, Remainder};
@@ -16,7 +18,7 @@ use crate::quantity::Digest;
 use crate::simulator::law::LawKind;
 use crate::simulator::Simulator;
 use crate::stats;
-use figures::{digits, p_compared, p_value, probability, signed};
+use figures::{digits, probability, signed};
 use residuals::{figure, Axis, Drawn};
 
 /// Greatest number of misfits in the table.
@@ -33,8 +35,12 @@ pub fn html(simulator: &Simulator, data: &Data, outcome: &Outcome) -> Option<Str
         ("Residuals".to_owned(), residual_plots(d, &drawn)),
         ("Deviations before any cause is added".to_owned(), misfits(d)),
     ];
+    if let Some(change) = &d.lasting_change {
+        sections.insert(1, ("A lasting change, perhaps damage".to_owned(), lasting::lasting_change(change, &drawn)));
+    }
     if !d.next_measurements.is_empty() {
-        sections.insert(3, ("What to measure next".to_owned(), next::next_measurements(&d.next_measurements)));
+        let place = 3 + usize::from(d.lasting_change.is_some());
+        sections.insert(place, ("What to measure next".to_owned(), next::next_measurements(&d.next_measurements)));
     }
     if let Some(left) = &d.remainder {
         sections.push(("Deviation that no cause explains".to_owned(), remainder(left, &drawn)));
@@ -60,17 +66,22 @@ fn in_short(d: &Diagnosis) -> String {
         DiagnosisVerdict::NoneOfThese => "a deviation that no known cause explains",
         DiagnosisVerdict::NothingFound => "no cause found",
     };
+    let set_aside = match d.set_aside_rows {
+        0 => String::new(),
+        rows => format!(", and {rows} set aside because of a lasting change"),
+    };
     let short = |digest: &Digest| digest.as_str().chars().take(12).collect::<String>();
     format!(
         "<p class=\"lead\">{}</p><p class=\"facts\"><strong>Verdict:</strong> {verdict}. <strong>Rows:</strong> {}, \
          of which \
-         {} were searched for causes and {} held out. <strong>Data</strong> {}, <strong>structure</strong> {} \
+         {} were searched for causes, {} held out{}. <strong>Data</strong> {}, <strong>structure</strong> {} \
          (SHA-256, \
          first 12 digits), <strong>seed</strong> {}.</p>",
         escaped(&d.summary),
-        d.training_rows + d.holdout_rows,
+        d.training_rows + d.holdout_rows + d.set_aside_rows,
         d.training_rows,
         d.holdout_rows,
+        set_aside,
         short(&d.data_digest),
         short(&d.structure_digest),
         d.seed
@@ -96,10 +107,15 @@ fn causes(d: &Diagnosis) -> String {
 }
 
 fn cause(cause: &Cause) -> String {
-    let (class, advice) = class(cause.class);
+    let (class, advice) = (cause.class.in_words(), advice(cause.class));
     // For categories, the size repeats the number of the first category.
     let repeated = usize::from(cause.law == LawKind::Category);
-    let rows: Vec<Vec<String>> = cause.parameters.iter().skip(repeated).map(|n| number(cause, n)).collect();
+    let rows: Vec<Vec<String>> = cause
+        .parameters
+        .iter()
+        .skip(repeated)
+        .map(|n| n.in_words(cause).iter().map(|cell| escaped(cell)).collect())
+        .collect();
     let header = [("number", true), ("most probable", false), ("90 % interval", false)];
     let table = if rows.is_empty() { String::new() } else { table_of_html("", &header, &rows) };
     format!(
@@ -110,59 +126,23 @@ fn cause(cause: &Cause) -> String {
     )
 }
 
-/// Name of a class, and what should be done about a cause of it.
-fn class(class: Class) -> (&'static str, &'static str) {
+/// What should be done about a cause of a class.
+fn advice(class: Class) -> &'static str {
     match class {
-        Class::Environment => ("environment", "Extend the simulation by this effect."),
-        Class::Instrument => {
-            ("instrument", "Check the calibration and mounting of the instrument before changing the simulation.")
-        }
-        Class::SetUp => {
-            ("set-up", "Check how the test was set up and recorded, and correct the record or the procedure.")
-        }
+        Class::Environment => "Extend the simulation by this effect.",
+        Class::Instrument => "Check the calibration and mounting of the instrument before changing the simulation.",
+        Class::SetUp => "Check how the test was set up and recorded, and correct the record or the procedure.",
         Class::Structure => {
-            ("structure", "Compare the simulation with drawings or the structure itself at this place, and correct it.")
+            "Compare the simulation with drawings or the structure itself at this place, and correct it."
         }
-        Class::PossibleDamage => {
-            ("possible damage", "Do not compensate for it: first inspect the structure at this place.")
-        }
+        Class::PossibleDamage => "Do not compensate for it: first inspect the structure at this place.",
     }
-}
-
-/// A row of the table of a cause's numbers: name, value and interval with unit; shares in per cent.
-fn number(cause: &Cause, n: &NamedNumber) -> Vec<String> {
-    let over = cause.covariate.as_deref().unwrap_or_default();
-    let name = match n.name.as_str() {
-        _ if cause.law == LawKind::Category => format!("where {over} is {}", n.name),
-        "swing" => format!("effect range: change from the 5 % to the 95 % quantile of {over}"),
-        "level" => format!("level at the middle of {over}"),
-        "slope_per_unit" => "slope".to_owned(),
-        "slope_below_per_unit" => "slope below the knee".to_owned(),
-        "slope_above_per_unit" => "slope above the knee".to_owned(),
-        "curvature_per_unit2" => "curvature".to_owned(),
-        "rate_per_unit" => "rate".to_owned(),
-        "lag_days" => "lag".to_owned(),
-        "frequency_hz" => "tuning frequency".to_owned(),
-        "time_days" => "time of the step".to_owned(),
-        other => other.replace('_', " "),
-    };
-    let (factor, unit) = match n.unit.strip_prefix("share") {
-        Some(rest) => (100.0, format!("%{rest}")),
-        None => (1.0, n.unit.clone()),
-    };
-    let [low, high] = n.interval90.map(|edge| factor * edge);
-    let std = (high - low) / (2.0 * stats::normal_quantile(0.95));
-    let shown = |value: f64| signed(&rounded(value, std).0);
-    let interval =
-        if std > 0.0 { format!("{} to {} {unit}", shown(low), shown(high)) } else { "not estimated".to_owned() };
-    let value = format!("{} {unit}", shown(factor * n.value));
-    vec![escaped(&name), escaped(&value), escaped(&interval)]
 }
 
 fn candidates(d: &Diagnosis) -> String {
     let intro = format!(
-        "<p>{} combinations of a target, a law and a covariate were compared. A difference in log evidence of −3 nats means \
-         that a candidate is about 20 times less probable than the chosen cause, prior included.</p>",
+        "<p>{} combinations of what may change (a target), a recorded quantity that it may depend on, and the form of this dependence (a \
+         law) were compared.</p>",
         d.candidates
     );
     // With an ambiguous verdict, the further causes are listed among the alternatives as well.
@@ -186,16 +166,16 @@ fn candidate_table(d: &Diagnosis, number: usize, cause: &Cause) -> String {
         vec![escaped(&capitalised(text)), difference, probability(p), bar, escaped(measurement)]
     };
     let others = || d.alternatives.iter().filter(|a| a.instead_of == number);
-    let mut rows = vec![row(&cause.sentence, "0".to_owned(), cause.probability, "chosen")];
+    let mut rows = vec![row(&cause.sentence, "–".to_owned(), cause.probability, "chosen")];
     rows.extend(others().map(|a| {
-        let difference = signed(&format!("{:.1}", a.log_evidence_difference));
+        let difference = times_less(a.log_evidence_difference);
         row(&a.cause.sentence, difference, a.cause.probability, &a.discriminating_measurement)
     }));
     let rest = 1.0 - cause.probability - others().map(|a| a.cause.probability).sum::<f64>();
     rows.push(row("all other candidates, and no further cause", "–".to_owned(), rest.max(0.0), ""));
     let header = [
         ("candidate", true),
-        ("Δ log evidence, nats", false),
+        ("compared with the chosen cause", false),
         ("probability", false),
         ("", false),
         ("measurement that would distinguish it from the chosen cause", true),
@@ -221,6 +201,7 @@ fn residual_plots(d: &Diagnosis, drawn: &Drawn<'_>) -> String {
     } else {
         String::new()
     };
+    let aside = if d.set_aside_rows > 0 { ", green ones rows set aside because of a lasting change" } else { "" };
     let over_time = if covariate == TIME {
         String::new()
     } else {
@@ -232,7 +213,7 @@ fn residual_plots(d: &Diagnosis, drawn: &Drawn<'_>) -> String {
     };
     format!(
         "<p>Each point is one measured frequency minus the predicted one, in per cent, over {}. {colours} Open circles \
-         are rows held out.{few}</p><div class=\"plots\">{plots}</div>{over_time}",
+         are rows held out{aside}.{few}</p><div class=\"plots\">{plots}</div>{over_time}",
         escaped(&axis.label)
     )
 }
@@ -245,14 +226,19 @@ fn misfits(d: &Diagnosis) -> String {
         let parameter = || format!("parameter {}", m.parameter.as_deref().unwrap_or_default());
         let what = m.mode.map_or_else(parameter, |mode| format!("frequency of mode {mode}"));
         let over = m.covariate.as_deref().unwrap_or("no covariate: constant deviation");
-        vec![escaped(&what), escaped(over), signed(&digits(m.size_percent)), p_value(m.p_value)]
+        vec![escaped(&what), escaped(over), signed(&digits(m.size_percent)), cases(m.p_value)]
     };
     let rows: Vec<Vec<String>> = d.misfit.iter().take(MISFITS).map(row).collect();
-    let header = [("quantity that deviates", true), ("depends on", true), ("size, %", false), ("p", false)];
+    let header = [
+        ("quantity that deviates", true),
+        ("depends on", true),
+        ("size, %", false),
+        ("cases in which chance gives it", false),
+    ];
     format!(
         "<p>Deviations of the simulation before any cause is added, the most significant first. A parameter is listed if its \
-         best value varies with a covariate, because it compensates for an effect that the simulation lacks. p: probability \
-         of at least this deviation by chance, corrected for the number of tests.</p>{}",
+         best value varies with a covariate, because it compensates for an effect that the simulation lacks. The last column \
+         says how often chance alone would give at least this deviation, corrected for the number of tests.</p>{}",
         table_of_html(&format!("The {} most significant of {}", rows.len(), d.misfit.len()), &header, &rows)
     )
 }
@@ -279,11 +265,11 @@ fn remainder(left: &Remainder, drawn: &Drawn<'_>) -> String {
         .map(|(m, s)| format!("mode {} {} %", m + 1, signed(&digits(*s))))
         .collect();
     format!(
-        "<p>With all causes above, the residuals still depend on <strong>{}</strong> (p {}). Effect range for each mode: {}. No \
+        "<p>With all causes above, the residuals still depend on <strong>{}</strong> ({}). Effect range for each mode: {}. No \
          cause known to this program has this dependence: look for another quantity that varies with it.</p>\
          <div class=\"plots\">{plots}</div>",
         escaped(&left.function),
-        p_compared(left.p_value),
+        chance(left.p_value),
         sizes.join(", ")
     )
 }
@@ -328,11 +314,12 @@ const GLOSSARY: &str = "<dl>\
     candidates.</dd>\
     <dt>90 % interval</dt><dd>Contains the number with a probability of 90 %, if the cause is right.</dd>\
     <dt>Effect range</dt><dd>Difference between the effect at the 95 % quantile and at the 5 % quantile of the covariate.</dd>\
-    <dt>Nat, log density, log evidence</dt><dd>Natural logarithms of the probability of the data under a model. One nat more \
-    means 2.7 times as probable, 3 nats 20 times. The evidence includes a penalty for every number that is fitted.</dd>\
+    <dt>Log density</dt><dd>Natural logarithm of the probability density of the measurements under a model. 1 more means 2.7 times as \
+    probable, 3 more 20 times.</dd>\
     <dt>Rows held out</dt><dd>Rows that were used neither to find nor to fit the causes, so that an improvement on them is not \
     due to overfitting.</dd>\
     <dt>Residual</dt><dd>Measured frequency minus the predicted one. Noise alone gives a horizontal band around 0; a pattern \
     means that the simulation lacks something.</dd>\
-    <dt>p</dt><dd>Probability that chance alone causes at least this deviation. Below 0.001, chance is unlikely.</dd>\
+    <dt>Lasting change</dt><dd>From a time on, the frequencies differ from those before, and neither the causes found, nor a recorded \
+    quantity with any linear or quadratic influence on each mode, nor a yearly or daily swing explains it.</dd>\
     <dt>Covariate</dt><dd>A quantity that was recorded with the frequencies: temperature, load, operator, time.</dd></dl>";

@@ -18,16 +18,26 @@ const GOLDEN: f64 = 0.618_033_988_749_895;
 /// Colours of [`Points`]: orange without, blue with the causes.
 const BEFORE: usize = 1;
 const AFTER: usize = 0;
+const SET_ASIDE: usize = 2;
 
 /// Label of the axis of residuals.
 const RESIDUAL: &str = "measured minus predicted, %";
+
+/// How a row was used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Use {
+    Searched,
+    HeldOut,
+    /// Since a lasting change.
+    SetAside,
+}
 
 /// Rows that are drawn, with the residuals of each mode without and with the causes, per cent.
 pub(super) struct Drawn<'a> {
     pub(super) data: &'a Data,
     pub(super) rows: Vec<usize>,
-    /// Whether each row is held out.
-    held: Vec<bool>,
+    /// How each row was used.
+    uses: Vec<Use>,
     /// `[modes][rows]`, NaN for a missing mode.
     pub(super) before: Vec<Vec<f64>>,
     /// The same with the causes; `None` if there are none.
@@ -64,9 +74,10 @@ impl<'a> Drawn<'a> {
         };
         let before = residuals(&outcome.before)?;
         let after = if outcome.diagnosis.causes.is_empty() { None } else { Some(residuals(&outcome.after)?) };
-        let mut held = vec![false; data.rows()];
-        outcome.holdout.iter().for_each(|row| held[*row] = true);
-        Some(Self { data, held: rows.iter().map(|row| held[*row]).collect(), rows, before, after })
+        let mut uses = vec![Use::Searched; data.rows()];
+        outcome.holdout.iter().for_each(|row| uses[*row] = Use::HeldOut);
+        outcome.set_aside.iter().for_each(|row| uses[*row] = Use::SetAside);
+        Some(Self { data, uses: rows.iter().map(|row| uses[*row]).collect(), rows, before, after })
     }
 
     pub(super) fn axis(&self, name: &str) -> Axis {
@@ -104,10 +115,17 @@ impl<'a> Drawn<'a> {
         let mut clouds = Vec::new();
         for (place, (name, colour, residuals)) in fits.iter().enumerate() {
             let shift = if fits.len() > 1 { 0.4 * place as f64 - 0.2 } else { 0.0 };
-            for held in [false, true] {
-                let what = if held { ", held out" } else { "" };
-                let points = self.points(residuals, axis, shift, |row| self.held[row] == held);
-                clouds.push(Points { name: format!("{name}{what}"), colour: *colour, hollow: held, points });
+            for (used, what) in [(Use::Searched, ""), (Use::HeldOut, ", held out")] {
+                let points = self.points(residuals, axis, shift, |row| self.uses[row] == used);
+                let hollow = used == Use::HeldOut;
+                clouds.push(Points { name: format!("{name}{what}"), colour: *colour, hollow, points });
+            }
+            // One cloud is enough to see what a change did.
+            let last = place + 1 == fits.len();
+            if last && self.uses.contains(&Use::SetAside) {
+                let points = self.points(residuals, axis, shift, |row| self.uses[row] == Use::SetAside);
+                let name = format!("{name}, set aside");
+                clouds.push(Points { name, colour: SET_ASIDE, hollow: true, points });
             }
         }
         figure(self.title(mode), axis, clouds)

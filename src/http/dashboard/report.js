@@ -1,7 +1,7 @@
 // The report of a diagnosis. It is shown inside this page, so that it is requested with the token of this tab.
 
 import { read, request } from "./api.js";
-import { h } from "./dom.js";
+import { fill, h, icon } from "./dom.js";
 
 const path = (id, rest = "") => `v1/diagnoses/${encodeURIComponent(id)}${rest}`;
 
@@ -37,7 +37,8 @@ export function report(id) {
     page.querySelectorAll("[data-style]").forEach((e) => (e.style.cssText = e.dataset.style));
     root.append(...page.body.childNodes);
     const file = URL.createObjectURL(new Blob([html], { type: "text/html" }));
-    element.replaceChildren(
+    fill(
+      element,
       h(
         "p",
         { class: "crumbs" },
@@ -47,6 +48,13 @@ export function report(id) {
         " / Diagnosis",
       ),
       h("h1", null, `Diagnosis of ${diagnosis.structure}`),
+      diagnosis.result?.lasting_change &&
+        h(
+          "p",
+          { class: "callout bad", dataset: { finding: "lasting-change" } },
+          icon("alarm"),
+          diagnosis.result.lasting_change.sentence,
+        ),
       h(
         "p",
         null,

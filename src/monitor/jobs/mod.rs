@@ -235,9 +235,23 @@ impl Jobs {
         simulator: Simulator,
         request: DiagnosisRequest,
     ) -> Result<Study, String> {
-        let measurements =
-            self.store.batches().measurements_of(structure, &request.batches).await.map_err(|e| e.to_string())?;
-        Ok(Study { id, simulator, measurements, request, progress: self.progress.clone() })
+        let batches = self.store.batches();
+        let text = |e: &dyn std::fmt::Display| e.to_string();
+        let mut measurements = batches.measurements_of(structure, &request.batches).await.map_err(|e| text(&e))?;
+        let all = measurements.len();
+        measurements.retain(|measurement| request.contains(measurement.measured_at));
+        if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
+            return Err(format!(
+                "{period}, and these are {} of {all}: a diagnosis needs at least {FEWEST_ROWS}",
+                measurements.len()
+            ));
+        }
+        let reference = self.store.reference().undamaged(structure).await.map_err(|e| text(&e))?;
+        let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
+        let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
+        let undamaged = batches.measurements_of(structure, &declared).await.map_err(|e| text(&e))?;
+        let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
+        Ok(Study { id, simulator, measurements, undamaged, request, progress: self.progress.clone() })
     }
 
     /// Extends a structure and puts the extension into use; the result as JSON.

@@ -1,5 +1,7 @@
 //! The computations behind the jobs: the diagnosis of measurements, and the training of an extension.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
@@ -13,6 +15,7 @@ use crate::discrepancy::learned::extension::extend_learned;
 use crate::discrepancy::{diagnose, report, Holdout, Outcome, Step};
 use crate::measurement::order::{Disorder, Ordered};
 use crate::measurement::ModalMeasurement;
+use crate::quantity::Timestamp;
 use crate::simulator::Simulator;
 
 /// Largest number of measurements that a note names.
@@ -23,6 +26,12 @@ const MOST_NAMED: usize = 5;
 pub struct DiagnosisRequest {
     /// Batches, by id.
     pub batches: Vec<String>,
+    /// Only measurements from this time on.
+    #[serde(default)]
+    pub from: Option<Timestamp>,
+    /// Only measurements before this time.
+    #[serde(default)]
+    pub to: Option<Timestamp>,
     /// Measurements held out to measure the gain.
     pub holdout: Holdout,
     /// Seed of the bootstrap and, in an extension, of the training.
@@ -32,7 +41,26 @@ pub struct DiagnosisRequest {
 impl Default for DiagnosisRequest {
     /// All batches; the last quarter of the measurements is held out.
     fn default() -> Self {
-        Self { batches: Vec::new(), holdout: Holdout::Last(0.25), seed: 1 }
+        Self { batches: Vec::new(), from: None, to: None, holdout: Holdout::Last(0.25), seed: 1 }
+    }
+}
+
+impl DiagnosisRequest {
+    /// Whether a time lies in the period of the request.
+    pub(super) fn contains(&self, time: Timestamp) -> bool {
+        self.from.is_none_or(|from| time >= from) && self.to.is_none_or(|to| time < to)
+    }
+
+    /// The period as a note; `None` for all measurements.
+    pub(super) fn period_in_words(&self) -> Option<String> {
+        match (self.from, self.to) {
+            (None, None) => None,
+            (Some(from), None) => Some(format!("only the measurements from {from} on are used, as requested")),
+            (None, Some(to)) => Some(format!("only the measurements before {to} are used, as requested")),
+            (Some(from), Some(to)) => {
+                Some(format!("only the measurements from {from} to before {to} are used, as requested"))
+            }
+        }
     }
 }
 
@@ -56,6 +84,8 @@ pub(super) struct Study {
     pub(super) id: String,
     pub(super) simulator: Simulator,
     pub(super) measurements: Vec<ModalMeasurement>,
+    /// Times of the measurements in the declared undamaged reference.
+    pub(super) undamaged: BTreeSet<Timestamp>,
     pub(super) request: DiagnosisRequest,
     pub(super) progress: Progress,
 }
@@ -110,11 +140,12 @@ impl Study {
     fn outcome(&self) -> Result<(Data, Outcome), String> {
         let ordered = Ordered::of(&self.measurements);
         let used: Vec<ModalMeasurement> = ordered.kept.iter().map(|index| self.measurements[*index].clone()).collect();
-        let data = Data::new(&self.simulator, &used);
+        let data = Data::new(&self.simulator, &used).with_undamaged(&self.undamaged);
         let progress = |step: Step| self.progress.report(&self.id, step.to_string());
         let outcome = diagnose(&self.simulator, &data, &self.request.holdout, self.request.seed, &progress);
         let mut outcome = outcome.map_err(|e| e.to_string())?;
-        outcome.diagnosis.notes.splice(0..0, self.left_out(&ordered).into_iter().chain(ordered.notes));
+        let notes = self.request.period_in_words().into_iter().chain(self.left_out(&ordered)).chain(ordered.notes);
+        outcome.diagnosis.notes.splice(0..0, notes);
         Ok((data, outcome))
     }
 

@@ -7,6 +7,26 @@ import { progress } from "../jobs.js";
 import { jobChip } from "../states.js";
 import { gainWords, isExtendable, latest, triggerWords } from "./latest.js";
 
+/** The day after a day such as `2025-08-07`, so that a period contains its last day. */
+function dayAfter(day) {
+  const next = new Date(`${day}T00:00:00Z`);
+  next.setUTCDate(next.getUTCDate() + 1);
+  return next.toISOString().slice(0, 10);
+}
+
+/** The request of the dialog: fields that are empty are left out. */
+function requestOf({ from, to, share, since }) {
+  const request = {};
+  if (from) request.from = from;
+  if (to) request.to = dayAfter(to);
+  const percent = Number(share.trim().replace(",", "."));
+  if (since) request.holdout = `since:${since}`;
+  else if (!(percent >= 0 && percent < 100))
+    throw new Error(`“${share}” is not a share to hold out: give per cent from 0 to below 100, such as 25.`);
+  else request.holdout = `last:${percent / 100}`;
+  return request;
+}
+
 export function diagnosis(structure, changed) {
   const content = h("div", null);
   const begin = h("button", { type: "button", onclick: () => diagnose() }, "Diagnose");
@@ -90,13 +110,36 @@ export function diagnosis(structure, changed) {
   const diagnose = async () => {
     const done = await ask({
       title: "Diagnose the model",
-      body: h(
-        "p",
-        null,
-        "All batches of the structure are searched for systematic deviations of the simulation; the last quarter is held out to measure the gain. The diagnosis runs in the background for seconds to minutes and changes nothing.",
-      ),
+      body: [
+        h(
+          "p",
+          null,
+          "The measurements of the period are searched for systematic deviations of the simulation. A part of them is held out: on it the gain is measured. The diagnosis runs in the background for seconds to minutes and changes nothing.",
+        ),
+        h(
+          "p",
+          null,
+          "All measurements are tested for a lasting change, which may be damage. Those since such a change are used neither to find causes nor to measure the gain.",
+        ),
+      ],
+      fields: [
+        { name: "from", label: "Period: first day (UTC)", type: "date", hint: "Empty: from the first measurement." },
+        { name: "to", label: "Period: last day (UTC)", type: "date", hint: "Empty: to the last measurement." },
+        {
+          name: "share",
+          label: "Held out: the last part of the period, in per cent",
+          value: "25",
+          hint: "0 searches all measurements; the gain is then measured by cross-validation.",
+        },
+        {
+          name: "since",
+          label: "Or held out: everything since this day (UTC)",
+          type: "date",
+          hint: "If a day is given, it counts instead of the share.",
+        },
+      ],
       confirm: "Diagnose",
-      submit: () => send(at(structure, "/diagnoses"), {}),
+      submit: (values) => send(at(structure, "/diagnoses"), requestOf(values)),
     });
     if (done) await load();
   };

@@ -38,25 +38,32 @@ export function isExtendable(item, present) {
   return item.state === "done" && EXTENDS.includes(item.verdict) && free && (!present || present === item.version);
 }
 
-/** Error and false alarms before and after the causes are modelled; `null` if no gain was measured. */
+/** Error of each mode and batches beyond an alarm limit before and after the causes are modelled; `null` if no gain was measured. */
 export function gainWords(gain) {
   if (!gain) return null;
-  const mean = (values) => {
-    const measured = values.filter(Number.isFinite);
-    return measured.reduce((sum, v) => sum + v, 0) / measured.length;
-  };
   const { before, after } = gain.rms_error_percent;
+  const modes = before
+    .map((value, mode) => [mode + 1, value, after[mode]])
+    .filter(([, from, to]) => Number.isFinite(from) && Number.isFinite(to))
+    .map(([mode, from, to]) => `mode ${mode} ${number(from, 2)} → ${number(to, 2)} %`);
+  const better = gain.rms_difference_interval90.filter(([, high]) => high < 0).length;
+  const worse = gain.rms_difference_interval90.filter(([low]) => low > 0).length;
   const alarms = gain.false_alarms_per_1000;
   const rows =
     gain.method === "cross_validation"
       ? `in cross-validation over ${gain.holdout_rows} measurements`
       : `on ${gain.holdout_rows} held-out measurements`;
   return [
-    `mean RMS error of the predicted frequencies ${number(mean(before), 2)} % → ${number(mean(after), 2)} % ${rows}`,
-    alarms && `false alarms per 1000 batches ${number(alarms.before, 2)} → ${number(alarms.after, 2)}`,
+    `error of the predicted frequencies ${rows}: ${modes.join(", ")}; ${better} clearly better, ${worse} clearly worse`,
+    alarms &&
+      `of 1000 batches of these rows beyond an alarm limit ${number(alarms.before, 2)} → ${number(alarms.after, 2)}${
+        gain.undamaged_rows === gain.holdout_rows
+          ? ", all in the undamaged reference"
+          : " (whether the structure was undamaged there is not known)"
+      }`,
   ]
     .filter(Boolean)
-    .join(", ");
+    .join("; ");
 }
 
 /** The card; `extend(item)` opens the dialog that extends the model. */
@@ -101,7 +108,9 @@ export function latest(extend) {
       return h("p", { class: "callout bad" }, icon("cross"), `It could not be made: ${item.failure ?? "unknown reason"}`);
     const [kind, sign, text] = VERDICTS[item.verdict] ?? ["", "note", `${words(item.verdict)}.`];
     const found = EXTENDS.includes(item.verdict) ? (item.result?.causes ?? []) : [];
+    const change = item.result?.lasting_change;
     return [
+      change && h("p", { class: "callout bad", dataset: { finding: "lasting-change" } }, icon("alarm"), change.sentence),
       h("p", { class: `callout ${kind}` }, icon(sign), h("strong", null, text)),
       found.length > 0 ? causes(found) : item.summary && h("p", null, item.summary),
     ];
