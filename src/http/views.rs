@@ -50,8 +50,12 @@ struct OverviewItem {
     model_digest: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
+    /// False for a model that is overconfident.
     #[schema(required)]
     calibration_passed: Option<bool>,
+    /// Outcome of the calibration of the model in use.
+    #[schema(required)]
+    calibration_outcome: Option<crate::baseline::manifest::Outcome>,
     #[schema(required)]
     undamaged_version: Option<u32>,
 }
@@ -175,7 +179,8 @@ fn item(found: StructureOverview, active: Result<Arc<ActiveStructure>, String>) 
         state: state(&found, baseline.is_some()),
         model_digest: baseline.map(|b| b.digest().to_string()),
         model_missing: model_missing.cloned(),
-        calibration_passed: baseline.map(|b| b.manifest().calibration.passed()),
+        calibration_passed: baseline.map(|b| b.manifest().calibration.failures.is_empty()),
+        calibration_outcome: baseline.map(|b| b.manifest().calibration.outcome()),
         latest: found.latest.map(latest),
         id: found.id,
         open_alarms: found.open_alarms,
