@@ -26,6 +26,9 @@ const FURTHER_RANGE: [usize; 2] = [512, 4_096];
 /// Fewest effective samples among the further proposals; and at least as many as are kept.
 const FURTHER_EFFECTIVE: usize = 64;
 
+/// Least effective share of the first proposals, as a share of the one that the further proposals must reach, for which they are drawn.
+const HOPEFUL: f64 = 0.5;
+
 /// Measurements that get further proposals together, which bounds the memory.
 const FURTHER_AT_A_TIME: usize = 128;
 
@@ -231,14 +234,15 @@ impl Baseline {
     ) -> Result<Corrected, InferenceError> {
         let first = self.propose(observations, proposals * draws, seed)?;
         let mut simulations = first.theta.nrows();
-        let Resampled { mut theta, mut weighted } =
+        let Resampled { mut theta, mut weighted, effective: share } =
             resample::resample(&self.simulator, observations, &first, (draws, EFFECTIVE), seed);
-        // Draws that were moved to the bounds of the prior have no density: their measurement lies outside the prior.
-        let poor: Vec<usize> =
-            (0..observations.len()).filter(|&row| !weighted[row] && !first.moved[row]).collect();
         let [fewest, most] = FURTHER_RANGE;
         let many = (FURTHER_PROPOSALS * draws).clamp(fewest, most).max(4 * draws);
         let effective = draws.max(FURTHER_EFFECTIVE) as f64 / many as f64;
+        // Where the first proposals are hopeless, so are further ones. That includes draws that were moved to the bounds of the prior,
+        // whose measurement lies outside the prior.
+        let poor: Vec<usize> =
+            (0..observations.len()).filter(|&row| !weighted[row] && share[row] >= HOPEFUL * effective).collect();
         for (chunk, rows) in poor.chunks(FURTHER_AT_A_TIME).enumerate() {
             let seed = stats::stream(seed, &format!("further proposals {chunk}")).next_u64();
             let of_rows: Vec<Observation> = rows.iter().map(|row| observations[*row].clone()).collect();

@@ -60,7 +60,10 @@ pub(super) fn judge(cells: &[Cell], index: usize, simulations: usize) -> Judgeme
         let (list, how) = if cell.tarp_spread.is_some_and(|spread| spread < 1.0) && judgement.narrow.is_empty() {
             (&mut judgement.wide, "wide: regions that should hold a given share of the true values hold more")
         } else {
-            (&mut judgement.narrow, "narrow or misplaced: regions that should hold a given share of the true values do not")
+            (
+                &mut judgement.narrow,
+                "narrow or misplaced: regions that should hold a given share of the true values do not",
+            )
         };
         list.push(format!(
             "The uncertainty of all parameters together is too {how} when {words} ({})",

@@ -39,6 +39,10 @@ impl Baseline {
         if let Some((what, found, expected)) = lengths.into_iter().find(|(_, found, expected)| found != expected) {
             return Err(LoadError::Shape { what, found, expected });
         }
+        let scales = manifest.spread.iter().flat_map(|cell| &cell.scales);
+        if let Some(scale) = scales.copied().find(|scale| !(*scale > 0.0 && scale.is_finite())) {
+            return Err(LoadError::Spread(scale));
+        }
         let flow = checkpoint::from_bytes(weights, &manifest.architecture, DType::F32)?;
         let digest = Digest::of_file(manifest_bytes);
         let baseline = Self::new(flow, simulator, manifest, digest).map_err(checkpoint::Error::from)?;

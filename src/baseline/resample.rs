@@ -31,6 +31,8 @@ pub(super) struct Resampled {
     pub theta: DMatrix<f64>,
     /// Whether the draws of each observation were weighted by their likelihood, `[n]`; the others are draws of the flow.
     pub weighted: Vec<bool>,
+    /// Effective sample size of the proposals of each observation, as a share of them, `[n]`; 0 where they have no densities.
+    pub effective: Vec<f64>,
 }
 
 /// Resamples `draws` of the proposals of each observation by their importance weights, `[n·draws, d]`.
@@ -54,10 +56,10 @@ pub(super) fn resample(
     let d = proposals.theta.ncols();
     let many = proposals.theta.nrows() / observations.len().max(1);
     let log_likelihoods = log_likelihoods(simulator, observations, &proposals.theta);
-    let choose = |row: usize| -> (Vec<usize>, bool) {
+    let choose = |row: usize| -> ((Vec<usize>, bool), f64) {
         let rows = row * many..(row + 1) * many;
         if proposals.moved[row] {
-            return (rows.take(draws).collect(), false);
+            return ((rows.take(draws).collect(), false), 0.0);
         }
         // Non-finite weights are set to zero.
         let log_weight = |row: usize| {
@@ -70,19 +72,31 @@ pub(super) fn resample(
         };
         let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
         let mut stream = stats::stream(seed, &format!("resampling {row}"));
-        match stats::weights(&log_weights, effective) {
+        let weights = stats::weights(&log_weights, 0.0);
+        let share = weights.as_deref().map_or(0.0, effective_share);
+        match weights.filter(|_| share >= effective) {
             Some(weights) => {
                 let chosen = stats::systematic(&weights, draws, &mut stream);
-                (chosen.into_iter().map(|i| rows.start + i).collect(), true)
+                ((chosen.into_iter().map(|i| rows.start + i).collect(), true), share)
             }
-            None => (rows.take(draws).collect(), false),
+            None => ((rows.take(draws).collect(), false), share),
         }
     };
     let rows = (0..observations.len()).into_par_iter().with_min_len(LEAST_PER_TASK);
-    let (chosen, weighted): (Vec<Vec<usize>>, Vec<bool>) = rows.map(choose).unzip();
+    let ((chosen, weighted), effective): ((Vec<Vec<usize>>, Vec<bool>), Vec<f64>) = rows.map(choose).unzip();
     let chosen = chosen.concat();
     let theta = DMatrix::from_fn(chosen.len(), d, |row, column| proposals.theta[(chosen[row], column)]);
-    Resampled { theta, weighted }
+    Resampled { theta, weighted, effective }
+}
+
+/// Effective sample size of weights w, `[n]`, as a share of n.
+///
+/// ```text
+///  (Σ w)²/(n Σ w²)
+/// ```
+fn effective_share(weights: &[f64]) -> f64 {
+    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
+    sum * sum / (squares * weights.len() as f64)
 }
 
 /// ln p(y | x) up to a constant for each row of `theta` `[n·k, d]`, k rows for each of the n observations; nats.

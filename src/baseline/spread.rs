@@ -162,3 +162,114 @@ fn interpolated(cells: &[(f64, &[f64])], column: usize, noise: f64) -> f64 {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::calibration::calibrate;
+    use super::super::manifest::Outcome;
+    use super::super::observation::DEFAULT_NOISE_RANGE;
+    use super::super::train::train;
+    use super::*;
+    use crate::flow::train::TrainSettings;
+    use crate::flow::FlowSettings;
+    use crate::simulator::definition::StructureDefinition;
+    use crate::simulator::Simulator;
+
+    /// A structure whose effect has an uncertain coefficient, so that the simulation corrects no draw.
+    const UNCERTAIN: &str = r#"
+id = "pair"
+modes = 2
+measurement_noise = { relative = 0.003 }
+mass = [{ name = "m1", kg = 1.0 }, { name = "m2", kg = 2.0 }]
+spring = [
+    { name = "k1", from = "ground", to = "m1" },
+    { name = "k2", from = "m1", to = "m2", n_per_m = 20.0 },
+]
+parameter = [{ name = "k1", prior = { uniform = [5.0, 15.0] }, sets = { spring = "k1" } }]
+covariate = [{ name = "temperature_c" }]
+[[effect]]
+name = "warm"
+target = { springs = ["k2"] }
+law = "linear"
+covariate = "temperature_c"
+reference = 10.0
+numbers = { slope_per_unit = -0.004 }
+covariance = [[1e-6]]
+seen = [-10.0, 10.0, 30.0]
+"#;
+
+    fn multiplied(spread: &[SpreadCell], factor: f64) -> Vec<SpreadCell> {
+        let one = |cell: &SpreadCell| SpreadCell {
+            scales: cell.scales.iter().map(|scale| scale * factor).collect(),
+            ..cell.clone()
+        };
+        spread.iter().map(one).collect()
+    }
+
+    #[test]
+    fn the_repair_restores_the_coverage_on_other_simulations() {
+        let simulator = Simulator::new(StructureDefinition::parse_toml(UNCERTAIN).unwrap()).unwrap();
+        let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
+        // Trained far too short, so that its intervals are wrong.
+        let trained =
+            train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
+        let mut baseline = trained.baseline;
+        let off = |baseline: &Baseline, seed: u64| {
+            let (record, _) = calibrate(baseline, seed).unwrap();
+            let of_all = record.cells.iter().flat_map(|cell| &cell.parameters);
+            (of_all.map(|p| (p.coverage_90 - 0.9).abs()).fold(0.0, f64::max), record.outcome())
+        };
+        baseline.manifest.spread.clear();
+        let (before, _) = off(&baseline, 11);
+        let spread = learn(&baseline, 12).unwrap();
+        baseline.manifest.spread.clone_from(&spread);
+        let (after, _) = off(&baseline, 13);
+        // Binomial errors of 1000 and of 2000 simulations, of which four, over nine cells.
+        let bound = 4.0 * (0.09_f64 / 1_000.0 + 0.09 / 2_000.0).sqrt();
+        println!("largest deviation of a coverage from 0.9: {before:.3}, after the repair {after:.3}");
+        assert!(before > bound, "the test needs a flow with wrong intervals: {before}");
+        assert!(after < bound, "{after}, before {before}");
+        // Deliberately too wide and too narrow.
+        baseline.manifest.spread = multiplied(&spread, 0.6);
+        assert_eq!(off(&baseline, 14).1, Outcome::Overconfident);
+        baseline.manifest.spread = multiplied(&spread, 1.5);
+        let (record, _) = calibrate(&baseline, 15).unwrap();
+        assert!(record.cells.iter().flat_map(|cell| &cell.parameters).all(|p| p.coverage_90 > 0.93), "{record:?}");
+    }
+
+    #[test]
+    fn stretched_draws_have_the_stretched_density() {
+        let simulator = Simulator::new(StructureDefinition::parse_toml(UNCERTAIN).unwrap()).unwrap();
+        let settings = TrainSettings { epochs: 4, ..TrainSettings::default() };
+        let trained =
+            train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &FlowSettings::default(), &settings, |_| {}).unwrap();
+        let mut baseline = trained.baseline;
+        let cell = |noise_multiple: f64| SpreadCell {
+            noise_multiple,
+            missing_mode: None,
+            without_shapes: None,
+            scales: vec![0.8],
+        };
+        let exact = simulator.frequencies_hz(&[10.0]).unwrap();
+        let observation = Observation { effect_sizes: vec![0.0], ..Observation::complete(&exact) };
+        let grid = DMatrix::from_fn(4_001, 1, |row, _| 5.0 + 10.0 * row as f64 / 4_000.0);
+        let moments = |baseline: &Baseline| {
+            let logs = baseline.log_posterior_of_draws(&grid, std::slice::from_ref(&observation)).unwrap();
+            let mass: f64 = logs.iter().map(|log| log.exp()).sum();
+            let mean = logs.iter().zip(grid.iter()).map(|(log, x)| log.exp() * x).sum::<f64>() / mass;
+            let square =
+                logs.iter().zip(grid.iter()).map(|(log, x)| log.exp() * (x - mean).powi(2)).sum::<f64>() / mass;
+            (mass / 4_000.0, square.sqrt())
+        };
+        baseline.manifest.spread.clear();
+        let (mass, std) = moments(&baseline);
+        baseline.manifest.spread = vec![cell(0.2), cell(5.0)];
+        let (stretched_mass, stretched_std) = moments(&baseline);
+        assert!((stretched_mass / mass - 1.0).abs() < 0.02, "{stretched_mass}, {mass}");
+        assert!((stretched_std / std - 0.8).abs() < 0.01, "{stretched_std}, {std}");
+        let drawn = baseline.infer(std::slice::from_ref(&observation), 20_000, 3).unwrap();
+        let found = stats::sample_std(&drawn.column(0)).unwrap();
+        // The standard error of a standard deviation of 20,000 normal draws is half a per cent.
+        assert!((found / stretched_std - 1.0).abs() < 0.04, "{found}, {stretched_std}");
+    }
+}

@@ -10,7 +10,8 @@ use super::error::{InferenceError, LoadError};
 use super::fitted::fitted_pairs;
 use super::identifiability::identifiability;
 use super::manifest::{
-    CalibrationRecord, FurtherRound, IdentifiabilityRecord, Manifest, SelfTest, TrainingRecord, ValidationRecord, FORMAT,
+    CalibrationRecord, FurtherRound, IdentifiabilityRecord, Manifest, SelfTest, TrainingRecord, ValidationRecord,
+    FORMAT,
 };
 use super::model::Baseline;
 use super::observation::{measure, measure_shapes, Encoder, Observation};
@@ -209,11 +210,7 @@ impl Prepared {
     }
 
     /// A training before its first round.
-    pub(super) fn begin<'a>(
-        self,
-        simulator: &'a Simulator,
-        settings: &'a TrainSettings,
-    ) -> Result<Ongoing<'a>, Error> {
+    pub(super) fn begin<'a>(self, simulator: &'a Simulator, settings: &'a TrainSettings) -> Result<Ongoing<'a>, Error> {
         let validation_samples = if self.conditions.starts_at_fit { VALIDATION_FITTED } else { VALIDATION_SAMPLES };
         let seed = purpose_seed(settings.seed, "validation set");
         let validation = simulator.pairs(&self.space, validation_samples, seed)?;

@@ -215,7 +215,8 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
     let manifest = trained.baseline.manifest();
     print_record(manifest);
     let (folder, epochs) = (args.out.display(), 2 * manifest.training.settings.epochs);
-    let next = format!("modalwatch train --structure {folder}/structure.json --out {folder} --epochs {epochs} --rounds 4");
+    let next =
+        format!("modalwatch train --structure {folder}/structure.json --out {folder} --epochs {epochs} --rounds 4");
     refuse_overconfident(manifest, &next)
 }
 

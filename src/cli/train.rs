@@ -126,7 +126,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     if !simulator.is_noisy() {
         // Posteriors of exact data are points: no further training helps.
         let path = &args.structure;
-        let next = format!("state measurement_noise in {path}, then modalwatch train --structure {path} --out {}", out.display());
+        let next = format!(
+            "state measurement_noise in {path}, then modalwatch train --structure {path} --out {}",
+            out.display()
+        );
         return refuse_overconfident(manifest, &next);
     }
     let again = again(args, &out, manifest);

@@ -42,8 +42,9 @@ pub struct Recipe {
 pub fn train_into(out: &Path, simulator: &Simulator, recipe: &Recipe) -> anyhow::Result<Trained> {
     let bar = progress_bar()?;
     let Recipe { samples, noise_range, flow, settings, rounds } = recipe;
-    let trained =
-        train_in_rounds(simulator, *samples, *noise_range, flow, settings, *rounds, &mut |progress| show(&bar, progress))?;
+    let trained = train_in_rounds(simulator, *samples, *noise_range, flow, settings, *rounds, &mut |progress| {
+        show(&bar, progress)
+    })?;
     bar.finish_and_clear();
     write_files(out, &trained)?;
     Ok(trained)

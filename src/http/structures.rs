@@ -99,7 +99,8 @@ struct ListedStructure {
 pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let mut items = Vec::new();
     for summary in shared.monitor.records().structures().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
-        let baseline = shared.monitor.structure(&summary.id).ok().and_then(|active| active.baseline.as_ref().ok().cloned());
+        let baseline =
+            shared.monitor.structure(&summary.id).ok().and_then(|active| active.baseline.as_ref().ok().cloned());
         items.push(ListedStructure {
             model_digest: baseline.as_ref().map(|baseline| baseline.digest().to_string()),
             calibration_outcome: baseline.as_ref().map(|baseline| baseline.manifest().calibration.outcome()),

@@ -233,7 +233,7 @@ impl ActiveStructures {
             return Ok(());
         }
         Err(format!(
-            "the trained baseline is overconfident ({}): train it again with `modalwatch train`, with a larger --epochs or --units; to \
+            "the trained baseline failed its calibration: it is overconfident ({}): train it again with `modalwatch train`, with a larger --epochs or --units; to \
              use it nevertheless, add its digest {digest} to monitor.accept_uncalibrated, and every assessment then has a finding \
              about it",
             calibration.failures.join("; ")

@@ -299,7 +299,7 @@ impl Jobs {
             Err(_) => {
                 let failures = &trained.baseline.manifest().calibration.failures;
                 Err(format!(
-                    "the new flow is overconfident ({}): repeat the request with \"from_scratch\": true or a larger number of \
+                    "the new flow failed its calibration: it is overconfident ({}): repeat the request with \"from_scratch\": true or a larger number of \
                      \"epochs\"; to use the flow nevertheless, set \"accept_uncalibrated\" to true, and every assessment then has a \
                      finding about it",
                     failures.join("; ")
