@@ -276,7 +276,7 @@ mod tests {
             let (wide, noise) = (0.1, 0.05 * situation.noise_multiple);
             let weight = wide * wide / (wide * wide + noise * noise);
             let std = weight.sqrt() * noise;
-            let mut normal = |stream: &mut Stream| -> f64 { stream.sample(StandardNormal) };
+            let normal = |stream: &mut Stream| -> f64 { stream.sample(StandardNormal) };
             let (mut truths, mut draws) = (Vec::new(), Vec::new());
             for _ in 0..SIMULATIONS {
                 let truth = [0; 2].map(|_| 0.5 + wide * normal(&mut stream));

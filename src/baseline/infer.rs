@@ -16,11 +16,12 @@ use crate::stats;
 /// Draws of the flow for each sample that is kept, where the draws are resampled by importance.
 const PROPOSALS: usize = 2;
 
-/// Further proposals for each sample that is kept, where the effective share of the first ones is too small. A flow that is wider than
+/// Most further proposals for each sample that is kept, where the effective share of the first ones is too small. A flow that is wider than
 /// the posterior, as where accurate frequencies leave a thin curved posterior, then still gives enough effective samples.
 const FURTHER_PROPOSALS: usize = 16;
 
-/// Fewest and most further proposals for a measurement; the most does not apply below four for each sample.
+/// Range of that most for a measurement; its end does not apply below four for each sample. A quarter and a half of it are tried where they
+/// promise to be enough.
 const FURTHER_RANGE: [usize; 2] = [512, 4_096];
 
 /// Fewest effective samples among the further proposals; and at least as many as are kept.
@@ -28,6 +29,9 @@ const FURTHER_EFFECTIVE: usize = 64;
 
 /// Least effective share of the first proposals, as a share of the one that the further proposals must reach, for which they are drawn.
 const HOPEFUL: f64 = 0.5;
+
+/// The number of further proposals promises this multiple of the effective ones that are needed.
+const RESERVE: f64 = 1.5;
 
 /// Measurements that get further proposals together, which bounds the memory.
 const FURTHER_AT_A_TIME: usize = 128;
@@ -237,21 +241,25 @@ impl Baseline {
         let Resampled { mut theta, mut weighted, effective: share } =
             resample::resample(&self.simulator, observations, &first, (draws, EFFECTIVE), seed);
         let [fewest, most] = FURTHER_RANGE;
-        let many = (FURTHER_PROPOSALS * draws).clamp(fewest, most).max(4 * draws);
-        let effective = draws.max(FURTHER_EFFECTIVE) as f64 / many as f64;
-        // Where the first proposals are hopeless, so are further ones. That includes draws that were moved to the bounds of the prior,
-        // whose measurement lies outside the prior.
-        let poor: Vec<usize> =
-            (0..observations.len()).filter(|&row| !weighted[row] && share[row] >= HOPEFUL * effective).collect();
-        for (chunk, rows) in poor.chunks(FURTHER_AT_A_TIME).enumerate() {
-            let seed = stats::stream(seed, &format!("further proposals {chunk}")).next_u64();
-            let of_rows: Vec<Observation> = rows.iter().map(|row| observations[*row].clone()).collect();
-            let further = self.propose(&of_rows, many, seed)?;
-            simulations += further.theta.nrows();
-            let found = resample::resample(&self.simulator, &of_rows, &further, (draws, effective), seed);
-            for (index, row) in rows.iter().enumerate().filter(|(index, _)| found.weighted[*index]) {
-                weighted[*row] = true;
-                theta.rows_mut(row * draws, draws).copy_from(&found.theta.rows(index * draws, draws));
+        let largest = (FURTHER_PROPOSALS * draws).clamp(fewest, most).max(4 * draws);
+        let needed = draws.max(FURTHER_EFFECTIVE) as f64;
+        for (index, many) in [largest / 4, largest / 2, largest].into_iter().enumerate() {
+            let effective = needed / many as f64;
+            // As many as promise enough effective ones. Where the first proposals are hopeless, so are further ones: that includes draws
+            // that were moved to the bounds of the prior, whose measurement lies outside the prior.
+            let least = if index == 2 { HOPEFUL * effective } else { RESERVE * effective };
+            let poor: Vec<usize> =
+                (0..observations.len()).filter(|&row| !weighted[row] && share[row] >= least).collect();
+            for (chunk, rows) in poor.chunks(FURTHER_AT_A_TIME).enumerate() {
+                let seed = stats::stream(seed, &format!("{many} further proposals {chunk}")).next_u64();
+                let of_rows: Vec<Observation> = rows.iter().map(|row| observations[*row].clone()).collect();
+                let further = self.propose(&of_rows, many, seed)?;
+                simulations += further.theta.nrows();
+                let found = resample::resample(&self.simulator, &of_rows, &further, (draws, effective), seed);
+                for (index, row) in rows.iter().enumerate().filter(|(index, _)| found.weighted[*index]) {
+                    weighted[*row] = true;
+                    theta.rows_mut(row * draws, draws).copy_from(&found.theta.rows(index * draws, draws));
+                }
             }
         }
         Ok(Corrected { samples: PosteriorSamples::new(theta, draws).after(simulations), weighted })

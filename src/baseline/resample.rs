@@ -83,8 +83,9 @@ pub(super) fn resample(
         }
     };
     let rows = (0..observations.len()).into_par_iter().with_min_len(LEAST_PER_TASK);
-    let ((chosen, weighted), effective): ((Vec<Vec<usize>>, Vec<bool>), Vec<f64>) = rows.map(choose).unzip();
-    let chosen = chosen.concat();
+    let found: Vec<((Vec<usize>, bool), f64)> = rows.map(choose).collect();
+    let chosen: Vec<usize> = found.iter().flat_map(|((chosen, _), _)| chosen.iter().copied()).collect();
+    let (weighted, effective) = found.iter().map(|((_, weighted), share)| (*weighted, *share)).unzip();
     let theta = DMatrix::from_fn(chosen.len(), d, |row, column| proposals.theta[(chosen[row], column)]);
     Resampled { theta, weighted, effective }
 }

@@ -30,7 +30,8 @@ const SCALES: [f64; 2] = [0.5, 2.0];
 /// Draws that estimate the median of a measurement for its density.
 const MEDIAN_DRAWS: usize = 200;
 
-/// Learns the factors of a model on simulations of their own. The present factors of the model are not used.
+/// Learns the factors of a model on simulations of their own, for the situations that `chosen` selects by their index; 1 for the others. The
+/// present factors of the model are not used.
 ///
 /// The factor is the ⌈0.9 (n + 1)⌉-th smallest of |truth − m|/h over the n measurements of a cell whose draws the simulation does not
 /// correct, where m is the median of their draws and h the half width of their 90 % interval on the side of the truth. Intervals that
@@ -38,11 +39,25 @@ const MEDIAN_DRAWS: usize = 200;
 ///
 /// # Errors
 /// As [`super::calibration::calibrate`].
-pub(super) fn learn(baseline: &Baseline, seed: u64) -> Result<Vec<SpreadCell>, InferenceError> {
-    Situation::all(baseline).iter().map(|situation| learn_cell(baseline, situation, seed)).collect()
+pub(super) fn learn(
+    baseline: &Baseline,
+    chosen: impl Fn(usize) -> bool,
+    seed: u64,
+) -> Result<Vec<SpreadCell>, InferenceError> {
+    let one = |(index, situation): (usize, &Situation)| {
+        let scales =
+            if chosen(index) { learn_cell(baseline, situation, seed)? } else { vec![1.0; baseline.space().len()] };
+        Ok(SpreadCell {
+            noise_multiple: situation.noise_multiple,
+            missing_mode: situation.missing.map(|mode| mode + 1),
+            without_shapes: situation.without_shapes,
+            scales,
+        })
+    };
+    Situation::all(baseline).iter().enumerate().map(one).collect()
 }
 
-fn learn_cell(baseline: &Baseline, situation: &Situation, seed: u64) -> Result<SpreadCell, InferenceError> {
+fn learn_cell(baseline: &Baseline, situation: &Situation, seed: u64) -> Result<Vec<f64>, InferenceError> {
     let mut stream = stats::stream(seed, &situation.purpose());
     let set = baseline
         .simulator()
@@ -67,12 +82,7 @@ fn learn_cell(baseline: &Baseline, situation: &Situation, seed: u64) -> Result<S
         let rank = (0.9 * (needed.len() + 1) as f64).ceil() as usize;
         needed[rank.min(needed.len()) - 1].clamp(SCALES[0], SCALES[1])
     };
-    Ok(SpreadCell {
-        noise_multiple: situation.noise_multiple,
-        missing_mode: situation.missing.map(|mode| mode + 1),
-        without_shapes: situation.without_shapes,
-        scales: (0..baseline.space().len()).map(scale).collect(),
-    })
+    Ok((0..baseline.space().len()).map(scale).collect())
 }
 
 impl Baseline {
@@ -221,7 +231,7 @@ seen = [-10.0, 10.0, 30.0]
         };
         baseline.manifest.spread.clear();
         let (before, _) = off(&baseline, 11);
-        let spread = learn(&baseline, 12).unwrap();
+        let spread = learn(&baseline, |_| true, 12).unwrap();
         baseline.manifest.spread.clone_from(&spread);
         let (after, _) = off(&baseline, 13);
         // Binomial errors of 1000 and of 2000 simulations, of which four, over nine cells.

@@ -9,6 +9,7 @@ use super::conditions::{Conditions, EffectRange, NoiseRange, Whitening};
 use super::error::{InferenceError, LoadError};
 use super::fitted::fitted_pairs;
 use super::identifiability::identifiability;
+use super::judge::judge;
 use super::manifest::{
     CalibrationRecord, FurtherRound, IdentifiabilityRecord, Manifest, SelfTest, TrainingRecord, ValidationRecord,
     FORMAT,
@@ -380,7 +381,9 @@ fn certify(mut manifest: Manifest, simulator: &Simulator, weights: Vec<u8>) -> R
     let calibration_seed = |what: &str| purpose_seed(seed, &format!("{what}{round}"));
     (manifest.calibration, _) = calibrate(&draft, calibration_seed("calibration"))?;
     if !manifest.calibration.passed() && simulator.is_noisy() {
-        draft.manifest.spread = spread::learn(&draft, calibration_seed("spread"))?;
+        let record = &manifest.calibration;
+        let faulty = |index: usize| !judge(&record.cells, index, record.simulations).is_clean();
+        draft.manifest.spread = spread::learn(&draft, faulty, calibration_seed("spread"))?;
         let (repaired, _) = calibrate(&draft, calibration_seed("calibration after the repair"))?;
         if repaired.findings() < manifest.calibration.findings() {
             (manifest.calibration, manifest.spread) = (repaired, draft.manifest.spread.clone());

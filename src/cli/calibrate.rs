@@ -108,7 +108,7 @@ fn print(record: &CalibrationRecord) {
             println!("passed: {cells} situations of {simulations} simulated measurements, {draws} samples each");
         }
         Outcome::Cautious => {
-            println!("cautious: intervals are too wide somewhere and nowhere too narrow; the service uses this model")
+            println!("cautious: intervals are too wide somewhere and nowhere too narrow; the service uses this model");
         }
         Outcome::Overconfident => println!("overconfident: intervals are too narrow or misplaced somewhere"),
     }
@@ -118,7 +118,8 @@ fn print(record: &CalibrationRecord) {
 }
 
 fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) -> String {
-    let items: String = record.reasons().map(|reason| format!("<li>{}</li>", escaped(reason))).collect();
+    let items: Vec<String> = record.reasons().map(|reason| format!("<li>{}</li>", escaped(reason))).collect();
+    let items = items.concat();
     let verdict = match record.outcome() {
         Outcome::Passed => "<p>Passed: the intervals hold the stated share of the true values in every situation.</p>".to_owned(),
         Outcome::Cautious => format!(

@@ -43,7 +43,7 @@ pub fn train_into(out: &Path, simulator: &Simulator, recipe: &Recipe) -> anyhow:
     let bar = progress_bar()?;
     let Recipe { samples, noise_range, flow, settings, rounds } = recipe;
     let trained = train_in_rounds(simulator, *samples, *noise_range, flow, settings, *rounds, &mut |progress| {
-        show(&bar, progress)
+        show(&bar, progress);
     })?;
     bar.finish_and_clear();
     write_files(out, &trained)?;

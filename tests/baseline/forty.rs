@@ -7,6 +7,11 @@
 //! `MODALWATCH_FORTY=0..10` restricts the seeds, so that the forty can be trained in parts. `MODALWATCH_FORTY_EPOCHS=20` trains a single round of
 //! so many epochs, which is quicker and harder to pass.
 
+#![expect(
+    clippy::format_push_string,
+    reason = "a structure file is written piece by piece, and the allocations do not matter"
+)]
+
 use std::ops::Range;
 use std::time::Instant;
 
