@@ -52,6 +52,11 @@ impl PosteriorSamples {
         &self.theta
     }
 
+    /// All samples, `[n·draws, d]`, parameter units, as a matrix of their own.
+    pub fn into_theta(self) -> DMatrix<f64> {
+        self.theta
+    }
+
     /// All samples of one parameter, given by its column, `[n·draws]`, in the unit of the parameter.
     pub fn column(&self, parameter: usize) -> Vec<f64> {
         self.theta.column(parameter).iter().copied().collect()

@@ -80,10 +80,8 @@ pub(super) fn population_behind(
 /// Stretches the draws of one measurement about their median by the factor that gave 90 % intervals their coverage in the
 /// calibration (conformal prediction), within the prior.
 fn conform(baseline: &Baseline, column: usize, observation: &Observation, draws: &mut [f64]) {
-    let modes = observation.modes_present();
-    let present = observation.frequencies_hz.iter().zip(&observation.noise_multiple).filter(|(f, _)| f.is_some());
-    let noise = (present.map(|(_, multiple)| multiple.ln()).sum::<f64>() / modes as f64).exp();
-    let complete = modes == baseline.simulator().modes();
+    let noise = observation.mean_noise_multiple();
+    let complete = observation.modes_present() == baseline.simulator().modes();
     let scale = baseline.manifest().calibration.interval_scale(column, noise, complete, observation.has_shapes());
     let (median, prior) = (stats::quantile(draws, 0.5), &baseline.space().as_slice()[column]);
     for draw in draws {

@@ -48,6 +48,9 @@ pub enum LoadError {
         /// Entries expected.
         expected: usize,
     },
+    /// A factor of the spread of draws is not a positive number.
+    #[error("spread has the factor {0}: it must be positive and finite")]
+    Spread(f64),
     /// The weight file is damaged or belongs to another architecture.
     #[error(transparent)]
     Weights(#[from] checkpoint::Error),

@@ -1,13 +1,17 @@
 //! Training of a model for a structure that extends another one.
 
 use super::conditions::NoiseRange;
+use super::manifest::Outcome;
 use super::model::Baseline;
 use super::observation::DEFAULT_NOISE_RANGE;
-use super::train::{default_epochs, default_samples, train, Error, Trained};
+use super::rounds::{run, train_in_rounds, MOST_ROUNDS};
+use super::train::{default_epochs, default_samples, Error, Trained};
 use super::warm::WarmStart;
-use crate::flow::train::{EpochReport, TrainSettings};
+use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
 use crate::simulator::Simulator;
+
+pub use super::rounds::Progress;
 
 /// How the model of an extension is trained.
 #[derive(Clone, Copy)]
@@ -24,26 +28,13 @@ pub struct ExtensionPlan<'a> {
     pub seed: u64,
 }
 
-/// What happens in the training of an extension.
-#[derive(Debug, Clone)]
-pub enum Progress {
-    /// How the training starts, and why.
-    Start(String),
-    /// An epoch has ended.
-    Epoch {
-        /// State after the epoch.
-        report: EpochReport,
-        /// Number of epochs of this training.
-        epochs: usize,
-    },
-}
-
 impl ExtensionPlan<'_> {
     /// Trains the model of `simulator`: from the weights of the parent where its inputs have the same meaning, otherwise from random
     /// weights, with the noise range of the parent and its number of units.
     ///
-    /// A model that was trained from the weights of its parent and fails its calibration is trained once more from random weights,
-    /// unless the numbers of samples or epochs were given.
+    /// The training goes on until its calibration passes or stops improving ([`super::rounds`]). A model that was trained from the
+    /// weights of its parent and remains overconfident is trained once more from random weights. Where the numbers of samples or
+    /// epochs were given, the training does just what was asked for, in one round.
     ///
     /// # Errors
     /// As [`train`].
@@ -62,21 +53,31 @@ impl ExtensionPlan<'_> {
                     "training starts from the weights of the model {}: {samples} samples, {epochs} epochs",
                     start.digest()
                 )));
-                let report = |report| on_progress(Progress::Epoch { report, epochs });
-                let trained = start.train(simulator, samples, &start.settings(epochs, self.seed), report)?;
+                let settings = start.settings(epochs, self.seed);
+                let prepared = start.prepare(simulator, samples, &settings)?;
+                let trained = run(prepared.begin(simulator, &settings)?, self.rounds(), on_progress)?;
                 let calibration = &trained.baseline.manifest().calibration;
-                let as_given = self.samples.is_some() || self.epochs.is_some();
-                if calibration.passed() || as_given || !simulator.is_noisy() {
+                if calibration.outcome() < Outcome::Overconfident || self.is_given() || !simulator.is_noisy() {
                     return Ok(trained);
                 }
-                format!(
-                    "the calibration of the model that started from its weights failed: {}",
-                    calibration.failures.join("; ")
-                )
+                format!("the model that started from its weights is overconfident: {}", calibration.failures.join("; "))
             }
             Err(why) => why,
         };
         self.train_from_scratch(simulator, &why, on_progress)
+    }
+
+    /// Whether the numbers of samples or epochs were given.
+    fn is_given(&self) -> bool {
+        self.samples.is_some() || self.epochs.is_some()
+    }
+
+    fn rounds(&self) -> usize {
+        if self.is_given() {
+            1
+        } else {
+            MOST_ROUNDS
+        }
     }
 
     fn train_from_scratch(
@@ -97,8 +98,6 @@ impl ExtensionPlan<'_> {
             "training starts from random weights ({why}): {samples} samples, {epochs} epochs"
         )));
         let settings = TrainSettings { epochs, seed: self.seed, ..TrainSettings::default() };
-        train(simulator, samples, noise_range, &flow, &settings, |report| {
-            on_progress(Progress::Epoch { report, epochs });
-        })
+        train_in_rounds(simulator, samples, noise_range, &flow, &settings, self.rounds(), on_progress)
     }
 }

@@ -7,6 +7,7 @@ use rand::RngCore as _;
 use super::error::InferenceError;
 use super::model::Baseline;
 use super::observation::Observation;
+use super::resample::{Resampled, EFFECTIVE};
 use super::{project, resample};
 use crate::posterior::PosteriorSamples;
 use crate::quantity::Digest;
@@ -14,6 +15,26 @@ use crate::stats;
 
 /// Draws of the flow for each sample that is kept, where the draws are resampled by importance.
 const PROPOSALS: usize = 2;
+
+/// Most further proposals for each sample that is kept, where the effective share of the first ones is too small. A flow that is wider than
+/// the posterior, as where accurate frequencies leave a thin curved posterior, then still gives enough effective samples.
+const FURTHER_PROPOSALS: usize = 16;
+
+/// Range of that most for a measurement; its end does not apply below four for each sample. A quarter and a half of it are tried where they
+/// promise to be enough.
+const FURTHER_RANGE: [usize; 2] = [512, 4_096];
+
+/// Fewest effective samples among the further proposals; and at least as many as are kept.
+const FURTHER_EFFECTIVE: usize = 64;
+
+/// Least effective share of the first proposals, as a share of the one that the further proposals must reach, for which they are drawn.
+const HOPEFUL: f64 = 0.5;
+
+/// The number of further proposals promises this multiple of the effective ones that are needed.
+const RESERVE: f64 = 1.5;
+
+/// Measurements that get further proposals together, which bounds the memory.
+const FURTHER_AT_A_TIME: usize = 128;
 
 /// Most degrees of freedom of a structure whose eigenproblem is solved for every draw: beyond it takes milliseconds per
 /// draw.
@@ -28,11 +49,20 @@ pub fn assessment_seed(content: &Digest, baseline: &Digest) -> u64 {
     stats::stream(0, &format!("assessment:{content}:{baseline}")).next_u64()
 }
 
+/// Posterior samples, and which of them the simulation has corrected.
+pub(super) struct Corrected {
+    pub(super) samples: PosteriorSamples,
+    /// Whether the samples of each observation are weighted by their likelihood, `[n]`; the others are draws of the flow.
+    pub(super) weighted: Vec<bool>,
+}
+
 impl Baseline {
     /// Posterior samples of each measurement, `[n·draws, d]` for n observations, in parameter units.
     ///
     /// The flow proposes two draws for each sample, and sampling–importance resampling corrects them by the exact
-    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where a covariate is missing, the samples go
+    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where fewer than half of them are effective, the flow
+    /// proposes more. Draws of the flow that the simulation has not corrected are stretched as the manifest's
+    /// [`spread`](super::manifest::Manifest::spread) says. Where a covariate is missing, the samples go
     /// through its possible values in turn:
     ///
     /// ```text
@@ -69,7 +99,7 @@ impl Baseline {
 
     /// Logarithm of the posterior density at `draws` rows of `theta` for each observation, in the unit box of the prior,
     /// nats, up to a constant for each observation. It is the simulation's likelihood where the draws are resampled by it,
-    /// otherwise the density of the flow.
+    /// otherwise the density of the flow, stretched as its draws are.
     ///
     /// `theta`: `[n·draws, d]`; `observations`: n. Returns n·draws values.
     ///
@@ -83,7 +113,12 @@ impl Baseline {
         if self.is_resampled() && !observations.iter().any(Observation::is_marginalised) {
             return Ok(resample::log_likelihoods(&self.simulator, observations, theta));
         }
-        self.log_density_of_draws(theta, observations)
+        if self.manifest.spread.is_empty() {
+            return self.log_density_of_draws(theta, observations);
+        }
+        let (before, log_stretch) = self.before_stretching(theta, observations)?;
+        let density = self.log_density_of_draws(&before, observations)?;
+        Ok(density.into_iter().zip(log_stretch).map(|(log_q, stretch)| log_q - stretch).collect())
     }
 
     /// As [`Self::infer`], with `proposals` draws of the flow for each sample.
@@ -135,7 +170,7 @@ impl Baseline {
     }
 
     /// Samples of measurements with all covariates. With noise the flow's draws are resampled by their likelihood; without
-    /// noise they are moved to parameters that reproduce the measurement.
+    /// noise they are moved to parameters that reproduce the measurement. What the simulation does not correct is stretched.
     fn infer_known(
         &self,
         observations: &[Observation],
@@ -143,20 +178,91 @@ impl Baseline {
         proposals: usize,
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
+        let Corrected { samples, weighted } = self.infer_unstretched(observations, draws, proposals, seed)?;
+        if self.manifest.spread.is_empty() {
+            return Ok(samples);
+        }
+        let simulations = samples.simulations();
+        let mut theta = samples.into_theta();
+        for (row, observation) in observations.iter().enumerate().filter(|(row, _)| !weighted[*row]) {
+            self.stretch(observation, theta.rows_mut(row * draws, draws));
+        }
+        Ok(PosteriorSamples::new(theta, draws).after(simulations))
+    }
+
+    /// As [`Self::infer`] for measurements with all covariates, before draws of the flow are stretched.
+    ///
+    /// # Errors
+    /// As [`Self::infer`].
+    pub(super) fn infer_as_known(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        seed: u64,
+    ) -> Result<Corrected, InferenceError> {
+        self.infer_unstretched(observations, draws, PROPOSALS, seed)
+    }
+
+    fn infer_unstretched(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        proposals: usize,
+        seed: u64,
+    ) -> Result<Corrected, InferenceError> {
+        let uncorrected = || vec![false; observations.len()];
         if self.starts_at_fit() {
-            return Ok(PosteriorSamples::new(self.propose_from_fit(observations, draws, seed)?.theta, draws));
+            let samples = PosteriorSamples::new(self.propose_from_fit(observations, draws, seed)?.theta, draws);
+            return Ok(Corrected { samples, weighted: uncorrected() });
         }
         if self.is_resampled() {
-            let proposals = self.propose(observations, proposals * draws, seed)?;
-            let theta = resample::resample(&self.simulator, observations, &proposals, draws, seed);
-            return Ok(PosteriorSamples::new(theta, draws).after(proposals.theta.nrows()));
+            return self.infer_weighted(observations, draws, proposals, seed);
         }
         let mut theta = self.propose(observations, draws, seed)?.theta;
         let simulations = match self.manifest.conditions.noise_range {
             None if self.is_corrected() => project::project(&self.simulator, observations, &mut theta),
             _ => 0,
         };
-        Ok(PosteriorSamples::new(theta, draws).after(simulations))
+        let samples = PosteriorSamples::new(theta, draws).after(simulations);
+        Ok(Corrected { samples, weighted: uncorrected() })
+    }
+
+    /// Sampling–importance resampling of the flow's draws, with more of them for the measurements for which the first ones do not
+    /// suffice.
+    fn infer_weighted(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        proposals: usize,
+        seed: u64,
+    ) -> Result<Corrected, InferenceError> {
+        let first = self.propose(observations, proposals * draws, seed)?;
+        let mut simulations = first.theta.nrows();
+        let Resampled { mut theta, mut weighted, effective: share } =
+            resample::resample(&self.simulator, observations, &first, (draws, EFFECTIVE), seed);
+        let [fewest, most] = FURTHER_RANGE;
+        let largest = (FURTHER_PROPOSALS * draws).clamp(fewest, most).max(4 * draws);
+        let needed = draws.max(FURTHER_EFFECTIVE) as f64;
+        for (index, many) in [largest / 4, largest / 2, largest].into_iter().enumerate() {
+            let effective = needed / many as f64;
+            // As many as promise enough effective ones. Where the first proposals are hopeless, so are further ones: that includes draws
+            // that were moved to the bounds of the prior, whose measurement lies outside the prior.
+            let least = if index == 2 { HOPEFUL * effective } else { RESERVE * effective };
+            let poor: Vec<usize> =
+                (0..observations.len()).filter(|&row| !weighted[row] && share[row] >= least).collect();
+            for (chunk, rows) in poor.chunks(FURTHER_AT_A_TIME).enumerate() {
+                let seed = stats::stream(seed, &format!("{many} further proposals {chunk}")).next_u64();
+                let of_rows: Vec<Observation> = rows.iter().map(|row| observations[*row].clone()).collect();
+                let further = self.propose(&of_rows, many, seed)?;
+                simulations += further.theta.nrows();
+                let found = resample::resample(&self.simulator, &of_rows, &further, (draws, effective), seed);
+                for (index, row) in rows.iter().enumerate().filter(|(index, _)| found.weighted[*index]) {
+                    weighted[*row] = true;
+                    theta.rows_mut(row * draws, draws).copy_from(&found.theta.rows(index * draws, draws));
+                }
+            }
+        }
+        Ok(Corrected { samples: PosteriorSamples::new(theta, draws).after(simulations), weighted })
     }
 
     /// Whether draws are resampled by importance. Without noise there is no likelihood to weight them by.

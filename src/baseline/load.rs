@@ -39,6 +39,10 @@ impl Baseline {
         if let Some((what, found, expected)) = lengths.into_iter().find(|(_, found, expected)| found != expected) {
             return Err(LoadError::Shape { what, found, expected });
         }
+        let scales = manifest.spread.iter().flat_map(|cell| &cell.scales);
+        if let Some(scale) = scales.copied().find(|scale| !(*scale > 0.0 && scale.is_finite())) {
+            return Err(LoadError::Spread(scale));
+        }
         let flow = checkpoint::from_bytes(weights, &manifest.architecture, DType::F32)?;
         let digest = Digest::of_file(manifest_bytes);
         let baseline = Self::new(flow, simulator, manifest, digest).map_err(checkpoint::Error::from)?;
@@ -75,7 +79,7 @@ impl Baseline {
 /// Every list of a manifest whose length depends on the structure: its name, its length, and the required length.
 fn lengths(manifest: &Manifest, simulator: &Simulator) -> Vec<(&'static str, usize, usize)> {
     let (d, m) = (simulator.space().len(), simulator.modes());
-    let Manifest { architecture, conditions, whitening, self_test, calibration, .. } = manifest;
+    let Manifest { architecture, conditions, whitening, self_test, calibration, spread, .. } = manifest;
     // Earlier versions of this program trained flows that start at the best fit without the sizes of the effects as inputs.
     let before_effects = conditions.starts_at_fit && architecture.fixed_context == fit_features(d);
     let fixed_context = if before_effects { fit_features(d) } else { conditions.fixed_context(d) };
@@ -97,5 +101,6 @@ fn lengths(manifest: &Manifest, simulator: &Simulator) -> Vec<(&'static str, usi
         all.extend(self_test.shapes.iter().map(|shape| ("a shape of self_test.shapes", shape.len(), points)));
     }
     all.extend(calibration.cells.iter().map(|cell| ("parameters of calibration.cells", cell.parameters.len(), d)));
+    all.extend(spread.iter().map(|cell| ("scales of spread", cell.scales.len(), d)));
     all
 }

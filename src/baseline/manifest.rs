@@ -46,6 +46,9 @@ pub struct Manifest {
     pub validation: ValidationRecord,
     /// Whether its posterior intervals have the stated coverage.
     pub calibration: CalibrationRecord,
+    /// Factors of the spread of draws that the simulation does not correct; empty where they need none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub spread: Vec<SpreadCell>,
     /// Which parameters the modes can distinguish.
     pub identifiability: IdentifiabilityRecord,
     /// An inference with a known result.
@@ -69,6 +72,41 @@ pub struct TrainingRecord {
     /// Digest of the model whose weights the training started from; `None` for random weights.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub parent: Option<Digest>,
+    /// How the training went on after its calibration did not pass; empty where it did not go on.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub further_rounds: Vec<FurtherRound>,
+}
+
+/// A round of training from the weights of the round before.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FurtherRound {
+    /// Epochs of this round.
+    pub epochs: usize,
+    /// Learning rate of its first step.
+    pub learning_rate: f64,
+    /// Epoch whose weights were kept, counted from 1 in this round.
+    pub best_epoch: usize,
+}
+
+/// Factors by which draws of the flow are stretched about their median for one kind of measurement, learned on simulations of their
+/// own (conformal calibration).
+///
+/// ```text
+///  x′ = m + s (x − m),    m: median of the draws of a measurement,  s: 90 % quantile of |truth − m|/half width of the 90 % interval
+/// ```
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SpreadCell {
+    /// Noise as a multiple of the structure's noise.
+    pub noise_multiple: f64,
+    /// Number of the missing mode, counted from 1; `None` for complete measurements.
+    pub missing_mode: Option<usize>,
+    /// Whether the mode shapes are missing; `None` for a structure without instrumented points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub without_shapes: Option<bool>,
+    /// s of each parameter.
+    pub scales: Vec<f64>,
 }
 
 /// Accuracy on held-out simulated pairs, which were used neither for training nor for selecting the epoch.
@@ -124,10 +162,28 @@ pub struct CalibrationRecord {
     pub simulations: usize,
     /// Posterior draws per measurement.
     pub draws: usize,
-    /// Reasons why the calibration fails; empty when it passes.
+    /// Where the intervals are too narrow; empty for a model that may be used.
     pub failures: Vec<String>,
+    /// Where the intervals are too wide and nothing says that they are too narrow; the model may be used. Empty in the manifests of
+    /// earlier versions of this program, which listed everything among the failures.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cautions: Vec<String>,
     /// One entry per noise level and set of modes.
     pub cells: Vec<Cell>,
+}
+
+/// What the calibration of a model says about its use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+#[schema(as = CalibrationOutcome)]
+pub enum Outcome {
+    /// The intervals hold the stated share of the true values.
+    Passed,
+    /// The intervals are too wide somewhere and nowhere too narrow: the model is used, and small changes may be noticed later than
+    /// they could be.
+    Cautious,
+    /// The intervals are too narrow somewhere: the model is not used unless it is accepted explicitly.
+    Overconfident,
 }
 
 /// Calibration at one noise level with one set of modes.
@@ -144,6 +200,10 @@ pub struct Cell {
     pub without_shapes: Option<bool>,
     /// p-value of uniform TARP ranks, for all parameters jointly.
     pub tarp_p_value: f64,
+    /// Mean square distance of the TARP ranks from the middle, as a multiple of that of uniform ranks: below 1 where the joint
+    /// posterior is too wide. `None` in the manifests of earlier versions of this program.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tarp_spread: Option<f64>,
     /// One entry per parameter.
     pub parameters: Vec<CellParameter>,
 }
@@ -161,15 +221,39 @@ pub struct CellParameter {
     pub coverage_50: f64,
     /// Share of the true values inside the central 90 % interval.
     pub coverage_90: f64,
+    /// Shares of the true values below and above the central 90 % interval, each 0.05 for a calibrated posterior. `None` in the
+    /// manifests of earlier versions of this program.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Vec<f64>>)]
+    pub outside_90: Option<[f64; 2]>,
     /// Factor that stretches the 90 % interval about the median to its nominal coverage (conformal calibration); 1 where
     /// the coverage is close enough to nominal.
     pub interval_scale: f64,
 }
 
 impl CalibrationRecord {
+    /// What the calibration says about the use of the model.
+    pub fn outcome(&self) -> Outcome {
+        match (self.failures.is_empty(), self.cautions.is_empty()) {
+            (false, _) => Outcome::Overconfident,
+            (true, false) => Outcome::Cautious,
+            (true, true) => Outcome::Passed,
+        }
+    }
+
+    /// Numbers of findings, the more serious ones first: a smaller value is better.
+    pub fn findings(&self) -> (usize, usize) {
+        (self.failures.len(), self.cautions.len())
+    }
+
+    /// What is wrong, in sentences: where the intervals are too narrow, then where they are too wide.
+    pub fn reasons(&self) -> impl Iterator<Item = &str> {
+        self.failures.iter().chain(&self.cautions).map(String::as_str)
+    }
+
     /// True when no test failed.
     pub fn passed(&self) -> bool {
-        self.failures.is_empty()
+        self.outcome() == Outcome::Passed
     }
 
     /// Factor for the 90 % interval of parameter `column` of one measurement, taken from the cell with the nearest noise

@@ -68,6 +68,12 @@ impl Observation {
         self.frequencies_hz.iter().flatten().count()
     }
 
+    /// Geometric mean of the noise multiples of the modes present.
+    pub fn mean_noise_multiple(&self) -> f64 {
+        let present = self.frequencies_hz.iter().zip(&self.noise_multiple).filter(|(f, _)| f.is_some());
+        (present.map(|(_, multiple)| multiple.ln()).sum::<f64>() / self.modes_present() as f64).exp()
+    }
+
     /// Shape of mode `mode` (counted from 0) at the instrumented points, of unit norm, `[points]`; `None` unless both the mode
     /// and its shape were identified.
     pub fn shape(&self, mode: usize) -> Option<&[f64]> {

@@ -1,31 +1,35 @@
 //! Training of a model for a structure, and its certification.
 
-use candle_core::{DType, Tensor};
+use candle_core::DType;
 use nalgebra::DMatrix;
 use rand::RngCore as _;
 
 use super::calibration::calibrate;
 use super::conditions::{Conditions, EffectRange, NoiseRange, Whitening};
 use super::error::{InferenceError, LoadError};
-use super::fitted::{fitted_pairs, inverse_error_from_fit};
+use super::fitted::fitted_pairs;
 use super::identifiability::identifiability;
+use super::judge::judge;
 use super::manifest::{
-    CalibrationRecord, IdentifiabilityRecord, Manifest, ParameterValidation, SelfTest, TrainingRecord,
-    ValidationRecord, FORMAT,
+    CalibrationRecord, FurtherRound, IdentifiabilityRecord, Manifest, SelfTest, TrainingRecord, ValidationRecord,
+    FORMAT,
 };
 use super::model::Baseline;
 use super::observation::{measure, measure_shapes, Encoder, Observation};
-use super::real_line::{logistic, to_real_line};
+use super::real_line::to_real_line;
+use super::spread;
 use super::start::starts_at_fit;
 use crate::flow::architecture::{Architecture, FlowSettings};
 use crate::flow::pairs::Pairs;
 use crate::flow::train::{EpochReport, Stopped, TrainOutcome, TrainSettings};
 use crate::flow::weights::Weights;
 use crate::flow::{checkpoint, weights, Flow};
-use crate::parameter::{Parameter, ParameterSpace};
+use crate::parameter::ParameterSpace;
 use crate::quantity::Digest;
 use crate::simulator::{Simulator, TrainingSet};
 use crate::stats::{self, Stream};
+
+pub use super::validation::validate;
 
 /// Number of validation pairs, which select the best epoch.
 const VALIDATION_SAMPLES: usize = 1_000;
@@ -35,8 +39,6 @@ const VALIDATION_FITTED: usize = 500;
 const HELD_OUT_SAMPLES: usize = 2_000;
 /// Number of held-out pairs where the flow starts at the best fit: a fit takes 0.2 s with three hundred parameters.
 const HELD_OUT_FITTED: usize = 300;
-/// Draws per held-out pair.
-const HELD_OUT_DRAWS: usize = 10;
 /// Draws of the self-test.
 const SELF_TEST_DRAWS: usize = 4;
 /// Purpose of the seed of the training set.
@@ -141,6 +143,18 @@ pub fn train(
     settings: &TrainSettings,
     on_epoch: impl FnMut(EpochReport),
 ) -> Result<Trained, Error> {
+    let prepared = prepare(simulator, samples, noise_range, flow_settings, settings)?;
+    prepared.train(simulator, settings, on_epoch)
+}
+
+/// A flow with random weights, and all that its training needs.
+pub(super) fn prepare(
+    simulator: &Simulator,
+    samples: usize,
+    noise_range: NoiseRange,
+    flow_settings: &FlowSettings,
+    settings: &TrainSettings,
+) -> Result<Prepared, Error> {
     check(samples, noise_range, flow_settings, settings)?;
     let fitted = starts_at_fit(simulator);
     let space = space_of_flow(simulator);
@@ -157,8 +171,7 @@ pub fn train(
         flow_settings.architecture(space.len(), simulator.modes(), conditions.channels(), &mut permutations);
     architecture.fixed_context = conditions.fixed_context(space.len());
     let (flow, weights) = weights::untrained_flow(&architecture, DType::F32, settings.seed)?;
-    Prepared { flow, weights, space, conditions, whitening, training, parent: None }
-        .train(simulator, settings, on_epoch)
+    Ok(Prepared { flow, weights, space, conditions, whitening, training, parent: None })
 }
 
 /// The box in which a new flow is trained.
@@ -185,31 +198,87 @@ pub(super) struct Prepared {
 }
 
 impl Prepared {
-    /// Trains the flow, and certifies the model.
+    /// Trains the flow in one round, and certifies the model.
     pub(super) fn train(
         self,
         simulator: &Simulator,
         settings: &TrainSettings,
         on_epoch: impl FnMut(EpochReport),
     ) -> Result<Trained, Error> {
-        let Self { flow, weights, space, conditions, whitening, training, parent } = self;
-        let validation_samples = if conditions.starts_at_fit { VALIDATION_FITTED } else { VALIDATION_SAMPLES };
-        let validation = simulator.pairs(&space, validation_samples, purpose_seed(settings.seed, "validation set"))?;
-        let task = Task { simulator, space: &space, conditions: &conditions, whitening: &whitening, settings };
-        let outcome = task.run(&flow, &weights, &training, &validation, on_epoch)?;
-        let weights = checkpoint::to_bytes(&weights)?;
-        let training = TrainingRecord {
-            samples: training.theta.nrows(),
+        let mut ongoing = self.begin(simulator, settings)?;
+        ongoing.first_round(on_epoch)?;
+        ongoing.certified()
+    }
+
+    /// A training before its first round.
+    pub(super) fn begin<'a>(self, simulator: &'a Simulator, settings: &'a TrainSettings) -> Result<Ongoing<'a>, Error> {
+        let validation_samples = if self.conditions.starts_at_fit { VALIDATION_FITTED } else { VALIDATION_SAMPLES };
+        let seed = purpose_seed(settings.seed, "validation set");
+        let validation = simulator.pairs(&self.space, validation_samples, seed)?;
+        let record = TrainingRecord {
+            samples: self.training.theta.nrows(),
             validation_samples,
             settings: settings.clone(),
-            best_epoch: outcome.best_epoch,
-            stopped: outcome.stopped,
-            parent,
+            best_epoch: 0,
+            stopped: Stopped::Completed,
+            parent: self.parent.clone(),
+            further_rounds: Vec::new(),
         };
-        let architecture = flow.architecture().clone();
-        let manifest = draft_manifest(simulator, &weights, architecture, (whitening, conditions), training);
-        let digest = manifest.weights_sha256.clone();
-        certify(&Baseline::new(flow, simulator, manifest, digest)?, weights)
+        Ok(Ongoing { prepared: self, simulator, settings, validation, record })
+    }
+}
+
+/// A training between two rounds.
+pub(super) struct Ongoing<'a> {
+    prepared: Prepared,
+    pub(super) simulator: &'a Simulator,
+    pub(super) settings: &'a TrainSettings,
+    validation: TrainingSet,
+    record: TrainingRecord,
+}
+
+impl Ongoing<'_> {
+    /// Trains the flow as the settings say.
+    pub(super) fn first_round(&mut self, on_epoch: impl FnMut(EpochReport)) -> Result<(), Error> {
+        let outcome = self.run(self.settings, on_epoch)?;
+        (self.record.best_epoch, self.record.stopped) = (outcome.best_epoch, outcome.stopped);
+        Ok(())
+    }
+
+    /// Continues with the present weights, on other noise and missing modes.
+    pub(super) fn further_round(
+        &mut self,
+        epochs: usize,
+        learning_rate: f64,
+        on_epoch: impl FnMut(EpochReport),
+    ) -> Result<(), Error> {
+        let seed = purpose_seed(self.settings.seed, &format!("round {}", self.rounds() + 1));
+        let settings = TrainSettings { epochs, learning_rate, seed, batch: self.settings.batch };
+        let TrainOutcome { best_epoch, stopped, .. } = self.run(&settings, on_epoch)?;
+        self.record.stopped = stopped;
+        self.record.further_rounds.push(FurtherRound { epochs, learning_rate, best_epoch });
+        Ok(())
+    }
+
+    /// Rounds so far.
+    pub(super) fn rounds(&self) -> usize {
+        1 + self.record.further_rounds.len()
+    }
+
+    fn run(&self, settings: &TrainSettings, on_epoch: impl FnMut(EpochReport)) -> Result<TrainOutcome, Error> {
+        let Prepared { flow, weights, space, conditions, whitening, training, .. } = &self.prepared;
+        let task = Task { simulator: self.simulator, space, conditions, whitening, settings };
+        task.run(flow, weights, training, &self.validation, on_epoch)
+    }
+
+    /// The model with the present weights.
+    pub(super) fn certified(&self) -> Result<Trained, Error> {
+        let Prepared { flow, weights, conditions, whitening, .. } = &self.prepared;
+        let weights = checkpoint::to_bytes(weights)?;
+        let described = (whitening.clone(), conditions.clone());
+        let manifest =
+            draft_manifest(self.simulator, &weights, flow.architecture().clone(), described, self.record.clone());
+        certify(manifest, self.simulator, weights)
     }
 }
 
@@ -277,6 +346,7 @@ fn draft_manifest(
         conditions,
         validation: ValidationRecord::default(),
         calibration: CalibrationRecord::default(),
+        spread: Vec::new(),
         identifiability: IdentifiabilityRecord::default(),
         self_test: SelfTest { seed: training.settings.seed, ..SelfTest::default() },
         training,
@@ -289,22 +359,44 @@ fn draft_manifest(
 /// # Errors
 /// As [`train`].
 pub fn renew(baseline: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
-    certify(baseline, weights)
+    certify(baseline.manifest().clone(), baseline.simulator(), weights)
 }
 
 /// Measures accuracy, calibration and identifiability of a trained model, completes its manifest, and loads it back.
-fn certify(draft: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
-    let simulator = draft.simulator();
-    let mut manifest = draft.manifest.clone();
+///
+/// Where the calibration does not pass, the spread of the draws that the simulation does not correct is repaired, and the calibration
+/// is measured again on other simulations. The repair is kept where it leaves fewer findings.
+fn certify(mut manifest: Manifest, simulator: &Simulator, weights: Vec<u8>) -> Result<Trained, Error> {
     env!("CARGO_PKG_VERSION").clone_into(&mut manifest.program_version);
+    manifest.spread = Vec::new();
+    let flow = checkpoint::from_bytes(&weights, &manifest.architecture, DType::F32)?;
+    let digest = manifest.weights_sha256.clone();
+    let mut draft = Baseline::new(flow, simulator, manifest.clone(), digest)?;
     let seed = manifest.training.settings.seed;
+    // Another round is judged on other simulations: the first ones have been looked at already.
+    let round = match manifest.training.further_rounds.len() {
+        0 => String::new(),
+        further => format!(" of round {}", further + 1),
+    };
+    let calibration_seed = |what: &str| purpose_seed(seed, &format!("{what}{round}"));
+    (manifest.calibration, _) = calibrate(&draft, calibration_seed("calibration"))?;
+    if !manifest.calibration.passed() && simulator.is_noisy() {
+        let record = &manifest.calibration;
+        let faulty = |index: usize| !judge(&record.cells, index, record.simulations).is_clean();
+        draft.manifest.spread = spread::learn(&draft, faulty, calibration_seed("spread"))?;
+        let (repaired, _) = calibrate(&draft, calibration_seed("calibration after the repair"))?;
+        if repaired.findings() < manifest.calibration.findings() {
+            (manifest.calibration, manifest.spread) = (repaired, draft.manifest.spread.clone());
+        } else {
+            draft.manifest.spread = Vec::new();
+        }
+    }
     let count = if draft.starts_at_fit() { HELD_OUT_FITTED } else { HELD_OUT_SAMPLES };
     let held_out = simulator.training_set(count, purpose_seed(seed, "held-out set"))?;
     let mut stream = stats::stream(seed, "observations of held-out set");
     let observations = observe(simulator, &manifest.conditions, &held_out, &mut stream);
-    manifest.validation = validate(draft, &held_out.theta, &observations, seed)?;
-    (manifest.calibration, _) = calibrate(draft, purpose_seed(seed, "calibration"))?;
-    manifest.identifiability = identifiability(draft, purpose_seed(seed, "identifiability"))?;
+    manifest.validation = validate(&draft, &held_out.theta, &observations, seed)?;
+    manifest.identifiability = identifiability(&draft, purpose_seed(seed, "identifiability"))?;
     manifest.self_test.frequencies_hz = held_out.frequencies_hz.row(0).iter().copied().collect();
     let exact = held_out.shapes.first();
     manifest.self_test.shapes =
@@ -397,63 +489,6 @@ pub fn observe(
         observation
     };
     rows(&set.frequencies_hz).into_iter().zip(&set.effect_sizes).enumerate().map(one).collect()
-}
-
-/// Measures a model on held-out pairs: mean log-density of the truth, R² of posterior means and samples, inverse error of
-/// the flow. `theta`: `[n, d]`, the truths of the n observations.
-///
-/// Source: Wang et al. (2025), Fig. 8.
-///
-/// # Errors
-/// [`InferenceError`] when a draw is not finite.
-pub fn validate(
-    baseline: &Baseline,
-    theta: &DMatrix<f64>,
-    observations: &[Observation],
-    seed: u64,
-) -> Result<ValidationRecord, InferenceError> {
-    let count = observations.len();
-    let losses: Vec<f64> = baseline.log_density_unit_box(theta, observations)?.iter().map(|log_q| -log_q).collect();
-    let samples = baseline.infer(observations, HELD_OUT_DRAWS, seed)?;
-    let means = samples.means();
-    let validation = |(column, parameter): (usize, &Parameter)| {
-        let truth: Vec<f64> = theta.column(column).iter().copied().collect();
-        let mean: Vec<f64> = means.column(column).iter().copied().collect();
-        let single: Vec<f64> = samples.column(column).into_iter().step_by(HELD_OUT_DRAWS).collect();
-        let all = samples.column(column);
-        let errors: Vec<f64> = all.iter().enumerate().map(|(i, x)| (x - truth[i / HELD_OUT_DRAWS]).abs()).collect();
-        ParameterValidation {
-            name: parameter.name.clone(),
-            r_squared_mean: stats::r_squared(&truth, &mean),
-            r_squared_single: stats::r_squared(&truth, &single),
-            error_quantile_999: stats::quantile(&errors, 0.999),
-        }
-    };
-    Ok(ValidationRecord {
-        samples: count,
-        negative_log_likelihood: stats::mean(&losses),
-        negative_log_likelihood_error: stats::sample_std(&losses).unwrap_or(f64::NAN) / (count as f64).sqrt(),
-        parameters: baseline.space().iter().enumerate().map(validation).collect(),
-        inverse_error: inverse_error(baseline, theta, observations)?,
-    })
-}
-
-/// Error of the numerical inverse of the flow: largest |u − u'| after x → z → x', where u is the position in the training box.
-fn inverse_error(
-    baseline: &Baseline,
-    theta: &DMatrix<f64>,
-    observations: &[Observation],
-) -> Result<f64, InferenceError> {
-    if baseline.starts_at_fit() {
-        return inverse_error_from_fit(baseline, theta, observations);
-    }
-    let x = to_real_line(theta, &baseline.training_space)?.to_dtype(DType::F32)?;
-    let context = baseline.condition(observations)?;
-    let (z, _) = baseline.flow.forward(&x, &context)?;
-    let back = baseline.flow.inverse(&z, &context)?;
-    let unit = |t: &Tensor| t.to_dtype(DType::F64)?.flatten_all()?.to_vec1::<f64>();
-    let pairs = unit(&x)?.into_iter().zip(unit(&back.0)?);
-    Ok(pairs.map(|(a, b)| (logistic(a) - logistic(b)).abs()).fold(0.0, f64::max))
 }
 
 /// Rows of a matrix.

@@ -182,6 +182,16 @@ impl<'a> WarmStart<'a> {
         settings: &TrainSettings,
         on_epoch: impl FnMut(EpochReport),
     ) -> Result<Trained, Error> {
+        self.prepare(simulator, samples, settings)?.train(simulator, settings, on_epoch)
+    }
+
+    /// A flow with the weights of the parent, and all that its training needs.
+    pub(super) fn prepare(
+        &self,
+        simulator: &Simulator,
+        samples: usize,
+        settings: &TrainSettings,
+    ) -> Result<Prepared, Error> {
         let of_parent = self.parent.manifest();
         // Without noise the range is not used.
         let noise_range = of_parent.conditions.noise_range.unwrap_or(super::observation::DEFAULT_NOISE_RANGE);
@@ -205,7 +215,7 @@ impl<'a> WarmStart<'a> {
         };
         let (flow, weights) = inherited_flow(&self.parent.flow, &architecture, &inputs)?;
         let (whitening, parent) = (of_parent.whitening.clone(), Some(self.parent.digest().clone()));
-        Prepared { flow, weights, space, conditions, whitening, training, parent }.train(simulator, settings, on_epoch)
+        Ok(Prepared { flow, weights, space, conditions, whitening, training, parent })
     }
 }
 

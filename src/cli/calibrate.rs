@@ -8,7 +8,7 @@ use clap::Args;
 use super::model::load;
 use super::output::write_whole;
 use crate::baseline::calibration::{calibrate as measure, cell_title, CellRanks, DRAWS};
-use crate::baseline::manifest::CalibrationRecord;
+use crate::baseline::manifest::{CalibrationRecord, Outcome};
 use crate::baseline::train::renew;
 use crate::baseline::Baseline;
 use crate::plot::{escaped, page, table, Line, Plot};
@@ -40,7 +40,7 @@ pub struct CalibrateArgs {
 /// Measures and prints the calibration.
 ///
 /// # Errors
-/// An invalid trained model, a file that cannot be written, a calibration that fails.
+/// An invalid trained model, a file that cannot be written, a model that is overconfident.
 pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     let mut baseline = load(&args.structure, args.model.as_deref())?;
     if let Some(path) = args.model.as_deref().filter(|_| args.renew) {
@@ -58,18 +58,30 @@ pub fn calibrate(args: &CalibrateArgs) -> anyhow::Result<()> {
     } else {
         print(&record);
     }
-    anyhow::ensure!(record.passed(), "the calibration failed: {}", record.failures.join("; "));
+    let epochs = 2 * baseline.manifest().training.settings.epochs;
+    anyhow::ensure!(
+        record.outcome() < Outcome::Overconfident,
+        "the model is overconfident: {} of its intervals are too narrow or misplaced. Next: modalwatch train --structure {} --epochs {epochs} \
+         --rounds 4{}",
+        record.failures.len(),
+        args.structure,
+        args.model.as_deref().and_then(|path| path.parent()).map(|out| format!(" --out {}", out.display())).unwrap_or_default()
+    );
     Ok(())
 }
 
 const HEADER: [&str; 6] =
-    ["noise and modes", "parameter", "90 % covers", "50 % covers", "ranks uniform, p", "TARP uniform, p"];
+    ["measured", "parameter", "in 90 % interval", "in 50 % interval", "ranks even, p", "together even, p"];
+
+const LEGEND: &str = "The third and fourth column are the shares of the true values inside the 90 % and 50 % intervals. The last two are the \
+    probabilities that a right model shows a less even distribution: of the place of the true value among the samples of the parameter, and \
+    of its place in the uncertainty of all parameters together (TARP). Small values mean that something is wrong.";
 
 fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
     let cell_rows = record.cells.iter().flat_map(|cell| {
         cell.parameters.iter().map(move |p| {
             vec![
-                cell_title(cell.noise_multiple, cell.missing_mode, cell.without_shapes),
+                cell_title(cell),
                 p.name.clone(),
                 format!("{:.3}", p.coverage_90),
                 format!("{:.3}", p.coverage_50),
@@ -83,29 +95,41 @@ fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
 
 fn print(record: &CalibrationRecord) {
     println!(
-        "{:>30} {:>12} {:>12} {:>12} {:>17} {:>16}",
+        "{:>36} {:>12} {:>16} {:>16} {:>14} {:>16}",
         HEADER[0], HEADER[1], HEADER[2], HEADER[3], HEADER[4], HEADER[5]
     );
     for row in rows(record) {
-        println!("{:>30} {:>12} {:>12} {:>12} {:>17} {:>16}", row[0], row[1], row[2], row[3], row[4], row[5]);
+        println!("{:>36} {:>12} {:>16} {:>16} {:>14} {:>16}", row[0], row[1], row[2], row[3], row[4], row[5]);
     }
-    if record.passed() {
-        println!(
-            "passed: {} cells of {} simulations, {} draws each",
-            record.cells.len(),
-            record.simulations,
-            record.draws
-        );
+    println!("{LEGEND}");
+    let (cells, simulations, draws) = (record.cells.len(), record.simulations, record.draws);
+    match record.outcome() {
+        Outcome::Passed => {
+            println!("passed: {cells} situations of {simulations} simulated measurements, {draws} samples each");
+        }
+        Outcome::Cautious => {
+            println!("cautious: intervals are too wide somewhere and nowhere too narrow; the service uses this model");
+        }
+        Outcome::Overconfident => println!("overconfident: intervals are too narrow or misplaced somewhere"),
+    }
+    for reason in record.reasons() {
+        println!("  {reason}.");
     }
 }
 
 fn html(baseline: &Baseline, record: &CalibrationRecord, ranks: &[CellRanks]) -> String {
-    let verdict = if record.passed() {
-        "<p>Passed: 90 % intervals cover about 90 % in every cell, ranks and TARP are uniform.</p>".to_owned()
-    } else {
-        let items: Vec<String> = record.failures.iter().map(|f| format!("<li>{}</li>", escaped(f))).collect();
-        format!("<p class=\"bad\">Failed: the service does not use this model unless its digest is accepted in the configuration.</p><ul>{}</ul>", items.concat())
+    let items: Vec<String> = record.reasons().map(|reason| format!("<li>{}</li>", escaped(reason))).collect();
+    let items = items.concat();
+    let verdict = match record.outcome() {
+        Outcome::Passed => "<p>Passed: the intervals hold the stated share of the true values in every situation.</p>".to_owned(),
+        Outcome::Cautious => format!(
+            "<p>Cautious: intervals are too wide somewhere and nowhere too narrow. The service uses this model.</p><ul>{items}</ul>"
+        ),
+        Outcome::Overconfident => format!(
+            "<p class=\"bad\">Overconfident: the service does not use this model unless its digest is accepted in the configuration.</p><ul>{items}</ul>"
+        ),
     };
+    let verdict = format!("{verdict}<p>{LEGEND}</p>");
     let names: Vec<String> = baseline.space().iter().map(|p| p.name.clone()).collect();
     let plots: String = ranks.iter().map(|cell| plot(cell, &names).svg()).collect();
     let explain = "<p>Each line shows the share of simulations whose true value has at most this rank among the posterior draws, \
@@ -142,13 +166,13 @@ fn plot(cell: &CellRanks, names: &[String]) -> Plot {
     let parameters = names.iter().zip(&cell.ranks);
     let mut lines: Vec<Line> =
         parameters.map(|(name, ranks)| Line { name: name.clone(), points: difference(ranks) }).collect();
-    lines.push(Line { name: "TARP".to_owned(), points: difference(&cell.tarp_ranks) });
+    lines.push(Line { name: "all together".to_owned(), points: difference(&cell.tarp_ranks) });
     // 99 % quantile of the largest deviation of an empirical distribution by Kolmogorov: 1.63/√n.
     let width = 1.63 / (cell.tarp_ranks.len() as f64).sqrt();
     Plot {
         title: cell.title.clone(),
         x_label: "rank / number of draws".to_owned(),
-        y_label: "difference from uniform".to_owned(),
+        y_label: "share minus the right share".to_owned(),
         lines,
         band: vec![(0.0, -width, width), (1.0, -width, width)],
         ..Plot::default()

@@ -10,7 +10,7 @@ use super::model::present_model;
 use super::next::join;
 use super::output::write_whole;
 use super::tables::{read_tables, TableArgs, Tables};
-use super::training::{print_record, train_extension_into};
+use super::training::{print_record, refuse_overconfident, train_extension_into};
 use crate::baseline::extension::ExtensionPlan;
 use crate::baseline::library::find_structure;
 use crate::discrepancy::chance::{cases, times_less};
@@ -239,8 +239,12 @@ pub fn extend(args: &ExtendArgs) -> anyhow::Result<()> {
         seed: args.study.seed,
     };
     let trained = train_extension_into(&args.out, &extension, &plan)?;
-    print_record(trained.baseline.manifest());
-    Ok(())
+    let manifest = trained.baseline.manifest();
+    print_record(manifest);
+    let (folder, epochs) = (args.out.display(), 2 * manifest.training.settings.epochs);
+    let next =
+        format!("modalwatch train --structure {folder}/structure.json --out {folder} --epochs {epochs} --rounds 4");
+    refuse_overconfident(manifest, &next)
 }
 
 fn print(d: &Diagnosis) {

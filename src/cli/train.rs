@@ -7,10 +7,11 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::output::write_whole;
-use super::training::{print_record, sizes, train_into};
+use super::training::{print_record, refuse_overconfident, sizes, train_into, Recipe};
 use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::{find_structure, read_structure_file};
-use crate::baseline::manifest::ValidationRecord;
+use crate::baseline::manifest::{Manifest, Outcome, ValidationRecord};
+use crate::baseline::rounds::MOST_ROUNDS;
 use crate::baseline::train::diverged;
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
@@ -35,6 +36,10 @@ pub struct TrainArgs {
     /// Number of coupling units of the network; more units represent more complex posteriors and take longer [default: 4]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=64))]
     units: Option<u16>,
+    /// Most rounds of training: after a round whose calibration does not pass, a shorter round follows [default: 4; 1 if --samples or
+    /// --epochs is given]
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=16))]
+    rounds: Option<u16>,
     /// Range of noise that the trained model must cover, as multiples of the noise of the structure
     #[arg(long, value_name = "LOW,HIGH", value_parser = noise_range, default_value = "0.1,5")]
     noise_range: NoiseRange,
@@ -49,7 +54,8 @@ pub struct TrainArgs {
 /// Trains the model, writes its files and prints its validation.
 ///
 /// # Errors
-/// An invalid structure file, a training that fails, a folder that cannot be written.
+/// An invalid structure file, a training that fails, a folder that cannot be written; a model that is overconfident, after its files
+/// are written.
 pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let simulator = find_structure(&args.structure)?;
     let out = args.out.clone().unwrap_or_else(|| PathBuf::from("models").join(simulator.id().as_str()));
@@ -86,7 +92,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     let mut flow = FlowSettings::default();
     flow.units = args.units.map_or(flow.units, usize::from);
     let started = Instant::now();
-    let trained = train_into(&out, &simulator, samples, args.noise_range, &flow, &settings)?;
+    let as_given = args.samples.is_some() || args.epochs.is_some();
+    let rounds = args.rounds.map_or(if as_given { 1 } else { MOST_ROUNDS }, usize::from);
+    let recipe = Recipe { samples, noise_range: args.noise_range, flow, settings, rounds };
+    let trained = train_into(&out, &simulator, &recipe)?;
     let seconds = started.elapsed().as_secs_f64();
 
     // `serve --models` only finds folders that contain the structure.
@@ -99,10 +108,10 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         let report = serde_json::json!({
             "structure": manifest.structure, "model_digest": trained.baseline.digest(), "out": out,
             "seconds": seconds, "training": manifest.training, "validation": manifest.validation,
-            "calibration": manifest.calibration, "identifiability": manifest.identifiability,
+            "outcome": manifest.calibration.outcome(), "calibration": manifest.calibration, "identifiability": manifest.identifiability,
         });
         println!("{}", serde_json::to_string_pretty(&report)?);
-        return Ok(());
+        return refuse_overconfident(manifest, &again(args, &out, manifest));
     }
     println!("Trained {} in {seconds:.1} s: {}", simulator.id(), out.join("baseline.safetensors").display());
     println!("model digest {}", trained.baseline.digest());
@@ -114,7 +123,37 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
             manifest.training.best_epoch
         );
     }
+    if !simulator.is_noisy() {
+        // Posteriors of exact data are points: no further training helps.
+        let path = &args.structure;
+        let next = format!(
+            "state measurement_noise in {path}, then modalwatch train --structure {path} --out {}",
+            out.display()
+        );
+        return refuse_overconfident(manifest, &next);
+    }
+    let again = again(args, &out, manifest);
+    match manifest.calibration.outcome() {
+        Outcome::Passed => {}
+        Outcome::Cautious => println!("for narrower intervals: {again}"),
+        Outcome::Overconfident => return refuse_overconfident(manifest, &again),
+    }
+    if let Some(models) = out.parent() {
+        let models = if models.as_os_str().is_empty() { std::path::Path::new(".") } else { models };
+        println!("next: modalwatch serve --models {}", models.display());
+    }
     Ok(())
+}
+
+/// The command that trains a larger network for longer.
+fn again(args: &TrainArgs, out: &std::path::Path, manifest: &Manifest) -> String {
+    let units = (2 * manifest.architecture.units).min(64);
+    let epochs = 2 * manifest.training.settings.epochs;
+    format!(
+        "modalwatch train --structure {} --out {} --units {units} --epochs {epochs} --rounds {MOST_ROUNDS}",
+        args.structure,
+        out.display()
+    )
 }
 
 fn noise_range(text: &str) -> Result<NoiseRange, String> {
@@ -127,15 +166,17 @@ fn noise_range(text: &str) -> Result<NoiseRange, String> {
 
 fn print_validation(validation: &ValidationRecord) {
     println!(
-        "held-out negative log-likelihood in the unit box {:.2} ± {:.2} nats over {} pairs, inverse error {:.1e}",
-        validation.negative_log_likelihood,
-        validation.negative_log_likelihood_error,
+        "{} simulated measurements that the training did not use: the density of the true values is on average {:.2} ± {:.2} nats above \
+         that of the prior (higher is better); the network inverts itself to {:.1e} of the prior's width",
         validation.samples,
+        -validation.negative_log_likelihood,
+        validation.negative_log_likelihood_error,
         validation.inverse_error
     );
-    println!("{:>16} {:>10} {:>10} {:>24}", "parameter", "R² mean", "R² single", "99.9 % of errors below");
+    println!("share of the variance of the true values that the answers explain (R², 1 is best), and the error that 99.9 % of the samples stay below:");
+    println!("{:>16} {:>12} {:>14} {:>14}", "parameter", "R² of means", "R² of samples", "error");
     for p in &validation.parameters {
         let (mean, single, quantile) = (p.r_squared_mean, p.r_squared_single, p.error_quantile_999);
-        println!("{:>16} {mean:>10.6} {single:>10.6} {quantile:>24.4}", p.name);
+        println!("{:>16} {mean:>12.6} {single:>14.6} {quantile:>14.4}", p.name);
     }
 }

@@ -8,9 +8,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::output::write_whole;
 use crate::baseline::conditions::NoiseRange;
 use crate::baseline::extension::{ExtensionPlan, Progress};
-use crate::baseline::manifest::Manifest;
-use crate::baseline::train::{default_epochs, default_samples, train, Trained};
-use crate::flow::train::{EpochReport, TrainSettings};
+use crate::baseline::manifest::{Manifest, Outcome};
+use crate::baseline::rounds::train_in_rounds;
+use crate::baseline::train::{default_epochs, default_samples, Trained};
+use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
 use crate::simulator::Simulator;
 
@@ -19,21 +20,31 @@ pub fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize
     (samples.unwrap_or_else(|| default_samples(simulator)), epochs.unwrap_or_else(|| default_epochs(simulator)))
 }
 
-/// Trains with a progress bar and writes the two files of the trained model to the folder `out`.
+/// How a model is trained.
+pub struct Recipe {
+    /// Number of simulated pairs.
+    pub samples: usize,
+    /// Noise that the model must cover.
+    pub noise_range: NoiseRange,
+    /// Size of the network.
+    pub flow: FlowSettings,
+    /// Epochs of the first round, and the seed.
+    pub settings: TrainSettings,
+    /// Most rounds.
+    pub rounds: usize,
+}
+
+/// Trains with a progress bar until the calibration passes or stops improving, and writes the two files of the trained model to the
+/// folder `out`.
 ///
 /// # Errors
 /// A training that fails, a folder that cannot be written.
-pub fn train_into(
-    out: &Path,
-    simulator: &Simulator,
-    samples: usize,
-    noise_range: NoiseRange,
-    flow: &FlowSettings,
-    settings: &TrainSettings,
-) -> anyhow::Result<Trained> {
+pub fn train_into(out: &Path, simulator: &Simulator, recipe: &Recipe) -> anyhow::Result<Trained> {
     let bar = progress_bar()?;
-    let trained =
-        train(simulator, samples, noise_range, flow, settings, |epoch| advance(&bar, epoch, settings.epochs))?;
+    let Recipe { samples, noise_range, flow, settings, rounds } = recipe;
+    let trained = train_in_rounds(simulator, *samples, *noise_range, flow, settings, *rounds, &mut |progress| {
+        show(&bar, progress);
+    })?;
     bar.finish_and_clear();
     write_files(out, &trained)?;
     Ok(trained)
@@ -46,10 +57,7 @@ pub fn train_into(
 /// A training that fails, a folder that cannot be written.
 pub fn train_extension_into(out: &Path, simulator: &Simulator, plan: &ExtensionPlan<'_>) -> anyhow::Result<Trained> {
     let bar = progress_bar()?;
-    let trained = plan.train(simulator, &mut |progress| match progress {
-        Progress::Start(how) => bar.suspend(|| println!("{how}")),
-        Progress::Epoch { report, epochs } => advance(&bar, report, epochs),
-    })?;
+    let trained = plan.train(simulator, &mut |progress| show(&bar, progress))?;
     bar.finish_and_clear();
     write_files(out, &trained)?;
     Ok(trained)
@@ -61,10 +69,20 @@ fn progress_bar() -> anyhow::Result<ProgressBar> {
     Ok(ProgressBar::new(0).with_style(style))
 }
 
-fn advance(bar: &ProgressBar, epoch: EpochReport, epochs: usize) {
-    bar.set_length(epochs as u64);
-    bar.set_message(format!("loss {:.3}, validation {:.3}", epoch.loss, epoch.validation_loss));
-    bar.set_position(epoch.epoch as u64);
+/// Shows what a training is doing. Sentences go to standard error, so that they stand above the bar and not in a JSON result.
+fn show(bar: &ProgressBar, progress: Progress) {
+    match progress {
+        Progress::Start(sentence) | Progress::Round(sentence) => bar.suspend(|| eprintln!("{sentence}")),
+        Progress::Calibration { round } => bar.set_message(format!("measuring the calibration after round {round}")),
+        Progress::Epoch { report, epochs } => {
+            bar.set_length(epochs as u64);
+            bar.set_message(format!(
+                "misfit {:.3}, on other simulations {:.3} (lower is better)",
+                report.loss, report.validation_loss
+            ));
+            bar.set_position(report.epoch as u64);
+        }
+    }
 }
 
 fn write_files(out: &Path, trained: &Trained) -> anyhow::Result<()> {
@@ -72,7 +90,7 @@ fn write_files(out: &Path, trained: &Trained) -> anyhow::Result<()> {
     write_whole(&out.join("baseline.json"), &trained.manifest_json)
 }
 
-/// Prints the identifiability and the calibration of a trained model.
+/// Prints what the modes determine, and the calibration.
 pub fn print_record(manifest: &Manifest) {
     for p in &manifest.identifiability.parameters {
         let (name, left) = (&p.name, 100.0 * p.variance_left);
@@ -85,14 +103,37 @@ pub fn print_record(manifest: &Manifest) {
         println!("the modes cannot distinguish these parameters: {}", group.join(", "));
     }
     let calibration = &manifest.calibration;
-    if calibration.passed() {
-        println!("calibration passed in {} cells of {} simulations", calibration.cells.len(), calibration.simulations);
-        return;
+    let (cells, simulations) = (calibration.cells.len(), calibration.simulations);
+    match calibration.outcome() {
+        Outcome::Passed => println!(
+            "calibration passed: the intervals hold the stated share of the true values in {cells} situations of {simulations} \
+             simulated measurements each"
+        ),
+        Outcome::Cautious => println!(
+            "calibration cautious: some intervals are wider than they need to be and none is too narrow; the service uses this model"
+        ),
+        Outcome::Overconfident => println!(
+            "calibration overconfident: some intervals are too narrow; the service does not use this model unless \
+             monitor.accept_uncalibrated lists its digest"
+        ),
     }
-    println!(
-        "CALIBRATION FAILED: the service does not use this model unless monitor.accept_uncalibrated lists its digest"
+    for reason in calibration.reasons() {
+        println!("  {reason}.");
+    }
+    if !manifest.spread.is_empty() {
+        println!("the spread of the network's own samples is adjusted by factors learned on further simulations");
+    }
+}
+
+/// Fails for a model whose intervals are too narrow; `next` is the command to type then.
+///
+/// # Errors
+/// The outcome `overconfident`, with the next command.
+pub fn refuse_overconfident(manifest: &Manifest, next: &str) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        manifest.calibration.outcome() < Outcome::Overconfident,
+        "the model is overconfident: {} of its intervals are too narrow or misplaced. Next: {next}",
+        manifest.calibration.failures.len()
     );
-    for failure in &calibration.failures {
-        println!("  {failure}");
-    }
+    Ok(())
 }

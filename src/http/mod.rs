@@ -42,8 +42,8 @@ mod tests;
 mod tokens;
 #[cfg(feature = "otel")]
 mod traceparent;
-mod verdict;
 mod upload;
+mod verdict;
 mod views;
 mod webhooks;
 

@@ -14,6 +14,7 @@ use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
 use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath};
 use super::shared::Shared;
 use crate::access::Grant;
+use crate::baseline::manifest::Outcome;
 use crate::measurement::check::Problem;
 use crate::monitor::stored::PutStructure;
 use crate::monitor::ActiveStructure;
@@ -58,6 +59,9 @@ struct ModelBody {
     training_samples: usize,
     validation: crate::baseline::manifest::ValidationRecord,
     conditions: crate::baseline::conditions::Conditions,
+    /// What the calibration says about the use of the model: `passed`; `cautious`, where intervals are too wide somewhere and nowhere too
+    /// narrow; `overconfident`, where they are too narrow somewhere and the model is used only because it was accepted.
+    calibration_outcome: Outcome,
     calibration: crate::baseline::manifest::CalibrationRecord,
 }
 
@@ -76,6 +80,8 @@ struct ListedStructure {
     batches: u64,
     last_measured_at: Option<Timestamp>,
     model_digest: Option<String>,
+    /// Outcome of the calibration of the model in use.
+    calibration_outcome: Option<Outcome>,
     /// Why this version of the program does not accept the stored definition.
     #[serde(skip_serializing_if = "Option::is_none")]
     definition_refused: Option<String>,
@@ -93,9 +99,11 @@ struct ListedStructure {
 pub async fn list(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
     let mut items = Vec::new();
     for summary in shared.monitor.records().structures().await?.into_iter().filter(|s| grant.may_see(&s.id)) {
-        let active = shared.monitor.structure(&summary.id);
+        let baseline =
+            shared.monitor.structure(&summary.id).ok().and_then(|active| active.baseline.as_ref().ok().cloned());
         items.push(ListedStructure {
-            model_digest: active.ok().and_then(|it| Some(it.baseline.as_ref().ok()?.digest().to_string())),
+            model_digest: baseline.as_ref().map(|baseline| baseline.digest().to_string()),
+            calibration_outcome: baseline.as_ref().map(|baseline| baseline.manifest().calibration.outcome()),
             definition_refused: shared.monitor.structures().refused().get(&summary.id).cloned(),
             id: summary.id,
             digest: summary.digest.to_string(),
@@ -208,6 +216,7 @@ fn body(id: &StructureId, active: &ActiveStructure, undamaged: Option<super::ans
         training_samples: baseline.manifest().training.samples,
         validation: baseline.manifest().validation.clone(),
         conditions: baseline.manifest().conditions.clone(),
+        calibration_outcome: baseline.manifest().calibration.outcome(),
         calibration: baseline.manifest().calibration.clone(),
     });
     let emulator = active.simulator.table().map(|table| {

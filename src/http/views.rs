@@ -54,8 +54,12 @@ struct OverviewItem {
     model_digest: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
+    /// False for a model that is overconfident.
     #[schema(required)]
     calibration_passed: Option<bool>,
+    /// Outcome of the calibration of the model in use.
+    #[schema(required)]
+    calibration_outcome: Option<crate::baseline::manifest::Outcome>,
     #[schema(required)]
     undamaged_version: Option<u32>,
 }
@@ -170,7 +174,8 @@ fn item(Judged { found, model, verdict }: Judged) -> OverviewItem {
         waiting_batches: found.waiting,
         model_digest: baseline.map(|b| b.digest().to_string()),
         model_missing: model_missing.cloned(),
-        calibration_passed: baseline.map(|b| b.manifest().calibration.passed()),
+        calibration_passed: baseline.map(|b| b.manifest().calibration.failures.is_empty()),
+        calibration_outcome: baseline.map(|b| b.manifest().calibration.outcome()),
         latest: found.latest.map(latest),
         id: found.id,
         open_alarms: found.open_alarms,

@@ -7,12 +7,15 @@ use tracing::{error, warn};
 
 use super::error::Error;
 use super::events::Events;
+use super::reason::Reason;
 use crate::baseline::library::Library;
+use crate::baseline::manifest::Outcome;
 use crate::baseline::Baseline;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::{NewVersion, PutStructure, Store};
+use crate::trust::calibration_in_words;
 
 /// What to do where a structure has no trained baseline.
 const TRAIN: &str =
@@ -153,6 +156,9 @@ impl ActiveStructures {
     /// Puts a structure into use, in place of its present version if there is one.
     pub(super) fn activate(&self, simulator: Simulator, baseline: Result<Arc<Baseline>, String>) {
         let id = simulator.id().clone();
+        if let Ok(baseline) = &baseline {
+            warn_of_calibration(&id, baseline);
+        }
         let active = Arc::new(ActiveStructure { simulator, baseline });
         self.active.write().expect("no holder of this lock panics").insert(id, active);
     }
@@ -165,6 +171,7 @@ impl ActiveStructures {
         if present.simulator.digest() != expected.simulator.digest() {
             return Err(Error::VersionChanged(structure.clone()));
         }
+        warn_of_calibration(structure, &baseline);
         let swapped = ActiveStructure { simulator: present.simulator.clone(), baseline: Ok(baseline) };
         all.insert(structure.clone(), Arc::new(swapped));
         Ok(())
@@ -216,21 +223,52 @@ impl ActiveStructures {
         self.usable(&baseline).map(|()| baseline)
     }
 
-    /// Whether a trained baseline passed its calibration or is accepted by configuration; otherwise why it may not be used.
+    /// Whether a trained baseline is not overconfident or is accepted by configuration; otherwise why it may not be used.
     pub(super) fn usable(&self, baseline: &Baseline) -> Result<(), String> {
-        let failures = &baseline.manifest().calibration.failures;
+        let calibration = &baseline.manifest().calibration;
         let digest = baseline.digest().as_str();
-        if failures.is_empty() || self.accept_uncalibrated.iter().any(|accepted| accepted == digest) {
+        if calibration.outcome() < Outcome::Overconfident
+            || self.accept_uncalibrated.iter().any(|accepted| accepted == digest)
+        {
             return Ok(());
         }
         Err(format!(
-            "the trained baseline failed its calibration ({}): train again with more samples or epochs; to use it nevertheless, \
-             add its digest {digest} to monitor.accept_uncalibrated, and every assessment then has a finding about it",
-            failures.join("; ")
+            "the trained baseline failed its calibration: it is overconfident ({}): train it again with `modalwatch train`, with a larger --epochs or --units; to \
+             use it nevertheless, add its digest {digest} to monitor.accept_uncalibrated, and every assessment then has a finding \
+             about it",
+            calibration.failures.join("; ")
         ))
+    }
+
+    /// Findings for `/readyz`: baselines in use that did not pass their calibration, each with what this means.
+    pub(super) fn calibration_findings(&self) -> Vec<Reason> {
+        let of = |(id, active): (&StructureId, &Arc<ActiveStructure>)| {
+            let baseline = active.baseline.as_ref().ok()?;
+            let (code, message) = doubtful_calibration(id, baseline)?;
+            Some(Reason::new(code, message))
+        };
+        self.read().iter().filter_map(of).collect()
     }
 
     fn read(&self) -> RwLockReadGuard<'_, BTreeMap<StructureId, Arc<ActiveStructure>>> {
         self.active.read().expect("no holder of this lock panics")
+    }
+}
+
+/// Code and sentence of a finding about a baseline that did not pass its calibration; `None` for one that passed.
+fn doubtful_calibration(structure: &StructureId, baseline: &Baseline) -> Option<(&'static str, String)> {
+    let calibration = &baseline.manifest().calibration;
+    let code = match calibration.outcome() {
+        Outcome::Passed => return None,
+        Outcome::Cautious => "model_cautious",
+        Outcome::Overconfident => "model_overconfident",
+    };
+    Some((code, format!("{structure}: {}", calibration_in_words(calibration)?)))
+}
+
+/// Logs a baseline that is put into use although it did not pass its calibration.
+fn warn_of_calibration(structure: &StructureId, baseline: &Baseline) {
+    if let Some((code, message)) = doubtful_calibration(structure, baseline) {
+        warn!(structure.id = %structure, model.digest = %baseline.digest(), finding = code, "Model of {message}");
     }
 }

@@ -113,6 +113,7 @@ impl Upkeep {
         for refusal in self.structures.library().refusals() {
             findings.push(Reason::new("model_refused", format!("{}: {}", refusal.file, refusal.reason)));
         }
+        findings.extend(self.structures.calibration_findings());
         for (structure, reason) in self.structures.refused() {
             let message = format!("structure {structure} is not monitored: {reason}");
             findings.push(Reason::new("definition_refused", message));

@@ -11,5 +11,5 @@ mod standing;
 mod verdict;
 
 pub use finding::{Finding, FindingCode, FindingEffect};
-pub use standing::standing_findings;
+pub use standing::{calibration_in_words, standing_findings};
 pub use verdict::{Trust, TrustVerdict};

@@ -1,22 +1,39 @@
 //! Findings that hold for every batch of a trained baseline.
 
 use super::finding::{Finding, FindingCode, FindingEffect};
+use crate::baseline::manifest::{CalibrationRecord, Outcome};
 use crate::baseline::Baseline;
 
 /// Failures of a calibration that a finding quotes.
 const SHOWN_FAILURES: usize = 3;
 
-/// Findings about the trained baseline itself: a failed calibration, parameters that it cannot distinguish, a doubtful emulator.
+/// What a calibration that did not pass means for the answers, with a few of its reasons; `None` for one that passed.
+pub fn calibration_in_words(record: &CalibrationRecord) -> Option<String> {
+    let (meaning, reasons) = match record.outcome() {
+        Outcome::Passed => return None,
+        Outcome::Cautious => (
+            "the trained baseline in use is cautious: some intervals are wider than they need to be, and none is too narrow",
+            &record.cautions,
+        ),
+        Outcome::Overconfident => (
+            "the trained baseline in use is overconfident: some intervals are too narrow, and it is used only because it was accepted",
+            &record.failures,
+        ),
+    };
+    // A flow that was trained far too short fails in dozens of places; a few of them are enough to read.
+    let some = reasons.iter().take(SHOWN_FAILURES).cloned().collect::<Vec<_>>().join("; ");
+    let more = reasons.len().saturating_sub(SHOWN_FAILURES);
+    let more = if more > 0 { format!("; and {more} more, see its manifest") } else { String::new() };
+    Some(format!("{meaning}: {some}{more}"))
+}
+
+/// Findings about the trained baseline itself: overconfidence, parameters that it cannot distinguish, a doubtful emulator.
 pub fn standing_findings(baseline: &Baseline) -> Vec<Finding> {
     let record = &baseline.manifest().calibration;
-    let uncalibrated = (!record.passed()).then(|| {
-        // A flow that was trained far too short fails in dozens of places; a few of them are enough to read.
-        let some = record.failures.iter().take(SHOWN_FAILURES).cloned().collect::<Vec<_>>().join("; ");
-        let more = record.failures.len().saturating_sub(SHOWN_FAILURES);
-        let more = if more > 0 { format!("; and {more} more, see its manifest") } else { String::new() };
-        let message = format!("the trained baseline in use failed its calibration: {some}{more}");
-        Finding::new(FindingCode::Uncalibrated, FindingEffect::Note, message)
-    });
+    let overconfident = record.outcome() == Outcome::Overconfident;
+    let uncalibrated = calibration_in_words(record)
+        .filter(|_| overconfident)
+        .map(|message| Finding::new(FindingCode::Uncalibrated, FindingEffect::Note, message));
     let grouped = baseline.groups().into_iter().map(|group| {
         let names: Vec<&str> = group.columns.iter().map(|&k| baseline.space().as_slice()[k].name.as_str()).collect();
         let message = format!(

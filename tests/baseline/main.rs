@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod forty;
+mod outcome;
 mod warm;
 
 use std::path::Path;
@@ -239,7 +241,8 @@ fn the_same_seed_gives_the_same_files_on_one_and_on_two_threads() {
             .env("RAYON_NUM_THREADS", threads)
             .output()
             .unwrap();
-        assert!(status.status.success(), "{}", String::from_utf8_lossy(&status.stderr));
+        // A model that was trained so briefly is overconfident: exit status 1, after its files are written.
+        assert!(status.status.code().is_some_and(|code| code <= 1), "{}", String::from_utf8_lossy(&status.stderr));
         ["baseline.safetensors", "baseline.json"].map(|file| std::fs::read(out.join(file)).unwrap())
     };
     let one = train("one", "1", "3");

@@ -16,5 +16,5 @@ mod helpers;
 mod needs;
 mod rejected;
 mod sign_in;
-mod verdict;
 mod upload;
+mod verdict;

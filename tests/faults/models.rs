@@ -179,4 +179,36 @@ async fn a_model_that_failed_its_calibration_is_used_only_if_its_digest_is_accep
         let codes = answer["assessment"]["findings"].as_array().unwrap().iter().map(|f| &f["code"]);
         assert!(codes.into_iter().any(|code| code == "uncalibrated"), "{answer}");
     }
+    assert_eq!(finding_about_the_model(&service).await, ["model_overconfident"]);
+    let structure = service.read("/v1/structures/three-dof").await;
+    assert_eq!(structure["model"]["calibration_outcome"], "overconfident", "{structure}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_cautious_model_is_used_and_named() {
+    let caution = "The intervals of k1 are too wide when all modes are measured and the noise is the nominal one: 95 % of the true \
+                   values lie inside the 90 % intervals";
+    let change: Change = Box::new(move |f| manifest(f, |m| m["calibration"]["cautions"] = json!([caution])));
+    let models = models_with(&change);
+    let folder = tempfile::tempdir().unwrap();
+    let service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));
+    let (status, answer) = post(&service, &batch("usable", 0, 5)).await.unwrap();
+    assert_eq!((status, &answer["state"]), (201, &json!("assessed")), "{answer}");
+    assert_eq!(finding_about_the_model(&service).await, ["model_cautious"]);
+    let structure = service.read("/v1/structures/three-dof").await;
+    assert_eq!(structure["model"]["calibration_outcome"], "cautious", "{structure}");
+    assert_eq!(structure["model"]["calibration"]["cautions"], json!([caution]), "{structure}");
+    let list = service.read("/v1/structures").await;
+    let outcomes: Vec<(&Value, &Value)> =
+        list["items"].as_array().unwrap().iter().map(|item| (&item["id"], &item["calibration_outcome"])).collect();
+    assert!(outcomes.contains(&(&json!("three-dof"), &json!("cautious"))), "{list}");
+    assert!(outcomes.contains(&(&json!("rig"), &json!("passed"))), "{list}");
+}
+
+/// Codes of the findings of `/readyz` that name the model of three-dof.
+async fn finding_about_the_model(service: &Service) -> Vec<String> {
+    let ready = service.read("/readyz").await;
+    let findings = ready["findings"].as_array().unwrap().clone();
+    let about = findings.into_iter().filter(|finding| finding["message"].as_str().unwrap().starts_with("three-dof: "));
+    about.map(|finding| finding["code"].as_str().unwrap().to_owned()).collect()
 }

@@ -2,6 +2,7 @@
 
 use super::check::Check;
 use crate::baseline::library::Library;
+use crate::baseline::manifest::Outcome;
 use crate::baseline::Baseline;
 use crate::config::Config;
 use crate::simulator::definition::StructureDefinition;
@@ -67,13 +68,20 @@ pub fn trained(inspection: &Inspection) -> Vec<Check> {
 }
 
 fn calibrated(name: String, baseline: &Baseline, accepted: &[String]) -> Check {
-    let failures = &baseline.manifest().calibration.failures;
+    let calibration = &baseline.manifest().calibration;
     let digest = baseline.digest().as_str();
     let short = digest.get(..12).unwrap_or(digest);
-    if failures.is_empty() {
-        return Check::ok(name, format!("{short}… loads, passes its self-test and its calibration"));
+    match calibration.outcome() {
+        Outcome::Passed => {
+            return Check::ok(name, format!("{short}… loads, passes its self-test and its calibration"));
+        }
+        Outcome::Cautious => {
+            let found = format!("{short}… is cautious, and may be used: {}", calibration.cautions.join("; "));
+            return Check::warn(name, found, "train it again with more epochs for narrower intervals");
+        }
+        Outcome::Overconfident => {}
     }
-    let found = format!("{short}… failed its calibration: {}", failures.join("; "));
+    let found = format!("{short}… is overconfident: {}", calibration.failures.join("; "));
     if accepted.iter().any(|accepted| accepted == digest) {
         return Check::warn(
             name,

@@ -304,8 +304,8 @@ impl Jobs {
         Ok(serde_json::to_string(&result).expect("a result is plain data"))
     }
 
-    /// Returns true if a flow that failed its calibration is accepted by the request, and false if the flow passed; an error if the
-    /// flow may not be used.
+    /// Returns true if an overconfident flow is accepted by the request, and false if the flow may be used without that; an error if
+    /// the flow may not be used.
     fn accepted(&self, trained: &Trained, training: ExtensionTraining) -> Result<bool, String> {
         match self.structures.usable(&trained.baseline) {
             Ok(()) => Ok(false),
@@ -313,8 +313,9 @@ impl Jobs {
             Err(_) => {
                 let failures = &trained.baseline.manifest().calibration.failures;
                 Err(format!(
-                    "the new flow failed its calibration ({}): repeat the request with more samples or epochs; to use the flow \
-                     nevertheless, set \"accept_uncalibrated\" to true, and every assessment then has a finding about it",
+                    "the new flow failed its calibration: it is overconfident ({}): repeat the request with \"from_scratch\": true or a larger number of \
+                     \"epochs\"; to use the flow nevertheless, set \"accept_uncalibrated\" to true, and every assessment then has a \
+                     finding about it",
                     failures.join("; ")
                 ))
             }

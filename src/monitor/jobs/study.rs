@@ -132,6 +132,13 @@ impl Study {
             TrainingProgress::Epoch { report, epochs } => {
                 self.progress.report(&self.id, format!("training: epoch {} of {epochs}", report.epoch));
             }
+            TrainingProgress::Calibration { round } => {
+                self.progress.report(&self.id, format!("training: calibration of round {round}"));
+            }
+            TrainingProgress::Round(why) => {
+                info!(structure.id = %simulator.id(), diagnosis = %self.id, "Extension of {}: {why}", simulator.id());
+                self.progress.report(&self.id, format!("training: {why}"));
+            }
         });
         self.progress.report(&self.id, "switching");
         Ok(TrainedExtension { added, left_out, simulator, trained: trained.map_err(|e| e.to_string())? })
