@@ -1,6 +1,7 @@
 //! The result of a diagnosis.
 
 use serde::{Deserialize, Serialize};
+use std::fmt::Write as _;
 
 use super::describe::Cause;
 use super::fit::Fit;
@@ -160,7 +161,7 @@ impl Diagnosis {
         }
         if self.set_aside_rows > 0 {
             let rows = self.training_rows + self.holdout_rows;
-            text += &format!("In the {rows} measurements before: ");
+            let _ = write!(text, "In the {rows} measurements before: ");
         }
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {

@@ -99,7 +99,9 @@ impl Tested {
             }
             let left = dot(&own, &own);
             if left > INDEPENDENT * size {
-                own.iter_mut().for_each(|v| *v /= left.sqrt());
+                for v in own.iter_mut() {
+                    *v /= left.sqrt();
+                }
                 competitors.push(own);
             }
         }
