@@ -173,14 +173,13 @@ impl Data {
         let values = Values::Numbers(times_days.clone());
         columns.push(Column { name: TIME.to_owned(), origin: Origin::Time, values });
         let second = |m: &&ModalMeasurement| m.covariates.get(SECOND_INSTRUMENT).is_some_and(is_marked);
-        let content = serde_json::to_vec(&sorted).expect("measurements can be written as JSON");
         Self {
             settings,
             second_instrument: sorted.iter().map(second).collect(),
             hung,
             weighings,
             further,
-            digest: Digest::of(&[&content]),
+            digest: digest_of(&sorted),
             measured_at: sorted.iter().map(|m| m.measured_at).collect(),
             declared_undamaged: vec![false; sorted.len()],
             times_days,
@@ -268,6 +267,11 @@ impl Data {
             }
         }
     }
+}
+
+/// Digest of measurements in order of time.
+fn digest_of(sorted: &[&ModalMeasurement]) -> Digest {
+    Digest::of(&[&serde_json::to_vec(sorted).expect("measurements can be written as JSON")])
 }
 
 /// A number of days or rows: one decimal, none if it is whole.

@@ -16,6 +16,7 @@ use super::next::experiment::NextMeasurement;
 use super::outside::OutsideSetting;
 use super::rank::Ranked;
 use super::scatter::ExcessScatter;
+use super::sentence::capitalised;
 use crate::quantity::Digest;
 
 /// A cause with a probability above this is named alone.
@@ -242,10 +243,4 @@ impl Diagnosis {
             }
         }
     }
-}
-
-/// The text with a capital first letter.
-pub(super) fn capitalised(text: &str) -> String {
-    let mut rest = text.chars();
-    rest.next().map_or_else(String::new, |first| first.to_uppercase().chain(rest).collect())
 }

@@ -68,6 +68,7 @@ mod row;
 pub mod scatter;
 pub mod screen;
 pub mod select;
+mod sentence;
 mod setting_candidates;
 mod setting_starts;
 pub mod shapes;
@@ -88,7 +89,7 @@ use fit::Fit;
 use gain::Unseen;
 use grammar::candidates;
 use lasting::found::LastingChange;
-use lasting::usable::{Held, Split};
+use lasting::usable::{Held, Split, FEWEST_BESIDE_HOLDOUT};
 use lasting::Examined;
 use learned::offer::Offered;
 use misfit::{misfits, remainder};
@@ -101,10 +102,6 @@ use study::Study;
 
 /// Smallest number of rows that a verdict can be based on.
 pub const FEWEST_ROWS: usize = 8;
-
-/// Smallest number of rows that must remain for the search if others are held out; with fewer, none are held out, and the gain is
-/// measured by cross-validation.
-const FEWEST_BESIDE_HOLDOUT: usize = 30;
 
 /// Share of the rows that may have a setting outside its prior after all corrections without changing the verdict.
 const FEW_OUTSIDE: f64 = 0.05;

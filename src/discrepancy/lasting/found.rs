@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::discrepancy::chance::chance;
 use crate::discrepancy::data::Data;
 use crate::discrepancy::describe::rounded;
-use crate::discrepancy::diagnosis::capitalised;
+use crate::discrepancy::sentence::capitalised;
 use crate::quantity::Timestamp;
 
 /// Data over fewer years than this do not show whether a change comes every year.

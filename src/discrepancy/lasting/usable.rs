@@ -2,7 +2,10 @@
 
 use super::found::LastingChange;
 use crate::discrepancy::data::Data;
-use crate::discrepancy::FEWEST_BESIDE_HOLDOUT;
+
+/// Smallest number of rows that must remain for the search if others are held out; with fewer, none are held out, and the gain is
+/// measured by cross-validation.
+pub const FEWEST_BESIDE_HOLDOUT: usize = 30;
 
 /// Smallest number of rows held out before a change on which the gain is measured: two batches of ten.
 const FEWEST_HELD: usize = 20;

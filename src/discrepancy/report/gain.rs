@@ -2,9 +2,9 @@
 
 use super::figures::{digits, plus, signed};
 use crate::discrepancy::describe::rounded;
-use crate::discrepancy::diagnosis::capitalised;
 use crate::discrepancy::gain::{Change, Gain, GainMethod};
 use crate::discrepancy::gain_words::Modes;
+use crate::discrepancy::sentence::capitalised;
 use crate::plot::{escaped, table_of_html};
 
 /// The table of the gain: each figure without and with the causes, its change and its meaning.
