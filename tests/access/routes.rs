@@ -31,7 +31,7 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 66] = [
+const TABLE: [(&str, &str, Needs, About); 68] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),

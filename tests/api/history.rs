@@ -85,7 +85,9 @@ async fn a_csv_file_has_the_whole_window_and_not_one_page_of_it() {
     };
     let whole = file("").await;
     assert_eq!(whole.lines().count(), 1 + 3 * 120);
-    assert_eq!(file("&limit=7").await, whole.lines().take(1 + 3 * 7).map(|l| format!("{l}\n")).collect::<String>());
+    let limited = file("&limit=7").await;
+    assert_eq!(limited.lines().count(), 1 + 3 * 7);
+    assert!(whole.starts_with(&limited), "{limited}");
 }
 
 #[tokio::test]

@@ -99,7 +99,7 @@ impl Tested {
             }
             let left = dot(&own, &own);
             if left > INDEPENDENT * size {
-                for v in own.iter_mut() {
+                for v in &mut own {
                     *v /= left.sqrt();
                 }
                 competitors.push(own);
