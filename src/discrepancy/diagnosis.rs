@@ -161,7 +161,7 @@ impl Diagnosis {
         }
         if self.set_aside_rows > 0 {
             let rows = self.training_rows + self.holdout_rows;
-            text += &format!("In the {rows} measurements before: ");
+            text.extend(["In the ", &rows.to_string(), " measurements before: "]);
         }
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {

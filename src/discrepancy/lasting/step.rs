@@ -99,7 +99,10 @@ impl Tested {
             }
             let left = dot(&own, &own);
             if left > INDEPENDENT * size {
-                own.iter_mut().for_each(|v| *v /= left.sqrt());
+                let scale = left.sqrt().recip();
+                for value in &mut own {
+                    *value *= scale;
+                }
                 competitors.push(own);
             }
         }
