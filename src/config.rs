@@ -168,9 +168,11 @@ impl Config {
         figment =
             figment.merge(admin_file).merge(Env::prefixed(ENVIRONMENT).split("__")).merge(Serialized::defaults(flags));
         // A port alone is a number in a file or in the environment.
-        let port = figment.find_value("http.listen").ok().and_then(|value| value.to_u128());
-        if let Some(port) = port {
-            figment = figment.merge(Serialized::default("http.listen", port.to_string()));
+        let number = |value: figment::value::Value| {
+            value.to_u128().map(|port| port.to_string()).or_else(|| value.to_i128().map(|port| port.to_string()))
+        };
+        if let Some(port) = figment.find_value("http.listen").ok().and_then(number) {
+            figment = figment.merge(Serialized::default("http.listen", port));
         }
         let mut config: Self = figment.extract().map_err(|e| Error::Value(Box::new(e)))?;
         config.http.listen = listen_address(&config.http.listen)?;

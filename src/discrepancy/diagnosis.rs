@@ -1,7 +1,6 @@
 //! The result of a diagnosis.
 
 use serde::{Deserialize, Serialize};
-use std::fmt::Write as _;
 
 use super::describe::Cause;
 use super::fit::Fit;
@@ -162,7 +161,7 @@ impl Diagnosis {
         }
         if self.set_aside_rows > 0 {
             let rows = self.training_rows + self.holdout_rows;
-            let _ = write!(text, "In the {rows} measurements before: ");
+            text.extend(["In the ", &rows.to_string(), " measurements before: "]);
         }
         text += &self.finding_in_words();
         if self.causes.iter().any(|c| c.class == Class::PossibleDamage) {

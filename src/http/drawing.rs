@@ -10,7 +10,8 @@ use super::error::ApiError;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
-use crate::quantity::shown;
+use crate::monitor::stored::LatestQuantity;
+use crate::quantity::{shown, StructureId};
 use crate::simulator::drawing::{Error, Marks};
 
 /// Nothing is loaded or run by a drawing.
@@ -33,7 +34,8 @@ pub struct DrawingQuery {
 #[utoipa::path(
     get, path = "/v1/structures/{id}/drawing.svg", tag = "structures", operation_id = "draw_structure",
     summary = "Drawing of a structure",
-    description = "Masses, springs, beams and supports with their names, as SVG: beams along their axis in metres, masses as many storeys \
+    description = "Masses, springs, beams and supports with their names, as SVG. Colours are the changes of the latest assessed batch from \
+                   the undamaged reference, outlines are open damage alarms. Beams along their axis in metres, masses as many storeys \
                    above the ground as springs lead there. A table of finite-element runs has no geometry and is answered 422.",
     params(StructurePath, DrawingQuery),
     responses((status = 200, description = "The drawing", body = String, content_type = "image/svg+xml"), Unknown, Invalid)
@@ -50,10 +52,11 @@ pub async fn drawing(
         ApiError::invalid_field("query/mode", message)
     };
     let mode = query.mode.as_deref().map(|text| text.parse::<usize>().map_err(|_| wrong(text))).transpose()?;
+    let marks = marks(&shared, &id).await?;
     // The shape needs an eigenproblem, which takes time for large structures.
     let draw = move || {
         let nominal = simulator.nominal_parameters();
-        simulator.drawing(&Marks::default(), mode.map(|mode| (mode, nominal.as_slice())))
+        simulator.drawing(&marks, mode.map(|mode| (mode, nominal.as_slice())))
     };
     let drawn = tokio::task::spawn_blocking(draw).await.map_err(|e| ApiError::internal(&e))?;
     let drawing = drawn.map_err(|error| match error {
@@ -63,4 +66,20 @@ pub async fn drawing(
     })?;
     let headers = [(header::CONTENT_TYPE, "image/svg+xml"), (header::CONTENT_SECURITY_POLICY, POLICY)];
     Ok((headers, drawing.svg()).into_response())
+}
+
+/// What the latest assessed batch and the open alarms say about the parts of a structure.
+pub(super) async fn marks(shared: &Shared, id: &StructureId) -> Result<Marks, ApiError> {
+    let quantities = shared.monitor.records().latest_quantities(id).await?;
+    let change = |q: LatestQuantity| Some((q.quantity, 100.0 * q.relative_change?));
+    let open = shared.monitor.alarms().open_damage().await?.remove(id).unwrap_or_default();
+    let names = |series: &str| -> Vec<String> {
+        series
+            .strip_prefix("group:")
+            .map_or_else(|| vec![series.to_owned()], |group| group.split('+').map(str::to_owned).collect())
+    };
+    Ok(Marks {
+        change_percent: quantities.into_iter().filter_map(change).collect(),
+        alarms: open.iter().flat_map(|episode| names(&episode.series)).collect(),
+    })
 }

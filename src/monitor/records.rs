@@ -105,7 +105,15 @@ impl Records {
     /// [`Error::Store`].
     pub async fn latest(&self, structures: usize) -> Result<(Vec<LatestQuantity>, Vec<LatestPoint>), Error> {
         let overview = self.assessor.store.overview();
-        Ok((overview.latest_quantities(structures).await?, overview.latest_points(structures).await?))
+        Ok((overview.latest_quantities(structures, None).await?, overview.latest_points(structures).await?))
+    }
+
+    /// The quantities of the latest assessed batch of a structure.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn latest_quantities(&self, structure: &StructureId) -> Result<Vec<LatestQuantity>, Error> {
+        Ok(self.assessor.store.overview().latest_quantities(1, Some(structure)).await?)
     }
 
     /// The newest undamaged reference of a structure.

@@ -6,6 +6,7 @@ use super::assessment::IS_CURRENT;
 use super::chart_point::CHARTS;
 use super::error::Error;
 use super::overview::Overview;
+use crate::quantity::StructureId;
 
 /// A quantity in the current assessment of the assessed batch that was measured last.
 #[derive(Debug, Clone, PartialEq, FromRow)]
@@ -44,18 +45,22 @@ pub struct LatestPoint {
 }
 
 impl Overview<'_> {
-    /// Quantities of the latest assessed batch of each of the first `structures` structures by id.
+    /// Quantities of the latest assessed batch of each of the first `structures` structures by id, or of one.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn latest_quantities(self, structures: usize) -> Result<Vec<LatestQuantity>, Error> {
+    pub async fn latest_quantities(
+        self,
+        structures: usize,
+        only: Option<&StructureId>,
+    ) -> Result<Vec<LatestQuantity>, Error> {
         let select = format!(
             "with latest as materialized (
                  select s.structure_id,
                         (select batch_id from measurement_batch b
                          where b.structure_id = s.structure_id and state = 'assessed'
                          order by measured_from_us desc, batch_id desc limit 1) as batch_id
-                 from structure s order by s.structure_id limit $1)
+                 from structure s where $2 is null or s.structure_id = $2 order by s.structure_id limit $1)
              select q.structure_id, q.quantity, q.unit, q.mean, q.std, q.probability_of_damage, q.relative_change
              from latest l
                   cross join assessment a on a.structure_id = l.structure_id and a.batch_id = l.batch_id
@@ -63,7 +68,11 @@ impl Overview<'_> {
                       and q.model_digest = a.model_digest and q.undamaged_version = a.undamaged_version
              where {IS_CURRENT} order by q.structure_id, q.position"
         );
-        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(structures as i64).fetch_all(&self.database.reader).await?)
+        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structures as i64)
+            .bind(only.map(StructureId::as_str))
+            .fetch_all(&self.database.reader)
+            .await?)
     }
 
     /// The last points of the alarm charts of each of the first `structures` structures by id.

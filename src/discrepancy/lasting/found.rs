@@ -127,7 +127,8 @@ impl LastingChange {
             String::new()
         };
         format!(
-            "a lasting change is reported where chance alone would give one in at most {:.0} of 100 data sets; here {}{season}",
+            "a lasting change is reported where chance alone would give one in about {:.0} of 100 data sets, or in up to 4 where scatter \
+             persists for weeks; here {}{season}",
             100.0 * self.error_rate,
             chance(self.p_value)
         )

@@ -99,8 +99,9 @@ impl Tested {
             }
             let left = dot(&own, &own);
             if left > INDEPENDENT * size {
-                for v in &mut own {
-                    *v /= left.sqrt();
+                let scale = left.sqrt().recip();
+                for value in &mut own {
+                    *value *= scale;
                 }
                 competitors.push(own);
             }

@@ -8,6 +8,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
+use crate::http::drawing;
 use crate::http::error::ApiError;
 use crate::http::openapi::{Invalid, StructurePath, Unknown};
 use crate::http::request::{structure_id, ApiPath, ApiQuery, Window};
@@ -75,7 +76,10 @@ pub async fn report(
     let alarms = shared.monitor.alarms().episodes(&id, all).await?;
     let maintenance = shared.monitor.alarms().maintenance(&id).await?;
     let judged = Judged::all(&shared.monitor).await?.into_iter().find(|judged| judged.found.id == id);
-    let contents = Contents {
+    let marks = drawing::marks(&shared, &id).await?;
+    let simulator = active.simulator.clone();
+    let mut contents = Contents {
+        drawing: None,
         description: active.simulator.definition().description.clone(),
         modes: active.simulator.modes(),
         structure: id,
@@ -89,7 +93,11 @@ pub async fn report(
         reference,
     };
     // Drawing takes a few milliseconds for each parameter.
-    let html = tokio::task::spawn_blocking(move || page::html(&contents)).await.map_err(|e| ApiError::internal(&e))?;
+    let draw = move || {
+        contents.drawing = simulator.drawing(&marks, None).ok().map(|drawing| drawing.svg());
+        page::html(&contents)
+    };
+    let html = tokio::task::spawn_blocking(draw).await.map_err(|e| ApiError::internal(&e))?;
     let policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:";
     let headers = [
         (header::CONTENT_TYPE, "text/html; charset=utf-8"),

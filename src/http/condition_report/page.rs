@@ -37,6 +37,8 @@ impl Period {
 
 /// What a report is made from.
 pub struct Contents {
+    /// The structure with the changes of its parts as SVG; `None` for a table of finite-element runs.
+    pub drawing: Option<String>,
     pub structure: StructureId,
     pub description: Option<String>,
     pub modes: usize,
@@ -54,7 +56,7 @@ pub struct Contents {
 /// One self-contained page.
 pub fn html(c: &Contents) -> String {
     let sections = [
-        ("Verdict".to_owned(), verdict(c)),
+        ("Verdict".to_owned(), verdict(c) + &structure(c)),
         ("Alarms in the period".to_owned(), alarms(c)),
         ("Stiffnesses and other parameters".to_owned(), parameters(c)),
         ("Quality of the data".to_owned(), quality(c)),
@@ -95,6 +97,14 @@ fn verdict(c: &Contents) -> String {
         env!("CARGO_PKG_VERSION")
     );
     text
+}
+
+fn structure(c: &Contents) -> String {
+    let caption = "Orange: the part has become softer than in the undamaged reference; blue: stiffer; grey: no change or no comparison; outlined: \
+                   open alarm. As of the latest assessed batch.";
+    c.drawing.as_ref().map_or_else(String::new, |svg| {
+        format!("<div class=\"plots\"><figure>{svg}<figcaption>{}</figcaption></figure></div>", escaped(caption))
+    })
 }
 
 fn alarms(c: &Contents) -> String {

@@ -3,6 +3,7 @@
 import { ApiError, keepToken, onUnauthorized, token } from "./api.js";
 import { endCharts } from "./charts/base.js";
 import { themeChanged } from "./charts/theme.js";
+import { condition } from "./condition.js";
 import { ask, fill, h, icon, notify, problem } from "./dom.js";
 import { follow } from "./events.js";
 import { refreshAges } from "./format.js";
@@ -20,6 +21,7 @@ let view = null;
 const ROUTES = [
   [/^#?\/?$/, "fleet", () => overview()],
   [/^#\/structures\/([^/?]+)(?:\?(.*))?$/, "fleet", (id, query) => structure(id, new URLSearchParams(query))],
+  [/^#\/structures\/([^/?]+)\/report(?:\?(.*))?$/, "fleet", (id, query) => condition(id, new URLSearchParams(query))],
   [/^#\/diagnoses\/([^/]+)$/, "fleet", (id) => report(id)],
   [/^#\/jobs$/, "jobs", () => jobs()],
 ];

@@ -2,6 +2,7 @@
 
 import { at, read } from "./api.js";
 import { acknowledgeDialog, alarmWords } from "./sections/alarms.js";
+import { describe } from "./sections/describe.js";
 import { cell, fill, h, icon, refill, throttled } from "./dom.js";
 import { age, count, percent } from "./format.js";
 import { EVERY_STATE, stateChip, stateWord, trustChip, urgency } from "./states.js";
@@ -39,6 +40,11 @@ export function overview() {
     alarmList,
     blank,
     table,
+    h(
+      "p",
+      { class: "buttons start" },
+      h("button", { type: "button", onclick: () => describe() }, "Describe a structure"),
+    ),
   );
 
   const load = async () => {
@@ -184,26 +190,26 @@ function modelMark(item) {
       { title: item.model_missing ?? "" },
       h("span", { class: "chip idle" }, icon("unassessed"), stateWord("no_model")),
     );
-  if (item.calibration_passed === false) return h("span", { class: "chip warn" }, icon("note"), "Calibration failed");
+  if (item.calibration_outcome === "overconfident")
+    return h("span", { class: "chip warn" }, icon("note"), "Intervals too narrow");
+  if (item.calibration_outcome === "cautious") return h("span", { class: "soft" }, "calibrated, some intervals too wide");
   return h("span", { class: "soft" }, "calibrated");
 }
 
-/** Instructions for a service without any structure. */
+/** The way to the first verdict, for a service without any structure. */
 function firstSteps() {
   return h(
     "div",
     { class: "blank" },
     h("h2", null, "No structures yet"),
-    h("p", null, "Write a structure file and send it; the structure appears here automatically."),
     h(
-      "pre",
-      { tabindex: 0 },
-      h(
-        "code",
-        null,
-        `curl -X PUT ${location.origin}/v1/structures/my-bridge \\\n  -H 'content-type: application/toml' --data-binary @my-bridge.toml`,
-      ),
+      "ol",
+      null,
+      h("li", null, h("strong", null, "Describe"), " the structure: button below, or a structure file."),
+      h("li", null, h("strong", null, "Train"), " its model: its page shows the command."),
+      h("li", null, h("strong", null, "Upload"), " measured frequencies: drag a table onto its page."),
+      h("li", null, h("strong", null, "Mark"), " the healthy period: its page compares all later batches with it."),
     ),
-    h("p", { class: "fine" }, 'If the service requires tokens, add -H "authorization: Bearer $TOKEN".'),
+    h("p", { class: "fine" }, "Programs do the same over the ", h("a", { href: "docs/api" }, "API"), "."),
   );
 }

@@ -25,17 +25,23 @@ function sheetOf(page) {
   return sheet;
 }
 
+/** A report as an element of this page: its HTML in a shadow root, with its own style sheet and without anything that runs or loads. */
+export function hosted(html) {
+  const page = parsed(html);
+  const host = h("article", { class: "report", "aria-label": page.title });
+  const root = host.attachShadow({ mode: "open" });
+  root.adoptedStyleSheets = [sheetOf(page)];
+  page.querySelectorAll("template, script, link, iframe, object, base, meta").forEach((e) => e.remove());
+  page.querySelectorAll("[data-style]").forEach((e) => (e.style.cssText = e.dataset.style));
+  root.append(...page.body.childNodes);
+  return host;
+}
+
 export function report(id) {
   const element = h("div", { class: "view", dataset: { page: "report" } });
   const load = async () => {
     const [diagnosis, html] = await Promise.all([read(path(id)), request(path(id, "/report")).then((r) => r.text())]);
-    const page = parsed(html);
-    const host = h("article", { class: "report", "aria-label": page.title });
-    const root = host.attachShadow({ mode: "open" });
-    root.adoptedStyleSheets = [sheetOf(page)];
-    page.querySelectorAll("template, script, link, iframe, object, base, meta").forEach((e) => e.remove());
-    page.querySelectorAll("[data-style]").forEach((e) => (e.style.cssText = e.dataset.style));
-    root.append(...page.body.childNodes);
+    const host = hosted(html);
     const file = URL.createObjectURL(new Blob([html], { type: "text/html" }));
     fill(
       element,

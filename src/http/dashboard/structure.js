@@ -12,6 +12,7 @@ import { age, count, local, percent, zone } from "./format.js";
 import { alarms } from "./sections/alarms.js";
 import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
+import { drawing } from "./sections/drawing.js";
 import { maintenance } from "./sections/maintenance.js";
 import { declare, model, postLine } from "./sections/model.js";
 import { upload } from "./sections/upload.js";
@@ -65,6 +66,10 @@ export function structure(id, query) {
     state.batch = chosen;
     writeAddress();
   });
+  const drawn = drawing(id, (name) => {
+    figures.control.choose(name);
+    figures.control.element.scrollIntoView({ block: "start" });
+  });
   const alarmList = alarms(id);
   const windows = maintenance(id, () => refresh.series());
   const diagnoses = diagnosis(id, () => refresh.all());
@@ -81,6 +86,7 @@ export function structure(id, query) {
     condition: section(
       "condition",
       "Condition",
+      drawn.element,
       figures.parameters.element,
       figures.control.element,
       figures.heat.element,
@@ -94,7 +100,7 @@ export function structure(id, query) {
     maintenance: windows.element,
   };
   let shown = SECTIONS.some(([name]) => name === query.get("section")) ? query.get("section") : "condition";
-  const printed = h("a", { class: "button", target: "_blank", rel: "noopener" }, "Condition report");
+  const printed = h("a", { class: "button" }, "Condition report");
   const spansRow = h("div", { class: "row spans" }, spans, spanText, asReference, printed);
   const jumps = h(
     "nav",
@@ -256,7 +262,7 @@ export function structure(id, query) {
     asReference.hidden = !info.model;
     const ends = shownSpan();
     const period = new URLSearchParams({ from: iso(ends[0]), to: iso(ends[1] + 60) });
-    printed.href = `${at(id, "/report")}?${period}`;
+    printed.href = `${address()}/report?${period}`;
     fill(
       spanText,
       `${local(1000 * ends[0])} to ${local(1000 * ends[1])} (${zone()}), ${count(series.batches, "batch", "batches")}${series.reduced ? ", thinned for display with extremes kept" : ""}`,
@@ -278,6 +284,7 @@ export function structure(id, query) {
     state.item = overview.items.find((item) => item.id === id) ?? null;
     fill(headline, head(id, state));
     used.update(info, state.item?.batches ?? 0);
+    await drawn.load(info);
   }
 
   const quietly = (work) => () => work().catch(() => {});

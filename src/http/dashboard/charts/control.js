@@ -182,6 +182,12 @@ export function control(group, selectBatch) {
 
   return {
     element: frame.element,
+    /** Shows the chart with a name, if there is one. */
+    choose(name) {
+      if (!newest?.charts.some((c) => c.chart === name)) return;
+      chosen = name;
+      show();
+    },
     update(series) {
       newest = series;
       show();

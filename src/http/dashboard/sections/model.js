@@ -77,7 +77,9 @@ function missing(info) {
 
 function inUse({ digest: structureDigest, definition, model: m, emulator }) {
   const { calibration, validation } = m;
-  const passed = calibration.failures.length === 0;
+  const outcome = m.calibration_outcome;
+  const reasons = [...calibration.failures, ...(calibration.cautions ?? [])];
+  const listed = `${reasons.slice(0, 3).join("; ")}${reasons.length > 3 ? `; and ${reasons.length - 3} more` : ""}`;
   const noise = m.conditions.noise_range;
   return [
     facts([
@@ -91,7 +93,7 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
       ],
       [
         "Validation",
-        `negative log-likelihood ${number(validation.negative_log_likelihood, 3)} ± ${number(validation.negative_log_likelihood_error, 2)} nats`,
+        `−ln of the density at the true parameters, lower is better: ${number(validation.negative_log_likelihood, 3)} ± ${number(validation.negative_log_likelihood_error, 2)}`,
       ],
       emulator && [
         "Emulator",
@@ -100,11 +102,13 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
     ]),
     h(
       "p",
-      { class: `callout ${passed ? "good" : "bad"}` },
-      icon(passed ? "check" : "alarm"),
-      passed
-        ? `Calibration passed: ${count(calibration.cells.length, "case")}, ${calibration.simulations} simulated measurements each.`
-        : `Calibration failed: ${calibration.failures.slice(0, 3).join("; ")}${calibration.failures.length > 3 ? `; and ${calibration.failures.length - 3} more` : ""}.`,
+      { class: `callout ${{ passed: "good", cautious: "" }[outcome] ?? "bad"}` },
+      icon({ passed: "check", cautious: "note" }[outcome] ?? "alarm"),
+      {
+        passed: `Calibration passed: ${count(calibration.cells.length, "case")}, ${calibration.simulations} simulated measurements each.`,
+        cautious: `Calibration: the model can be used, and some of its intervals are wider than they need to be, so that a small change may be noticed later than possible. ${listed}.`,
+      }[outcome] ??
+        `Calibration: some intervals are too narrow, so that the model claims to know more than it does. It is used only because it was accepted in the configuration. ${listed}.`,
     ),
     calibrationTable(calibration.cells),
   ];
@@ -124,16 +128,16 @@ function calibrationTable(cells) {
       h(
         "th",
         { scope: "row" },
-        `${number(condition.noise_multiple, 2)} × noise, ${condition.missing_mode ? `without mode ${condition.missing_mode}` : "all modes"}`,
+        `${number(condition.noise_multiple, 2)} times the usual noise, ${condition.missing_mode ? `mode ${condition.missing_mode} missing` : "all modes"}`,
       ),
       cell("Coverage of 50 % intervals", range(condition.parameters.map((p) => p.coverage_50))),
       cell("Coverage of 90 % intervals", range(condition.parameters.map((p) => p.coverage_90))),
-      cell("p-value (TARP)", number(condition.tarp_p_value, 2)),
+      cell("Joint test (p-value)", number(condition.tarp_p_value, 2)),
     );
   return h(
     "details",
     null,
-    h("summary", null, "Calibration by noise level and missing mode"),
+    h("summary", null, "Calibration by noise level and missing mode: how often the intervals contain the true value"),
     h(
       "table",
       { class: "cards" },
@@ -144,7 +148,7 @@ function calibrationTable(cells) {
         h(
           "tr",
           null,
-          ["Noise and modes", "Coverage of 50 % intervals", "Coverage of 90 % intervals", "p-value (TARP)"].map((c) =>
+          ["Noise and modes", "Coverage of 50 % intervals", "Coverage of 90 % intervals", "Joint test (p-value)"].map((c) =>
             h("th", { scope: "col" }, c),
           ),
         ),

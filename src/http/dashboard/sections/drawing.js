@@ -1,0 +1,49 @@
+// The drawing of the structure: colours are changes, outlines are open alarms, a click on a part shows its charts.
+
+import { at, request } from "../api.js";
+import { fill, h } from "../dom.js";
+
+/** `choose(name)` is called with the name of a part that the user selects. */
+export function drawing(structure, choose) {
+  const place = h("div", { class: "drawing" });
+  const picker = h("select", { id: "drawing-mode", onchange: () => load() });
+  const element = h(
+    "figure",
+    { class: "figure", dataset: { drawing: structure }, hidden: true },
+    h("figcaption", null, h("h3", { id: "drawing-title" }, "Structure")),
+    h("p", { class: "row" }, h("label", { for: "drawing-mode" }, "Mode shape"), picker),
+    place,
+    h(
+      "p",
+      { class: "fine" },
+      "Orange: softer than in the undamaged reference, strongest from −10 %; blue: stiffer; grey: no change or no comparison; outlined: open alarm. As of the latest assessed batch. Select a part to see its control chart.",
+    ),
+  );
+  const load = async () => {
+    const mode = picker.value === "" ? "" : `?mode=${picker.value}`;
+    const answer = await request(at(structure, `/drawing.svg${mode}`));
+    const svg = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
+    fill(place, document.importNode(svg, true));
+    for (const part of place.querySelectorAll("[data-name]")) {
+      part.addEventListener("click", () => choose(part.dataset.name));
+    }
+    element.hidden = false;
+  };
+
+  return {
+    element,
+    async load(info) {
+      // A table of finite-element runs has no geometry.
+      if (info.definition.simulation === "table") return;
+      const modes = info.nominal_frequencies_hz.length;
+      if (picker.options.length === 0) {
+        fill(
+          picker,
+          h("option", { value: "" }, "none"),
+          Array.from({ length: modes }, (_, i) => h("option", { value: i + 1 }, `mode ${i + 1}`)),
+        );
+      }
+      await load();
+    },
+  };
+}
