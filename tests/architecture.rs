@@ -80,7 +80,18 @@ const TABLE: [(&str, &[&str], bool); 35] = [
     ("reproduce", &["assessment", "baseline", "damage", "gsa", "physics", "plot", "simulator", "updating"], true),
     (
         "monitor",
-        &["alarm", "assessment", "baseline", "damage", "discrepancy", "flow", "reduction", "simulator", "store"],
+        &[
+            "alarm",
+            "assessment",
+            "baseline",
+            "damage",
+            "discrepancy",
+            "flow",
+            "reduction",
+            "simulator",
+            "store",
+            "trust",
+        ],
         true,
     ),
     (
@@ -94,6 +105,8 @@ const TABLE: [(&str, &[&str], bool); 35] = [
             "discrepancy",
             "monitor",
             "notify",
+            // The condition report is a page with plots.
+            "plot",
             "process",
             "reduction",
             "simulator",

@@ -300,7 +300,7 @@ fn print_table(report: &Report) {
             );
         }
     }
-    println!("\nAbout every second undamaged batch of {MEASUREMENTS} has a PoD above 5 %: that is not an alarm. False alarms have a");
-    println!("fixed rate, one in 1000 undamaged batches. Compare \"updated\" with \"realised\": {MEASUREMENTS} draws deviate");
-    println!("randomly from their population.");
+    println!("\nAbout every second undamaged batch of {MEASUREMENTS} has a PoD above 5 %: that is not an alarm. False alarms");
+    println!("have a fixed rate, one in 1000 undamaged batches. Compare \"updated\" with \"realised\":");
+    println!("{MEASUREMENTS} draws deviate randomly from their population.");
 }

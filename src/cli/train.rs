@@ -1,6 +1,6 @@
 //! `modalwatch train`: trains the model of a structure by simulation.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context as _;
@@ -15,6 +15,7 @@ use crate::baseline::rounds::MOST_ROUNDS;
 use crate::baseline::train::diverged;
 use crate::flow::train::TrainSettings;
 use crate::flow::FlowSettings;
+use crate::simulator::Simulator;
 
 /// Train the model of a structure.
 #[derive(Debug, Args)]
@@ -62,19 +63,7 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     // Before the training, so that minutes are not wasted if the folder cannot be written.
     std::fs::create_dir_all(&out).with_context(|| format!("cannot create the folder {}", out.display()))?;
 
-    let own_file =
-        ["structure.toml", "structure.json"].map(|name| out.join(name)).into_iter().find(|path| path.exists());
-    if let Some(path) = &own_file {
-        // A trained model in the folder of another structure would be refused when it is loaded.
-        let beside = read_structure_file(path)?;
-        anyhow::ensure!(
-            beside.digest() == simulator.digest(),
-            "{} describes a different structure than {}: choose another folder with --out",
-            path.display(),
-            args.structure
-        );
-    }
-
+    let own_file = own_structure_file(&out, &simulator, &args.structure)?;
     if let Some(table) = simulator.table() {
         let error = |mode: usize| format!("{:.2e}", table.emulator().relative_error(mode));
         let errors: Vec<String> = (0..simulator.modes()).map(error).collect();
@@ -139,14 +128,31 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
         Outcome::Overconfident => return refuse_overconfident(manifest, &again),
     }
     if let Some(models) = out.parent() {
-        let models = if models.as_os_str().is_empty() { std::path::Path::new(".") } else { models };
+        let models = if models.as_os_str().is_empty() { Path::new(".") } else { models };
         println!("next: modalwatch serve --models {}", models.display());
     }
     Ok(())
 }
 
+/// The structure file that the folder has already.
+///
+/// # Errors
+/// If it describes another structure: a trained model beside it would be refused when it is loaded.
+fn own_structure_file(out: &Path, simulator: &Simulator, given: &str) -> anyhow::Result<Option<PathBuf>> {
+    let own_file =
+        ["structure.toml", "structure.json"].map(|name| out.join(name)).into_iter().find(|path| path.exists());
+    if let Some(path) = &own_file {
+        anyhow::ensure!(
+            read_structure_file(path)?.digest() == simulator.digest(),
+            "{} describes a different structure than {given}: choose another folder with --out",
+            path.display(),
+        );
+    }
+    Ok(own_file)
+}
+
 /// The command that trains a larger network for longer.
-fn again(args: &TrainArgs, out: &std::path::Path, manifest: &Manifest) -> String {
+fn again(args: &TrainArgs, out: &Path, manifest: &Manifest) -> String {
     let units = (2 * manifest.architecture.units).min(64);
     let epochs = 2 * manifest.training.settings.epochs;
     format!(

@@ -243,6 +243,9 @@ async fn everything_is_reached_and_done_by_keyboard() {
     page.wait_for("[...document.querySelectorAll('.spans button')].some((b) => b.ariaPressed === 'true' && b.textContent === '1 week')");
     // The arrow keys move through a chart.
     page.evaluate("document.querySelector('[data-figure=control] .plot').focus()");
+    // The chart is drawn again when the week has arrived.
+    page.wait_for("!document.querySelector('.spans .fine').textContent.includes('10 batches')");
+    page.evaluate("document.querySelector('[data-figure=control] .plot').focus()");
     page.press("ArrowRight");
     page.wait_for("document.querySelector('[data-figure=control] .readout').textContent.includes('shift')");
     tab_to(&mut page, |f| f["text"] == "Show as table");
@@ -272,7 +275,7 @@ async fn the_address_says_what_is_shown_and_shows_it_again() {
     assert_eq!(page.evaluate("location.hash"), json!("#/structures/three-dof"));
     page.evaluate("document.querySelector('.jumps [data-section=batch]').click()");
     page.evaluate(&format!(
-        "(() => {{ const picker = document.getElementById('batch-picker'); picker.value = '{}'; picker.onchange(); }})()",
+        "(() => {{ const picker = document.getElementById('batch-picker'); picker.value = '{}'; picker.dispatchEvent(new Event('change')); }})()",
         ids[2]
     ));
     page.evaluate(

@@ -14,6 +14,7 @@ mod helpers;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;
+mod pages;
 mod rejected;
 mod sign_in;
 mod upload;

@@ -36,6 +36,7 @@ pub struct StiffnessChange {
 /// From a time on, the measurements differ from those before, and neither the causes found nor the recorded quantities nor the seasons
 /// explain it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = DiagnosedChange)]
 pub struct LastingChange {
     /// Most probable time of the first measurement after the change.
     pub since: Timestamp,
