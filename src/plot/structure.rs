@@ -16,7 +16,7 @@ const SWING: f64 = 0.12;
 const MOST_DOTS: usize = 12;
 
 /// Farthest that a spring goes aside, px.
-const BEND_PX: f64 = 0.7 * MARGIN;
+const BEND_PX: f64 = 0.55 * MARGIN;
 
 /// A white edge, so that text can be read on lines.
 const HALO: &str = "paint-order=\"stroke\" stroke=\"#ffffff\" stroke-width=\"3\"";

@@ -214,10 +214,17 @@ fn latest(c: &Contents, q: &QuantitySeries) -> Vec<String> {
         [Some(low), Some(high)] => format!("{} to {}", number(factor * low), number(factor * high)),
         _ => "–".to_owned(),
     };
-    let change =
-        reference.map_or_else(|| "–".to_owned(), |r| format!("{:+.1} %", change_percent(&q.unit, mean, r.mean)));
+    let change = reference.map_or_else(
+        || "–".to_owned(),
+        |r| format!("{:+.1} %", change_percent(&q.unit, mean, r.mean)).replace('-', "−"),
+    );
     let threshold = reference.and_then(|r| r.threshold).map_or_else(|| "–".to_owned(), with_unit);
-    let probability = if probability.is_finite() { format!("{:.1} %", 100.0 * probability) } else { "–".to_owned() };
+    let probability = match probability {
+        p if !p.is_finite() => "–".to_owned(),
+        p if p > 0.0 && p < 0.001 => "< 0.1 %".to_owned(),
+        p if p > 0.999 => "> 99.9 %".to_owned(),
+        p => format!("{:.1} %", 100.0 * p),
+    };
     [q.name.clone(), with_unit(mean), interval, change, threshold, probability].map(|cell| escaped(&cell)).to_vec()
 }
 
