@@ -8,9 +8,9 @@ export function drawing(structure, choose) {
   const place = h("div", { class: "drawing" });
   const picker = h("select", { id: "drawing-mode", onchange: () => load() });
   const element = h(
-    "figure",
+    "div",
     { class: "figure", dataset: { drawing: structure }, hidden: true },
-    h("figcaption", null, h("h3", { id: "drawing-title" }, "Structure")),
+    h("h3", null, "Structure"),
     h("p", { class: "row" }, h("label", { for: "drawing-mode" }, "Mode shape"), picker),
     place,
     h(
