@@ -37,7 +37,7 @@ impl ExtensionPlan<'_> {
     /// epochs were given, the training does just what was asked for, in one round.
     ///
     /// # Errors
-    /// As [`train`].
+    /// As [`super::train::train`].
     pub fn train(&self, simulator: &Simulator, on_progress: &mut dyn FnMut(Progress)) -> Result<Trained, Error> {
         let warm = match (self.parent, self.from_scratch) {
             (_, true) => Err("as requested".to_owned()),

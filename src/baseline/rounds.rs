@@ -2,7 +2,7 @@
 //!
 //! After each round the model is certified, on simulations of its own. A further round continues from the present weights with half
 //! the learning rate and half the epochs of the first. The training ends when the calibration passes, after [`MOST_ROUNDS`] rounds, or
-//! after [`PATIENCE`] rounds in a row that leave no fewer findings than the best one before. The model with the fewest findings is
+//! after two rounds in a row that leave no fewer findings than the best one before. The model with the fewest findings is
 //! kept; one that is too narrow anywhere counts as worse than any that is not.
 
 use super::conditions::NoiseRange;

@@ -3,11 +3,11 @@
 //! New damage must not be taken for a cause, and not for the condition in which the gain is measured. All rows are therefore tested
 //! together, those held out as well:
 //!
-//! - [`series`]: what is tested: the residual of each mode, and the best value of each free parameter in each row;
-//! - [`competitors`]: what else may explain it: recorded quantities and the seasons;
-//! - [`step`]: the test for a step at many times, with its onset;
-//! - [`stiffness`]: the stiffness whose change looks like it;
-//! - [`found`]: the finding in numbers and words; [`usable`]: the rows that may be used nevertheless.
+//! - `series`: what is tested: the residual of each mode, and the best value of each free parameter in each row;
+//! - `competitors`: what else may explain it: recorded quantities and the seasons;
+//! - `step`: the test for a step at many times, with its onset;
+//! - `stiffness`: the stiffness whose change looks like it;
+//! - `found`: the finding in numbers and words; `usable`: the rows that may be used nevertheless.
 
 pub(super) mod competitors;
 pub mod found;
