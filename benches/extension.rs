@@ -91,7 +91,11 @@ fn extended(parent: &Baseline) -> StructureDefinition {
     let spring = free.unwrap_or(&definition.springs[0].name).clone();
     let covariate = "temperature_c".to_owned();
     definition.parent = Some(parent.simulator().digest().to_string());
-    definition.covariates.push(CovariateDefinition { name: covariate.clone(), kind: CovariateKind::Number });
+    definition.covariates.push(CovariateDefinition {
+        name: covariate.clone(),
+        kind: CovariateKind::Number,
+        unit: None,
+    });
     definition.effects.push(EffectDefinition {
         name: "temperature".to_owned(),
         description: None,

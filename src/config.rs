@@ -14,7 +14,7 @@ use crate::monitor::automatic_diagnoses::DiagnosisSettings;
 use crate::monitor::retention::RetentionSettings;
 use crate::monitor::MonitorSettings;
 use crate::mqtt::MqttSettings;
-use crate::notify::NotifySettings;
+use crate::notify::{EmailSettingError, EmailSettings, NotifySettings};
 use crate::quantity::shown;
 use crate::store::StoreSettings;
 use crate::telemetry::LogSettings;
@@ -47,6 +47,8 @@ pub struct Config {
     pub diagnosis: DiagnosisSettings,
     /// Webhooks.
     pub notify: NotifySettings,
+    /// Mails about alarms.
+    pub email: EmailSettings,
     /// MQTT broker.
     pub mqtt: MqttSettings,
     /// Requirements on the file system of the database.
@@ -67,6 +69,7 @@ impl Default for Config {
             monitor: MonitorSettings::default(),
             diagnosis: DiagnosisSettings::default(),
             notify: NotifySettings::default(),
+            email: EmailSettings::default(),
             mqtt: MqttSettings::default(),
             store: StoreSettings::default(),
             retention: RetentionSettings::default(),
@@ -120,6 +123,9 @@ pub enum Error {
     /// An invalid setting of the MQTT broker.
     #[error("configuration: {0}")]
     Mqtt(#[from] crate::mqtt::SettingError),
+    /// An invalid setting of the mails.
+    #[error("configuration: {0}")]
+    Email(#[from] EmailSettingError),
     /// A `--data-dir` that does not exist.
     #[error(
         "--data-dir {} does not exist: correct the path; only `modalwatch serve` and `modalwatch demo` create a data folder (or create an \
@@ -233,11 +239,18 @@ impl Config {
             return Err(Error::Range { key, value, must });
         }
         self.mqtt.check()?;
+        self.email.check()?;
         if self.retention.measurements_days > 36_500 {
             let value = self.retention.measurements_days.to_string();
             return Err(Error::Range { key: "retention.measurements_days", value, must: "at most 36500" });
         }
-        if let Some((key, value, must)) = self.monitor.alarm.problem().or_else(|| self.diagnosis.problem()) {
+        if let Some((key, value, must)) = self
+            .monitor
+            .alarm
+            .problem()
+            .or_else(|| self.monitor.severity.problem())
+            .or_else(|| self.diagnosis.problem())
+        {
             return Err(Error::Range { key, value, must });
         }
         Ok(())

@@ -15,7 +15,7 @@
 //!  reproduce                             both cases of the paper by all methods, beside its figures
 //!  mqtt                                  batches from a message broker
 //!  monitor                               the application: ingest, replay, jobs, upkeep
-//!  notify                                webhooks
+//!  notify                                webhooks and e-mail
 //!  store                                 the database; the only module with SQL
 //!  access                                tokens and scopes
 //!  assessment                            from the measurements of a batch to its assessment and its chart points

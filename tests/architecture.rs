@@ -66,7 +66,7 @@ const TABLE: [(&str, &[&str], bool); 35] = [
     ("discrepancy", &["physics", "plot", "simulator"], true),
     ("process", &[], true),
     ("damage", &["hierarchy", "posterior", "process"], true),
-    ("alarm", &["damage"], true),
+    ("alarm", &["damage", "process"], true),
     (
         "assessment",
         &["alarm", "baseline", "damage", "hierarchy", "physics", "plot", "posterior", "process", "simulator", "trust"],

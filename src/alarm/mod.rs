@@ -3,12 +3,13 @@
 //! A probability of damage above its threshold is an exceedance, and nearly half of the healthy batches exceed. An alarm needs
 //! more: [`chart`] compares the mean of a batch with the undamaged reference in units of its standard error, [`limits`] computes
 //! the limit that healthy operation reaches once in ARL0 batches (average run length), [`machine`] turns points above the limit
-//! into states and episodes, and [`detection`] computes which losses are detected.
+//! into states and episodes, [`severity`] grades them, and [`detection`] computes which losses are detected.
 
 pub mod chart;
 pub mod detection;
 pub mod limits;
 pub mod machine;
+pub mod severity;
 
 use serde::{Deserialize, Serialize};
 

@@ -41,7 +41,12 @@ pub fn assess(
     let mut findings = std::mem::take(&mut samples.findings);
     if let Some(undamaged) = context.undamaged {
         let learned = undamaged.process.as_ref().map_or(&[][..], |process| &process.process.covariates);
-        findings.extend(compare_conditions(measurements, &undamaged.conditions, learned));
+        findings.extend(compare_conditions(
+            measurements,
+            &undamaged.conditions,
+            learned,
+            baseline.simulator().covariates(),
+        ));
     }
     findings.extend(standing_findings(baseline));
     if let Some(process) = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::damage::SeenCovariate;
-use crate::measurement::{CovariateValue, ModalMeasurement};
+use crate::measurement::{Covariate, CovariateValue, ModalMeasurement};
 use crate::trust::{Finding, FindingCode, FindingEffect};
 
 /// The range or the categories of each covariate over some measurements.
@@ -32,14 +32,16 @@ pub(super) fn conditions<'a>(
 
 /// Findings about values of covariates that lie outside those of the undamaged reference, followed by findings about missing
 /// covariates. `learned`: covariates whose influence the process of the reference has learned: outside their range, its charts are
-/// less sensitive instead of being held.
+/// less sensitive instead of being held. `declared`: the covariates of the structure, for their units.
 pub(super) fn compare_conditions(
     measurements: &[ModalMeasurement],
     seen: &BTreeMap<String, SeenCovariate>,
     learned: &[String],
+    declared: &[Covariate],
 ) -> impl Iterator<Item = Finding> {
     let (mut outside, mut missing) = (Vec::new(), Vec::new());
     for (name, seen) in seen {
+        let unit = declared.iter().find(|c| c.name == *name).and_then(Covariate::unit);
         let mut example: Option<String> = None;
         let (mut rows, mut lacking) = (Vec::new(), 0);
         for (index, measurement) in measurements.iter().enumerate() {
@@ -47,7 +49,7 @@ pub(super) fn compare_conditions(
                 lacking += 1;
                 continue;
             };
-            if let Some(difference) = difference(name, value, seen) {
+            if let Some(difference) = difference(name, unit, value, seen) {
                 rows.push(index);
                 example.get_or_insert(difference);
             }
@@ -73,10 +75,11 @@ pub(super) fn compare_conditions(
 }
 
 /// Describes a value that is outside the range or the categories of the reference; `None` if it is inside.
-fn difference(name: &str, value: &CovariateValue, seen: &SeenCovariate) -> Option<String> {
+fn difference(name: &str, unit: Option<&str>, value: &CovariateValue, seen: &SeenCovariate) -> Option<String> {
     match (value, seen) {
         (CovariateValue::Number(x), SeenCovariate::Range([low, high])) => {
-            (!(low..=high).contains(&x)).then(|| format!("{name} = {x}, reference {low} to {high}"))
+            let unit = unit.map_or_else(String::new, |unit| format!(" {unit}"));
+            (!(low..=high).contains(&x)).then(|| format!("{name} = {x}{unit}, reference {low} to {high}{unit}"))
         }
         (CovariateValue::Category(c), SeenCovariate::Categories(all)) => (!all.contains(c))
             .then(|| format!("{name} = {c}, reference {}", all.iter().cloned().collect::<Vec<_>>().join(", "))),

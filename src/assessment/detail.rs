@@ -7,6 +7,7 @@ use crate::measurement::ModalMeasurement;
 use crate::parameter::Parameter;
 use crate::plot::density;
 use crate::quantity::{Digest, Hertz};
+use crate::simulator::shape_comparison::ShapeComparison;
 use crate::stats;
 
 /// Measured values shown for each mode, evenly spaced in the batch.
@@ -39,6 +40,8 @@ pub struct BatchDetail {
     pub parameters: Vec<ParameterDetail>,
     /// One entry for each mode.
     pub modes: Vec<ModeDetail>,
+    /// Measured mode shapes beside those at the mean of the posterior samples; `None` if the batch has no shapes.
+    pub shapes: Option<ShapeComparison>,
 }
 
 /// Densities of one parameter, all on the same grid, in 1/unit.
@@ -118,7 +121,9 @@ pub fn detail(
         predicted_mean_hz: stats::mean(&predicted),
         predicted_interval_hz: [0.05, 0.95].map(|level| stats::quantile(&predicted, level)),
     };
+    let means: Vec<f64> = (0..baseline.space().len()).map(|column| stats::mean(&pooled.column(column))).collect();
     Ok(BatchDetail {
+        shapes: baseline.simulator().compare_shapes(&means, measurements)?,
         model_digest: baseline.digest().clone(),
         measurements: measurements.len(),
         shown: shown.len(),

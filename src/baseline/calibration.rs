@@ -63,6 +63,21 @@ pub struct CellRanks {
 /// # Errors
 /// [`InferenceError`] when a draw is not finite or a simulation fails inside the prior.
 pub fn calibrate(baseline: &Baseline, seed: u64) -> Result<(CalibrationRecord, Vec<CellRanks>), InferenceError> {
+    calibrate_watched(baseline, seed, &mut |_, _| {})
+}
+
+/// Called before each cell with the number of cells measured so far, and their number.
+pub(super) type OnCell<'a> = &'a mut dyn FnMut(usize, usize);
+
+/// As [`calibrate`]; `on_cell` learns of the progress.
+///
+/// # Errors
+/// As [`calibrate`].
+pub(super) fn calibrate_watched(
+    baseline: &Baseline,
+    seed: u64,
+    on_cell: OnCell<'_>,
+) -> Result<(CalibrationRecord, Vec<CellRanks>), InferenceError> {
     let situations = Situation::all(baseline);
     if situations.is_empty() {
         let failure =
@@ -74,9 +89,36 @@ pub fn calibrate(baseline: &Baseline, seed: u64) -> Result<(CalibrationRecord, V
     }
     judged(situations.len(), simulations(baseline), |index, second_look| {
         let situation = &situations[index];
+        // The second looks come after all first ones.
+        on_cell(if second_look { situations.len() } else { index }, situations.len());
         let look = if second_look { ", second look" } else { "" };
         measure_cell(baseline, situation, seed, &format!("{}{look}", situation.purpose()))
     })
+}
+
+/// Measures the cells that `chosen` selects by their index again, on other simulations; the others keep what `record` says of them. For
+/// a model whose draws have changed in the chosen cells only. `on_cell` as in [`calibrate_watched`].
+///
+/// # Errors
+/// As [`calibrate`].
+pub(super) fn calibrate_again(
+    baseline: &Baseline,
+    record: &CalibrationRecord,
+    (chosen, seed): (impl Fn(usize) -> bool, u64),
+    on_cell: OnCell<'_>,
+) -> Result<CalibrationRecord, InferenceError> {
+    let situations = Situation::all(baseline);
+    let measured = judged(situations.len(), record.simulations, |index, second_look| {
+        if !chosen(index) {
+            let cell = record.cells[index].clone();
+            let title = cell_title(&cell);
+            return Ok((cell, CellRanks { title, ranks: Vec::new(), tarp_ranks: Vec::new() }));
+        }
+        on_cell(if second_look { situations.len() } else { index }, situations.len());
+        let look = if second_look { ", second look" } else { "" };
+        measure_cell(baseline, &situations[index], seed, &format!("{}{look}", situations[index].purpose()))
+    });
+    measured.map(|(record, _)| record)
 }
 
 /// The record of `count` cells, which `measure` measures on `simulations` simulations each.

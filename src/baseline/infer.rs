@@ -7,7 +7,7 @@ use rand::RngCore as _;
 use super::error::InferenceError;
 use super::model::Baseline;
 use super::observation::Observation;
-use super::resample::{Resampled, EFFECTIVE};
+use super::resample::Resampled;
 use super::{project, resample};
 use crate::posterior::PosteriorSamples;
 use crate::quantity::Digest;
@@ -15,26 +15,6 @@ use crate::stats;
 
 /// Draws of the flow for each sample that is kept, where the draws are resampled by importance.
 const PROPOSALS: usize = 2;
-
-/// Most further proposals for each sample that is kept, where the effective share of the first ones is too small. A flow that is wider than
-/// the posterior, as where accurate frequencies leave a thin curved posterior, then still gives enough effective samples.
-const FURTHER_PROPOSALS: usize = 16;
-
-/// Range of that most for a measurement; its end does not apply below four for each sample. A quarter and a half of it are tried where they
-/// promise to be enough.
-const FURTHER_RANGE: [usize; 2] = [512, 4_096];
-
-/// Fewest effective samples among the further proposals; and at least as many as are kept.
-const FURTHER_EFFECTIVE: usize = 64;
-
-/// Least effective share of the first proposals, as a share of the one that the further proposals must reach, for which they are drawn.
-const HOPEFUL: f64 = 0.5;
-
-/// The number of further proposals promises this multiple of the effective ones that are needed.
-const RESERVE: f64 = 1.5;
-
-/// Measurements that get further proposals together, which bounds the memory.
-const FURTHER_AT_A_TIME: usize = 128;
 
 /// Most degrees of freedom of a structure whose eigenproblem is solved for every draw: beyond it takes milliseconds per
 /// draw.
@@ -60,8 +40,8 @@ impl Baseline {
     /// Posterior samples of each measurement, `[n·draws, d]` for n observations, in parameter units.
     ///
     /// The flow proposes two draws for each sample, and sampling–importance resampling corrects them by the exact
-    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where fewer than half of them are effective, the flow
-    /// proposes more. Draws of the flow that the simulation has not corrected are stretched as the manifest's
+    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where fewer than half of them are effective, the
+    /// proposals are adapted to the posterior, see `src/baseline/adapt.rs`. Draws of the flow that the simulation has not corrected are stretched as the manifest's
     /// [`spread`](super::manifest::Manifest::spread) says. Where a covariate is missing, the samples go
     /// through its possible values in turn:
     ///
@@ -227,8 +207,8 @@ impl Baseline {
         Ok(Corrected { samples, weighted: uncorrected() })
     }
 
-    /// Sampling–importance resampling of the flow's draws, with more of them for the measurements for which the first ones do not
-    /// suffice.
+    /// Sampling–importance resampling of the flow's draws, and adaptive importance sampling for the measurements for which they do
+    /// not suffice.
     fn infer_weighted(
         &self,
         observations: &[Observation],
@@ -238,27 +218,18 @@ impl Baseline {
     ) -> Result<Corrected, InferenceError> {
         let first = self.propose(observations, proposals * draws, seed)?;
         let mut simulations = first.theta.nrows();
-        let Resampled { mut theta, mut weighted, effective: share } =
-            resample::resample(&self.simulator, observations, &first, (draws, EFFECTIVE), seed);
-        let [fewest, most] = FURTHER_RANGE;
-        let largest = (FURTHER_PROPOSALS * draws).clamp(fewest, most).max(4 * draws);
-        let needed = draws.max(FURTHER_EFFECTIVE) as f64;
-        for (index, many) in [largest / 4, largest / 2, largest].into_iter().enumerate() {
-            let effective = needed / many as f64;
-            // As many as promise enough effective ones. Where the first proposals are hopeless, so are further ones: that includes draws
-            // that were moved to the bounds of the prior, whose measurement lies outside the prior.
-            let least = if index == 2 { HOPEFUL * effective } else { RESERVE * effective };
-            let poor: Vec<usize> =
-                (0..observations.len()).filter(|&row| !weighted[row] && share[row] >= least).collect();
-            for (chunk, rows) in poor.chunks(FURTHER_AT_A_TIME).enumerate() {
-                let seed = stats::stream(seed, &format!("{many} further proposals {chunk}")).next_u64();
-                let of_rows: Vec<Observation> = rows.iter().map(|row| observations[*row].clone()).collect();
-                let further = self.propose(&of_rows, many, seed)?;
-                simulations += further.theta.nrows();
-                let found = resample::resample(&self.simulator, &of_rows, &further, (draws, effective), seed);
-                for (index, row) in rows.iter().enumerate().filter(|(index, _)| found.weighted[*index]) {
-                    weighted[*row] = true;
-                    theta.rows_mut(row * draws, draws).copy_from(&found.theta.rows(index * draws, draws));
+        let Resampled { mut theta, mut weighted } =
+            resample::resample(&self.simulator, observations, &first, draws, seed);
+        // Draws that were moved to the bounds of the prior tell of a measurement outside it, which has no posterior to adapt to.
+        let poor: Vec<usize> = (0..observations.len()).filter(|&row| !weighted[row] && !first.moved[row]).collect();
+        if !poor.is_empty() {
+            let of_poor: Vec<Observation> = poor.iter().map(|row| observations[*row].clone()).collect();
+            let adapted = self.adapt(&of_poor, draws, seed)?;
+            simulations += adapted.simulations;
+            for (row, found) in poor.into_iter().zip(adapted.theta) {
+                if let Some(found) = found {
+                    weighted[row] = true;
+                    theta.rows_mut(row * draws, draws).copy_from(&found);
                 }
             }
         }

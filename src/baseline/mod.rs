@@ -34,6 +34,7 @@
 //! # }
 //! ```
 
+mod adapt;
 mod admit;
 pub mod calibration;
 pub mod conditions;
@@ -53,6 +54,7 @@ pub mod observation;
 mod project;
 mod propose;
 mod real_line;
+pub mod recipe;
 mod resample;
 pub mod rounds;
 mod situations;

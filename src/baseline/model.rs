@@ -1,6 +1,6 @@
 //! The trained model itself: a flow, the standardisation of its inputs, its structure, and its manifest.
 
-use candle_core::Tensor;
+use candle_core::{DType, Tensor};
 
 use super::conditions::Conditions;
 use super::error::InferenceError;
@@ -90,6 +90,30 @@ impl Baseline {
             Some(sampler) => sampler.sample(context, draws, stream),
             None => self.flow.sample(context, draws, stream),
         }
+    }
+
+    /// Maps z to the real line x, where `latent` holds z `[n·k·d]`, k rows for each of the n rows of `context`. Returns x and
+    /// ln|det ∂z/∂x| of each row.
+    ///
+    /// # Errors
+    /// A candle error, which would be a bug.
+    pub(super) fn map_latent(
+        &self,
+        mut latent: Vec<f32>,
+        context: &Tensor,
+    ) -> Result<(Vec<f64>, Vec<f64>), candle_core::Error> {
+        let (rows, features) = context.dims2()?;
+        let wide = |values: Vec<f32>| values.into_iter().map(f64::from).collect();
+        if let Some(sampler) = &self.sampler {
+            let log_det = sampler.inverse(&mut latent, &context.flatten_all()?.to_vec1()?, features);
+            return Ok((wide(latent), wide(log_det)));
+        }
+        let d = self.flow.architecture().parameters;
+        let each = latent.len() / d / rows.max(1);
+        let z = Tensor::from_vec(latent, (rows * each, d), context.device())?.to_dtype(self.flow.dtype())?;
+        let repeated = context.unsqueeze(1)?.expand((rows, each, features))?.reshape((rows * each, features))?;
+        let (x, log_det) = self.flow.inverse(&z, &repeated)?;
+        Ok((x.to_dtype(DType::F64)?.flatten_all()?.to_vec1()?, log_det.to_dtype(DType::F64)?.to_vec1()?))
     }
 
     /// The summary S(y) of each observation, `[n, context]`, for a flow that does not start at the best fit.

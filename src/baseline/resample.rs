@@ -10,7 +10,7 @@ use crate::stats;
 /// Smallest effective sample size, as a share of the proposals, for which the first proposals are resampled. Where the flow differs
 /// more from the posterior (few accurate frequencies of many parameters give a thin curved posterior), a few draws would
 /// dominate and the sample would be too narrow.
-pub(super) const EFFECTIVE: f64 = 0.5;
+const EFFECTIVE: f64 = 0.5;
 
 /// Fewest observations per task, so that the cost of scheduling stays small.
 const LEAST_PER_TASK: usize = 8;
@@ -31,8 +31,6 @@ pub(super) struct Resampled {
     pub theta: DMatrix<f64>,
     /// Whether the draws of each observation were weighted by their likelihood, `[n]`; the others are draws of the flow.
     pub weighted: Vec<bool>,
-    /// Effective sample size of the proposals of each observation, as a share of them, `[n]`; 0 where they have no densities.
-    pub effective: Vec<f64>,
 }
 
 /// Resamples `draws` of the proposals of each observation by their importance weights, `[n·draws, d]`.
@@ -43,23 +41,23 @@ pub(super) struct Resampled {
 ///
 /// under the uniform prior; the sum is over the modes present. Resampling is systematic, followed by a shuffle, so that any
 /// first few draws are a sample too. Spurious modes of the flow, such as bridges between two modes of the posterior, are
-/// removed. Where the effective sample size is less than the share `effective` of the proposals, the flow's draws are kept unchanged.
+/// removed. Where the effective sample size is less than [`EFFECTIVE`], the flow's draws are kept unchanged.
 ///
 /// Source: D. B. Rubin (1988), Using the SIR algorithm to simulate posterior distributions, Bayesian Statistics 3, 395–402.
 pub(super) fn resample(
     simulator: &Simulator,
     observations: &[Observation],
     proposals: &Proposals,
-    (draws, effective): (usize, f64),
+    draws: usize,
     seed: u64,
 ) -> Resampled {
     let d = proposals.theta.ncols();
     let many = proposals.theta.nrows() / observations.len().max(1);
     let log_likelihoods = log_likelihoods(simulator, observations, &proposals.theta);
-    let choose = |row: usize| -> ((Vec<usize>, bool), f64) {
+    let choose = |row: usize| -> (Vec<usize>, bool) {
         let rows = row * many..(row + 1) * many;
         if proposals.moved[row] {
-            return ((rows.take(draws).collect(), false), 0.0);
+            return (rows.take(draws).collect(), false);
         }
         // Non-finite weights are set to zero.
         let log_weight = |row: usize| {
@@ -72,32 +70,20 @@ pub(super) fn resample(
         };
         let log_weights: Vec<f64> = rows.clone().map(log_weight).collect();
         let mut stream = stats::stream(seed, &format!("resampling {row}"));
-        let weights = stats::weights(&log_weights, 0.0);
-        let share = weights.as_deref().map_or(0.0, effective_share);
-        match weights.filter(|_| share >= effective) {
+        match stats::weights(&log_weights, EFFECTIVE) {
             Some(weights) => {
                 let chosen = stats::systematic(&weights, draws, &mut stream);
-                ((chosen.into_iter().map(|i| rows.start + i).collect(), true), share)
+                (chosen.into_iter().map(|i| rows.start + i).collect(), true)
             }
-            None => ((rows.take(draws).collect(), false), share),
+            None => (rows.take(draws).collect(), false),
         }
     };
     let rows = (0..observations.len()).into_par_iter().with_min_len(LEAST_PER_TASK);
-    let found: Vec<((Vec<usize>, bool), f64)> = rows.map(choose).collect();
-    let chosen: Vec<usize> = found.iter().flat_map(|((chosen, _), _)| chosen.iter().copied()).collect();
-    let (weighted, effective) = found.iter().map(|((_, weighted), share)| (*weighted, *share)).unzip();
+    let found: Vec<(Vec<usize>, bool)> = rows.map(choose).collect();
+    let chosen: Vec<usize> = found.iter().flat_map(|(chosen, _)| chosen.iter().copied()).collect();
+    let weighted = found.iter().map(|(_, weighted)| *weighted).collect();
     let theta = DMatrix::from_fn(chosen.len(), d, |row, column| proposals.theta[(chosen[row], column)]);
-    Resampled { theta, weighted, effective }
-}
-
-/// Effective sample size of weights w, `[n]`, as a share of n.
-///
-/// ```text
-///  (Σ w)²/(n Σ w²)
-/// ```
-fn effective_share(weights: &[f64]) -> f64 {
-    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
-    sum * sum / (squares * weights.len() as f64)
+    Resampled { theta, weighted }
 }
 
 /// ln p(y | x) up to a constant for each row of `theta` `[n·k, d]`, k rows for each of the n observations; nats.

@@ -41,6 +41,13 @@ pub enum Progress {
         /// Number of the round, counted from 1.
         round: usize,
     },
+    /// A cell of the calibration is measured. A calibration that does not pass is measured again after a repair.
+    Cell {
+        /// Cells measured so far.
+        done: usize,
+        /// Number of cells.
+        cells: usize,
+    },
     /// The training goes on or ends without having passed, and why.
     Round(String),
 }
@@ -73,7 +80,7 @@ pub(super) fn run(
     let first = ongoing.settings;
     ongoing.first_round(|report| on_progress(Progress::Epoch { report, epochs: first.epochs }))?;
     on_progress(Progress::Calibration { round: 1 });
-    let mut best = ongoing.certified()?;
+    let mut best = ongoing.certified(&mut |done, cells| on_progress(Progress::Cell { done, cells }))?;
     let epochs = (first.epochs as f64 * SHARE_OF_EPOCHS).ceil() as usize;
     let learning_rate = first.learning_rate * SHARE_OF_LEARNING_RATE;
     let mut without_improvement = 0;
@@ -99,7 +106,7 @@ pub(super) fn run(
             other => other?,
         }
         on_progress(Progress::Calibration { round: ongoing.rounds() });
-        let next = ongoing.certified()?;
+        let next = ongoing.certified(&mut |done, cells| on_progress(Progress::Cell { done, cells }))?;
         if calibration(&next).findings() < calibration(&best).findings() {
             (best, without_improvement) = (next, 0);
         } else {

@@ -4,7 +4,7 @@ use candle_core::DType;
 use nalgebra::DMatrix;
 use rand::RngCore as _;
 
-use super::calibration::calibrate;
+use super::calibration::{calibrate_again, calibrate_watched, OnCell};
 use super::conditions::{Conditions, EffectRange, NoiseRange, Whitening};
 use super::error::{InferenceError, LoadError};
 use super::fitted::fitted_pairs;
@@ -22,8 +22,8 @@ use super::start::starts_at_fit;
 use crate::flow::architecture::{Architecture, FlowSettings};
 use crate::flow::pairs::Pairs;
 use crate::flow::train::{EpochReport, Stopped, TrainOutcome, TrainSettings};
-use crate::flow::weights::Weights;
-use crate::flow::{checkpoint, weights, Flow};
+use crate::flow::weights::{self, Weights};
+use crate::flow::{checkpoint, Flow};
 use crate::parameter::ParameterSpace;
 use crate::quantity::Digest;
 use crate::simulator::{Simulator, TrainingSet};
@@ -143,8 +143,7 @@ pub fn train(
     settings: &TrainSettings,
     on_epoch: impl FnMut(EpochReport),
 ) -> Result<Trained, Error> {
-    let prepared = prepare(simulator, samples, noise_range, flow_settings, settings)?;
-    prepared.train(simulator, settings, on_epoch)
+    prepare(simulator, samples, noise_range, flow_settings, settings)?.train(simulator, settings, on_epoch)
 }
 
 /// A flow with random weights, and all that its training needs.
@@ -207,7 +206,7 @@ impl Prepared {
     ) -> Result<Trained, Error> {
         let mut ongoing = self.begin(simulator, settings)?;
         ongoing.first_round(on_epoch)?;
-        ongoing.certified()
+        ongoing.certified(&mut |_, _| {})
     }
 
     /// A training before its first round.
@@ -271,14 +270,14 @@ impl Ongoing<'_> {
         task.run(flow, weights, training, &self.validation, on_epoch)
     }
 
-    /// The model with the present weights.
-    pub(super) fn certified(&self) -> Result<Trained, Error> {
+    /// The model with the present weights; `on_cell` is called as in the calibration.
+    pub(super) fn certified(&self, on_cell: OnCell<'_>) -> Result<Trained, Error> {
         let Prepared { flow, weights, conditions, whitening, .. } = &self.prepared;
         let weights = checkpoint::to_bytes(weights)?;
         let described = (whitening.clone(), conditions.clone());
         let manifest =
             draft_manifest(self.simulator, &weights, flow.architecture().clone(), described, self.record.clone());
-        certify(manifest, self.simulator, weights)
+        certify(manifest, self.simulator, weights, on_cell)
     }
 }
 
@@ -359,14 +358,18 @@ fn draft_manifest(
 /// # Errors
 /// As [`train`].
 pub fn renew(baseline: &Baseline, weights: Vec<u8>) -> Result<Trained, Error> {
-    certify(baseline.manifest().clone(), baseline.simulator(), weights)
+    certify(baseline.manifest().clone(), baseline.simulator(), weights, &mut |_, _| {})
 }
 
 /// Measures accuracy, calibration and identifiability of a trained model, completes its manifest, and loads it back.
 ///
-/// Where the calibration does not pass, the spread of the draws that the simulation does not correct is repaired, and the calibration
-/// is measured again on other simulations. The repair is kept where it leaves fewer findings.
-fn certify(mut manifest: Manifest, simulator: &Simulator, weights: Vec<u8>) -> Result<Trained, Error> {
+/// Where it does not pass, the spread of the uncorrected draws is repaired, and these cells are judged on other simulations.
+fn certify(
+    mut manifest: Manifest,
+    simulator: &Simulator,
+    weights: Vec<u8>,
+    cell: OnCell<'_>,
+) -> Result<Trained, Error> {
     env!("CARGO_PKG_VERSION").clone_into(&mut manifest.program_version);
     manifest.spread = Vec::new();
     let flow = checkpoint::from_bytes(&weights, &manifest.architecture, DType::F32)?;
@@ -379,12 +382,12 @@ fn certify(mut manifest: Manifest, simulator: &Simulator, weights: Vec<u8>) -> R
         further => format!(" of round {}", further + 1),
     };
     let calibration_seed = |what: &str| purpose_seed(seed, &format!("{what}{round}"));
-    (manifest.calibration, _) = calibrate(&draft, calibration_seed("calibration"))?;
+    (manifest.calibration, _) = calibrate_watched(&draft, calibration_seed("calibration"), cell)?;
     if !manifest.calibration.passed() && simulator.is_noisy() {
         let record = &manifest.calibration;
         let faulty = |index: usize| !judge(&record.cells, index, record.simulations).is_clean();
         draft.manifest.spread = spread::learn(&draft, faulty, calibration_seed("spread"))?;
-        let (repaired, _) = calibrate(&draft, calibration_seed("calibration after the repair"))?;
+        let repaired = calibrate_again(&draft, record, (&faulty, calibration_seed("repair")), cell)?;
         if repaired.findings() < manifest.calibration.findings() {
             (manifest.calibration, manifest.spread) = (repaired, draft.manifest.spread.clone());
         } else {

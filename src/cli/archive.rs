@@ -90,8 +90,9 @@ pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
     }
     println!("{}: {} of {} batches were new and have been assessed", done.structure, done.batches_new, done.batches);
     println!(
-        "  new: {} versions, {} trained models, {} undamaged references, {} maintenance windows, {} acknowledgements",
-        done.versions, done.models, done.undamaged_states, done.maintenance_windows, done.acknowledgements
+        "  new: {} versions, {} trained models, {} undamaged references, {} maintenance windows, {} acknowledgements, {} alarm actions, {} notes",
+        done.versions, done.models, done.undamaged_states, done.maintenance_windows, done.acknowledgements,
+        done.alarm_actions, done.notes
     );
     for warning in done.warnings {
         println!("  warning: {warning}");

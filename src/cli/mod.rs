@@ -35,6 +35,7 @@ mod update;
 
 use std::future::Future;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 
@@ -194,6 +195,14 @@ pub fn run() -> anyhow::Result<()> {
     }
 }
 
+/// Time that computations have to end after their command has ended. A job between two of its steps is left behind: the process ends
+/// without it, and what it computes is not stored.
+const LAST_STEPS: Duration = Duration::from_secs(1);
+
 fn block_on(future: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
-    tokio::runtime::Builder::new_multi_thread().enable_all().build()?.block_on(future)
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    let outcome = runtime.block_on(future);
+    // Without a limit, the runtime would wait for the thread of a training.
+    runtime.shutdown_timeout(LAST_STEPS);
+    outcome
 }

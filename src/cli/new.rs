@@ -30,8 +30,8 @@ pub struct NewArgs {
     /// Spring as name=from,to,N/m, where one end may be `ground`; once per spring
     #[arg(long = "spring", value_name = "NAME=FROM,TO,N_PER_M", value_parser = spring)]
     springs: Vec<NewSpring>,
-    /// Unknown stiffness of a spring, with the range of possible values as factors of its nominal stiffness: k1=0.5..1.5; once per
-    /// unknown spring
+    /// Unknown stiffness of a spring, with the range of possible values as factors of its nominal stiffness, k1=0.5..1.5, or as
+    /// stiffnesses, k1=1.5e7..4.5e7N/m; once per unknown spring
     #[arg(long = "parameter", value_name = "SPRING=LOW..HIGH", value_parser = unknown)]
     parameters: Vec<NewParameter>,
     /// Number of measured modes, from the lowest
@@ -40,9 +40,9 @@ pub struct NewArgs {
     /// Standard deviation of a measured frequency, in per cent of it
     #[arg(long, value_name = "PERCENT%", value_parser = noise)]
     noise: Option<f64>,
-    /// Covariate that is noted beside the frequencies, such as temperature_c; may be repeated
-    #[arg(long = "covariate", value_name = "NAME")]
-    covariates: Vec<String>,
+    /// Covariate that is noted beside the frequencies, if wanted with its unit, such as temperature=°C; may be repeated
+    #[arg(long = "covariate", value_name = "NAME[=UNIT]", value_parser = covariate)]
+    covariates: Vec<NewCovariate>,
     /// File to write [default: <id>.toml]
     #[arg(long)]
     out: Option<PathBuf>,
@@ -68,8 +68,16 @@ struct NewSpring {
 #[derive(Debug, Clone, PartialEq)]
 struct NewParameter {
     spring: String,
-    /// Range as factors of the nominal stiffness.
-    factors: [f64; 2],
+    /// Range as factors of the nominal stiffness, or as stiffnesses, N/m.
+    range: [f64; 2],
+    /// Whether the range is one of stiffnesses.
+    in_n_per_m: bool,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+struct NewCovariate {
+    name: String,
+    unit: Option<String>,
 }
 
 /// The answers from which a file is written.
@@ -80,7 +88,7 @@ struct Answers {
     parameters: Vec<NewParameter>,
     modes: usize,
     noise: f64,
-    covariates: Vec<String>,
+    covariates: Vec<NewCovariate>,
 }
 
 /// Asks for what the flags do not give, writes the file and says what to do next.
@@ -206,15 +214,45 @@ fn answers<R: BufRead>(args: &NewArgs, terminal: &mut Terminal<R>) -> anyhow::Re
     let covariates = if by_flags || !args.covariates.is_empty() {
         args.covariates.clone()
     } else {
-        let read = |text: &str| Ok(text.split(',').map(|c| c.trim().to_owned()).filter(|c| !c.is_empty()).collect());
-        terminal.ask("Covariates noted beside the frequencies, separated by commas (may be empty)", Some(""), read)?
+        let read = |text: &str| text.split(',').map(str::trim).filter(|c| !c.is_empty()).map(covariate).collect();
+        let question =
+            "Covariates noted beside the frequencies, such as temperature=°C, separated by commas (may be empty)";
+        terminal.ask(question, Some(""), read)?
     };
     Ok(Answers { id, masses, springs, parameters, modes, noise, covariates })
 }
 
+/// A text as TOML writes it.
+fn quoted(text: &str) -> String {
+    toml::Value::String(text.to_owned()).to_string()
+}
+
+/// A parameter with comments.
+fn write_parameter(out: &mut String, p: &NewParameter, springs: &[NewSpring]) -> anyhow::Result<()> {
+    let spring = springs.iter().find(|s| s.name == p.spring);
+    let k = spring.with_context(|| format!("--parameter {}: there is no spring of this name", p.spring))?.n_per_m;
+    let ([low, high], name) = (p.range, quoted(&p.spring));
+    if p.in_n_per_m {
+        writeln!(out, "\n# The unknown stiffness of {}, N/m.", p.spring)?;
+    } else {
+        let [from, to] = [low, high].map(|factor| significant(factor * k));
+        writeln!(
+            out,
+            "\n# The unknown stiffness of {} as a factor of its nominal value: {from} to {to} N/m.",
+            p.spring
+        )?;
+    }
+    writeln!(out, "# The range holds every value that is possible, damaged states included.")?;
+    writeln!(out, "[[parameter]]\nname = {name}")?;
+    if !p.in_n_per_m {
+        writeln!(out, "scale = true    # a factor of n_per_m; results are in per cent of it")?;
+    }
+    writeln!(out, "prior = {{ uniform = [{low:?}, {high:?}] }}\nsets = {{ spring = {name} }}\ndamage = \"decrease\"")?;
+    Ok(())
+}
+
 /// The structure file with comments.
 fn text(answers: &Answers) -> anyhow::Result<String> {
-    let quoted = |name: &str| toml::Value::String(name.to_owned()).to_string();
     let mut text = String::new();
     let out = &mut text;
     writeln!(out, "# Structure file of modalwatch. Every key is explained in docs/structure-file.md (served at /docs/structure-file).")?;
@@ -237,32 +275,14 @@ fn text(answers: &Answers) -> anyhow::Result<String> {
         writeln!(out, "n_per_m = {:?}    # nominal stiffness", s.n_per_m)?;
     }
     for p in &answers.parameters {
-        let spring = answers.springs.iter().find(|s| s.name == p.spring);
-        let k = spring.with_context(|| format!("--parameter {}: there is no spring of this name", p.spring))?.n_per_m;
-        let [low, high] = p.factors;
-        writeln!(
-            out,
-            "\n# The unknown stiffness of {}, N/m: {} to {} times its nominal value.",
-            p.spring,
-            significant(low),
-            significant(high)
-        )?;
-        writeln!(out, "# The range holds every value that is possible, damaged states included.")?;
-        writeln!(
-            out,
-            "[[parameter]]\nname = {0}\nprior = {{ uniform = [{1:?}, {2:?}] }}\nsets = {{ spring = {0} }}",
-            quoted(&p.spring),
-            low * k,
-            high * k
-        )?;
-        writeln!(out, "damage = \"decrease\"")?;
+        write_parameter(out, p, &answers.springs)?;
     }
-    for name in &answers.covariates {
-        writeln!(
-            out,
-            "\n# Noted beside the frequencies, as a column of this name.\n[[covariate]]\nname = {}",
-            quoted(name)
-        )?;
+    for covariate in &answers.covariates {
+        let name = quoted(&covariate.name);
+        writeln!(out, "\n# Noted beside the frequencies, as a column of this name.\n[[covariate]]\nname = {name}")?;
+        if let Some(unit) = &covariate.unit {
+            writeln!(out, "unit = {}", quoted(unit))?;
+        }
     }
     Ok(text)
 }
@@ -289,25 +309,40 @@ fn spring(text: &str) -> Result<NewSpring, String> {
 fn unknown(text: &str) -> Result<NewParameter, String> {
     let wrong = || {
         format!(
-            "{} must have the form spring=LOW..HIGH with factors of the nominal stiffness, such as k1=0.5..1.5",
+            "{} must have the form spring=LOW..HIGH with factors of the nominal stiffness, such as k1=0.5..1.5, or with stiffnesses, such \
+             as k1=1.5e7..4.5e7N/m",
             shown(text)
         )
     };
     let (name, range) = text.split_once('=').ok_or_else(wrong)?;
+    let (range, in_n_per_m) = match range.trim().strip_suffix("N/m") {
+        Some(stiffnesses) => (stiffnesses, true),
+        None => (range, false),
+    };
     let (low, high) = range.split_once("..").ok_or_else(wrong)?;
-    let factors = [positive(low).ok_or_else(wrong)?, positive(high).ok_or_else(wrong)?];
-    if factors[0] >= factors[1] {
+    let range = [positive(low).ok_or_else(wrong)?, positive(high).ok_or_else(wrong)?];
+    if range[0] >= range[1] {
         return Err(wrong());
     }
-    // A stiffness in N/m instead of a factor.
-    if factors[0] > 100.0 {
+    if !in_n_per_m && range[0] > 100.0 {
         return Err(format!(
-            "{}: {} is not a factor of the nominal stiffness; write 0.5..1.5",
+            "{}: {} is not a factor of the nominal stiffness; write 0.5..1.5, or add the unit to stiffnesses, {low}..{high}N/m",
             shown(text),
-            factors[0]
+            range[0]
         ));
     }
-    Ok(NewParameter { spring: name.trim().to_owned(), factors })
+    Ok(NewParameter { spring: name.trim().to_owned(), range, in_n_per_m })
+}
+
+fn covariate(text: &str) -> Result<NewCovariate, String> {
+    let (name, unit) = match text.split_once('=') {
+        Some((name, unit)) => (name, Some(unit.trim().to_owned())),
+        None => (text, None),
+    };
+    if name.trim().is_empty() || unit.as_ref().is_some_and(String::is_empty) {
+        return Err(format!("{} must have the form name or name=unit, such as temperature=°C", shown(text)));
+    }
+    Ok(NewCovariate { name: name.trim().to_owned(), unit })
 }
 
 /// A share from per cent; the sign may be left out, because the question names it.

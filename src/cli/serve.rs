@@ -2,12 +2,13 @@
 
 use std::future::Future;
 use std::net::SocketAddr;
+use std::sync::Arc;
 
 use anyhow::Context as _;
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{signal, SignalKind};
-use tokio::sync::watch;
+use tokio::sync::{watch, Notify};
 use tracing::{error, info};
 
 use super::reload::Reloading;
@@ -18,7 +19,7 @@ use crate::http::access::AccessControl;
 use crate::http::{router, server, Service};
 use crate::monitor::{declare_metrics, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
-use crate::notify::Notifier;
+use crate::notify::{Mailer, Notifier};
 use crate::store::Store;
 
 /// Upper bounds of the latency histogram buckets, s.
@@ -51,19 +52,26 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let store = Store::open_with(&config.data_dir, &config.store).await?;
     let (place, largest_batch) = ((address, config.data_dir.as_path()), config.monitor.max_measurements);
     let access = AccessControl::open(store.clone(), &config.access, &config.http, place, largest_batch).await?;
+    let limits = config.monitor.severity;
+    let wake = Arc::new(Notify::new());
+    let mailer = Mailer::new(store.clone(), config.email, config.notify.clone(), limits, Arc::clone(&wake))?;
+    // Before the first batch is assessed, so that its alarms are addressed.
+    mailer.prepare().await?;
     let monitor = Monitor::open(store.clone(), library, config.monitor).await?;
     let upkeep = monitor.upkeep();
     upkeep.retention().set(config.retention);
     monitor.replay().resume_all();
+    monitor.jobs().resume().await?;
     upkeep.silence().watch();
     upkeep.retention().watch();
     upkeep.diagnoses().watch(config.diagnosis);
     let metrics = PrometheusBuilder::new()
         .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS_SECONDS)?
         .install_recorder()?;
-    let notifier = Notifier::new(store.clone(), config.notify).map_err(anyhow::Error::msg)?;
+    let notifier = Notifier::new(store.clone(), config.notify, limits, wake).map_err(anyhow::Error::msg)?;
     let (stop, stopped) = watch::channel(false);
-    let mut background = vec![tokio::spawn(notifier.clone().run(stopped.clone()))];
+    let mut background =
+        vec![tokio::spawn(notifier.clone().run(stopped.clone())), tokio::spawn(mailer.clone().run(stopped.clone()))];
     let broker = MqttStatus::default();
     background.extend(mqtt::run(&config.mqtt, monitor.clone(), &broker, stopped)?);
     let rights = access.clone();
@@ -71,17 +79,21 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let sender = notifier.clone();
     upkeep.report_findings_from(move || {
         let broker = broker.finding().map(|it| Reason::new("mqtt_unavailable", it));
-        broker.into_iter().chain(sender.finding().map(|it| Reason::new("webhooks_failing", it))).collect()
+        let webhooks = sender.finding().map(|it| Reason::new("webhooks_failing", it));
+        let mails = mailer.finding().map(|it| Reason::new("mail_failing", it));
+        broker.into_iter().chain(webhooks).chain(mails).collect()
     });
     let router = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
     declare_metrics(store.file().sqlite_version());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
-    let events = monitor.events().clone();
+    let (events, jobs) = (monitor.events().clone(), monitor.jobs().clone());
     let task = tokio::spawn(async move {
         let shutdown = async {
             shutdown.await;
             supervisor::stopping();
+            // Jobs that compute end at their next epoch or step, while open requests finish.
+            jobs.stop().await;
             // Event streams do not end by themselves and would delay the shutdown up to its time limit.
             events.close();
             // Sending fails only if all background tasks have ended already.

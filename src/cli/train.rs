@@ -7,14 +7,14 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::output::write_whole;
-use super::training::{print_record, refuse_overconfident, sizes, train_into, Recipe};
+use super::training::{print_record, refuse_overconfident, train_into};
 use crate::baseline::conditions::NoiseRange;
 use crate::baseline::library::{find_structure, read_structure_file};
 use crate::baseline::manifest::{Manifest, Outcome, ValidationRecord};
+use crate::baseline::recipe::RecipeRequest;
 use crate::baseline::rounds::MOST_ROUNDS;
 use crate::baseline::train::diverged;
 use crate::flow::train::TrainSettings;
-use crate::flow::FlowSettings;
 use crate::simulator::Simulator;
 
 /// Train the model of a structure.
@@ -76,14 +76,16 @@ pub fn train(args: &TrainArgs) -> anyhow::Result<()> {
     for warning in simulator.warnings() {
         eprintln!("note: {warning}");
     }
-    let (samples, epochs) = sizes(&simulator, args.samples, args.epochs);
-    let settings = TrainSettings { epochs, seed: args.seed, ..TrainSettings::default() };
-    let mut flow = FlowSettings::default();
-    flow.units = args.units.map_or(flow.units, usize::from);
+    let request = RecipeRequest {
+        samples: args.samples,
+        epochs: args.epochs,
+        units: args.units.map(usize::from),
+        rounds: args.rounds.map(usize::from),
+        noise_range: Some(args.noise_range),
+        seed: Some(args.seed),
+    };
     let started = Instant::now();
-    let as_given = args.samples.is_some() || args.epochs.is_some();
-    let rounds = args.rounds.map_or(if as_given { 1 } else { MOST_ROUNDS }, usize::from);
-    let recipe = Recipe { samples, noise_range: args.noise_range, flow, settings, rounds };
+    let recipe = request.recipe(&simulator);
     let trained = train_into(&out, &simulator, &recipe)?;
     let seconds = started.elapsed().as_secs_f64();
 

@@ -6,33 +6,11 @@ use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::output::write_whole;
-use crate::baseline::conditions::NoiseRange;
 use crate::baseline::extension::{ExtensionPlan, Progress};
 use crate::baseline::manifest::{Manifest, Outcome};
-use crate::baseline::rounds::train_in_rounds;
-use crate::baseline::train::{default_epochs, default_samples, Trained};
-use crate::flow::train::TrainSettings;
-use crate::flow::FlowSettings;
+use crate::baseline::recipe::Recipe;
+use crate::baseline::train::Trained;
 use crate::simulator::Simulator;
-
-/// Number of samples and epochs of a training: those given, otherwise the defaults for the structure.
-pub fn sizes(simulator: &Simulator, samples: Option<usize>, epochs: Option<usize>) -> (usize, usize) {
-    (samples.unwrap_or_else(|| default_samples(simulator)), epochs.unwrap_or_else(|| default_epochs(simulator)))
-}
-
-/// How a model is trained.
-pub struct Recipe {
-    /// Number of simulated pairs.
-    pub samples: usize,
-    /// Noise that the model must cover.
-    pub noise_range: NoiseRange,
-    /// Size of the network.
-    pub flow: FlowSettings,
-    /// Epochs of the first round, and the seed.
-    pub settings: TrainSettings,
-    /// Most rounds.
-    pub rounds: usize,
-}
 
 /// Trains with a progress bar until the calibration passes or stops improving, and writes the two files of the trained model to the
 /// folder `out`.
@@ -41,10 +19,7 @@ pub struct Recipe {
 /// A training that fails, a folder that cannot be written.
 pub fn train_into(out: &Path, simulator: &Simulator, recipe: &Recipe) -> anyhow::Result<Trained> {
     let bar = progress_bar()?;
-    let Recipe { samples, noise_range, flow, settings, rounds } = recipe;
-    let trained = train_in_rounds(simulator, *samples, *noise_range, flow, settings, *rounds, &mut |progress| {
-        show(&bar, progress);
-    })?;
+    let trained = recipe.train(simulator, &mut |progress| show(&bar, progress))?;
     bar.finish_and_clear();
     write_files(out, &trained)?;
     Ok(trained)
@@ -74,6 +49,7 @@ fn show(bar: &ProgressBar, progress: Progress) {
     match progress {
         Progress::Start(sentence) | Progress::Round(sentence) => bar.suspend(|| eprintln!("{sentence}")),
         Progress::Calibration { round } => bar.set_message(format!("measuring the calibration after round {round}")),
+        Progress::Cell { .. } => bar.tick(),
         Progress::Epoch { report, epochs } => {
             bar.set_length(epochs as u64);
             bar.set_message(format!(

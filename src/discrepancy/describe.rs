@@ -9,6 +9,7 @@ use super::fit::Fit;
 use super::grammar::Class;
 use super::rank::Ranked;
 use super::target_name::{phrase, target_name, TargetName};
+use crate::measurement::{unit_of_name, Covariate};
 use crate::physics::effect::Target;
 use crate::simulator::law::{Input, LawKind};
 use crate::simulator::Simulator;
@@ -67,22 +68,13 @@ fn unit(simulator: &Simulator, target: &Target) -> (String, f64, String) {
     }
 }
 
-/// Unit of a covariate, from the end of its name.
-fn covariate_unit(name: &str, unit_of_time: &str) -> String {
-    let last = name.rsplit('_').next().unwrap_or_default();
-    match last {
-        _ if name == TIME => unit_of_time,
-        "c" | "degc" => "°C",
-        "percent" => "%",
-        "um" => "µm",
-        "mm" => "mm",
-        "m" => "m",
-        "k" => "K",
-        "kn" => "kN",
-        "kg" => "kg",
-        _ => "unit",
+/// Unit of a covariate: the one that the structure states, or else that at the end of its name; `unit` if neither is known.
+fn covariate_unit(simulator: &Simulator, name: &str, unit_of_time: &str) -> String {
+    if name == TIME {
+        return unit_of_time.to_owned();
     }
-    .to_owned()
+    let declared = simulator.covariates().iter().find(|c| c.name == name).and_then(Covariate::unit);
+    declared.or_else(|| unit_of_name(name)).unwrap_or("unit").to_owned()
 }
 
 /// The effect range of an effect of a numeric covariate, otherwise its size, with its standard deviation.
@@ -159,7 +151,8 @@ pub fn cause(
         value,
         interval90: [value - Z90 * std, value + Z90 * std],
     };
-    let over = effect.law.covariate.as_deref().map(|name| covariate_unit(name, data.time_unit)).unwrap_or_default();
+    let over =
+        effect.law.covariate.as_deref().map(|name| covariate_unit(simulator, name, data.time_unit)).unwrap_or_default();
     let numeric = matches!(
         effect.law.covariate.as_deref().and_then(|c| data.column(c)).map(|c| &c.values),
         Some(Values::Numbers(_))
@@ -201,6 +194,7 @@ pub fn cause(
         covariance: &covariance,
         factor,
         unit: &shown_unit,
+        over: &over,
         time_unit: data.time_unit,
     };
     let sentence = wording.sentence((value, std));
@@ -224,6 +218,8 @@ struct Wording<'a> {
     /// From the unit of the target to `unit`.
     factor: f64,
     unit: &'a str,
+    /// Unit of the covariate.
+    over: &'a str,
     time_unit: &'a str,
 }
 
@@ -365,7 +361,7 @@ impl Wording<'_> {
             Some(lag) => format!(", which it follows with a lag of {:.1} {}s", self.psi[lag], self.time_unit),
             None => String::new(),
         };
-        let per = format!("{} per {}", self.unit, covariate_unit(covariate, self.time_unit));
+        let per = format!("{} per {}", self.unit, self.over);
         format!("{what} {} {} of {covariate}{later}", self.changes(slope), self.plus_minus(slope, std, &per))
     }
 
@@ -373,7 +369,7 @@ impl Wording<'_> {
     fn two_slopes(&self, what: &str, covariate: &str) -> String {
         let first = self.effect.numbers.len() - 3;
         let (below, above, knee) = (self.psi[first], self.psi[first + 1], self.psi[first + 2]);
-        let (unit, over) = (self.unit, covariate_unit(covariate, self.time_unit));
+        let (unit, over) = (self.unit, self.over);
         format!(
             "{what} changes by {:.3} {unit} per {over} of {covariate} below {knee:.1} {over} and by {:.3} {unit} per {over} above",
             self.factor * below,

@@ -1,4 +1,4 @@
-//! `/v1/structures/{id}/alarms`, `/charts`, `/maintenance`, `/identifiability`.
+//! `/v1/structures/{id}/alarms`, `/charts`, `/maintenance`, `/identifiability`. What people do with alarms is in `alarm_actions`.
 
 use axum::body::Body;
 use axum::extract::State;
@@ -8,19 +8,16 @@ use axum::Json;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
+use super::alarm_item::AlarmItem;
 use super::answer::ChartBody;
 use super::error::ApiError;
 use super::openapi::{AlarmPath, BodyRefused, Conflict, Invalid, StructurePath, Unknown};
+use super::people::check_text;
 use super::request::{json_body, page_cursor, page_limit, structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
-use crate::alarm::chart::parameter_of;
 use crate::baseline::manifest::ParameterIdentifiability;
-use crate::monitor::stored::{Acknowledgement, Episode, EpisodeQuery, JobState, MaintenanceWindow};
-use crate::process::reference::LastingChange;
+use crate::monitor::stored::{Acknowledgement, EpisodeQuery, MaintenanceWindow};
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
-
-/// Maximum length of a name or note, characters.
-const LONGEST_TEXT: usize = 500;
 
 /// Query of the alarms.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -93,65 +90,6 @@ struct Identifiability {
     groups: Vec<Vec<String>>,
 }
 
-/// An alarm episode, from its start to its end.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Alarm)]
-struct AlarmItem {
-    /// Its number.
-    alarm: i64,
-    /// `damage`, `simulation_does_not_fit` or `silence`.
-    kind: String,
-    /// Only for a damage alarm; absent if the parameters together raised it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    parameter: Option<String>,
-    /// `open`, `ended`, `withdrawn` if data that arrived later showed that there was no alarm, or `superseded` if the charts of a later
-    /// undamaged reference cover its time.
-    state: &'static str,
-    /// Version of the undamaged reference that has superseded it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    superseded_by: Option<u32>,
-    /// The alarm of an earlier undamaged reference about the same parameter and time.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    continues: Option<i64>,
-    opened_at: Timestamp,
-    opened_batch: Option<String>,
-    ended_at: Option<Timestamp>,
-    noticed_at: Timestamp,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    peak_shift_standard_errors: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    undamaged_version: Option<u32>,
-    /// Why the alarm was raised, in one sentence; only with a process behind the undamaged reference.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    sentence: Option<String>,
-    /// Onset and size of the change, as the newest batch of the alarm shows them.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    change: Option<LastingChange>,
-    acknowledgement: Option<AcknowledgementItem>,
-    /// The latest diagnosis that the service started because of this alarm.
-    #[schema(required)]
-    diagnosis: Option<AlarmDiagnosis>,
-}
-
-/// The diagnosis that the service started because of an alarm.
-#[derive(Debug, Serialize, ToSchema)]
-struct AlarmDiagnosis {
-    diagnosis: String,
-    state: JobState,
-    /// Its verdict, once it is done.
-    #[schema(required)]
-    verdict: Option<String>,
-}
-
-/// Acknowledgement of an alarm.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Acknowledgement)]
-struct AcknowledgementItem {
-    at: Timestamp,
-    by: String,
-    note: Option<String>,
-}
-
 /// Acknowledgement of an alarm by a person.
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -184,30 +122,6 @@ struct MaintenanceItem {
     from: Timestamp,
     to: Timestamp,
     reason: String,
-}
-
-impl From<Episode> for AlarmItem {
-    fn from(e: Episode) -> Self {
-        let damage = e.kind == "damage";
-        Self {
-            alarm: e.number,
-            state: e.state(),
-            superseded_by: e.superseded_by,
-            continues: e.continues,
-            parameter: parameter_of(e.series),
-            sentence: e.change.as_ref().map(LastingChange::sentence),
-            change: e.change,
-            peak_shift_standard_errors: (damage && e.peak_shift.is_finite()).then_some(e.peak_shift),
-            undamaged_version: damage.then_some(e.undamaged_version),
-            kind: e.kind,
-            opened_at: e.opened_at,
-            opened_batch: e.opened_batch,
-            ended_at: e.ended_at,
-            noticed_at: e.noticed_at,
-            acknowledgement: e.acknowledgement.map(|a| AcknowledgementItem { at: a.at, by: a.by, note: a.note }),
-            diagnosis: e.diagnosis.map(|d| AlarmDiagnosis { diagnosis: d.id, state: d.state, verdict: d.verdict }),
-        }
-    }
 }
 
 /// `GET /v1/structures/{id}/alarms`: alarm episodes, newest first.
@@ -251,7 +165,13 @@ pub async fn list(
     let query = EpisodeQuery { before, open_only, superseded, limit };
     let found = shared.monitor.alarms().episodes(&id, query).await?;
     let next = (found.len() == limit).then(|| found.last().map(|e| e.number.to_string())).flatten();
-    Ok(Json(AlarmPage { structure: id, items: found.into_iter().map(AlarmItem::from).collect(), next }).into_response())
+    let mut handling = shared.monitor.alarms().handling(&id, &found).await?;
+    let limits = shared.monitor.alarms().limits();
+    let items = found.into_iter().map(|episode| {
+        let handling = handling.remove(&episode.number).unwrap_or_default();
+        AlarmItem::new(episode, handling, limits)
+    });
+    Ok(Json(AlarmPage { structure: id, items: items.collect(), next }).into_response())
 }
 
 /// `POST /v1/structures/{id}/alarms/{n}/acknowledgement`: records who has seen the alarm. The first acknowledgement is
@@ -283,8 +203,9 @@ pub async fn acknowledge(
     };
     let acknowledgement = Acknowledgement { at: Timestamp::now(), by: body.by, note: body.note };
     let parsed: i64 = number.parse().map_err(|_| unknown())?;
-    let episode = shared.monitor.alarms().acknowledge(&id, parsed, acknowledgement).await?.ok_or_else(unknown)?;
-    Ok(Json(AlarmItem::from(episode)).into_response())
+    shared.monitor.alarms().acknowledge(&id, parsed, acknowledgement).await?.ok_or_else(unknown)?;
+    let (episode, handling) = shared.monitor.alarms().one(&id, parsed).await?.ok_or_else(unknown)?;
+    Ok(Json(AlarmItem::new(episode, handling, shared.monitor.alarms().limits())).into_response())
 }
 
 /// `GET /v1/structures/{id}/charts`: the newest points of each chart, oldest first.
@@ -387,13 +308,4 @@ pub async fn identifiability(State(shared): State<Shared>, ApiPath(id): ApiPath<
         groups: record.groups.clone(),
     };
     Ok(Json(body).into_response())
-}
-
-fn check_text(pointer: &str, text: &str) -> Result<(), ApiError> {
-    let length = text.chars().count();
-    if (1..=LONGEST_TEXT).contains(&length) && !text.chars().any(char::is_control) {
-        return Ok(());
-    }
-    let message = format!("{} must have 1 to {LONGEST_TEXT} printable characters", shown(text));
-    Err(ApiError::invalid_field(pointer.to_owned(), message))
 }

@@ -127,6 +127,24 @@ mod tests {
     }
 
     #[test]
+    fn every_term_with_help_is_an_entry_of_the_glossary() {
+        let glossary = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/", "glossary.md")).unwrap();
+        let entries: Vec<String> =
+            glossary.lines().filter_map(|line| line.strip_prefix("### ")).map(str::to_lowercase).collect();
+        let mut terms = 0;
+        for path in Files::iter().filter(|path| has_ending(path, "js") && !path.starts_with("vendor/")) {
+            let source = String::from_utf8(Files::get(&path).unwrap().data.into_owned()).unwrap();
+            for begin in ["help(\"", "term: \""] {
+                for term in source.split(begin).skip(1).filter_map(|rest| rest.split('"').next()) {
+                    assert!(entries.contains(&term.to_lowercase()), "{path}: {term} is not in docs/glossary.md");
+                    terms += 1;
+                }
+            }
+        }
+        assert!(terms > 10, "only {terms} terms have help");
+    }
+
+    #[test]
     fn what_the_page_refers_to_is_embedded() {
         let text = |path: &str| String::from_utf8(Files::get(path).unwrap().data.into_owned()).unwrap();
         for reference in text("index.html").split('"').filter_map(|part| part.strip_prefix("assets/")) {

@@ -16,7 +16,7 @@ use super::request::{json_body, structure_id, whole_number, ApiPath};
 use super::shared::Shared;
 use crate::discrepancy::Diagnosis;
 use crate::monitor::stored::{DiagnosisRecord, DiagnosisTrigger, JobState};
-use crate::monitor::{DiagnosisRequest, ExtensionResult, ExtensionTraining};
+use crate::monitor::{DiagnosisRequest, ExtensionResult, ExtensionTraining, JobStatus};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// Maximum number of diagnoses in the list of a structure.
@@ -83,8 +83,18 @@ struct DiagnosisAnswer {
     #[schema(required)]
     alarm: Option<i64>,
     state: JobState,
+    /// What it or its extension is doing, in words.
     #[serde(skip_serializing_if = "Option::is_none")]
     progress: Option<String>,
+    /// The share of the present round of the training of an extension that is done, 0 to 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    share: Option<f64>,
+    /// Estimated time left in that round, s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    time_left_s: Option<f64>,
+    /// Place among the waiting jobs of its lane, from 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    place: Option<usize>,
     #[serde(skip_serializing_if = "Option::is_none")]
     failure: Option<String>,
     created_at: Timestamp,
@@ -127,6 +137,9 @@ struct Listed {
 #[derive(Debug, Serialize, ToSchema)]
 struct DiagnosisList {
     structure: StructureId,
+    /// Why the structure cannot be diagnosed now; `null` where it can.
+    #[schema(required)]
+    not_possible: Option<String>,
     items: Vec<Listed>,
 }
 
@@ -142,7 +155,7 @@ fn raw(json: Option<String>) -> Result<Option<Box<RawValue>>, ApiError> {
     json.map(RawValue::from_string).transpose().map_err(|e| ApiError::internal(&e))
 }
 
-fn answer(record: DiagnosisRecord, progress: Option<String>) -> Result<DiagnosisAnswer, ApiError> {
+fn answer(record: DiagnosisRecord, status: Option<JobStatus>) -> Result<DiagnosisAnswer, ApiError> {
     let done = record.state == JobState::Done;
     let extension = match record.extension_state {
         Some(state) => {
@@ -158,7 +171,10 @@ fn answer(record: DiagnosisRecord, progress: Option<String>) -> Result<Diagnosis
         trigger: record.trigger,
         alarm: record.alarm,
         state: record.state,
-        progress,
+        share: status.as_ref().and_then(|status| status.share),
+        time_left_s: status.as_ref().and_then(|status| status.time_left_s),
+        place: status.as_ref().and_then(|status| status.place),
+        progress: status.map(|status| status.progress),
         failure: record.failure,
         created_at: record.created_at,
         finished_at: record.finished_at,
@@ -221,7 +237,8 @@ pub async fn create(
     };
     let record = shared.monitor.jobs().start_diagnosis(&id, request).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{}", record.id))];
-    Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
+    let status = shared.monitor.jobs().status(&record.id);
+    Ok((StatusCode::ACCEPTED, location, Json(answer(record, status)?)).into_response())
 }
 
 /// `GET /v1/structures/{id}/diagnoses`: the newest first.
@@ -252,7 +269,8 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
             extension: record.extension_state,
         });
     }
-    Ok(Json(DiagnosisList { structure: id, items }).into_response())
+    let not_possible = shared.monitor.jobs().no_diagnosis(&id).await?;
+    Ok(Json(DiagnosisList { structure: id, not_possible, items }).into_response())
 }
 
 /// `GET /v1/diagnoses/{id}`: state, progress and result.
@@ -266,8 +284,8 @@ pub async fn list(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
     responses((status = 200, description = "The diagnosis", body = DiagnosisAnswer), Unknown)
 )]
 pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) -> Result<Response, ApiError> {
-    let (record, progress) = shared.monitor.jobs().diagnosis(&id).await?;
-    Ok(Json(answer(record, progress)?).into_response())
+    let (record, status) = shared.monitor.jobs().diagnosis(&id).await?;
+    Ok(Json(answer(record, status)?).into_response())
 }
 
 /// `GET /v1/diagnoses/{id}/report`: the report as HTML.
@@ -325,7 +343,8 @@ pub async fn extend(
     let training = ExtensionTraining { samples, epochs, from_scratch, accept_uncalibrated, learned };
     let record = shared.monitor.jobs().start_extension(&id, training).await?;
     let location = [(header::LOCATION, format!("/v1/diagnoses/{id}"))];
-    Ok((StatusCode::ACCEPTED, location, Json(answer(record, Some("waiting".to_owned()))?)).into_response())
+    let status = shared.monitor.jobs().status(&id);
+    Ok((StatusCode::ACCEPTED, location, Json(answer(record, status)?)).into_response())
 }
 
 /// `DELETE /v1/structures/{id}/extension`: reverts the last extension.

@@ -10,9 +10,12 @@ use super::error::ApiError;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
+use crate::assessment::Assessment;
 use crate::monitor::stored::LatestQuantity;
+use crate::parameter::Parameter;
 use crate::quantity::{shown, StructureId};
 use crate::simulator::drawing::{Error, Marks};
+use crate::simulator::Simulator;
 
 /// Nothing is loaded or run by a drawing.
 const POLICY: &str = "default-src 'none'";
@@ -25,6 +28,9 @@ pub struct DrawingQuery {
     /// Measured mode, counted from 1, whose shape at the nominal parameters is drawn too.
     #[param(value_type = Option<u32>, minimum = 1, maximum = 2000)]
     mode: Option<String>,
+    /// Batch whose measured shape of the mode is drawn beside that of the simulation at the batch's estimated parameters, with their MAC.
+    /// Only with `mode`.
+    batch: Option<String>,
 }
 
 /// `GET /v1/structures/{id}/drawing.svg`: masses, springs, beams and supports with their names.
@@ -52,11 +58,25 @@ pub async fn drawing(
         ApiError::invalid_field("query/mode", message)
     };
     let mode = query.mode.as_deref().map(|text| text.parse::<usize>().map_err(|_| wrong(text))).transpose()?;
+    if mode.is_none() && query.batch.is_some() {
+        let message = "a batch is drawn beside a mode: give the mode too, such as ?mode=1&batch=…";
+        return Err(ApiError::invalid_field("query/batch", message.to_owned()));
+    }
+    let batch = match &query.batch {
+        Some(batch) => Some(shared.monitor.records().batch(&id, batch).await?),
+        None => None,
+    };
     let marks = marks(&shared, &id).await?;
     // The shape needs an eigenproblem, which takes time for large structures.
     let draw = move || {
         let nominal = simulator.nominal_parameters();
-        simulator.drawing(&marks, mode.map(|mode| (mode, nominal.as_slice())))
+        match (mode, batch) {
+            (Some(mode), Some(view)) => {
+                let theta = view.assessment.map_or(nominal, |assessment| estimated(&simulator, &assessment));
+                simulator.drawing_beside(&marks, (mode, &theta), &view.record.batch.measurements)
+            }
+            (mode, _) => simulator.drawing(&marks, mode.map(|mode| (mode, nominal.as_slice()))),
+        }
     };
     let drawn = tokio::task::spawn_blocking(draw).await.map_err(|e| ApiError::internal(&e))?;
     let drawing = drawn.map_err(|error| match error {
@@ -66,6 +86,14 @@ pub async fn drawing(
     })?;
     let headers = [(header::CONTENT_TYPE, "image/svg+xml"), (header::CONTENT_SECURITY_POLICY, POLICY)];
     Ok((headers, drawing.svg()).into_response())
+}
+
+/// Mean of the posterior samples of each parameter in an assessment, `[d]`; the nominal value of a parameter that it does not have.
+fn estimated(simulator: &Simulator, assessment: &Assessment) -> Vec<f64> {
+    let quantity = |name: &str| assessment.quantities.iter().find(|q| q.name == name);
+    let nominal = simulator.nominal_parameters();
+    let one = |(parameter, nominal): (&Parameter, f64)| quantity(&parameter.name).map_or(nominal, |q| q.pooled.mean);
+    simulator.space().iter().zip(nominal).map(one).collect()
 }
 
 /// What the latest assessed batch and the open alarms say about the parts of a structure.

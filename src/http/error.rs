@@ -157,6 +157,10 @@ impl From<monitor::JobError> for ApiError {
         let detail = error.to_string();
         match error {
             E::UnknownDiagnosis(_) => Self::new(StatusCode::NOT_FOUND, "unknown_diagnosis", detail),
+            E::UnknownTraining(_) => Self::new(StatusCode::NOT_FOUND, "unknown_training", detail),
+            E::UnknownJob(_) => Self::new(StatusCode::NOT_FOUND, "unknown_job", detail),
+            E::NotWaiting(_) => Self::new(StatusCode::CONFLICT, "job_not_waiting", detail),
+            E::TrainingRuns { .. } => Self::new(StatusCode::CONFLICT, "training_runs", detail),
             E::RepeatedBatch(_) => Self::invalid("unusable_baseline", detail, Vec::new()),
             E::TooManyMeasurements { .. } => Self::invalid("too_many_measurements", detail, Vec::new()),
             E::NoExtension { .. } => Self::new(StatusCode::CONFLICT, "no_extension", detail),

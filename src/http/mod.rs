@@ -1,6 +1,8 @@
 //! The HTTP API: its routes, and the layers that every request passes. `openapi` describes how a route is added.
 
 pub mod access;
+mod alarm_actions;
+mod alarm_item;
 mod alarms;
 mod answer;
 mod audit;
@@ -18,11 +20,15 @@ mod explorer;
 mod export;
 mod file_parts;
 mod history;
+mod jobs;
+mod mode_shapes;
+mod notes;
 mod observe;
 mod openapi;
 mod operations;
 #[cfg(feature = "parquet")]
 mod parquet;
+mod people;
 mod problem;
 mod quarantine;
 mod reference;
@@ -42,6 +48,7 @@ mod tests;
 mod tokens;
 #[cfg(feature = "otel")]
 mod traceparent;
+mod trainings;
 mod upload;
 mod verdict;
 mod views;
@@ -103,6 +110,12 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(history::exceedances))
         .routes(routes!(alarms::list))
         .routes(routes!(alarms::acknowledge))
+        .routes(routes!(alarm_actions::comment))
+        .routes(routes!(alarm_actions::assign))
+        .routes(routes!(alarm_actions::close))
+        .routes(routes!(alarm_actions::reopen))
+        .routes(routes!(notes::list, notes::create))
+        .routes(routes!(notes::remove))
         .routes(routes!(alarms::charts))
         .routes(routes!(alarms::maintenance, alarms::add_maintenance))
         .routes(routes!(alarms::identifiability))
@@ -113,7 +126,11 @@ fn api() -> OpenApiRouter<Shared> {
         .routes(routes!(diagnoses::extend))
         .routes(routes!(condition_report::report))
         .routes(routes!(views::overview))
-        .routes(routes!(views::jobs))
+        .routes(routes!(jobs::list))
+        .routes(routes!(jobs::cancel))
+        .routes(routes!(jobs::first))
+        .routes(routes!(trainings::list, trainings::create))
+        .routes(routes!(trainings::read))
         .routes(routes!(events::events))
         .routes(routes!(tokens::list, tokens::create))
         .routes(routes!(tokens::revoke))

@@ -51,10 +51,12 @@ use crate::access::Need;
         (name = "structures", description = "Structures, their simulation and trained model"),
         (name = "batches", description = "Posting and exporting measurements"),
         (name = "results", description = "Results over time, compared with the undamaged reference"),
-        (name = "alarms", description = "Alarms, alarm charts and maintenance"),
+        (name = "alarms", description = "Alarms, alarm charts, maintenance and notes"),
         (name = "access", description = "Tokens and the audit of changes"),
         (name = "webhooks", description = "Receivers of alarm events"),
         (name = "diagnoses", description = "Diagnoses of systematic errors of the simulation, and extensions by them"),
+        (name = "trainings", description = "Training of models by the service"),
+        (name = "jobs", description = "Diagnoses, extensions and trainings as jobs: their order and their end"),
         (name = "operations", description = "Operation of the service")
     ),
     components(schemas(ProblemBody))
@@ -100,12 +102,45 @@ pub struct AlarmPath {
     alarm: String,
 }
 
+/// Path of a note.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "as in StructurePath")]
+pub struct NotePath {
+    /// Id of the structure.
+    #[param(value_type = String, min_length = 1, max_length = 64, pattern = "^[a-z0-9][a-z0-9._-]*$", example = "three-dof")]
+    id: String,
+    /// Id of the note.
+    #[param(min_length = 1)]
+    note: String,
+}
+
 /// Path of a diagnosis.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "as in StructurePath")]
 pub struct DiagnosisPath {
     /// Id of the diagnosis.
+    #[param(min_length = 1)]
+    id: String,
+}
+
+/// Path of a training.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "as in StructurePath")]
+pub struct TrainingPath {
+    /// Id of the training.
+    #[param(min_length = 1)]
+    id: String,
+}
+
+/// Path of a job.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "as in StructurePath")]
+pub struct JobPath {
+    /// Id of the diagnosis or training.
     #[param(min_length = 1)]
     id: String,
 }

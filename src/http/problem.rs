@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 64] = [
+pub const CODES: [(&str, StatusCode, &str); 74] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -33,7 +33,10 @@ pub const CODES: [(&str, StatusCode, &str); 64] = [
     ("unknown_structure", StatusCode::NOT_FOUND, "there is no structure with this id"),
     ("unknown_batch", StatusCode::NOT_FOUND, "the structure has no such batch"),
     ("unknown_alarm", StatusCode::NOT_FOUND, "the structure has no such alarm"),
+    ("unknown_note", StatusCode::NOT_FOUND, "the structure has no such note"),
     ("unknown_diagnosis", StatusCode::NOT_FOUND, "there is no diagnosis with this id"),
+    ("unknown_training", StatusCode::NOT_FOUND, "there is no training with this id"),
+    ("unknown_job", StatusCode::NOT_FOUND, "no job with this id runs or waits"),
     ("unknown_token", StatusCode::NOT_FOUND, "there is no token with this id"),
     ("unknown_webhook", StatusCode::NOT_FOUND, "there is no webhook with this id"),
     ("unknown_delivery", StatusCode::NOT_FOUND, "the webhook has no such delivery"),
@@ -50,6 +53,8 @@ pub const CODES: [(&str, StatusCode, &str); 64] = [
     ("structure_in_use", StatusCode::CONFLICT, "the structure has batches under another definition"),
     ("no_report", StatusCode::CONFLICT, "the diagnosis has no report yet"),
     ("no_extension", StatusCode::CONFLICT, "the structure cannot be extended by this diagnosis"),
+    ("training_runs", StatusCode::CONFLICT, "a training of the structure runs or waits"),
+    ("job_not_waiting", StatusCode::CONFLICT, "the job runs already"),
     ("version_changed", StatusCode::CONFLICT, "the structure was changed to another version in the meantime"),
     ("no_step_back", StatusCode::CONFLICT, "the present version of the structure is not an extension"),
     ("not_assessed", StatusCode::CONFLICT, "the batch has no assessment by the trained model in use"),
@@ -60,6 +65,11 @@ pub const CODES: [(&str, StatusCode, &str); 64] = [
     ("token_not_active", StatusCode::CONFLICT, "the token was revoked or has expired"),
     ("last_admin_token", StatusCode::CONFLICT, "this is the last token that can manage the service"),
     ("too_many_webhooks", StatusCode::CONFLICT, "the maximum number of webhooks exists"),
+    ("alarm_closed", StatusCode::CONFLICT, "a person has closed the alarm already"),
+    ("alarm_not_closed", StatusCode::CONFLICT, "no person has closed the alarm"),
+    ("alarm_changed", StatusCode::CONFLICT, "the alarm was assigned, closed or reopened in the meantime"),
+    ("too_many_actions", StatusCode::CONFLICT, "the maximum number of actions on the alarm is reached"),
+    ("too_many_notes", StatusCode::CONFLICT, "the maximum number of notes exists"),
     ("already_delivered", StatusCode::CONFLICT, "the receiver has accepted the delivery"),
     ("body_too_large", StatusCode::PAYLOAD_TOO_LARGE, "the body is larger than the limit"),
     ("line_too_large", StatusCode::PAYLOAD_TOO_LARGE, "a line of NDJSON is larger than the limit"),

@@ -10,12 +10,13 @@ use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::error::ApiError;
+use super::notes::NoteItem;
 use super::openapi::{Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery, Window};
 use super::shared::Shared;
 use crate::alarm::chart::parameter_of;
 use crate::damage::{QuantityKind, UndamagedReference};
-use crate::measurement::CovariateKind;
+use crate::measurement::{Covariate, CovariateKind};
 use crate::monitor::stored::{
     ChartMark, ChartSeries, Episode, EpisodeQuery, MaintenanceWindow, QuantityMark, QuantitySeries, ReferenceVersion,
     SeriesWindow, TrustMark,
@@ -73,6 +74,7 @@ struct SeriesBody {
     trust: Vec<TrustPoint>,
     alarms: Vec<AlarmSpan>,
     maintenance: Vec<MaintenanceSpan>,
+    notes: Vec<NoteItem>,
     /// The versions of the undamaged reference that begin in the time span, the newest first.
     references: Vec<ReferenceSpan>,
 }
@@ -86,6 +88,8 @@ struct Frequencies {
     times: Vec<Timestamp>,
     values_hz: Vec<Vec<Option<f64>>>,
     covariates: BTreeMap<String, Vec<Option<f64>>>,
+    /// Unit of each covariate that has one: stated in the structure file, or else that at the end of its name.
+    covariate_units: BTreeMap<String, String>,
 }
 
 /// A monitored quantity; `low` and `high` bound the 90 % interval of the mean.
@@ -196,6 +200,8 @@ pub async fn series(
     let _turn = shared.series.acquire().await.map_err(|e| ApiError::internal(&e))?;
     let (modes, declared) = (active.simulator.modes(), active.simulator.covariates().iter());
     let names: Vec<String> = declared.filter(|c| c.kind == CovariateKind::Number).map(|c| c.name.clone()).collect();
+    let unit = |c: &Covariate| Some((c.name.clone(), c.unit()?.to_owned()));
+    let covariate_units = active.simulator.covariates().iter().filter_map(unit).collect();
     let Series { extent, measured, quantities, trust, charts } =
         shared.monitor.records().series(&id, window, modes, &names).await?;
     let (from, to) = (window.from.or(extent.measured.map(|m| m.0)), window.to.or(extent.measured.map(|m| m.1)));
@@ -215,6 +221,7 @@ pub async fn series(
     let current = EpisodeQuery { before: None, open_only: false, superseded: false, limit: MOST_ALARMS };
     let episodes = shared.monitor.alarms().episodes(&id, current).await?;
     let maintenance = shared.monitor.alarms().maintenance(&id).await?;
+    let notes = shared.monitor.alarms().notes(&id).await?;
     let versions = shared.monitor.records().reference_versions(&id).await?;
     let body = SeriesBody {
         from,
@@ -223,7 +230,10 @@ pub async fn series(
         measurements: extent.measurements,
         reduced,
         thinned_to_every: Some(extent.stride()).filter(|stride| *stride > 1),
-        frequencies: frequencies(measured, active.simulator.nominal_frequencies_hz(), &names)?,
+        frequencies: Frequencies {
+            covariate_units,
+            ..frequencies(measured, active.simulator.nominal_frequencies_hz(), &names)?
+        },
         parameters: quantities
             .into_iter()
             .map(|q| track(q, undamaged.as_ref().map(|u| &u.state)))
@@ -232,6 +242,7 @@ pub async fn series(
         trust: trust.rows.into_iter().map(trust_point).collect::<Result<_, _>>()?,
         alarms: episodes.into_iter().filter(|e| !e.withdrawn && within(e.opened_at, e.ended_at)).map(alarm).collect(),
         maintenance: maintenance.into_iter().filter(|w| within(w.from, Some(w.to))).map(maintenance_span).collect(),
+        notes: notes.into_iter().filter(|n| within(n.from, Some(n.to.unwrap_or(n.from)))).map(NoteItem::from).collect(),
         references: versions
             .into_iter()
             .filter(|v| within(v.measured_from, Some(v.measured_to)))
@@ -279,7 +290,7 @@ fn frequencies(measured: Reduced<()>, nominal_hz: Vec<f64>, covariates: &[String
         put(row.time_us, row.values.iter().copied().map(number).collect())?;
     }
     let covariates = covariates.iter().cloned().zip(of_covariates).collect();
-    Ok(Frequencies { modes, nominal_hz, times, values_hz, covariates })
+    Ok(Frequencies { modes, nominal_hz, times, values_hz, covariates, covariate_units: BTreeMap::new() })
 }
 
 fn track(series: QuantitySeries, undamaged: Option<&UndamagedReference>) -> Result<Track, ApiError> {

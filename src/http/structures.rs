@@ -37,6 +37,9 @@ struct StructureBody {
     #[serde(skip_serializing_if = "Option::is_none")]
     model_missing: Option<String>,
     undamaged: Option<super::answer::Undamaged>,
+    /// What is doubtful in the definition: priors that do not contain the nominal stiffness, with the probable cause.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    notes: Vec<String>,
 }
 
 /// Accuracy of the emulator of a table of simulation runs. Lists have one entry per measured mode.
@@ -238,5 +241,6 @@ fn body(id: &StructureId, active: &ActiveStructure, undamaged: Option<super::ans
         model,
         model_missing: active.baseline.as_ref().err().cloned(),
         undamaged,
+        notes: active.simulator.prior_doubts().into_iter().map(|doubt| doubt.message).collect(),
     }
 }

@@ -1,5 +1,6 @@
 //! A panic while a request is answered: the client receives an error, and the next request is answered.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use metrics_exporter_prometheus::PrometheusBuilder;
@@ -9,6 +10,7 @@ use tokio::net::TcpListener;
 use super::access::AccessControl;
 use super::{router, server, HttpSettings, Service};
 use crate::access::AccessSettings;
+use crate::alarm::severity::SeverityLimits;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
 use crate::monitor::{Monitor, MonitorSettings};
@@ -26,7 +28,7 @@ async fn a_panic_is_a_500_with_the_requests_id_and_the_next_request_is_served() 
     let url = format!("http://{}/v1/structures/three-dof/batches", listener.local_addr().unwrap());
     let place = (listener.local_addr().unwrap(), folder.path());
     let access = AccessControl::open(store.clone(), &AccessSettings::default(), &settings, place, 100).await.unwrap();
-    let notifier = Notifier::new(store, NotifySettings::default()).unwrap();
+    let notifier = Notifier::new(store, NotifySettings::default(), SeverityLimits::default(), Arc::default()).unwrap();
     let metrics = PrometheusBuilder::new().build_recorder().handle();
     let routes = router(Service { monitor, notifier, access, metrics }, &settings);
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();

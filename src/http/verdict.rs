@@ -336,6 +336,8 @@ mod tests {
             change,
             superseded_by: None,
             continues: None,
+            batch_change: None,
+            highest_grade: None,
         }
     }
 

@@ -1,4 +1,4 @@
-//! Views for the dashboard: `/v1/overview`, `/v1/jobs`, `/v1/structures/{id}/batches/{batch}/detail`.
+//! Views for the dashboard: `/v1/overview`, `/v1/structures/{id}/batches/{batch}/detail`.
 
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
@@ -7,24 +7,22 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::error::ApiError;
+use super::mode_shapes::ShapeComparisonBody;
 use super::openapi::{BatchPath, Busy, Conflict, Invalid, Unknown};
 use super::request::{structure_id, ApiPath};
 use super::shared::Shared;
 use super::verdict::{Condition, Judged};
 use crate::access::Grant;
 use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
-use crate::monitor::stored::{DiagnosisTrigger, JobKind, JobRecord, JobState, LatestAssessment};
+use crate::monitor::stored::LatestAssessment;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
-
-/// Maximum number of jobs in the list.
-const LISTED_JOBS: usize = 100;
 
 /// Overview of all structures.
 #[derive(Debug, Serialize, ToSchema)]
 struct Overview {
     items: Vec<OverviewItem>,
-    /// Number of diagnoses and extensions that are running or waiting.
+    /// Number of diagnoses, extensions and trainings that are running or waiting.
     jobs_running: usize,
 }
 
@@ -78,36 +76,6 @@ struct Latest {
     findings: usize,
 }
 
-/// Jobs, newest first.
-#[derive(Debug, Serialize, ToSchema)]
-struct JobList {
-    items: Vec<JobItem>,
-}
-
-/// A diagnosis or an extension.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Job)]
-struct JobItem {
-    job: String,
-    structure: StructureId,
-    kind: JobKind,
-    /// Why a diagnosis was started; `null` for an extension.
-    #[schema(required)]
-    trigger: Option<DiagnosisTrigger>,
-    state: JobState,
-    #[schema(required)]
-    progress: Option<String>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    failure: Option<String>,
-    created_at: Timestamp,
-    #[schema(required)]
-    finished_at: Option<Timestamp>,
-    #[schema(required)]
-    verdict: Option<String>,
-    #[schema(required)]
-    summary: Option<String>,
-}
-
 /// Densities of the parameters for a batch, and the predicted frequencies.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = BatchDetail)]
@@ -122,6 +90,9 @@ struct DetailBody {
     simulations: usize,
     parameters: Vec<ParameterDensities>,
     modes: Vec<ModeFrequencies>,
+    /// Measured mode shapes beside those of the simulation; `null` if the batch has none.
+    #[schema(required)]
+    mode_shapes: Option<ShapeComparisonBody>,
 }
 
 /// Densities of a parameter on one grid, per unit of the parameter.
@@ -199,34 +170,6 @@ fn latest(found: LatestAssessment) -> Latest {
     }
 }
 
-/// `GET /v1/jobs`: diagnoses and extensions of all structures that the token may see, newest first.
-///
-/// # Errors
-/// 500.
-#[utoipa::path(
-    get, path = "/v1/jobs", tag = "diagnoses", operation_id = "list_jobs",
-    summary = "Jobs", description = "Diagnoses and extensions of all structures that the token may see: the 100 newest, newest first.",
-    responses((status = 200, description = "The jobs", body = JobList))
-)]
-pub async fn jobs(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
-    let item = |(job, progress): (JobRecord, Option<String>)| JobItem {
-        job: job.id,
-        structure: job.structure,
-        kind: job.kind,
-        trigger: job.trigger,
-        state: job.state,
-        progress,
-        failure: job.failure,
-        created_at: job.created_at,
-        finished_at: job.finished_at,
-        verdict: job.verdict,
-        summary: job.summary,
-    };
-    let jobs = shared.monitor.jobs().list(LISTED_JOBS).await?;
-    let items: Vec<JobItem> = jobs.into_iter().filter(|(job, _)| grant.may_see(&job.structure)).map(item).collect();
-    Ok(Json(JobList { items }).into_response())
-}
-
 /// `GET /v1/structures/{id}/batches/{batch}/detail`: densities and predicted frequencies, sampled as for the
 /// assessment.
 ///
@@ -274,5 +217,6 @@ fn detail_body(structure: StructureId, batch: String, detail: BatchDetail) -> De
         simulations: detail.simulations,
         parameters: detail.parameters.into_iter().map(parameter).collect(),
         modes: detail.modes.into_iter().enumerate().map(mode).collect(),
+        mode_shapes: detail.shapes.map(ShapeComparisonBody::from),
     }
 }

@@ -123,9 +123,9 @@ pub fn offered(
         }
         // A few cells that are not numbers do not make the column text: `read` then reports them with their lines.
         Some(if numbers[position] >= 9 * others[position] {
-            Offered::Covariate(Covariate { name, kind: CovariateKind::Number })
+            Offered::Covariate(Covariate::new(name, CovariateKind::Number))
         } else if values <= most_categories {
-            Offered::Covariate(Covariate { name, kind: CovariateKind::Category })
+            Offered::Covariate(Covariate::new(name, CovariateKind::Category))
         } else {
             Offered::Ignored { name, values }
         })

@@ -23,7 +23,7 @@ use crate::quantity::{Digest, Hertz, OutOfRange, StructureId, Timestamp};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CovariateKind {
-    /// A finite number, in the unit that the name of the covariate contains.
+    /// A finite number, in the unit of the covariate.
     #[default]
     Number,
     /// A label such as an operator or a laboratory.
@@ -33,10 +33,55 @@ pub enum CovariateKind {
 /// A covariate that a structure declares.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Covariate {
-    /// Name that includes the unit, such as `temperature_c`.
+    /// Name, such as `temperature_c`.
     pub name: String,
     /// Kind of its values.
     pub kind: CovariateKind,
+    /// Unit of a number, as the structure file states it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit: Option<String>,
+}
+
+impl Covariate {
+    /// A covariate whose unit is at most in its name.
+    pub fn new(name: impl Into<String>, kind: CovariateKind) -> Self {
+        Self { name: name.into(), kind, unit: None }
+    }
+
+    /// Its unit: the stated one, or else that of [`unit_of_name`]; `None` for a category and for an unknown unit.
+    pub fn unit(&self) -> Option<&str> {
+        let number = self.kind == CovariateKind::Number;
+        number.then(|| self.unit.as_deref().or_else(|| unit_of_name(&self.name))).flatten()
+    }
+}
+
+/// The unit of a number that a name ends with, such as °C for `temperature_c`; `None` if the end is not known.
+pub fn unit_of_name(name: &str) -> Option<&'static str> {
+    let lower = name.to_ascii_lowercase();
+    if lower.ends_with("_m_per_s") {
+        return Some("m/s");
+    }
+    let (_, last) = lower.rsplit_once('_')?;
+    let unit = match last {
+        "c" | "degc" => "°C",
+        "k" => "K",
+        "percent" => "%",
+        "um" => "µm",
+        "mm" => "mm",
+        "m" => "m",
+        "hz" => "Hz",
+        "n" => "N",
+        "kn" => "kN",
+        "pa" => "Pa",
+        "kpa" => "kPa",
+        "bar" => "bar",
+        "kg" => "kg",
+        "t" => "t",
+        "v" => "V",
+        "s" => "s",
+        _ => return None,
+    };
+    Some(unit)
 }
 
 /// Value of a covariate in one measurement.

@@ -1,4 +1,4 @@
-//! Reading and acknowledging the alarms of the structures, publishing them as events, and logging them.
+//! Reading the alarms of the structures and what people do with them, publishing them as events, and logging them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Mutex;
@@ -7,13 +7,18 @@ use tracing::{error, warn};
 
 use super::error::Error;
 use super::events::{Events, News};
+use crate::alarm::severity::{Grade, SeverityLimits};
 use crate::quantity::{StructureId, Timestamp};
-use crate::store::{Acknowledgement, Episode, EpisodeQuery, MaintenanceWindow, OpenAlarms, Store, StoredChartPoint};
+use crate::store::{
+    Acknowledgement, ActionKind, ActionOutcome, Episode, EpisodeQuery, Handling, MaintenanceWindow, NewAction, Note,
+    OpenAlarms, Store, StoredChartPoint,
+};
 
 /// The alarms of the structures, with a record of those that were already published and logged.
 pub struct Alarms {
     store: Store,
     events: Events,
+    limits: SeverityLimits,
     published: Mutex<BTreeMap<StructureId, Published>>,
     /// Alarms that this process has logged.
     logged: Mutex<BTreeSet<(StructureId, i64)>>,
@@ -28,8 +33,8 @@ struct Published {
 }
 
 impl Alarms {
-    pub(super) fn new(store: Store, events: Events) -> Self {
-        Self { store, events, published: Mutex::default(), logged: Mutex::default() }
+    pub(super) fn new(store: Store, events: Events, limits: SeverityLimits) -> Self {
+        Self { store, events, limits, published: Mutex::default(), logged: Mutex::default() }
     }
 
     /// Alarms of a structure, newest first.
@@ -65,6 +70,88 @@ impl Alarms {
         Ok(episode)
     }
 
+    /// Limits of the severity of alarms.
+    pub fn limits(&self) -> SeverityLimits {
+        self.limits
+    }
+
+    /// What people have done with alarms of a structure, by the number of the alarm.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn handling(
+        &self,
+        structure: &StructureId,
+        episodes: &[Episode],
+    ) -> Result<BTreeMap<i64, Handling>, Error> {
+        let numbers: Vec<i64> = episodes.iter().map(|episode| episode.number).collect();
+        Ok(self.store.alarm_actions().of(structure, &numbers).await?)
+    }
+
+    /// An alarm with what people have done with it; `None` when there is no such alarm.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn one(&self, structure: &StructureId, number: i64) -> Result<Option<(Episode, Handling)>, Error> {
+        let query = EpisodeQuery { before: number.checked_add(1), open_only: false, superseded: true, limit: 1 };
+        let mut found = self.store.alarms().episodes(structure, query).await?;
+        let Some(episode) = found.pop().filter(|episode| episode.number == number) else { return Ok(None) };
+        let mut handling = self.store.alarm_actions().of(structure, &[number]).await?;
+        Ok(Some((episode, handling.remove(&number).unwrap_or_default())))
+    }
+
+    /// Does something with an alarm.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn act(&self, structure: &StructureId, number: i64, action: NewAction) -> Result<ActionOutcome, Error> {
+        let state = match action.kind {
+            ActionKind::Comment { .. } => "commented",
+            ActionKind::Assignment { .. } => "assigned",
+            ActionKind::Closing { .. } => "closed",
+            ActionKind::Reopening { .. } => "reopened",
+        };
+        let outcome = self.store.alarm_actions().add(structure, number, action).await?;
+        if outcome == ActionOutcome::Stored {
+            if let Some((episode, _)) = self.one(structure, number).await? {
+                self.events.publish(event(structure, &episode, state));
+            }
+        }
+        Ok(outcome)
+    }
+
+    /// Adds a note to the time line; false if there are too many.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn add_note(&self, structure: &StructureId, note: Note) -> Result<bool, Error> {
+        let stored = self.store.notes().insert(structure, note).await?;
+        if stored {
+            self.events.structure_changed(structure);
+        }
+        Ok(stored)
+    }
+
+    /// Notes of a structure, the newest first.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn notes(&self, structure: &StructureId) -> Result<Vec<Note>, Error> {
+        Ok(self.store.notes().list(structure).await?)
+    }
+
+    /// Deletes a note. Returns whether it existed.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn delete_note(&self, structure: &StructureId, note: &str) -> Result<bool, Error> {
+        let deleted = self.store.notes().delete(structure, note).await?;
+        if deleted {
+            self.events.structure_changed(structure);
+        }
+        Ok(deleted)
+    }
+
     /// The newest `limit` points of each chart of a structure, oldest first.
     ///
     /// # Errors
@@ -91,7 +178,9 @@ impl Alarms {
 
     /// Publishes the alarms that changed since the last call, and logs each open alarm once.
     pub(super) async fn report(&self, structure: &StructureId) {
-        for episode in self.publish_changes(structure).await {
+        let open = self.publish_changes(structure).await;
+        self.grade(structure, &open).await;
+        for episode in open {
             let key = (structure.clone(), episode.number);
             if !self.logged.lock().expect("no holder of this lock panics").insert(key) {
                 continue;
@@ -101,6 +190,19 @@ impl Alarms {
                 structure.id = %structure, episode = episode.number, kind = %episode.kind, series = %episode.series,
                 "Alarm {} of {structure}: {} ({}), since {}", episode.number, episode.kind, episode.series, episode.opened_at
             );
+        }
+    }
+
+    /// Stores the grades of open alarms that have become more severe, which sends a message.
+    async fn grade(&self, structure: &StructureId, open: &[Episode]) {
+        let grade = |episode: &Episode| (episode.number, episode.severity(self.limits).grade);
+        let risen = open.iter().filter(|episode| Some(grade(episode).1) > episode.highest_grade);
+        let risen: Vec<(i64, Grade)> = risen.map(grade).collect();
+        if risen.is_empty() {
+            return;
+        }
+        if let Err(failure) = self.store.alarms().raise_grades(structure, risen).await {
+            error!(structure.id = %structure, error = %failure, "Could not store the severity of alarms of {structure}: {failure}");
         }
     }
 

@@ -209,12 +209,29 @@ impl DeclareError {
     }
 }
 
-/// Why a diagnosis or an extension was not started.
+/// Why a job was not started, not found or not changed.
 #[derive(Debug, thiserror::Error)]
 pub enum JobError {
     /// No such diagnosis.
     #[error("there is no diagnosis {0}")]
     UnknownDiagnosis(String),
+    /// No such training.
+    #[error("there is no training {0}")]
+    UnknownTraining(String),
+    /// No job with this id runs or waits.
+    #[error("there is no job {0} that runs or waits")]
+    UnknownJob(String),
+    /// The job runs already.
+    #[error("job {0} runs already: only a job that waits can be moved")]
+    NotWaiting(String),
+    /// A training of the structure runs or waits.
+    #[error("training {training} of structure {structure} runs or waits: wait for its end, or end it by DELETE /v1/jobs/{training}")]
+    TrainingRuns {
+        /// The structure.
+        structure: StructureId,
+        /// The training.
+        training: String,
+    },
     /// A batch is listed twice.
     #[error("batch {0} is listed twice")]
     RepeatedBatch(String),

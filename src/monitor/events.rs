@@ -27,7 +27,7 @@ pub enum News {
         /// State of its processing.
         state: BatchState,
     },
-    /// An alarm was opened, ended, withdrawn or acknowledged.
+    /// An alarm was opened, ended or withdrawn, or a person did something with it.
     Alarm {
         /// Its structure.
         structure: StructureId,
@@ -35,12 +35,12 @@ pub enum News {
         alarm: i64,
         /// `damage`, `simulation_does_not_fit` or `silence`.
         kind: String,
-        /// `open`, `ended`, `withdrawn`, or `acknowledged` for one that was just acknowledged.
+        /// `open`, `ended`, `withdrawn`; or what a person just did: `acknowledged`, `commented`, `assigned`, `closed`, `reopened`.
         state: &'static str,
     },
     /// A job began, progressed or ended.
     Job {
-        /// Its id, that of the diagnosis.
+        /// Its id, that of the diagnosis or training.
         job: String,
         /// Its structure.
         structure: StructureId,
@@ -50,7 +50,16 @@ pub enum News {
         state: JobState,
         /// What it is doing now; `None` when it has ended.
         progress: Option<String>,
-        /// Why it was started; `None` for an extension.
+        /// The share that is done, 0 to 1, where it is known.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        share: Option<f64>,
+        /// Estimated time left, s, where there is something to estimate it from.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        time_left_s: Option<f64>,
+        /// Its place among the waiting jobs of its lane, from 1; `None` for one that does not wait.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        place: Option<usize>,
+        /// Why it was started; `None` for an extension or a training.
         trigger: Option<DiagnosisTrigger>,
     },
     /// A structure was defined, or its version or undamaged reference changed.

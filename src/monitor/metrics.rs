@@ -3,7 +3,7 @@
 use crate::alarm::ALARM_KINDS;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
-const MEANINGS: [(&str, &str); 34] = [
+const MEANINGS: [(&str, &str); 37] = [
     ("modalwatch_alarms_total", "Alarms raised."),
     ("modalwatch_assessment_seconds", "Time of an assessment."),
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
@@ -18,6 +18,9 @@ const MEANINGS: [(&str, &str); 34] = [
     ("modalwatch_http_request_seconds", "Time to answer a request."),
     ("modalwatch_http_requests_total", "Requests answered."),
     ("modalwatch_last_backup_timestamp_seconds", "When this process made its last backup; 0 = never."),
+    ("modalwatch_mail_dead", "Mails about alarms that were abandoned."),
+    ("modalwatch_mail_deliveries_total", "Attempts to send a mail about an alarm, by outcome."),
+    ("modalwatch_mail_pending", "Mails about alarms that wait for the server."),
     ("modalwatch_measurements_received_total", "Measurements in new batches."),
     ("modalwatch_model_reloads_total", "Reloads of a trained baseline, by outcome."),
     ("modalwatch_mqtt_connected", "1 while the broker is connected."),

@@ -9,7 +9,7 @@
 //! | [`Replay`] | declare an undamaged reference, assess stored batches that wait |
 //! | [`Records`] | read batches, assessments and series |
 //! | [`Alarms`] | read and acknowledge alarms, charts, maintenance |
-//! | [`Jobs`], [`Versions`] | diagnose, extend a structure, undo an extension |
+//! | [`Jobs`], [`Versions`] | diagnose, train, extend a structure, undo an extension |
 //! | [`Models`] | replace a trained baseline |
 //! | [`Upkeep`] | health, gauges, backups, retention, silence, diagnoses that nobody requested |
 //! | [`Archive`] | export and import a structure |
@@ -55,7 +55,9 @@ use self::compute::Compute;
 pub use self::error::{BackupError, DeclareError, Error, IngestError, JobError, LeftOutBatch, ReloadError};
 use self::events::Events;
 pub use self::ingest::{Ingest, Ingested, DEFAULT_SOURCE};
-pub use self::jobs::{DiagnosisRequest, ExtensionResult, ExtensionTraining, Jobs};
+pub use self::jobs::{
+    DiagnosisRequest, ExtensionResult, ExtensionTraining, JobStatus, Jobs, TrainingRequest, TrainingResult,
+};
 pub use self::metrics::declare_metrics;
 pub use self::models::{Models, Reloaded};
 use self::probe::WriterProbe;
@@ -101,7 +103,7 @@ impl Monitor {
         let accept_uncalibrated = settings.accept_uncalibrated.clone();
         let structures = ActiveStructures::open(store.clone(), library, events.clone(), accept_uncalibrated).await?;
         let structures = Arc::new(structures);
-        let alarms = Arc::new(Alarms::new(store.clone(), events.clone()));
+        let alarms = Arc::new(Alarms::new(store.clone(), events.clone(), settings.severity));
         for structure in structures.ids() {
             // Alarms of an earlier run are not published again.
             alarms.changes(&structure).await;
@@ -122,7 +124,6 @@ impl Monitor {
         let records = Records::new(Arc::clone(&assessor));
         let versions = Versions::new(store.clone(), Arc::clone(&structures), Arc::clone(&references), replay.clone());
         let jobs = Jobs::new(store.clone(), Arc::clone(&structures), versions.clone(), events.clone());
-        jobs.end_interrupted().await?;
         let models = Models::new(store.clone(), Arc::clone(&structures), references, replay.clone());
         let upkeep = Upkeep {
             store: store.clone(),
@@ -175,7 +176,7 @@ impl Monitor {
         &self.alarms
     }
 
-    /// Starts diagnoses and extensions, and reads their results.
+    /// Starts diagnoses, extensions and trainings, and reads their results.
     pub fn jobs(&self) -> &Jobs {
         &self.jobs
     }

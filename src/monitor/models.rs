@@ -103,9 +103,14 @@ impl Models {
             kept: before.as_ref().map(Digest::to_string),
         };
         if self.store.structures().trained_baseline(structure, active.simulator.digest()).await?.is_some() {
-            let reason =
+            let version = self.store.structures().structure_version(structure, active.simulator.digest()).await?;
+            let reason = if version.is_some_and(|(_, parent)| parent.is_some()) {
                 "the present version is an extension, whose trained baseline was made by the service and cannot be \
-                 replaced by a file: undo the extension first";
+                 replaced by a file: undo the extension first"
+            } else {
+                "the service trained the model of this structure itself, and a file cannot replace it: train it again by \
+                 POST /v1/structures/{id}/trainings, or on the page of the structure"
+            };
             return Err(refused(reason.to_owned()));
         }
         let library = self.structures.library();

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::compute::ComputeSettings;
+use crate::alarm::severity::SeverityLimits;
 use crate::alarm::AlarmSettings;
 use crate::assessment::Draws;
 
@@ -24,6 +25,8 @@ pub struct MonitorSettings {
     pub missing_covariate: MissingCovariate,
     /// How alarms are raised.
     pub alarm: AlarmSettings,
+    /// Limits of the severity of alarms.
+    pub severity: SeverityLimits,
     /// Limits of the queue of assessments.
     pub compute: ComputeSettings,
 }
@@ -47,6 +50,7 @@ impl Default for MonitorSettings {
             accept_uncalibrated: Vec::new(),
             missing_covariate: MissingCovariate::Marginalise,
             alarm: AlarmSettings::default(),
+            severity: SeverityLimits::default(),
             compute: ComputeSettings::default(),
         }
     }

@@ -19,7 +19,8 @@ use crate::trust::calibration_in_words;
 
 /// What to do where a structure has no trained baseline.
 const TRAIN: &str =
-    "train one with `modalwatch train` into the models folder (--models), then reload it or start the service again";
+    "train one on the page of the structure, by POST /v1/structures/{id}/trainings, or with `modalwatch train` into the models \
+     folder (--models), and then reload it or start the service again";
 
 /// A structure in use.
 pub struct ActiveStructure {

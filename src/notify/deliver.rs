@@ -49,7 +49,10 @@ impl Notifier {
             };
             tokio::select! {
                 () = stopped(&mut stop) => break,
-                () = self.store.outbox().written() => tokio::time::sleep(SHORTEST_WAIT).await,
+                () = self.store.outbox().written() => {
+                    self.wake.notify_one();
+                    tokio::time::sleep(SHORTEST_WAIT).await;
+                }
                 Some(ended) = turns.join_next_with_id() => {
                     let id = ended.map_or_else(|panicked| panicked.id(), |(id, ())| id);
                     busy.remove(&id);

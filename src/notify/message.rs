@@ -2,17 +2,28 @@
 //!
 //! Source: CNCF (2022), CloudEvents – Version 1.0.2, §3.1 and JSON event format §3; Standard Webhooks specification 1.0.0.
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use standardwebhooks::{Webhook, WebhookError};
 
+use super::facts::{ActionFacts, Facts};
 use crate::alarm::chart::parameter_of;
+use crate::alarm::severity::{Severity, SeverityLimits};
 use crate::process::reference::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 use crate::store::{OutboxEvent, Secret};
 
 /// Kinds of events, as in the table `outbox_event`.
-pub const EVENT_KINDS: [&str; 5] =
-    ["alarm.opened", "alarm.reopened", "alarm.ended", "alarm.withdrawn", "alarm.acknowledged"];
+pub const EVENT_KINDS: [&str; 9] = [
+    "alarm.opened",
+    "alarm.worsened",
+    "alarm.reopened",
+    "alarm.ended",
+    "alarm.withdrawn",
+    "alarm.acknowledged",
+    "alarm.commented",
+    "alarm.assigned",
+    "alarm.closed",
+];
 
 /// Prefix of the kind of an event in the CloudEvents type.
 const TYPE_PREFIX: &str = "org.modalwatch.";
@@ -72,7 +83,11 @@ struct AlarmData<'a> {
     peak_shift_standard_errors: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     undamaged_version: Option<u32>,
+    severity: Severity,
     acknowledgement: Option<AcknowledgementData>,
+    /// What a person did; only in events about that.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    action: Option<ActionData>,
     /// URL of the alarm.
     alarm_url: String,
     /// URL of the batch that raised the alarm.
@@ -86,27 +101,20 @@ struct AcknowledgementData {
     note: Option<String>,
 }
 
+/// What a person did with the alarm.
+#[derive(Debug, Serialize)]
+struct ActionData {
+    kind: String,
+    at: Timestamp,
+    author: String,
+    text: Option<String>,
+    reason: Option<String>,
+    assignee: Option<String>,
+}
+
 #[derive(Debug, Serialize)]
 struct TestData {
     message: &'static str,
-}
-
-/// An alarm as the triggers of the database write it.
-#[derive(Debug, Deserialize)]
-struct Facts {
-    kind: String,
-    series: String,
-    undamaged_version: u32,
-    opened_at_us: i64,
-    opened_batch: Option<String>,
-    ended_at_us: Option<i64>,
-    withdrawn: u8,
-    peak_shift: Option<f64>,
-    noticed_at_us: i64,
-    acknowledged_at_us: Option<i64>,
-    acknowledged_by: Option<String>,
-    acknowledgement_note: Option<String>,
-    change: Option<LastingChange>,
 }
 
 impl Message {
@@ -114,8 +122,9 @@ impl Message {
     ///
     /// # Errors
     /// [`Error`] if the stored event cannot be read.
-    pub fn of_event(event: &OutboxEvent, public_url: &str) -> Result<Self, Error> {
+    pub fn of_event(event: &OutboxEvent, limits: SeverityLimits, public_url: &str) -> Result<Self, Error> {
         let facts: Facts = serde_json::from_str(&event.facts)?;
+        let severity = limits.severity(facts.alarm());
         let (structure, number) = (&event.structure, event.alarm);
         let time = |micros: i64| Timestamp::from_micros(micros);
         let root = public_url.trim_end_matches('/');
@@ -124,6 +133,9 @@ impl Message {
             _ => None,
         };
         let damage = facts.kind == "damage";
+        let action = |ActionFacts { kind, at_us, author, text, reason, assignee }| {
+            Ok::<_, Error>(ActionData { kind, at: time(at_us)?, author, text, reason, assignee })
+        };
         let data = AlarmData {
             structure,
             alarm: number,
@@ -139,7 +151,9 @@ impl Message {
             noticed_at: time(facts.noticed_at_us)?,
             peak_shift_standard_errors: facts.peak_shift.filter(|_| damage),
             undamaged_version: damage.then_some(facts.undamaged_version),
+            severity,
             acknowledgement,
+            action: facts.action.map(action).transpose()?,
             // The alarm is on the page of one item that begins after the next number.
             alarm_url: format!("{root}/v1/structures/{structure}/alarms?limit=1&cursor={}", number + 1),
             batch_url: facts.opened_batch.as_ref().map(|id| format!("{root}/v1/structures/{structure}/batches/{id}")),
@@ -229,15 +243,16 @@ mod tests {
         let silence = r#"{"kind":"silence","series":"structure:silence","undamaged_version":0,"opened_at_us":0,
             "opened_batch":null,"ended_at_us":1000000,"withdrawn":0,"peak_shift":0.0,"noticed_at_us":5,
             "acknowledged_at_us":7000000,"acknowledged_by":"Ann","acknowledgement_note":null}"#;
-        let message = Message::of_event(&event(silence), "https://shm.example.org/").unwrap();
+        let message =
+            Message::of_event(&event(silence), SeverityLimits::default(), "https://shm.example.org/").unwrap();
         let body: serde_json::Value = serde_json::from_str(message.body()).unwrap();
         assert_eq!(body["type"], "org.modalwatch.alarm.opened");
         assert_eq!(body["source"], "https://shm.example.org/");
         assert_eq!(body["subject"], "structures/bridge/alarms/3");
         let data = &body["data"];
         assert_eq!((&data["state"], &data["parameter"]), (&"ended".into(), &serde_json::Value::Null));
-        assert_eq!(data["acknowledgement"]["by"], "Ann");
+        assert_eq!((&data["acknowledgement"]["by"], &data["severity"]["grade"]), (&"Ann".into(), &"moderate".into()));
         assert_eq!(data["alarm_url"], "https://shm.example.org/v1/structures/bridge/alarms?limit=1&cursor=4");
-        assert!(Message::of_event(&event("{}"), "").is_err());
+        assert!(Message::of_event(&event("{}"), SeverityLimits::default(), "").is_err());
     }
 }

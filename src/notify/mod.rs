@@ -1,4 +1,4 @@
-//! Webhooks: notification of other programs about alarms.
+//! Notification about alarms: webhooks for other programs, mails for people.
 //!
 //! Triggers of the database write an event to the outbox in the same transaction that changes the alarm. Each message
 //! is then sent at least once: until its receiver accepts it, or until it has failed for days and is given up as a dead
@@ -8,10 +8,16 @@
 mod address;
 mod backoff;
 mod deliver;
+mod email_settings;
+mod facts;
+mod mail;
+mod mailer;
 mod message;
 mod notifier;
 mod settings;
 
+pub use email_settings::{EmailSettingError, EmailSettings, Encryption};
+pub use mailer::Mailer;
 pub use message::EVENT_KINDS;
 pub use notifier::{client_builder, install_tls_provider, new_secret, Attempt, Notifier};
 pub use settings::NotifySettings;

@@ -8,11 +8,13 @@ use base64::Engine as _;
 use rand::rngs::OsRng;
 use rand::TryRngCore as _;
 use reqwest::{header, redirect, Certificate, Client, ClientBuilder};
+use tokio::sync::Notify;
 
 use super::address::{Guard, GuardedResolver};
 use super::backoff::later;
 use super::message::{seconds, Message};
 use super::settings::NotifySettings;
+use crate::alarm::severity::SeverityLimits;
 use crate::quantity::Timestamp;
 use crate::store::{OutboxEvent, Secret, Store, WebhookRecord};
 
@@ -41,18 +43,27 @@ pub struct Notifier {
     pub(super) settings: Arc<NotifySettings>,
     /// Number of failing webhooks and of dead letters at the last check.
     pub(super) trouble: Arc<Mutex<(u64, u64)>>,
+    limits: SeverityLimits,
+    /// Woken when something was written, for the mailer.
+    pub(super) wake: Arc<Notify>,
     /// One client for each port, because the allowed addresses depend on the port.
     clients: Arc<Mutex<BTreeMap<u16, Client>>>,
 }
 
 impl Notifier {
-    /// A notifier for the outbox of a store.
+    /// A notifier for the outbox of a store, which wakes `wake` when something was written.
     ///
     /// # Errors
     /// The entry of `allow_private_targets` that is not an address or network.
-    pub fn new(store: Store, settings: NotifySettings) -> Result<Self, String> {
+    pub fn new(
+        store: Store,
+        settings: NotifySettings,
+        limits: SeverityLimits,
+        wake: Arc<Notify>,
+    ) -> Result<Self, String> {
         let guard = Arc::new(Guard::new(&settings.allow_private_targets)?);
-        Ok(Self { store, guard, settings: Arc::new(settings), trouble: Arc::default(), clients: Arc::default() })
+        let settings = Arc::new(settings);
+        Ok(Self { store, guard, settings, trouble: Arc::default(), limits, wake, clients: Arc::default() })
     }
 
     /// The addresses that webhooks may reach.
@@ -85,7 +96,7 @@ impl Notifier {
 
     /// Sends a message of the outbox.
     pub(super) async fn send(&self, webhook: &WebhookRecord, event: &OutboxEvent) -> Attempt {
-        match Message::of_event(event, &self.settings.public_url) {
+        match Message::of_event(event, self.limits, &self.settings.public_url) {
             Ok(message) => self.attempt(webhook, &message).await,
             Err(error) => Attempt { status: None, took: Duration::ZERO, error: Some(error.to_string()) },
         }

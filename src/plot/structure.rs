@@ -109,6 +109,10 @@ pub struct Drawing {
     pub shape: Vec<Vec<(Place, Place)>>,
     /// What the shape is, such as `mode 1, 0.95 Hz`.
     pub shape_label: String,
+    /// Measured displacements of single places, on the scale of `shape`.
+    pub measured: Vec<(Place, Place)>,
+    /// What was measured, such as `measured, MAC 0.998`.
+    pub measured_label: String,
     /// Change at which the colours are strongest, per cent.
     pub full_percent: f64,
 }
@@ -229,32 +233,53 @@ impl Drawing {
     }
 
     fn shape_svg(&self, frame: &Frame) -> String {
-        let all = || self.shape.iter().flatten();
+        let all = || self.shape.iter().flatten().chain(&self.measured);
         let largest = all().map(|(_, moved)| moved[0].hypot(moved[1])).fold(0.0, f64::max);
         if largest <= 0.0 {
             return String::new();
         }
         let swing = SWING * (WIDTH - 2.0 * MARGIN) / largest;
         let mut svg = String::from("<g class=\"shape\" fill=\"none\" stroke=\"#009e73\" stroke-width=\"2\">");
+        // A page that animates the shape needs each point at rest and its displacement.
+        let motion = |(place, moved): &(Place, Place)| (frame.at(*place), [swing * moved[0], -swing * moved[1]]);
         for line in &self.shape {
-            let points = line.iter().map(|(place, moved)| {
-                let [x, y] = frame.at(*place);
-                [x + swing * moved[0], y - swing * moved[1]]
-            });
-            let points: Vec<Place> = points.collect();
-            let path: Vec<String> = points.iter().map(|[x, y]| format!("{x:.1},{y:.1}")).collect();
-            write!(svg, "<polyline points=\"{}\" stroke-dasharray=\"5 3\"/>", path.join(" "))
-                .expect("writing to memory cannot fail");
-            if points.len() <= MOST_DOTS {
-                for [x, y] in points {
-                    write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"4\" fill=\"#009e73\" stroke=\"none\"/>")
-                        .expect("writing to memory cannot fail");
-                }
+            let moving: Vec<(Place, Place)> = line.iter().map(motion).collect();
+            let joined = |place: &dyn Fn(&(Place, Place)) -> Place| {
+                let pair = |one: &(Place, Place)| {
+                    let [x, y] = place(one);
+                    format!("{x:.1},{y:.1}")
+                };
+                moving.iter().map(pair).collect::<Vec<_>>().join(" ")
+            };
+            write!(
+                svg,
+                "<polyline points=\"{}\" data-rest=\"{}\" data-moved=\"{}\" stroke-dasharray=\"5 3\"/>",
+                joined(&displaced),
+                joined(&|one| one.0),
+                joined(&|one| one.1)
+            )
+            .expect("writing to memory cannot fail");
+            if moving.len() <= MOST_DOTS {
+                let dot = "r=\"4\" fill=\"#009e73\" stroke=\"none\"";
+                svg.extend(moving.iter().map(|one| dot_svg(one, dot)));
             }
+        }
+        svg.push_str("</g>");
+        if !self.measured.is_empty() {
+            svg.push_str("<g class=\"measured-shape\">");
+            let dot = "r=\"7\" fill=\"none\" stroke=\"#7b2d8b\" stroke-width=\"2.5\"";
+            svg.extend(self.measured.iter().map(|one| dot_svg(&motion(one), dot)));
+            write!(
+                svg,
+                "<text x=\"{:.0}\" y=\"40\" text-anchor=\"end\" fill=\"#7b2d8b\">{}</text></g>",
+                WIDTH - 12.0,
+                escaped(&self.measured_label)
+            )
+            .expect("writing to memory cannot fail");
         }
         write!(
             svg,
-            "</g><text x=\"{:.0}\" y=\"22\" text-anchor=\"end\" fill=\"#006b4e\">{}</text>",
+            "<text x=\"{:.0}\" y=\"22\" text-anchor=\"end\" fill=\"#006b4e\">{}</text>",
             WIDTH - 12.0,
             escaped(&self.shape_label)
         )
@@ -309,6 +334,19 @@ impl Drawing {
         };
         [-full, 0.0, full].into_iter().enumerate().map(one).collect()
     }
+}
+
+/// Where a place at rest is after its displacement.
+fn displaced((rest, moved): &(Place, Place)) -> Place {
+    [rest[0] + moved[0], rest[1] + moved[1]]
+}
+
+/// A dot at a displaced place, with its place at rest and its displacement for a page that animates it.
+fn dot_svg(one: &(Place, Place), style: &str) -> String {
+    let ([x, y], [rest_x, rest_y], [dx, dy]) = (displaced(one), one.0, one.1);
+    format!(
+        "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" data-rest=\"{rest_x:.1},{rest_y:.1}\" data-moved=\"{dx:.1},{dy:.1}\" {style}/>"
+    )
 }
 
 /// A body with its label: beside it, or below it on a beam, whose own label stands beside it.

@@ -3,16 +3,16 @@
 use std::collections::BTreeMap;
 
 use super::definition::{
-    DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Prior, Sets, SimulationKind,
-    StructureDefinition,
+    CovariateDefinition, DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Prior, Sets,
+    SimulationKind, StructureDefinition, PERCENT_OF_NOMINAL,
 };
 use super::discrepancy;
 use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::{self, Instrumented};
 use super::layout::{check_kg, check_names, check_spring, Layout, Problems};
-use super::model::{Binding, SimulationModel};
-use super::{beam, table};
+use super::model::{Binding, SimulationModel, StiffnessForm};
+use super::{beam, covariates, table};
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::physics::{
@@ -44,7 +44,7 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
         StructureId::parse(&definition.id).map_err(|e| problems.push(DefinitionProblem::new("/id", e.to_string())));
     check_counts_and_noise(definition, &mut problems);
     check_sections(definition, &mut problems);
-    check_covariates(definition, &mut problems);
+    covariates::check(definition, &mut problems);
     let layout = layout(definition, &mut problems);
     let bindings = check_parameters(definition, &mut problems);
     let (Ok(id), true) = (id, problems.is_empty()) else { return Err(problems) };
@@ -66,8 +66,8 @@ pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problem
             (SimulationModel::Matrices { structure, bindings }, nominal)
         }
     };
-    let covariates: Vec<Covariate> =
-        definition.covariates.iter().map(|c| Covariate { name: c.name.clone(), kind: c.kind }).collect();
+    let covariate = |c: &CovariateDefinition| Covariate { name: c.name.clone(), kind: c.kind, unit: c.unit.clone() };
+    let covariates: Vec<Covariate> = definition.covariates.iter().map(covariate).collect();
     check_names("effect", definition.effects.iter().map(|e| &e.name), &mut problems);
     let effects = effect::check(definition, &model, &covariates, &mut problems);
     let discrepancy = discrepancy::check::check(definition, &covariates, &mut problems);
@@ -234,24 +234,6 @@ fn check_springs(
     forms
 }
 
-/// Checks that no covariate has the name of another column of measurement tables.
-fn check_covariates(definition: &StructureDefinition, problems: &mut Problems) {
-    check_names("covariate", definition.covariates.iter().map(|c| &c.name), problems);
-    for (index, covariate) in definition.covariates.iter().enumerate() {
-        let name = covariate.name.to_ascii_lowercase();
-        let digits = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
-        let frequency = name.strip_prefix("std_").unwrap_or(&name);
-        let frequency = frequency.strip_prefix('f').and_then(|n| n.strip_suffix("_hz")).is_some_and(digits);
-        if frequency || name == "measured_at" || name == "source" || name.starts_with("set_") {
-            let message = format!(
-                "the covariate name {} is taken by another column of measurement tables: choose another name",
-                shown(&covariate.name)
-            );
-            problems.push(DefinitionProblem::new(format!("/covariate/{index}/name"), message));
-        }
-    }
-}
-
 /// Checks the parameters. Returns which parameter sets which stiffness.
 fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -> Vec<Binding> {
     check_names("parameter", definition.parameters.iter().map(|p| &p.name), problems);
@@ -264,6 +246,7 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
             problems.push(DefinitionProblem::new(format!("/parameter/{index}/prior/uniform"), message));
         }
         let table = definition.simulation == SimulationKind::Table;
+        check_factor(definition, index, problems);
         if parameter.sets.is_empty() && !table {
             let what = if definition.simulation == SimulationKind::Beam { "a beam or a spring" } else { "a spring" };
             let message = format!("parameter {} sets nothing: name {what} in sets", shown(&parameter.name));
@@ -297,16 +280,72 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
                 wrong(format!("{key} {} is set by parameter {other} already", shown(name)));
                 continue;
             }
-            if let Some(Law::Exponential(e)) = sets.law {
-                if !(e.a.is_finite() && e.b.is_finite() && e.c.is_finite()) {
-                    wrong(format!("the constants of a law must be finite: a = {}, b = {}, c = {}", e.a, e.b, e.c));
-                    continue;
-                }
+            match form(definition, parameter, sets) {
+                Ok(form) => bindings.push(Binding { parameter: index, spring, form }),
+                Err(message) => wrong(message),
             }
-            bindings.push(Binding { parameter: index, spring, law: sets.law });
         }
     }
     bindings
+}
+
+/// Checks that a parameter which is a factor has neither a unit of its own nor a table of runs.
+fn check_factor(definition: &StructureDefinition, index: usize, problems: &mut Problems) {
+    let parameter = &definition.parameters[index];
+    if !parameter.scale {
+        return;
+    }
+    let name = shown(&parameter.name);
+    if definition.simulation == SimulationKind::Table {
+        let message = format!(
+            "parameter {name} is a column of the runs of a simulation \"table\", which has no nominal stiffness: remove scale"
+        );
+        problems.push(DefinitionProblem::new(format!("/parameter/{index}/scale"), message));
+    }
+    if let Some(unit) = parameter.unit.as_ref().filter(|unit| *unit != PERCENT_OF_NOMINAL) {
+        let message = format!(
+            "parameter {name} has the unit {}, but a factor (scale = true) is given in {PERCENT_OF_NOMINAL}: remove unit",
+            shown(unit)
+        );
+        problems.push(DefinitionProblem::new(format!("/parameter/{index}/unit"), message));
+    }
+}
+
+/// Stiffness that an entry of `sets` describes, as a function of its parameter.
+fn form(
+    definition: &StructureDefinition,
+    parameter: &ParameterDefinition,
+    sets: &Sets,
+) -> Result<StiffnessForm, String> {
+    let kind = if sets.beam.is_some() { "beam" } else { "spring" };
+    let name = || shown(sets.spring.as_ref().or(sets.beam.as_ref()).map_or("", String::as_str));
+    match (sets.law, parameter.scale) {
+        (None, false) => Ok(StiffnessForm::Itself),
+        (Some(_), true) => Err(format!(
+            "parameter {} is a factor (scale = true) and has a law for {kind} {}: remove one of the two",
+            shown(&parameter.name),
+            name()
+        )),
+        (Some(law @ Law::Exponential(e)), false) => {
+            if e.a.is_finite() && e.b.is_finite() && e.c.is_finite() {
+                Ok(StiffnessForm::Law(law))
+            } else {
+                Err(format!("the constants of a law must be finite: a = {}, b = {}, c = {}", e.a, e.b, e.c))
+            }
+        }
+        (None, true) => {
+            let key = if sets.beam.is_some() { "bending_stiffness_n_m2" } else { "n_per_m or n_m_per_rad" };
+            let nominal = definition.stated_stiffness(sets).filter(|k| *k > 0.0);
+            nominal.map(StiffnessForm::PercentOf).ok_or_else(|| {
+                format!(
+                    "parameter {} is a factor (scale = true) of the nominal stiffness of {kind} {}, which must be stated and above 0: \
+                     give {key} there",
+                    shown(&parameter.name),
+                    name()
+                )
+            })
+        }
+    }
 }
 
 /// Index of the stiffness that an entry of `sets` names: springs come first, then beam spans.
@@ -326,17 +365,13 @@ fn stiffness_index(definition: &StructureDefinition, sets: &Sets) -> Result<usiz
 
 /// The parameter of a checked definition, with the unit of the stiffness that it sets unless the file gives one.
 fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) -> Parameter {
-    let Prior::Uniform([lower, upper]) = definition.prior;
+    let [lower, upper] = definition.bounds();
     let without_law = |sets: &Sets| sets.law.is_none();
-    let rotation = |sets: &Sets| {
-        structure.springs.iter().any(|s| Some(&s.name) == sets.spring.as_ref() && s.n_m_per_rad.is_some())
-    };
     let unit = match definition.sets.first() {
+        _ if definition.scale => PERCENT_OF_NOMINAL,
         Some(_) if !definition.sets.iter().all(without_law) => "–",
         None => "–",
-        Some(sets) if sets.beam.is_some() => "N·m²",
-        Some(sets) if rotation(sets) => "N·m/rad",
-        Some(_) => "N/m",
+        Some(sets) => structure.stiffness_unit(sets),
     };
     let unit = definition.unit.clone().unwrap_or_else(|| unit.to_owned());
     Parameter { name: definition.name.clone(), unit, lower, upper, damage: definition.damage }
@@ -350,12 +385,12 @@ fn springs(
     bindings: &[Binding],
     problems: &mut Problems,
 ) -> Vec<Spring> {
-    let springs = definition.springs.iter().map(|s| (&s.name, s.n_per_m.or(s.n_m_per_rad)));
+    let springs = definition.springs.iter().map(|s| (&s.name, s.stiffness()));
     let spans = definition.beams.iter().map(|b| (&b.name, b.bending_stiffness_n_m2));
     let nominal = |(index, ((name, value), form)): (usize, ((&String, Option<f64>), Form))| {
         let binding = bindings.iter().find(|b| b.spring == index);
         let middle = binding.map(|b| {
-            let Prior::Uniform([lower, upper]) = definition.parameters[b.parameter].prior;
+            let [lower, upper] = definition.parameters[b.parameter].bounds();
             b.stiffness(f64::midpoint(lower, upper))
         });
         let n_per_m = value.or(middle).unwrap_or_else(|| {
@@ -384,7 +419,7 @@ fn check_priors(
 ) -> Vec<Spring> {
     let mut weakest: Vec<Spring> = springs.to_vec();
     for binding in bindings {
-        let Prior::Uniform([lower, upper]) = definition.parameters[binding.parameter].prior;
+        let [lower, upper] = definition.parameters[binding.parameter].bounds();
         // Every law is monotone, so that its smallest value is at a bound of the prior.
         let (at_lower, at_upper) = (binding.stiffness(lower), binding.stiffness(upper));
         let least = at_lower.min(at_upper);
@@ -394,8 +429,9 @@ fn check_priors(
         // Both bounds are checked, because `min` ignores NaN, which 0·exp(large) gives.
         if !(least >= 0.0 && at_lower.is_finite() && at_upper.is_finite()) {
             let unit = if kind == "beam" { "N·m²" } else { "N/m" };
+            let Prior::Uniform([first, last]) = definition.parameters[binding.parameter].prior;
             let message = format!(
-                "the prior [{lower}, {upper}] lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must \
+                "the prior [{first}, {last}] lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must \
                  be finite and not negative"
             );
             problems.push(DefinitionProblem::new(pointer, message));

@@ -277,6 +277,10 @@ pub struct ParameterDefinition {
     /// Unit, for display; by default that of the stiffness that the parameter sets without a law.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
+    /// Whether the parameter is a factor p of the nominal stiffness of everything that it sets, k = p·k_nominal. Its prior is then
+    /// given in factors, such as 0.5 to 1.5. Everywhere else its values are per cent of the nominal stiffness: 92 for p = 0.92.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub scale: bool,
     /// Prior distribution.
     pub prior: Prior,
     /// The stiffnesses that the parameter sets: one table or a list of tables; none in a simulation `table`.
@@ -295,6 +299,22 @@ pub enum Prior {
     Uniform([f64; 2]),
 }
 
+/// Unit of the values of a parameter that is a factor of the nominal stiffness.
+pub const PERCENT_OF_NOMINAL: &str = "% of nominal";
+
+impl ParameterDefinition {
+    /// Bounds of the prior in the unit of the parameter's values: those of the file, or 100 times the factors of the file for
+    /// `scale`, because the values of such a parameter are per cent of the nominal stiffness.
+    pub fn bounds(&self) -> [f64; 2] {
+        let Prior::Uniform(bounds) = self.prior;
+        if self.scale {
+            bounds.map(|factor| 100.0 * factor)
+        } else {
+            bounds
+        }
+    }
+}
+
 /// A stiffness that a parameter sets: of a spring or of a beam span.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
@@ -305,9 +325,40 @@ pub struct Sets {
     /// Name of the beam span whose bending stiffness it sets, instead of `spring`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beam: Option<String>,
-    /// Stiffness as a function of the parameter; without a law the parameter is the stiffness itself.
+    /// Stiffness as a function of the parameter; without a law the parameter is the stiffness itself, or a factor of it for `scale`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub law: Option<Law>,
+}
+
+impl StructureDefinition {
+    /// Nominal stiffness that the file states for the stiffness of an entry of `sets`, in the unit of that stiffness (N/m, N·m/rad or
+    /// N·m²).
+    pub fn stated_stiffness(&self, sets: &Sets) -> Option<f64> {
+        match (&sets.spring, &sets.beam) {
+            (Some(name), _) => self.springs.iter().find(|s| s.name == *name)?.stiffness(),
+            (None, Some(name)) => self.beams.iter().find(|b| b.name == *name)?.bending_stiffness_n_m2,
+            (None, None) => None,
+        }
+    }
+}
+
+impl StructureDefinition {
+    /// Unit of the stiffness of an entry of `sets`.
+    pub fn stiffness_unit(&self, sets: &Sets) -> &'static str {
+        let rotational = |name: &String| self.springs.iter().any(|s| s.name == *name && s.n_m_per_rad.is_some());
+        match &sets.spring {
+            None => "N·m²",
+            Some(name) if rotational(name) => "N·m/rad",
+            Some(_) => "N/m",
+        }
+    }
+}
+
+impl SpringDefinition {
+    /// Stated nominal stiffness, N/m, or N·m/rad for a rotational spring.
+    pub fn stiffness(&self) -> Option<f64> {
+        self.n_per_m.or(self.n_m_per_rad)
+    }
 }
 
 /// Stiffness as a function of a parameter.
@@ -348,11 +399,14 @@ impl Law {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CovariateDefinition {
-    /// Unique name that includes the unit, such as `temperature_c`.
+    /// Unique name, such as `temperature_c`.
     pub name: String,
     /// Kind of its values.
     #[serde(default)]
     pub kind: CovariateKind,
+    /// Unit of a number, such as `°C`; by default the one that the name ends with, if it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit: Option<String>,
 }
 
 /// One mistake in a structure file.

@@ -9,7 +9,9 @@ use std::sync::Arc;
 use super::definition::{
     MassDefinition, ParameterDefinition, SimulationKind, SpringDefinition, StructureDefinition, Support,
 };
+use super::shape_comparison::{MeasuredShape, ShapeComparison};
 use super::simulate::Simulator;
+use crate::measurement::ModalMeasurement;
 use crate::physics;
 use crate::physics::beam::Span;
 use crate::physics::Form;
@@ -67,9 +69,59 @@ impl Simulator {
             self.mark(link, marks);
         }
         if let Some((mode, theta)) = mode {
-            self.add_shape(&mut drawing, mode, theta)?;
+            let modes = self.modes();
+            if mode == 0 || mode > modes {
+                return Err(Error::NoMode { mode, modes });
+            }
+            drawing.shape_label = format!("mode {mode}, {:.4} Hz", self.frequencies_hz(theta)?[mode - 1]);
+            self.add_shape(&mut drawing, mode - 1, modes, theta)?;
         }
         Ok(drawing)
+    }
+
+    /// As [`Self::drawing`], with the measured shape of the mode (counted from 1) beside that of the simulated mode which it belongs to at
+    /// the parameters `theta` (`[d]`). Without a measured shape of the mode, it is the drawing of the simulated mode alone.
+    ///
+    /// # Errors
+    /// [`Error`], see its variants.
+    pub fn drawing_beside(
+        &self,
+        marks: &Marks,
+        (mode, theta): (usize, &[f64]),
+        measurements: &[ModalMeasurement],
+    ) -> Result<Drawing, Error> {
+        let comparison = self.compare_shapes(theta, measurements)?;
+        let own = |c: ShapeComparison| {
+            let measured = c.measured.iter().find(|m| m.mode + 1 == mode)?.clone();
+            Some((c, measured))
+        };
+        let Some((comparison, measured)) = comparison.and_then(own) else {
+            return self.drawing(marks, Some((mode, theta)));
+        };
+        let mut drawing = self.drawing(marks, None)?;
+        let index = measured.simulated_mode;
+        let count = comparison.simulated.len();
+        drawing.shape_label =
+            format!("simulated mode {}, {:.4} Hz", index + 1, comparison.simulated[index].frequency_hz);
+        drawing.measured_label = format!("measured mode {mode}, MAC {:.3}", measured.mac[index]);
+        let whole = self.add_shape(&mut drawing, index, count, theta)?;
+        self.add_measured(&mut drawing, &comparison.points, &measured, &whole);
+        Ok(drawing)
+    }
+
+    /// Adds a measured shape on the scale of the simulated one: φ·(ψᵀφ)/(φᵀφ) with the simulated displacements ψ at the instrumented
+    /// points, out of those of all degrees of freedom, `whole`.
+    fn add_measured(&self, drawing: &mut Drawing, points: &[String], measured: &MeasuredShape, whole: &[f64]) {
+        let simulated: Vec<f64> = self.shape_dofs().iter().map(|dof| whole[*dof]).collect();
+        let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+        let scale = product(&simulated, &measured.shape) / product(&measured.shape, &measured.shape);
+        let sideways = self.definition().simulation == SimulationKind::SpringMass;
+        let place = |(name, component): (&String, &f64)| {
+            let body = drawing.bodies.iter().find(|b| b.name == *name)?;
+            let moved = scale * component;
+            Some((body.at, if sideways { [moved, 0.0] } else { [0.0, moved] }))
+        };
+        drawing.measured = points.iter().zip(&measured.shape).filter_map(place).collect();
     }
 
     /// Colours and outlines a link, and writes the stiffness below its name: the parameters that set it, or its value.
@@ -87,18 +139,14 @@ impl Simulator {
         (link.change_percent, link.alarm) = (change, alarm);
     }
 
-    /// Adds the shape of a mode: of each body, or along the spans.
-    fn add_shape(&self, drawing: &mut Drawing, mode: usize, theta: &[f64]) -> Result<(), Error> {
-        let modes = self.modes();
-        if mode == 0 || mode > modes {
-            return Err(Error::NoMode { mode, modes });
-        }
+    /// Adds the shape of mode `index` (from 0) of the lowest `count`: of each body, or along the spans. Returns the displacement of each
+    /// degree of freedom.
+    fn add_shape(&self, drawing: &mut Drawing, index: usize, count: usize, theta: &[f64]) -> Result<Vec<f64>, Error> {
         let structure = self.structure().ok_or(Error::NoGeometry)?;
         let dofs: Vec<usize> = (0..structure.dofs()).collect();
-        let shapes = self.shapes_under(theta, modes, (&[], &[]), &dofs)?.ok_or(Error::NoGeometry)?;
-        let shape = shapes.column(mode - 1);
-        let frequency_hz = self.frequencies_hz(theta)?[mode - 1];
-        drawing.shape_label = format!("mode {mode}, {frequency_hz:.4} Hz");
+        let effects = (self.targets(), self.sizes());
+        let shapes = self.shapes_under(theta, count, (&effects.0, effects.1), &dofs)?.ok_or(Error::NoGeometry)?;
+        let shape: Vec<f64> = shapes.column(index).iter().copied().collect();
         let deflection = |dof: Option<usize>| dof.map_or(0.0, |dof| shape[dof]);
         drawing.shape = if self.definition().simulation == SimulationKind::Beam {
             let bending = structure.springs().iter().filter_map(|s| match &s.form {
@@ -126,7 +174,7 @@ impl Simulator {
             }
             vec![bodies]
         };
-        Ok(())
+        Ok(shape)
     }
 }
 

@@ -37,19 +37,38 @@ pub struct Binding {
     pub parameter: usize,
     /// Index of the spring or beam span.
     pub spring: usize,
-    /// Stiffness as a function of the parameter; without a law the parameter is the stiffness itself.
-    pub law: Option<Law>,
+    /// Stiffness as a function of the parameter.
+    pub form: StiffnessForm,
+}
+
+/// Stiffness k as a function of the parameter p that sets it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum StiffnessForm {
+    /// k = p: the parameter is the stiffness itself.
+    Itself,
+    /// k = k_nominal·p/100: the parameter is per cent of this nominal stiffness, which is in the unit of the spring or beam.
+    PercentOf(f64),
+    /// k(p) by a law of the structure file.
+    Law(Law),
 }
 
 impl Binding {
     /// Stiffness k(p) at a parameter value, N/m.
     pub fn stiffness(&self, p: f64) -> f64 {
-        self.law.map_or(p, |law| law.value(p))
+        match self.form {
+            StiffnessForm::Itself => p,
+            StiffnessForm::PercentOf(nominal) => 0.01 * nominal * p,
+            StiffnessForm::Law(law) => law.value(p),
+        }
     }
 
     /// Derivative dk/dp at a parameter value, N/m per unit of the parameter.
     pub fn slope(&self, p: f64) -> f64 {
-        self.law.map_or(1.0, |law| law.slope(p))
+        match self.form {
+            StiffnessForm::Itself => 1.0,
+            StiffnessForm::PercentOf(nominal) => 0.01 * nominal,
+            StiffnessForm::Law(law) => law.slope(p),
+        }
     }
 }
 

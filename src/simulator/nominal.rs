@@ -1,7 +1,7 @@
 //! The parameters at which a structure has its nominal stiffnesses.
 
 use super::definition::Law;
-use super::model::Binding;
+use super::model::{Binding, StiffnessForm};
 use super::simulate::Simulator;
 
 impl Simulator {
@@ -18,9 +18,13 @@ impl Simulator {
     }
 }
 
-/// The parameter at which a binding gives the stiffness k, N/m: p = ln((k − c)/a)/b for the exponential law.
+/// The parameter at which a binding gives the stiffness k, N/m: 100 k/k_nominal for a factor, p = ln((k − c)/a)/b for the exponential
+/// law.
 fn at_stiffness(binding: &Binding, n_per_m: f64) -> Option<f64> {
-    let Some(Law::Exponential(e)) = binding.law else { return Some(n_per_m) };
-    let p = ((n_per_m - e.c) / e.a).ln() / e.b;
+    let p = match binding.form {
+        StiffnessForm::Itself => n_per_m,
+        StiffnessForm::PercentOf(nominal) => 100.0 * n_per_m / nominal,
+        StiffnessForm::Law(Law::Exponential(e)) => ((n_per_m - e.c) / e.a).ln() / e.b,
+    };
     p.is_finite().then_some(p)
 }

@@ -20,7 +20,13 @@ impl StructureDefinition {
     fn from_toml(text: &str) -> Result<Self, DefinitionError> {
         let syntax = |error: &toml::de::Error, pointer: String| {
             let line = error.span().map(|span| line_at(text, span.start));
-            DefinitionError { problems: vec![DefinitionProblem { pointer, line, message: one_line(error.message()) }] }
+            DefinitionError {
+                problems: vec![DefinitionProblem {
+                    message: with_hint(&pointer, &one_line(error.message())),
+                    pointer,
+                    line,
+                }],
+            }
         };
         let document = toml::Deserializer::parse(text).map_err(|e| syntax(&e, String::new()))?;
         serde_path_to_error::deserialize(document).map_err(|e| syntax(e.inner(), json_pointer(e.path())))
@@ -92,12 +98,51 @@ impl StructureDefinition {
 fn from_json<T: DeserializeOwned>(text: &str) -> Result<T, DefinitionError> {
     let mut deserializer = serde_json::Deserializer::from_str(text);
     let failed = |pointer: String, error: &serde_json::Error| DefinitionError {
-        problems: vec![DefinitionProblem { pointer, line: Some(error.line()), message: error.to_string() }],
+        problems: vec![DefinitionProblem {
+            message: with_hint(&pointer, &error.to_string()),
+            pointer,
+            line: Some(error.line()),
+        }],
     };
     let value =
         serde_path_to_error::deserialize(&mut deserializer).map_err(|e| failed(json_pointer(e.path()), e.inner()))?;
     deserializer.end().map_err(|e| failed(String::new(), &e))?;
     Ok(value)
+}
+
+/// Adds to the message of a parser where the key belongs that was looked for at the pointer.
+fn with_hint(pointer: &str, message: &str) -> String {
+    let hint = hint(pointer, message);
+    hint.map_or_else(|| message.to_owned(), |hint| format!("{message}; {hint}"))
+}
+
+/// Where `law`, `scale`, `unit` and `covariate` belong, which are looked for in several tables.
+fn hint(pointer: &str, message: &str) -> Option<&'static str> {
+    const LAW: &str = "the law of a stiffness belongs into sets of its [[parameter]]: sets = { spring = \"k1\", law = { exponential = { a = \
+                       1e3, b = 0.5, c = 2e4 } } }";
+    const INFLUENCE: &str = "the influence of a covariate is an [[effect]] with target, law, covariate and numbers: target = { springs = \
+                             [\"k1\"] }, law = \"linear\", covariate = \"temperature_c\", numbers = { slope_per_unit = -0.001 }";
+    let section = pointer.split('/').nth(1).unwrap_or_default();
+    let unknown = |key: &str| message.contains(&format!("unknown field `{key}`"));
+    match section {
+        "covariate" if unknown("law") || unknown("effect") => Some(INFLUENCE),
+        _ if pointer.contains("/sets") && pointer.ends_with("/law") && !unknown("law") => {
+            Some("a stiffness has the law exponential, k = a·exp(b·p) + c; the laws linear, bilinear and others are those of an [[effect]]")
+        }
+        _ if unknown("law") || unknown("laws") => Some(LAW),
+        "parameter" if unknown("covariate") => Some(INFLUENCE),
+        _ if unknown("scale") => {
+            Some("scale = true belongs to the [[parameter]], which then is a factor of the nominal stiffness of all that it sets")
+        }
+        "parameter" if message.contains("unknown variant") && pointer.contains("/prior") => Some(
+            "a prior is uniform between the smallest and the largest possible value, damaged states included: for a mean and a standard \
+             deviation write uniform = [mean − 3 std, mean + 3 std]",
+        ),
+        "spring" | "beam" if unknown("prior") || unknown("uniform") => {
+            Some("a prior belongs to a [[parameter]] that sets the stiffness: sets = { spring = \"k1\" } or { beam = \"span\" }")
+        }
+        _ => None,
+    }
 }
 
 fn one_line(message: &str) -> String {

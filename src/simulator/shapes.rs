@@ -125,7 +125,8 @@ impl Simulator {
         CorrectedParameters::new(theta, &self.targets(), self.sizes(), usize::MAX)
     }
 
-    fn targets(&self) -> Vec<Target> {
+    /// Targets of the effects of the structure file.
+    pub(super) fn targets(&self) -> Vec<Target> {
         self.effects().iter().map(|effect| effect.target.clone()).collect()
     }
 

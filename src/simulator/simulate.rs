@@ -12,7 +12,7 @@ use super::definition::{DefinitionError, Law, MeasurementNoise, StructureDefinit
 use super::discrepancy::input::Discrepancy;
 use super::effect::{self, SimulationEffect};
 use super::instrumented::Instrumented;
-use super::model::{chained, changes, structure_at, Binding, SimulationModel};
+use super::model::{chained, changes, structure_at, Binding, SimulationModel, StiffnessForm};
 use super::settings::CorrectedParameters;
 use super::table::Table;
 use crate::measurement::{Covariate, CovariateValue};
@@ -357,8 +357,9 @@ impl Simulator {
     /// The springs that a parameter sets through a law. Their stiffness is monitored in addition to the parameter.
     pub fn derived_stiffnesses(&self) -> Vec<DerivedStiffness> {
         let derived = |binding: &Binding| {
+            let StiffnessForm::Law(law) = binding.form else { return None };
             let name = format!("spring:{}", self.structure()?.springs()[binding.spring].name);
-            Some(DerivedStiffness { name, parameter: binding.parameter, law: binding.law? })
+            Some(DerivedStiffness { name, parameter: binding.parameter, law })
         };
         self.bindings().iter().filter_map(derived).collect()
     }

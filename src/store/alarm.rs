@@ -1,4 +1,4 @@
-//! Alarm episodes and maintenance windows.
+//! Alarm episodes.
 
 use std::collections::BTreeMap;
 
@@ -10,6 +10,7 @@ use super::diagnosis::{job_state, JobState};
 use super::error::Error;
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
+use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
 use crate::process::reference::LastingChange;
 use crate::quantity::{StructureId, Timestamp};
 
@@ -50,6 +51,10 @@ pub struct Episode {
     pub superseded_by: Option<u32>,
     /// The latest alarm of an earlier undamaged reference about the same series and time.
     pub continues: Option<i64>,
+    /// The change in its newest batch above a limit; `None` without one, and for alarms that are no damage.
+    pub batch_change: Option<BatchChange>,
+    /// The largest grade that it has had; `None` before it was graded.
+    pub highest_grade: Option<Grade>,
 }
 
 /// Which episodes are read.
@@ -89,6 +94,12 @@ impl Episode {
             (false, None, None) => "open",
         }
     }
+
+    /// Its severity by the size and certainty of the loss.
+    pub fn severity(&self, limits: SeverityLimits) -> Severity {
+        let (kind, change) = (self.kind.as_str(), self.change.as_ref());
+        limits.severity(AlarmFacts { kind, change, batch_change: self.batch_change })
+    }
 }
 
 /// The acknowledgement of an alarm.
@@ -100,17 +111,6 @@ pub struct Acknowledgement {
     pub by: String,
     /// Their note.
     pub note: Option<String>,
-}
-
-/// A period in which batches do not change the alarm charts.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct MaintenanceWindow {
-    /// Beginning.
-    pub from: Timestamp,
-    /// End.
-    pub to: Timestamp,
-    /// Reason.
-    pub reason: String,
 }
 
 #[derive(FromRow)]
@@ -135,6 +135,8 @@ struct EpisodeRow {
     change: Option<String>,
     superseded_by: Option<u32>,
     continues: Option<i64>,
+    batch_change: Option<String>,
+    grade: Option<i64>,
 }
 
 /// The version of the latest undamaged reference whose charts have a point of the series of a damage alarm `e` at its opening or
@@ -161,12 +163,14 @@ macro_rules! select_episodes {
                     and o.undamaged_version < e.undamaged_version
                     and o.opened_at_us <= coalesce(e.ended_at_us, 9e18)
                     and coalesce(o.ended_at_us, 9e18) >= e.opened_at_us) as continues,
-                 d.diagnosis_id, d.state as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict,
+                 d.diagnosis_id, iif(d.cancelled_at_us is null, d.state, 'cancelled') as diagnosis_state, d.result ->> 'verdict' as diagnosis_verdict,
                  (select p.changes -> e.series from process_point p
                   where p.structure_id = e.structure_id and p.undamaged_version = e.undamaged_version
                     and p.measured_to_us between e.opened_at_us and coalesce(e.ended_at_us, 9e18)
                     and p.changes -> e.series is not null
-                  order by p.measured_to_us desc, p.batch_id desc limit 1) as change
+                  order by p.measured_to_us desc, p.batch_id desc limit 1) as change,
+                 (select b.batch_change from alarm_batch_change b
+                  where b.structure_id = e.structure_id and b.episode = e.episode) as batch_change
              from alarm_episode e
              left join diagnosis d on d.diagnosis_id =
                  (select max(diagnosis_id) from diagnosis where structure_id = e.structure_id and alarm = e.episode)
@@ -322,6 +326,32 @@ impl Alarms<'_> {
         row.map(episode).transpose()
     }
 
+    /// Stores grades of alarms, by their numbers, that are larger than the stored ones.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn raise_grades(self, structure: &StructureId, grades: Vec<(i64, Grade)>) -> Result<(), Error> {
+        let id = structure.to_string();
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    for (number, grade) in grades {
+                        sqlx::query(
+                            "update alarm_episode set grade = $1
+                             where structure_id = $2 and episode = $3 and coalesce(grade, -1) < $1",
+                        )
+                        .bind(grade.number())
+                        .bind(&id)
+                        .bind(number)
+                        .execute(transaction.connection())
+                        .await?;
+                    }
+                    Ok(())
+                })
+            })
+            .await
+    }
+
     /// Opens an episode of missing data that began at `since`, or ends the open one if `since` is `None`. Returns whether
     /// something changed.
     ///
@@ -364,71 +394,6 @@ impl Alarms<'_> {
         })
         .await
     }
-
-    /// Stores a maintenance window. Points of batches that are already on the charts do not change.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn insert_maintenance(
-        self,
-        structure: &StructureId,
-        window: MaintenanceWindow,
-        now: Timestamp,
-    ) -> Result<(), Error> {
-        let id = structure.to_string();
-        self.database
-            .write(move |transaction| {
-                Box::pin(async move {
-                    sqlx::query(
-                        "insert into maintenance_window values ($1, $2, $3, $4, $5)
-                     on conflict (structure_id, from_us, to_us) do update
-                     set reason = excluded.reason, created_at_us = excluded.created_at_us",
-                    )
-                    .bind(&id)
-                    .bind(window.from.micros())
-                    .bind(window.to.micros())
-                    .bind(&window.reason)
-                    .bind(now.micros())
-                    .execute(transaction.connection())
-                    .await?;
-                    Ok(())
-                })
-            })
-            .await
-    }
-
-    /// Whether a time is in a maintenance window.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn is_in_maintenance(self, structure: &StructureId, at: Timestamp) -> Result<bool, Error> {
-        let (found,): (bool,) = sqlx::query_as(
-            "select exists (select 1 from maintenance_window where structure_id = $1 and from_us <= $2 and to_us > $2)",
-        )
-        .bind(structure.as_str())
-        .bind(at.micros())
-        .fetch_one(&self.database.reader)
-        .await?;
-        Ok(found)
-    }
-
-    /// Maintenance windows of a structure, newest first, at most 1000.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn maintenance(self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
-        let rows: Vec<(i64, i64, String)> = sqlx::query_as(
-            "select from_us, to_us, reason from maintenance_window where structure_id = $1 order by from_us desc limit 1000",
-        )
-        .bind(structure.as_str())
-        .fetch_all(&self.database.reader)
-        .await?;
-        let window = |(from, to, reason)| {
-            let what = "maintenance window";
-            Ok(MaintenanceWindow { from: timestamp(what, from)?, to: timestamp(what, to)?, reason })
-        };
-        rows.into_iter().map(window).collect()
-    }
 }
 
 fn episode(row: EpisodeRow) -> Result<Episode, Error> {
@@ -459,5 +424,10 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         change: row.change.map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e))).transpose()?,
         superseded_by: row.superseded_by,
         continues: row.continues,
+        batch_change: row
+            .batch_change
+            .map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e)))
+            .transpose()?,
+        highest_grade: row.grade.and_then(Grade::of_number),
     })
 }

@@ -5,18 +5,23 @@ use sqlx::FromRow;
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::job_end::JobEnd;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// State of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum JobState {
+    /// It waits for its turn.
+    Waiting,
     /// It is running.
     Running,
     /// It has a result.
     Done,
     /// It failed.
     Failed,
+    /// Somebody ended it.
+    Cancelled,
 }
 
 /// Why a diagnosis was started.
@@ -118,13 +123,16 @@ struct DiagnosisRow {
 }
 
 const COLUMNS: &str =
-    "diagnosis_id, structure_id, structure_digest, request, started_by, alarm, state, failure, result, \
-                       created_at_us, finished_at_us, extension_state, extension_failure, extension";
+    "diagnosis_id, structure_id, structure_digest, request, started_by, alarm, iif(cancelled_at_us is null, state, 'cancelled') as state,
+     failure, result, created_at_us, finished_at_us,
+     iif(extension_cancelled_at_us is null, extension_state, 'cancelled') as extension_state, extension_failure, extension";
 
 /// The state with a name.
 pub(super) fn job_state(text: &str) -> Result<JobState, Error> {
     match text {
+        "waiting" => Ok(JobState::Waiting),
         "running" => Ok(JobState::Running),
+        "cancelled" => Ok(JobState::Cancelled),
         "done" => Ok(JobState::Done),
         "failed" => Ok(JobState::Failed),
         other => Err(Error::Row { what: "diagnosis", detail: format!("unknown state {other:?}") }),
@@ -185,33 +193,37 @@ impl Diagnoses<'_> {
             .await
     }
 
-    /// Stores the outcome of a diagnosis: result and report, or the reason of the failure.
+    /// Stores the end of a diagnosis; its result is the JSON and the report.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn finish_diagnosis(
         self,
         id: &str,
-        outcome: Result<(String, Option<String>), String>,
+        end: JobEnd<(String, Option<String>)>,
         now: Timestamp,
     ) -> Result<(), Error> {
         let (id, now) = (id.to_owned(), now.micros());
-        let (state, failure, result, report) = match outcome {
-            Ok((result, report)) => ("done", None, Some(result), report),
-            Err(failure) => ("failed", Some(failure), None, None),
+        let cancelled = (end == JobEnd::Cancelled).then_some(now);
+        let (state, failure, result, report) = match end {
+            JobEnd::Done((result, report)) => ("done", None, Some(result), report),
+            JobEnd::Failed(failure) => ("failed", Some(failure), None, None),
+            JobEnd::Cancelled => ("failed", None, None, None),
         };
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
                     sqlx::query(
-                        "update diagnosis set state = $1, failure = $2, result = $3, report = $4, finished_at_us = $5
-                     where diagnosis_id = $6",
+                        "update diagnosis set state = $1, failure = $2, result = $3, report = $4, finished_at_us = $5,
+                             cancelled_at_us = $6
+                     where diagnosis_id = $7",
                     )
                     .bind(state)
                     .bind(failure)
                     .bind(result)
                     .bind(report)
                     .bind(now)
+                    .bind(cancelled)
                     .bind(&id)
                     .execute(transaction.connection())
                     .await?;
@@ -221,22 +233,25 @@ impl Diagnoses<'_> {
             .await
     }
 
-    /// Marks the extension of a finished diagnosis as running, unless one is running. Returns whether it was marked.
+    /// Marks the extension of a finished diagnosis as running, unless one is running. Returns whether it was marked. `training` says
+    /// how it is trained, JSON.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn begin_extension(self, id: &str, now: Timestamp) -> Result<bool, Error> {
+    pub async fn begin_extension(self, id: &str, training: String, now: Timestamp) -> Result<bool, Error> {
         let (id, now) = (id.to_owned(), now.micros());
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
                     let updated = sqlx::query(
                         "update diagnosis set extension_state = 'running', extension_failure = null,
-                         extension_begun_at_us = $1, extended_at_us = null
-                     where diagnosis_id = $2 and state = 'done'
+                         extension_begun_at_us = $1, extended_at_us = null, extension_cancelled_at_us = null,
+                         extension_request = $2, extension_interruptions = 0
+                     where diagnosis_id = $3 and state = 'done'
                        and (extension_state is null or extension_state <> 'running')",
                     )
                     .bind(now)
+                    .bind(&training)
                     .bind(&id)
                     .execute(transaction.connection())
                     .await?;
@@ -246,31 +261,30 @@ impl Diagnoses<'_> {
             .await
     }
 
-    /// Stores the outcome of an extension.
+    /// Stores the end of an extension; its result is JSON.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
-    pub async fn finish_extension(
-        self,
-        id: &str,
-        outcome: Result<String, String>,
-        now: Timestamp,
-    ) -> Result<(), Error> {
+    pub async fn finish_extension(self, id: &str, end: JobEnd<String>, now: Timestamp) -> Result<(), Error> {
         let (id, now) = (id.to_owned(), now.micros());
-        let (state, failure, extension) = match outcome {
-            Ok(extension) => ("done", None, Some(extension)),
-            Err(failure) => ("failed", Some(failure), None),
+        let cancelled = (end == JobEnd::Cancelled).then_some(now);
+        let (state, failure, extension) = match end {
+            JobEnd::Done(extension) => ("done", None, Some(extension)),
+            JobEnd::Failed(failure) => ("failed", Some(failure), None),
+            JobEnd::Cancelled => ("failed", None, None),
         };
         self.database.write(move |transaction| {
             Box::pin(async move {
                 sqlx::query(
-                    "update diagnosis set extension_state = $1, extension_failure = $2, extension = $3, extended_at_us = $4
-                     where diagnosis_id = $5",
+                    "update diagnosis set extension_state = $1, extension_failure = $2, extension = $3, extended_at_us = $4,
+                         extension_cancelled_at_us = $5
+                     where diagnosis_id = $6",
                 )
                 .bind(state)
                 .bind(failure)
                 .bind(extension)
                 .bind(now)
+                .bind(cancelled)
                 .bind(&id)
                 .execute(transaction.connection())
                 .await?;
@@ -278,37 +292,6 @@ impl Diagnoses<'_> {
             })
         })
         .await
-    }
-
-    /// Marks jobs that were running when an earlier process stopped as failed. Returns their number.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn end_interrupted_jobs(self, now: Timestamp) -> Result<u64, Error> {
-        const WHY: &str = "the service stopped while it was running: request it again";
-        let now = now.micros();
-        self.database
-            .write(move |transaction| {
-                Box::pin(async move {
-                    let diagnoses = sqlx::query(
-                    "update diagnosis set state = 'failed', failure = $1, finished_at_us = $2 where state = 'running'",
-                )
-                .bind(WHY)
-                .bind(now)
-                .execute(transaction.connection())
-                .await?;
-                    let extensions = sqlx::query(
-                        "update diagnosis set extension_state = 'failed', extension_failure = $1, extended_at_us = $2
-                     where extension_state = 'running'",
-                    )
-                    .bind(WHY)
-                    .bind(now)
-                    .execute(transaction.connection())
-                    .await?;
-                    Ok(diagnoses.rows_affected() + extensions.rows_affected())
-                })
-            })
-            .await
     }
 
     /// A diagnosis.
@@ -335,18 +318,6 @@ impl Diagnoses<'_> {
             .fetch_all(&self.database.reader)
             .await?;
         rows.into_iter().map(record).collect()
-    }
-
-    /// The structure of a diagnosis.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub async fn structure_of_diagnosis(self, id: &str) -> Result<Option<String>, Error> {
-        let row: Option<(String,)> = sqlx::query_as("select structure_id from diagnosis where diagnosis_id = $1")
-            .bind(id)
-            .fetch_optional(&self.database.reader)
-            .await?;
-        Ok(row.map(|(structure,)| structure))
     }
 
     /// The report of a diagnosis, HTML.

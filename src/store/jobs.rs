@@ -1,4 +1,4 @@
-//! Diagnoses and extensions as one list of jobs.
+//! Diagnoses, extensions and trainings as one list of jobs.
 
 use sqlx::FromRow;
 
@@ -15,12 +15,14 @@ pub enum JobKind {
     Diagnosis,
     /// Extends the structure by the findings of a diagnosis.
     Extension,
+    /// Trains the model of a structure.
+    Training,
 }
 
 /// A job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JobRecord {
-    /// Id of the diagnosis.
+    /// Id of the diagnosis or training.
     pub id: String,
     /// The structure.
     pub structure: StructureId,
@@ -36,17 +38,17 @@ pub struct JobRecord {
     pub created_at: Timestamp,
     /// When it ended.
     pub finished_at: Option<Timestamp>,
-    /// Verdict of a diagnosis.
+    /// Verdict of a diagnosis, or outcome of a training.
     pub verdict: Option<String>,
-    /// A sentence about what a diagnosis found, or a list of what an extension added.
+    /// A sentence about what a diagnosis found or about the outcome of a training, or a list of what an extension added.
     pub summary: Option<String>,
 }
 
 #[derive(FromRow)]
 struct JobRow {
-    diagnosis_id: String,
+    job_id: String,
     structure_id: String,
-    extension: bool,
+    kind: String,
     started_by: Option<String>,
     state: String,
     failure: Option<String>,
@@ -59,35 +61,66 @@ struct JobRow {
 }
 
 impl Diagnoses<'_> {
-    /// Diagnoses and extensions of all structures, newest first.
+    /// Jobs of all structures, newest first.
     ///
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn jobs(self, limit: usize) -> Result<Vec<JobRecord>, Error> {
         // The inner select chooses the newest jobs before their results, which can be long, are read.
         let rows: Vec<JobRow> = sqlx::query_as(
-            "select d.diagnosis_id, d.structure_id, j.extension,
-                    case when j.extension then null else d.started_by end as started_by,
-                    case when j.extension then d.extension_state else d.state end as state,
-                    case when j.extension then d.extension_failure else d.failure end as failure,
-                    j.created_at_us,
-                    case when j.extension then d.extended_at_us else d.finished_at_us end as finished_at_us,
-                    case when j.extension then null else d.result ->> 'verdict' end as verdict,
-                    case when j.extension then null else d.result ->> 'summary' end as summary,
-                    case when j.extension then d.extension ->> 'added' end as added
-             from (select * from (
-                       select diagnosis_id, false as extension, created_at_us from diagnosis
-                       union all
-                       select diagnosis_id, true, coalesce(extension_begun_at_us, finished_at_us, created_at_us)
-                       from diagnosis where extension_state is not null) a
-                   order by created_at_us desc, diagnosis_id desc, extension desc limit $1) j
-             join diagnosis d using (diagnosis_id)
-             order by j.created_at_us desc, d.diagnosis_id desc, j.extension desc",
+            "with newest as (
+                 select * from (
+                     select diagnosis_id as job_id, 'diagnosis' as kind, created_at_us from diagnosis
+                     union all
+                     select diagnosis_id, 'extension', coalesce(extension_begun_at_us, finished_at_us, created_at_us)
+                     from diagnosis where extension_state is not null
+                     union all
+                     select training_id, 'training', created_at_us from training)
+                 order by created_at_us desc, job_id desc, kind desc limit $1)
+             select n.job_id as job_id, d.structure_id, n.kind as kind, d.started_by, iif(d.cancelled_at_us is null, d.state, 'cancelled') as state,
+                    d.failure, n.created_at_us as created_at_us, d.finished_at_us, d.result ->> 'verdict' as verdict,
+                    d.result ->> 'summary' as summary, null as added
+             from newest n join diagnosis d on d.diagnosis_id = n.job_id where n.kind = 'diagnosis'
+             union all
+             select n.job_id, d.structure_id, n.kind, null,
+                    iif(d.extension_cancelled_at_us is null, d.extension_state, 'cancelled'), d.extension_failure, n.created_at_us,
+                    d.extended_at_us, null, null, d.extension ->> 'added'
+             from newest n join diagnosis d on d.diagnosis_id = n.job_id where n.kind = 'extension'
+             union all
+             select n.job_id, t.structure_id, n.kind, null, t.state, t.failure, n.created_at_us, t.finished_at_us,
+                    t.result ->> 'outcome', t.result ->> 'summary', null
+             from newest n join training t on t.training_id = n.job_id where n.kind = 'training'
+             order by created_at_us desc, job_id desc, kind desc",
         )
         .bind(limit as i64)
         .fetch_all(&self.database.reader)
         .await?;
         rows.into_iter().map(record).collect()
+    }
+
+    /// The structure of a diagnosis or training.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn structure_of_job(self, id: &str) -> Result<Option<String>, Error> {
+        let row: Option<(String,)> = sqlx::query_as(
+            "select structure_id from diagnosis where diagnosis_id = $1
+             union all select structure_id from training where training_id = $1",
+        )
+        .bind(id)
+        .fetch_optional(&self.database.reader)
+        .await?;
+        Ok(row.map(|(structure,)| structure))
+    }
+}
+
+/// The kind with a name.
+fn kind(text: &str) -> Result<JobKind, Error> {
+    match text {
+        "diagnosis" => Ok(JobKind::Diagnosis),
+        "extension" => Ok(JobKind::Extension),
+        "training" => Ok(JobKind::Training),
+        other => Err(Error::Row { what: "job", detail: format!("unknown kind {other:?}") }),
     }
 }
 
@@ -99,9 +132,9 @@ fn record(row: JobRow) -> Result<JobRecord, Error> {
     };
     let added = added.filter(|added| !added.is_empty()).map(|added| added.join("; "));
     Ok(JobRecord {
-        id: row.diagnosis_id,
+        id: row.job_id,
         structure: StructureId::parse(&row.structure_id).map_err(|e| bad_row(what)(&e))?,
-        kind: if row.extension { JobKind::Extension } else { JobKind::Diagnosis },
+        kind: kind(&row.kind)?,
         trigger: row.started_by.as_deref().map(DiagnosisTrigger::from_stored).transpose()?,
         state: job_state(&row.state)?,
         failure: row.failure,

@@ -7,6 +7,7 @@
 //! wait at the same time share one transaction and its sync to disk.
 
 mod alarm;
+mod alarm_action;
 pub mod archive;
 mod assessed;
 mod assessment;
@@ -27,10 +28,15 @@ mod figures;
 mod file;
 mod history;
 pub mod inspect;
+mod interrupted;
+mod job_end;
 mod jobs;
 mod latest_quantities;
+mod mail;
+mod maintenance;
 mod measurement_row;
 mod measurements;
+mod note;
 mod outbox;
 mod overview;
 mod plotted;
@@ -45,6 +51,7 @@ mod structure;
 #[cfg(test)]
 mod tests;
 mod token;
+mod training;
 mod transaction;
 mod undamaged;
 mod version;
@@ -59,7 +66,10 @@ use database::Database;
 use undamaged::Newest;
 use writer::Writer;
 
-pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, MaintenanceWindow, OpenAlarms};
+pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, OpenAlarms};
+pub use alarm_action::{
+    ActionKind, ActionOutcome, AlarmAction, AlarmActions, ClosingReason, Handling, NewAction, MOST_ACTIONS,
+};
 pub use archive::Archive;
 pub use assessment::{Assessments, StoredAssessment};
 pub use audit::{Audit, AuditEntry, AuditQuery, NewAuditEntry};
@@ -73,9 +83,14 @@ pub use error::Error;
 pub use figures::{Figures, FolderFigures};
 pub use file::{schema_version, StoreSettings, DATABASE_FILE};
 pub use history::{Exceedance, History, HistoryEntry, HistoryQuery};
+pub use interrupted::Interrupted;
+pub use job_end::JobEnd;
 pub use jobs::{JobKind, JobRecord};
 pub use latest_quantities::{LatestPoint, LatestQuantity};
+pub use mail::{DueMail, MailFigures, MailState, Mails};
+pub use maintenance::MaintenanceWindow;
 pub use measurements::{MeasurementPlace, MeasurementQuery, StoredMeasurement};
+pub use note::{Note, Notes, MOST_NOTES};
 pub use outbox::{Delivery, DeliveryState, Outbox, OutboxEvent, Settlement, Turns};
 pub use overview::{LatestAssessment, Overview, RelativeChange, StructureOverview};
 pub use quarantine::{Quarantine, QuarantinedMessage};
@@ -84,6 +99,7 @@ pub use retention::{Deleted, Expired, Retention};
 pub use series::{Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};
 pub use token::Tokens;
+pub use training::{NewTraining, TrainingJobRecord, Trainings};
 pub use undamaged::{MeasuredBatch, ReferenceRecord, References};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
@@ -168,9 +184,29 @@ impl Store {
         Alarms { database: &self.database }
     }
 
+    /// What people do with alarms.
+    pub fn alarm_actions(&self) -> AlarmActions<'_> {
+        AlarmActions { database: &self.database }
+    }
+
+    /// Notes on time lines.
+    pub fn notes(&self) -> Notes<'_> {
+        Notes { database: &self.database }
+    }
+
+    /// Mails about alarms.
+    pub fn mails(&self) -> Mails<'_> {
+        Mails { database: &self.database }
+    }
+
     /// Diagnoses and extensions.
     pub fn diagnoses(&self) -> Diagnoses<'_> {
         Diagnoses { database: &self.database }
+    }
+
+    /// Trainings of models.
+    pub fn trainings(&self) -> Trainings<'_> {
+        Trainings { database: &self.database }
     }
 
     /// The registered webhooks.

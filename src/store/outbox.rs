@@ -349,9 +349,17 @@ impl Outbox<'_> {
                     .bind(before.micros())
                     .execute(transaction.connection())
                     .await?;
+                    sqlx::query(
+                        "delete from mail_delivery where state in ('delivered', 'skipped')
+                       and event_id in (select event_id from outbox_event where created_at_us < $1)",
+                    )
+                    .bind(before.micros())
+                    .execute(transaction.connection())
+                    .await?;
                     let deleted = sqlx::query(
                         "delete from outbox_event where created_at_us < $1
-                       and not exists (select 1 from webhook_delivery d where d.event_id = outbox_event.event_id)",
+                       and not exists (select 1 from webhook_delivery d where d.event_id = outbox_event.event_id)
+                       and not exists (select 1 from mail_delivery d where d.event_id = outbox_event.event_id)",
                     )
                     .bind(before.micros())
                     .execute(transaction.connection())

@@ -22,7 +22,7 @@ enum Needs {
 }
 use Needs::{Admin, Ingest, Nothing, Read};
 
-/// What a route is about: one structure (also by a diagnosis), a filtered list, or the whole service.
+/// What a route is about: one structure (also by a diagnosis, training or job), a filtered list, or the whole service.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum About {
     Structure,
@@ -31,7 +31,7 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 68] = [
+const TABLE: [(&str, &str, Needs, About); 80] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
@@ -48,6 +48,13 @@ const TABLE: [(&str, &str, Needs, About); 68] = [
     ("GET", "/v1/structures/{}/exceedances", Read, Structure),
     ("GET", "/v1/structures/{}/alarms", Read, Structure),
     ("POST", "/v1/structures/{}/alarms/{}/acknowledgement", Admin, Structure),
+    ("POST", "/v1/structures/{}/alarms/{}/comments", Admin, Structure),
+    ("PUT", "/v1/structures/{}/alarms/{}/assignee", Admin, Structure),
+    ("POST", "/v1/structures/{}/alarms/{}/closing", Admin, Structure),
+    ("POST", "/v1/structures/{}/alarms/{}/reopening", Admin, Structure),
+    ("GET", "/v1/structures/{}/notes", Read, Structure),
+    ("POST", "/v1/structures/{}/notes", Admin, Structure),
+    ("DELETE", "/v1/structures/{}/notes/{}", Admin, Structure),
     ("GET", "/v1/structures/{}/charts", Read, Structure),
     ("GET", "/v1/structures/{}/maintenance", Read, Structure),
     ("POST", "/v1/structures/{}/maintenance", Admin, Structure),
@@ -58,6 +65,11 @@ const TABLE: [(&str, &str, Needs, About); 68] = [
     ("GET", "/v1/diagnoses/{}", Read, Structure),
     ("GET", "/v1/diagnoses/{}/report", Read, Structure),
     ("POST", "/v1/diagnoses/{}/extension", Admin, Structure),
+    ("GET", "/v1/structures/{}/trainings", Read, Structure),
+    ("POST", "/v1/structures/{}/trainings", Admin, Structure),
+    ("GET", "/v1/trainings/{}", Read, Structure),
+    ("DELETE", "/v1/jobs/{}", Admin, Structure),
+    ("POST", "/v1/jobs/{}/first", Admin, Structure),
     ("GET", "/v1/tokens", Admin, Service),
     ("POST", "/v1/tokens", Admin, Service),
     ("DELETE", "/v1/tokens/{}", Admin, Service),
@@ -128,7 +140,9 @@ fn candidates(folder: &Path, found: &mut BTreeSet<String>) {
 
 /// A path of a pattern that names `structure`; all other parameters name nothing that exists.
 fn path_of(pattern: &str, structure: &str, diagnosis: &str) -> String {
-    let first = if pattern.starts_with("/v1/diagnoses/") { diagnosis } else { structure };
+    // The routes of a training or job are asked for the diagnosis: what matters here is the structure that its id leads to.
+    let of_job = ["/v1/diagnoses/", "/v1/trainings/", "/v1/jobs/"].iter().any(|start| pattern.starts_with(start));
+    let first = if of_job { diagnosis } else { structure };
     pattern.replacen("{}", first, 1).replace("{}", "1")
 }
 

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod alarms;
 mod automatic_diagnosis;
 mod bad_input;
 mod batches;
@@ -26,6 +27,7 @@ mod reference_extension;
 mod restart;
 mod ruler_frame;
 mod tables;
+mod trainings;
 mod uploads;
 mod views;
 mod z24;

@@ -370,10 +370,11 @@ async fn events_follow_a_job_from_beginning_to_end_and_it_is_listed() {
     let asked = service.post("/v1/structures/three-dof/diagnoses", &json!({})).await;
     assert_eq!(asked.status(), 202);
     let id = asked.json::<Value>().await.unwrap()["diagnosis"].clone();
-    let seen = watcher.until("job", |data| data["state"] != "running").await;
-    assert!(seen.len() >= 2, "{seen:?}");
+    let seen = watcher.until("job", |data| !["waiting", "running"].contains(&data["state"].as_str().unwrap())).await;
+    assert!(seen.len() >= 3, "{seen:?}");
     let expected = json!({
-        "job": id, "structure": "three-dof", "kind": "diagnosis", "state": "running", "progress": "waiting", "trigger": "requested"
+        "job": id, "structure": "three-dof", "kind": "diagnosis", "state": "waiting", "progress": "waiting", "place": 1,
+        "trigger": "requested"
     });
     assert_eq!(seen[0], ("job".to_owned(), expected));
     let state = seen.last().unwrap().1["state"].clone();
@@ -416,4 +417,63 @@ async fn streams_are_counted_and_a_closed_one_makes_room() {
         (service.get("/v1/events").send().await.unwrap().status() == 200).then_some(())
     })
     .await;
+}
+
+/// Two equal masses on two equal springs, whose shapes are orthogonal: (1, 1.618…) and (1, −0.618…).
+const SHAPES: &str = r#"
+id = "shapes"
+modes = 2
+measurement_noise = { relative = 0.002 }
+mode_shapes = { points = ["m1", "m2"], noise = 0.01 }
+mass = [{ name = "m1", kg = 2.0 }, { name = "m2", kg = 2.0 }]
+spring = [
+    { name = "k1", from = "ground", to = "m1", n_per_m = 800.0 },
+    { name = "k2", from = "m1", to = "m2", n_per_m = 800.0 },
+]
+parameter = [{ name = "low", scale = true, prior = { uniform = [0.5, 1.5] }, sets = { spring = "k1" } }]
+covariate = [{ name = "air", unit = "°C" }, { name = "wind_m_per_s" }, { name = "load" }]
+"#;
+
+#[tokio::test]
+async fn measured_shapes_are_drawn_with_their_mac_and_covariates_have_their_units() {
+    let (service, _folder) = spawn();
+    let put = service.request(Method::PUT, "/v1/structures/shapes").header("content-type", "application/toml");
+    let stored = created(put.body(SHAPES).send().await.unwrap()).await;
+    assert_eq!(stored.get("notes"), None, "{stored}");
+    let hz = numbers(&stored["nominal_frequencies_hz"]);
+    let golden = 0.5 * (1.0 + 5.0_f64.sqrt());
+    let row = json!({ "measured_at": time(0), "frequencies_hz": hz, "mode_shapes": [[-2.0, -2.0 * golden], null],
+        "covariates": { "air": 12.5, "wind_m_per_s": 3.0, "load": 1.0 } });
+    let batch = service.post_batch("shapes", &[row]).await;
+    let batch = batch["batch"].as_str().unwrap();
+
+    let drawn = async |query: &str| {
+        let answer = service.request(Method::GET, &format!("/v1/structures/shapes/drawing.svg?{query}")).send().await;
+        answer.unwrap()
+    };
+    let svg = drawn(&format!("mode=1&batch={batch}")).await.text().await.unwrap();
+    assert!(svg.contains("measured mode 1, MAC 1.000") && svg.contains("class=\"measured-shape\""), "{svg}");
+    // The measured points lie on the simulated ones, whatever the norm and sign that were sent.
+    let of = |class: &str| -> Vec<String> {
+        let group = svg.split(&format!("class=\"{class}\"")).nth(1).unwrap().split("</g>").next().unwrap();
+        let moved = group.split("<circle ").skip(1).map(|c| c.split("data-moved=\"").nth(1).unwrap());
+        moved.map(|m| m.split('"').next().unwrap().to_owned()).collect()
+    };
+    let simulated = of("shape");
+    assert_eq!(of("measured-shape"), simulated[simulated.len() - 2..], "{svg}");
+    // A mode without a measured shape is drawn alone, and a batch needs a mode.
+    let alone = drawn(&format!("mode=2&batch={batch}")).await.text().await.unwrap();
+    assert!(alone.contains("mode 2, ") && !alone.contains("MAC"), "{alone}");
+    let refused = problem(drawn(&format!("batch={batch}")).await, 422, "invalid").await;
+    assert!(refused.to_string().contains("query/batch"), "{refused}");
+    assert_eq!(drawn("mode=1&batch=none").await.status(), 404);
+
+    let series = service.read("/v1/structures/shapes/series").await;
+    assert_eq!(series["frequencies"]["covariate_units"], json!({ "air": "°C", "wind_m_per_s": "m/s" }), "{series}");
+
+    // A prior in factors without `scale` is stored with a question.
+    let doubtful = SHAPES.replace("scale = true, ", "").replacen("\"shapes\"", "\"doubtful\"", 1);
+    let put = service.request(Method::PUT, "/v1/structures/doubtful").header("content-type", "application/toml");
+    let answer: Value = put.body(doubtful).send().await.unwrap().json().await.unwrap();
+    assert!(answer["notes"][0].as_str().is_some_and(|note| note.contains("did you mean `scale = true`")), "{answer}");
 }

@@ -177,7 +177,7 @@ fn forty_random_structures_train_to_passed_by_default() {
                         println!("    {seed}: round {round} trained after {:.0} s", started.elapsed().as_secs_f64());
                     }
                     Progress::Round(why) => println!("    {seed}: {why}"),
-                    Progress::Start(_) | Progress::Epoch { .. } => {}
+                    Progress::Start(_) | Progress::Epoch { .. } | Progress::Cell { .. } => {}
                 }
             });
         let manifest = trained.unwrap().baseline.manifest().clone();

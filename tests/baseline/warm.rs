@@ -21,7 +21,11 @@ use crate::THREE_DOF;
 /// The structure `base` whose springs `springs` change linearly with a covariate, by `slope` per unit of 0 ± 20.
 fn extended(base: &StructureDefinition, covariate: &str, springs: &[&str], slope: f64) -> StructureDefinition {
     let mut definition = base.clone();
-    definition.covariates.push(CovariateDefinition { name: covariate.to_owned(), kind: CovariateKind::Number });
+    definition.covariates.push(CovariateDefinition {
+        name: covariate.to_owned(),
+        kind: CovariateKind::Number,
+        unit: None,
+    });
     definition.effects.push(EffectDefinition {
         name: format!("effect-of-{covariate}"),
         description: None,

@@ -101,6 +101,11 @@ impl Page {
 
     /// Waits until an expression is true; returns its value.
     pub fn wait_for(&mut self, expression: &str) -> Value {
+        self.wait_within(expression, PATIENCE)
+    }
+
+    /// Waits until an expression is true, at most for a time such as that of a training.
+    pub fn wait_within(&mut self, expression: &str, patience: Duration) -> Value {
         let started = Instant::now();
         loop {
             let value = self.evaluate(expression);
@@ -109,7 +114,7 @@ impl Page {
             }
             let complaints = &self.complaints;
             assert!(
-                started.elapsed() < PATIENCE,
+                started.elapsed() < patience,
                 "{expression} did not become true; errors of the page: {complaints:?}"
             );
             std::thread::sleep(Duration::from_millis(50));

@@ -309,7 +309,7 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     watched_bridge(&service).await;
     let mut page = Page::open();
     visit_structure(&mut page, &service);
-    page.evaluate("document.querySelector('#alarms button').click()");
+    page.evaluate("document.querySelector('#alarms button.primary').click()");
     page.wait_for("document.querySelector('dialog[open] input[name=by]') !== null");
     page.evaluate("document.querySelector('input[name=by]').focus()");
     page.type_text("Ines Vogel");
@@ -317,6 +317,26 @@ async fn an_alarm_is_acknowledged_and_a_maintenance_window_added_from_the_page()
     page.wait_for("document.getElementById('alarms').textContent.includes('acknowledged by Ines Vogel')");
     let alarms = service.read("/v1/structures/three-dof/alarms").await;
     assert_eq!(alarms["items"][0]["acknowledgement"]["by"], "Ines Vogel", "{alarms}");
+
+    // The name is remembered; the alarm is closed with a reason and is then found by the filter.
+    let button = |word: &str| {
+        format!("[...document.querySelectorAll('#alarms li button')].find((b) => b.textContent.startsWith('{word}')).click()")
+    };
+    page.evaluate(&button("Close"));
+    page.wait_for("document.querySelector('dialog[open] select[name=reason]') !== null");
+    page.evaluate("document.querySelector('dialog select').value = 'other'");
+    page.evaluate("document.querySelector('dialog .primary').click()");
+    page.wait_for("document.querySelector('dialog .problem')?.textContent.includes('/text')");
+    page.evaluate("document.querySelector('dialog textarea').value = 'a test of\\nthe alarm'");
+    page.evaluate("document.querySelector('dialog .primary').click()");
+    page.wait_for("document.getElementById('alarms').textContent.includes('closed by Ines Vogel')");
+    page.evaluate("document.querySelector('#alarms [data-filter=closed]').click()");
+    page.wait_for("document.querySelectorAll('#alarms > div > ul.alarms > li').length === 1");
+    assert_eq!(
+        service.read("/v1/structures/three-dof/alarms").await["items"][0]["closing"]["text"],
+        "a test of\nthe alarm"
+    );
+    assert!(page.complaints().iter().all(|c| c.contains("422")), "only the refused request is reported");
 
     page.evaluate("document.querySelector('#maintenance button').click()");
     page.wait_for("document.querySelector('dialog[open] input[name=reason]') !== null");

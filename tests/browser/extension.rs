@@ -15,7 +15,7 @@ use crate::helpers::{command, created, time, within, Service};
 
 /// Two masses on two springs; the simulation does not contain the temperature. The structure is small, so that its model is
 /// trained in seconds.
-const STRUCTURE: &str = r#"
+pub const STRUCTURE: &str = r#"
 id = "tiny"
 modes = 2
 measurement_noise = { relative = 0.002 }
@@ -52,7 +52,7 @@ fn frequencies_hz(k1: f64, k2: f64) -> [f64; 2] {
 }
 
 /// Ten measurements of a day of 2026; k2 softens with the temperature.
-fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
+pub fn batch(day: usize, rng: &mut impl Rng) -> Vec<Value> {
     let mut one = |i: usize| {
         let mut normal = || rng.sample::<f64, _>(StandardNormal);
         let temperature_c = 10.0 - 13.0 * (TAU * day as f64 / 365.0).cos() + 2.0 * normal();
@@ -81,7 +81,7 @@ fn press_and_confirm(page: &mut Page, section: &str, button: &str) {
 }
 
 /// Presses a button of a section, fills fields of the dialog and confirms it.
-fn press_and_fill(page: &mut Page, section: &str, button: &str, fields: &[(&str, &str)]) {
+pub fn press_and_fill(page: &mut Page, section: &str, button: &str, fields: &[(&str, &str)]) {
     let find = format!(
         "[...document.querySelectorAll('#{section} button')].find((b) => b.textContent === '{button}' && !b.hidden)"
     );

@@ -8,6 +8,8 @@
 mod chromium;
 mod dashboard;
 mod extension;
+mod figures;
+mod firefox;
 #[allow(dead_code, reason = "of the helpers of tests/api some are enough here")]
 #[path = "../api/helpers.rs"]
 mod helpers;
@@ -17,5 +19,8 @@ mod needs;
 mod pages;
 mod rejected;
 mod sign_in;
+mod speed;
+mod training;
 mod upload;
 mod verdict;
+mod walk;

@@ -46,7 +46,7 @@ fn measured_frequencies_are_compared_with_the_prior() {
     assert!(world.run(&["check", "tower.toml", "--measured", &text(1.0)]).contains("inside"));
     let (_, said) = world.fails(&["check", "tower.toml", "--measured", &text(2.0)]);
     assert!(
-        said.contains("mode 1:") && said.contains("outside the prior's range") && !said.contains("may be"),
+        said.contains("mode 1:") && said.contains("outside the prior's range") && !said.contains("scale = true"),
         "{said}"
     );
 
@@ -58,15 +58,25 @@ fn measured_frequencies_are_compared_with_the_prior() {
     std::fs::write(world.path("factors.toml"), &factors).unwrap();
     let (_, said) = world.fails(&["check", "factors.toml"]);
     assert!(
-        said.contains("the prior of k1 is 0.5 to 1.5 N/m, but the nominal stiffness is 30 MN/m")
+        said.contains("the prior of k1 runs from 0.5 to 1.5 N/m, but the nominal stiffness of spring k1 is 30 MN/m: did you mean `scale = true`")
             && said.contains("[1.5e7, 4.5e7]"),
         "{said}"
     );
+    // As said: with `scale = true` the same file has the frequencies of the tower.
+    let scaled = factors
+        .replace("prior = { uniform = [0.5", "scale = true, prior = { uniform = [0.5")
+        .replace("n_per_m = 1.0", "n_per_m = 2.5e7");
+    std::fs::write(world.path("scaled.toml"), scaled).unwrap();
+    assert!(!world.run(&["check", "scaled.toml", "--measured", &text(1.0)]).contains("PROBLEM"));
     std::fs::write(world.path("bare.toml"), factors.replace(", n_per_m = 3e7", "").replace(", n_per_m = 2.5e7", ""))
         .unwrap();
     assert!(world.run(&["check", "bare.toml"]).contains("modes at the nominal parameters"));
     let (_, said) = world.fails(&["check", "bare.toml", "--measured", &text(1.0)]);
-    assert!(said.contains("may be factors, such as 0.5 to 1.5"), "{said}");
+    assert!(
+        said.contains("the measured frequency of mode 1 is ")
+            && said.contains("the prior of k1 runs from 0.5 to 1.5 N/m: did you mean `scale = true`"),
+        "{said}"
+    );
 }
 
 #[test]

@@ -36,7 +36,15 @@ fn flags_and_answers_write_the_same_file_which_check_accepts() {
     let [flags, answers] =
         ["flags.toml", "answers.toml"].map(|name| std::fs::read_to_string(world.path(name)).unwrap());
     assert_eq!(flags, answers);
-    assert!(flags.contains("uniform = [15000000.0, 45000000.0]"), "{flags}");
+    assert!(flags.contains("scale = true") && flags.contains("uniform = [0.5, 1.5]"), "{flags}");
+    let unit = ["--parameter", "k2=1e7..4e7N/m", "--covariate", "wind=m/s", "--out", "units.toml"];
+    world.run(&[BY_FLAGS, &unit].concat());
+    let units = std::fs::read_to_string(world.path("units.toml")).unwrap();
+    assert!(units.contains("uniform = [10000000.0, 40000000.0]") && units.contains("unit = \"m/s\""), "{units}");
+    assert_eq!(units.matches("scale = true").count(), 1, "{units}");
+    assert!(world
+        .run(&["check", "units.toml"])
+        .contains("uniform prior 50 to 150 % of nominal, nominal 100 % of nominal"));
     let checked = world.run(&["check", "flags.toml"]);
     assert!(checked.contains("ground ─k1─ [m1] ─k2─ [m2]"), "{checked}");
 }

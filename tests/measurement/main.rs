@@ -17,10 +17,7 @@ use modalwatch::quantity::{Hertz, Timestamp};
 use proptest::prelude::*;
 
 fn covariates() -> Vec<Covariate> {
-    vec![
-        Covariate { name: "temperature_c".to_owned(), kind: CovariateKind::Number },
-        Covariate { name: "Operator".to_owned(), kind: CovariateKind::Category },
-    ]
+    vec![Covariate::new("temperature_c", CovariateKind::Number), Covariate::new("Operator", CovariateKind::Category)]
 }
 
 fn space() -> ParameterSpace {

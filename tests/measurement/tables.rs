@@ -16,7 +16,7 @@ use proptest::prelude::*;
 use crate::space;
 
 fn covariates() -> Vec<Covariate> {
-    let number = |name: &str| Covariate { name: name.to_owned(), kind: CovariateKind::Number };
+    let number = |name: &str| Covariate::new(name, CovariateKind::Number);
     vec![number("temperature_c"), number("wind_m_per_s")]
 }
 
@@ -343,4 +343,32 @@ proptest! {
     ) {
         planned(text.as_bytes(), query);
     }
+}
+
+#[test]
+fn the_stated_unit_of_a_covariate_decides_over_its_name() {
+    let air = |unit: Option<&str>| Covariate {
+        unit: unit.map(str::to_owned),
+        ..Covariate::new("air", CovariateKind::Number)
+    };
+    let understood = |covariate: Covariate, header: &str| {
+        let covariates = [covariate];
+        let layout = Layout { modes: 1, covariates: &covariates, points: &[] };
+        let text = format!("measured_at,f1_hz,{header}\n2026-03-01T12:00:00Z,2.5,285.65\n");
+        let found = read(text.as_bytes(), &layout, &options("split=none").unwrap());
+        let row = found.rows.first().and_then(|row| row.as_ref().ok()).cloned();
+        row.and_then(|row| row.covariates.get("air").cloned())
+    };
+    let celsius = |value: Option<CovariateValue>| match value {
+        Some(CovariateValue::Number(value)) => value,
+        other => panic!("{other:?}"),
+    };
+    assert!((celsius(understood(air(Some("°C")), "Air (K)")) - 12.5).abs() < 1e-9);
+    assert!((celsius(understood(air(Some("K")), "Air (K)")) - 285.65).abs() < 1e-9);
+    // Without a unit the header cannot be compared with anything.
+    assert_eq!(understood(air(None), "Air (K)"), None);
+    assert_eq!(air(Some("°C")).unit(), Some("°C"));
+    assert_eq!(Covariate::new("deck_c", CovariateKind::Number).unit(), Some("°C"));
+    assert_eq!(Covariate::new("wind_m_per_s", CovariateKind::Number).unit(), Some("m/s"));
+    assert_eq!((air(None).unit(), Covariate::new("team_c", CovariateKind::Category).unit()), (None, None));
 }

@@ -59,7 +59,7 @@ async fn an_invalid_webhook_is_a_422_with_the_reason() {
         (json!({ "url": "https://u:p@example.org/" }), "/url", "user name"),
         (json!({ "url": "hook" }), "/url", "not a valid URL"),
         (json!({ "url": format!("https://93.184.216.34/{}", "a".repeat(3_000)) }), "/url", "at most 2000"),
-        (json!({ "url": "https://93.184.216.34/", "events": ["alarm.closed"] }), "/events/0", "alarm.opened"),
+        (json!({ "url": "https://93.184.216.34/", "events": ["alarm.shouted"] }), "/events/0", "alarm.opened"),
         (json!({ "url": "https://93.184.216.34/", "alarm_kinds": ["fire"] }), "/alarm_kinds/0", "damage"),
         (json!({ "url": "https://93.184.216.34/", "structures": ["nowhere"] }), "/structures/0", "no structure"),
         (json!({ "url": "https://93.184.216.34/", "structures": ["../x"] }), "/structures/0", "no structure"),

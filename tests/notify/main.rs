@@ -8,6 +8,8 @@ mod filters;
 #[path = "../api/helpers.rs"]
 mod helpers;
 mod hostile;
+mod mail;
+mod mail_server;
 mod mqtt;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]

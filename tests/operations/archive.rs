@@ -5,8 +5,9 @@ use serde_json::Value;
 use crate::helpers::{problem, spawn, Service};
 use crate::world::{answers, fails, run, text, with_past, without};
 
-/// Fields that differ between installations: times at which something was computed or noticed.
-const OF_THE_INSTALLATION: [&str; 4] = ["assessed_at", "noticed_at", "created_at", "updated_at"];
+/// Fields that differ between installations: times at which something was computed or noticed, and the largest grade of an alarm while it was
+/// watched.
+const OF_THE_INSTALLATION: [&str; 5] = ["assessed_at", "noticed_at", "created_at", "updated_at", "highest_grade"];
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn another_installation_answers_the_same_to_the_last_bit() {
@@ -32,6 +33,7 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
     assert_eq!((&done["batches"], &done["batches_new"]), (&10.into(), &10.into()), "{done}");
     assert_eq!((&done["undamaged_states"], &done["maintenance_windows"]), (&1.into(), &1.into()), "{done}");
     assert_eq!(done["acknowledgements"], 1, "{done}");
+    assert_eq!((&done["alarm_actions"], &done["notes"]), (&3.into(), &1.into()), "{done}");
     assert_eq!(done["warnings"], serde_json::json!([]), "{done}");
     let mut second = Service::start(&target);
     let compare = |expected: &std::collections::BTreeMap<String, Value>,
@@ -49,7 +51,16 @@ async fn another_installation_answers_the_same_to_the_last_bit() {
 
     // A second import changes nothing.
     let again: Value = serde_json::from_str(&run(&import).await).unwrap();
-    for what in ["versions", "models", "batches_new", "undamaged_states", "maintenance_windows", "acknowledgements"] {
+    for what in [
+        "versions",
+        "models",
+        "batches_new",
+        "undamaged_states",
+        "maintenance_windows",
+        "acknowledgements",
+        "alarm_actions",
+        "notes",
+    ] {
         assert_eq!(again[what], 0, "{what}: {again}");
     }
     compare(&expected, &answers(&Service::start(&target)).await);

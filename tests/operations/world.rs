@@ -60,6 +60,14 @@ pub async fn with_past(service: &Service, later: usize) {
     let seen = json!({ "by": "Ida", "note": "on my way" });
     let path = format!("/v1/structures/three-dof/alarms/{alarm}/acknowledgement");
     assert!(service.post(&path, &seen).await.status().is_success());
+    let alarm = format!("/v1/structures/three-dof/alarms/{alarm}");
+    let comment = json!({ "text": "a crack\nat the bearing", "author": "Ida" });
+    created(service.post(&format!("{alarm}/comments"), &comment).await).await;
+    let closing = json!({ "reason": "other", "text": "test", "author": "Ida" });
+    created(service.post(&format!("{alarm}/closing"), &closing).await).await;
+    created(service.post(&format!("{alarm}/reopening"), &json!({ "author": "Ida" })).await).await;
+    let note = json!({ "at": "2026-01-05T00:00:00Z", "text": "new road surface", "author": "Ida" });
+    created(service.post("/v1/structures/three-dof/notes", &note).await).await;
 }
 
 /// Waits until no batch waits for its assessment.
@@ -82,7 +90,7 @@ pub async fn answers(service: &Service) -> BTreeMap<String, Value> {
         all.insert(path, answer);
     }
     all.insert(history.to_owned(), page);
-    for path in ["", "/exceedances", "/alarms", "/charts?limit=1000", "/maintenance", "/diagnoses"] {
+    for path in ["", "/exceedances", "/alarms", "/charts?limit=1000", "/maintenance", "/notes", "/diagnoses"] {
         let path = format!("/v1/structures/three-dof{path}");
         let answer = service.read(&path).await;
         all.insert(path, answer);

@@ -52,11 +52,93 @@ fn json_and_toml_of_the_same_structure_have_the_same_digest() {
     }
 }
 
+#[expect(clippy::too_many_lines, reason = "a table of cases")]
 #[test]
 fn each_mistake_is_named_with_its_line_and_place() {
     // Text to be replaced in the file, its replacement, and the line, the pointer and a part of the message of the mistake.
     let cases: &[(&str, &str, usize, &str, &str)] = &[
         ("modes = 2", "modes = 2\nmods = 3", 3, "", "unknown field `mods`"),
+        (
+            "name = \"p\"",
+            "name = \"p\"\nlaw = \"linear\"",
+            20,
+            "/parameter/0",
+            "belongs into sets of its [[parameter]]",
+        ),
+        ("to = \"m2\"\n", "to = \"m2\"\nlaw = \"linear\"\n", 18, "/spring/1", "belongs into sets of its [[parameter]]"),
+        (
+            "name = \"temperature_c\"",
+            "name = \"temperature_c\"\nlaw = \"linear\"",
+            24,
+            "/covariate/0",
+            "is an [[effect]]",
+        ),
+        ("name = \"p\"", "name = \"p\"\ncovariate = \"temperature_c\"", 20, "/parameter/0", "is an [[effect]]"),
+        (
+            "uniform = [5.0, 15.0]",
+            "normal = { mean = 10.0, std = 1.0 }",
+            20,
+            "/parameter/0/prior",
+            "uniform = [mean − 3 std",
+        ),
+        ("modes = 2", "modes = 2\nlaw = \"linear\"", 3, "", "belongs into sets of its [[parameter]]"),
+        (
+            "sets = { spring = \"k2\" }",
+            "sets = { spring = \"k2\", law = \"linear\" }",
+            21,
+            "/parameter/0/sets",
+            "those of an [[effect]]",
+        ),
+        (
+            "sets = { spring = \"k2\" }",
+            "sets = { spring = \"k2\", scale = true }",
+            21,
+            "/parameter/0/sets",
+            "belongs to the [[parameter]]",
+        ),
+        ("to = \"m2\"\n", "to = \"m2\"\nscale = true\n", 18, "/spring/1", "belongs to the [[parameter]]"),
+        (
+            "to = \"m2\"\n",
+            "to = \"m2\"\nprior = { uniform = [5.0, 15.0] }\n",
+            18,
+            "/spring/1",
+            "a prior belongs to a [[parameter]]",
+        ),
+        (
+            "sets = { spring = \"k2\" }",
+            "scale = true\nsets = { spring = \"k2\" }",
+            22,
+            "/parameter/0/sets",
+            "must be stated and above 0",
+        ),
+        (
+            "sets = { spring = \"k2\" }",
+            "scale = true\nunit = \"N/m\"\nsets = { spring = \"k2\" }",
+            22,
+            "/parameter/0/unit",
+            "remove unit",
+        ),
+        (
+            "sets = { spring = \"k2\" }",
+            "scale = true\nsets = { spring = \"k2\", law = { exponential = { a = 1.0, b = 1.0, c = 0.0 } } }",
+            22,
+            "/parameter/0/sets",
+            "remove one of the two",
+        ),
+        (
+            "name = \"temperature_c\"",
+            "name = \"temperature_c\"\nunit = \" \"",
+            24,
+            "/covariate/0/unit",
+            "1 to 20 characters",
+        ),
+        (
+            "name = \"temperature_c\"",
+            "name = \"lab\"\nkind = \"category\"\nunit = \"°C\"",
+            25,
+            "/covariate/0/unit",
+            "no unit",
+        ),
         ("modes = 2", "modes = 3", 2, "/modes", "1 to 2"),
         ("modes = 2", "modes = 0", 2, "/modes", "0 modes"),
         ("modes = 2", "modes = \"two\"", 2, "/modes", "invalid type"),

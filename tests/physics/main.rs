@@ -6,6 +6,7 @@ mod batched;
 mod beam;
 mod definition;
 mod effect;
+mod factor;
 mod table;
 
 use std::f64::consts::PI;

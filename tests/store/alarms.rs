@@ -10,36 +10,47 @@ use modalwatch::store::{
 use super::{assessment, at, batch, bridge, open, undamaged};
 
 /// Stores a batch that ends at `time` with one point of k1 on a chart with limit 3.
-async fn chart(store: &Store, id: &str, time: i64, shift: f64) {
+pub async fn chart(store: &Store, id: &str, time: i64, shift: f64) {
     let given = batch(id, time, 1);
     let measured = given.time_span();
     store.batches().insert_batch(&given, id, at(time)).await.unwrap();
     assess(store, id, measured, shift).await;
 }
 
-async fn assess(
+pub async fn assess(
     store: &Store,
     id: &str,
     measured: (modalwatch::quantity::Timestamp, modalwatch::quantity::Timestamp),
     shift: f64,
 ) {
+    assess_with(store, id, measured, shift, 1).await;
+}
+
+/// Assesses a batch by a version of the undamaged reference.
+pub async fn assess_with(
+    store: &Store,
+    id: &str,
+    measured: (modalwatch::quantity::Timestamp, modalwatch::quantity::Timestamp),
+    shift: f64,
+    undamaged_version: u32,
+) {
     let settings = AlarmSettings { ewma_weight: 0.0, recovery: 2, ..AlarmSettings::default() };
     let point = ChartPoint { shift, limit: 3.0, ewma_limit: f64::INFINITY, slow: None, held: false };
     let series = "k1".to_owned();
-    let point = NewChartPoint { series, undamaged_version: 1, point, probability_limit: Some(0.3), settings };
+    let point = NewChartPoint { series, undamaged_version, point, probability_limit: Some(0.3), settings };
     store
         .assessments()
         .insert_assessment(
             &bridge(),
             id,
-            &assessment("m", Some(1), measured.1),
+            &assessment("m", Some(undamaged_version), measured.1),
             NewCharts { points: vec![point], process: None },
         )
         .await
         .unwrap();
 }
 
-async fn opened() -> (Store, tempfile::TempDir) {
+pub async fn opened() -> (Store, tempfile::TempDir) {
     let (store, folder) = open().await;
     store.batches().insert_batch(&batch("first", -5_000, 1), "b0", at(0)).await.unwrap();
     let model = modalwatch::quantity::Digest::of(&[b"m"]);
@@ -47,7 +58,7 @@ async fn opened() -> (Store, tempfile::TempDir) {
     (store, folder)
 }
 
-async fn episodes(store: &Store) -> Vec<Episode> {
+pub async fn episodes(store: &Store) -> Vec<Episode> {
     store
         .alarms()
         .episodes(&bridge(), EpisodeQuery { before: None, open_only: false, superseded: true, limit: 100 })
@@ -196,13 +207,13 @@ async fn missing_data_are_one_alarm_until_a_batch_arrives() {
 }
 
 /// The messages in the outbox for a webhook that selects all events, oldest first.
-async fn messages(store: &Store) -> Vec<String> {
+pub async fn messages(store: &Store) -> Vec<String> {
     let mut found = store.outbox().deliveries("hook", None, None, 100).await.unwrap();
     found.reverse();
     found.into_iter().map(|d| format!("{} {}", d.event.kind, d.event.alarm)).collect()
 }
 
-async fn opened_with_a_webhook() -> (Store, tempfile::TempDir) {
+pub async fn opened_with_a_webhook() -> (Store, tempfile::TempDir) {
     let (store, folder) = opened().await;
     let webhook = WebhookRecord {
         id: "hook".to_owned(),

@@ -1,7 +1,7 @@
 //! Diagnoses and extensions as one list of jobs.
 
 use modalwatch::quantity::Digest;
-use modalwatch::store::{DiagnosisTrigger, JobKind, JobState, LatestDiagnoses, NewDiagnosis};
+use modalwatch::store::{DiagnosisTrigger, JobEnd, JobKind, JobState, LatestDiagnoses, NewDiagnosis, NewTraining};
 
 use super::{at, bridge, open};
 
@@ -22,9 +22,9 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
         store.diagnoses().insert_diagnosis(new, at(time)).await.unwrap();
     }
     let found = r#"{"verdict": "temperature", "summary": "k2 softens with temperature_c"}"#.to_owned();
-    store.diagnoses().finish_diagnosis("d1", Ok((found, None)), at(15)).await.unwrap();
-    store.diagnoses().finish_diagnosis("d2", Err("no data".to_owned()), at(25)).await.unwrap();
-    assert!(store.diagnoses().begin_extension("d1", at(40)).await.unwrap());
+    store.diagnoses().finish_diagnosis("d1", JobEnd::Done((found, None)), at(15)).await.unwrap();
+    store.diagnoses().finish_diagnosis("d2", JobEnd::Failed("no data".to_owned()), at(25)).await.unwrap();
+    assert!(store.diagnoses().begin_extension("d1", "{}".to_owned(), at(40)).await.unwrap());
     let jobs = store.diagnoses().jobs(100).await.unwrap();
     let of = |kind: JobKind, id: &str| jobs.iter().find(|job| job.kind == kind && job.id == id).unwrap().clone();
     let order: Vec<(&str, JobKind)> = jobs.iter().map(|job| (job.id.as_str(), job.kind)).collect();
@@ -48,16 +48,49 @@ async fn jobs_are_listed_newest_first_and_extensions_have_a_time_of_their_own() 
     assert_eq!((failed.state, failed.failure.as_deref(), failed.summary), (JobState::Failed, Some("no data"), None));
 
     let added = r#"{"added": ["k2 by temperature_c", "k1 by wind"], "left_out": []}"#.to_owned();
-    store.diagnoses().finish_extension("d1", Ok(added), at(50)).await.unwrap();
+    store.diagnoses().finish_extension("d1", JobEnd::Done(added), at(50)).await.unwrap();
     let newest = store.diagnoses().jobs(1).await.unwrap().remove(0);
     assert_eq!((newest.kind, newest.state, newest.finished_at), (extension, JobState::Done, Some(at(50))));
     assert_eq!(newest.summary.as_deref(), Some("k2 by temperature_c; k1 by wind"));
+}
 
-    // Jobs that were running when the service stopped have failed.
-    assert!(store.diagnoses().begin_extension("d1", at(60)).await.unwrap());
-    assert_eq!(store.diagnoses().end_interrupted_jobs(at(70)).await.unwrap(), 2);
+#[tokio::test]
+async fn after_a_stop_diagnoses_have_failed_and_long_jobs_begin_again_unless_the_program_keeps_ending_during_them() {
+    let (store, _folder) = open().await;
+    let digest = Digest::of(&[b"v1"]);
+    for id in ["d1", "d2"] {
+        let (structure, request) = (bridge(), "{}".to_owned());
+        let (trigger, id) = (DiagnosisTrigger::Requested, id.to_owned());
+        let new = NewDiagnosis { id, structure, structure_digest: digest.clone(), request, trigger, alarm: None };
+        store.diagnoses().insert_diagnosis(new, at(10)).await.unwrap();
+    }
+    let end = JobEnd::Done(("{}".to_owned(), None));
+    store.diagnoses().finish_diagnosis("d1", end, at(20)).await.unwrap();
+    assert!(store.diagnoses().begin_extension("d1", "the request".to_owned(), at(30)).await.unwrap());
+    let training =
+        NewTraining { id: "t1".to_owned(), structure: bridge(), structure_digest: digest, request: "{}".to_owned() };
+    store.trainings().insert(training, at(40)).await.unwrap();
+    let stop = async || store.diagnoses().end_interrupted_jobs(at(70)).await.unwrap();
+    let unfinished = async || store.trainings().unfinished().await.unwrap().len();
+
+    let first = stop().await;
+    assert_eq!((first.failed, unfinished().await), (1, 1), "the diagnosis d2");
+    assert_eq!(first.extensions, [("d1".to_owned(), "the request".to_owned())]);
+    for _ in 0..5 {
+        // Orderly stops are no reason to give up.
+        store.diagnoses().note_orderly_stop().await.unwrap();
+        assert_eq!((stop().await.failed, unfinished().await), (0, 1));
+    }
+    assert_eq!([stop().await.failed, stop().await.failed], [0, 0]);
+    let last = stop().await;
+    assert_eq!((last.failed, last.extensions.len(), unfinished().await), (2, 0, 0));
     let jobs = store.diagnoses().jobs(100).await.unwrap();
-    for job in jobs.iter().filter(|job| job.id == "d3" || job.kind == extension) {
+    for job in jobs.iter().filter(|job| job.kind != JobKind::Diagnosis) {
         assert_eq!((job.state, job.finished_at), (JobState::Failed, Some(at(70))), "{job:?}");
     }
+    assert!(store.diagnoses().begin_extension("d1", "{}".to_owned(), at(80)).await.unwrap());
+    store.diagnoses().finish_extension("d1", JobEnd::Cancelled, at(90)).await.unwrap();
+    let cancelled = store.diagnoses().jobs(1).await.unwrap().remove(0);
+    assert_eq!((cancelled.kind, cancelled.state, cancelled.failure), (JobKind::Extension, JobState::Cancelled, None));
+    assert_eq!(store.diagnoses().structure_of_job("t1").await.unwrap().as_deref(), Some("bridge"));
 }

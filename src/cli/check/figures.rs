@@ -6,7 +6,8 @@ use serde::Serialize;
 
 use crate::baseline::identifiability::local_covariance;
 use crate::parameter::{DamageDirection, Parameter};
-use crate::quantity::{significant, with_prefix};
+use crate::quantity::significant;
+use crate::simulator::plausibility::MISTAKEN;
 use crate::simulator::{SimulationModel, Simulator};
 use crate::stats;
 
@@ -20,9 +21,6 @@ const TOGETHER: f64 = 0.95;
 
 /// Share of the prior variance above which one measurement says little about a parameter.
 const LITTLE: f64 = 0.5;
-
-/// Factor by which prior and nominal stiffness, or prior and measured frequency, differ if a unit or a factor was mistaken.
-const MISTAKEN: f64 = 10.0;
 
 /// Variance of a uniform distribution of width 1, inverse.
 const PRIOR_PRECISION: f64 = 12.0;
@@ -156,63 +154,43 @@ impl Figures {
                 "measurement_noise is 0: state the scatter of repeated measurements, such as { relative = 0.002 }, before you train".to_owned(),
             );
         }
-        let priors = self.parameters.iter().filter_map(|p| far_from_nominal(p, simulator));
-        self.problems.extend(priors.collect::<Vec<_>>());
-        self.judge_measured();
+        for doubt in simulator.prior_doubts() {
+            if doubt.far { &mut self.problems } else { &mut self.notes }.push(doubt.message);
+        }
+        self.judge_measured(simulator);
     }
 
-    /// Compares the measured frequencies with the ranges of the prior.
-    fn judge_measured(&mut self) {
-        let outside = |m: &&ModeFigures| m.measured_is_possible == Some(false);
-        let mut factors = Vec::new();
-        for mode in self.modes.iter().filter(outside) {
-            let measured = mode.measured_hz.unwrap_or(f64::NAN);
+    /// Compares the measured frequencies with the ranges of the prior, and the lowest one with that in the middle of the prior.
+    fn judge_measured(&mut self, simulator: &Simulator) {
+        for mode in self.modes.iter().filter(|m| m.measured_is_possible == Some(false)) {
             let [low, high] = mode.prior_hz;
-            factors.push(if measured > high { measured / high } else { measured / low });
             self.problems.push(format!(
                 "mode {}: {} Hz is outside the prior's range, {} to {} Hz",
                 mode.mode,
-                significant(measured),
+                significant(mode.measured_hz.unwrap_or(f64::NAN)),
                 significant(low),
                 significant(high)
             ));
         }
-        let all = self.modes.iter().filter(|m| m.measured_hz.is_some()).count();
-        let far = factors.iter().all(|f| *f > MISTAKEN) || factors.iter().all(|f| *f < 1.0 / MISTAKEN);
-        if all > 0 && factors.len() == all && far {
-            let factor = (factors.iter().map(|f| f.ln()).sum::<f64>() / all as f64).exp();
-            let names: Vec<&str> = self.parameters.iter().map(|p| p.name.as_str()).collect();
-            self.problems.push(format!(
-                "all measured frequencies are about {} times those of the prior, and stiffness goes with the square: the priors of {} may be \
-                 factors, such as 0.5 to 1.5, although the parameters are stiffnesses in N/m; or masses or frequencies have another unit",
-                significant(factor),
-                names.join(", ")
-            ));
+        let Some(measured) = self.modes.first().and_then(|m| m.measured_hz) else { return };
+        let middle: Vec<f64> = simulator.space().iter().map(|p| p.from_unit(0.5)).collect();
+        let Ok(frequencies) = simulator.frequencies_hz(&middle) else { return };
+        let factor = measured / frequencies[0];
+        if (1.0 / MISTAKEN..=MISTAKEN).contains(&factor) {
+            return;
         }
+        let factors = simulator.probable_factors();
+        let cause = if factors.is_empty() {
+            "a stiffness, a mass or the frequency probably has another unit".to_owned()
+        } else {
+            factors.join(" ")
+        };
+        self.problems.push(format!(
+            "the measured frequency of mode 1 is {} times that in the middle of the priors, {} Hz, and stiffness goes with the square: {cause}",
+            significant(factor),
+            significant(frequencies[0])
+        ));
     }
-}
-
-/// A sentence if the prior of a parameter that is a stiffness does not come near the stiffness of its spring.
-fn far_from_nominal(p: &ParameterFigures, simulator: &Simulator) -> Option<String> {
-    let definition = simulator.definition().parameters.iter().find(|d| d.name == p.name)?;
-    if definition.sets.iter().any(|s| s.law.is_some()) {
-        return None;
-    }
-    let [low, high] = p.prior;
-    let far = p.nominal > MISTAKEN * high || p.nominal < low / MISTAKEN;
-    far.then(|| {
-        format!(
-            "the prior of {} is {} to {} {}, but the nominal stiffness is {}: a parameter is the stiffness itself, not a factor of it; write \
-             prior = {{ uniform = [{:e}, {:e}] }} for 0.5 to 1.5 times the nominal stiffness",
-            p.name,
-            significant(low),
-            significant(high),
-            p.unit,
-            with_prefix(p.nominal, &p.unit),
-            0.5 * p.nominal,
-            1.5 * p.nominal
-        )
-    })
 }
 
 /// What a parameter sets, by name.

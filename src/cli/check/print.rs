@@ -3,7 +3,7 @@
 use super::figures::{Figures, ModeFigures, ParameterFigures};
 use crate::parameter::DamageDirection;
 use crate::quantity::{significant, with_prefix};
-use crate::simulator::definition::{MeasurementNoise, SpringDefinition, StructureDefinition};
+use crate::simulator::definition::{CovariateDefinition, MeasurementNoise, SpringDefinition, StructureDefinition};
 
 /// Most points of a shape that are printed beside a mode.
 const MOST_POINTS: usize = 12;
@@ -47,13 +47,12 @@ impl Figures {
                 DamageDirection::None => "no change is damage",
             };
             let sets = if p.sets.is_empty() { String::new() } else { format!("; sets {}", p.sets.join(", ")) };
-            println!(
-                "  {:width$}  uniform prior {} to {}, nominal {}; {damage}{sets}",
-                p.name,
-                with_prefix(p.prior[0], &p.unit),
-                with_prefix(p.prior[1], &p.unit),
-                with_prefix(p.nominal, &p.unit)
-            );
+            let nominal = with_prefix(p.nominal, &p.unit);
+            let [low, high] = p.prior;
+            // Per cent take no prefix, so that the unit is needed only once.
+            let low = if p.unit.starts_with('%') { significant(low) } else { with_prefix(low, &p.unit) };
+            let high = with_prefix(high, &p.unit);
+            println!("  {:width$}  uniform prior {low} to {high}, nominal {nominal}; {damage}{sets}", p.name);
         }
     }
 
@@ -159,6 +158,13 @@ fn print_parts(definition: &StructureDefinition) {
             let k = s.n_m_per_rad.map_or_else(|| stiffness(s.n_per_m, "N/m"), |k| with_prefix(k, "N·m/rad"));
             println!("  {}  {} – {}: {k}{}", s.name, s.from, s.to, by(&s.name, false));
         }
+    }
+    if !definition.covariates.is_empty() {
+        let with_unit = |c: &CovariateDefinition| match &c.unit {
+            Some(unit) => format!("{} ({unit})", c.name),
+            None => c.name.clone(),
+        };
+        println!("\ncovariates\n  {}", definition.covariates.iter().map(with_unit).collect::<Vec<_>>().join(", "));
     }
     if !definition.beams.is_empty() {
         println!("\nbeams");

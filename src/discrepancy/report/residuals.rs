@@ -35,6 +35,7 @@ enum Use {
 /// Rows that are drawn, with the residuals of each mode without and with the causes, per cent.
 pub(super) struct Drawn<'a> {
     pub(super) data: &'a Data,
+    simulator: &'a Simulator,
     pub(super) rows: Vec<usize>,
     /// How each row was used.
     uses: Vec<Use>,
@@ -77,7 +78,7 @@ impl<'a> Drawn<'a> {
         let mut uses = vec![Use::Searched; data.rows()];
         outcome.holdout.iter().for_each(|row| uses[*row] = Use::HeldOut);
         outcome.set_aside.iter().for_each(|row| uses[*row] = Use::SetAside);
-        Some(Self { data, uses: rows.iter().map(|row| uses[*row]).collect(), rows, before, after })
+        Some(Self { data, simulator, uses: rows.iter().map(|row| uses[*row]).collect(), rows, before, after })
     }
 
     pub(super) fn axis(&self, name: &str) -> Axis {
@@ -89,8 +90,12 @@ impl<'a> Drawn<'a> {
             }
             None => (Vec::new(), self.rows.iter().map(|r| self.data.times_days[*r]).collect()),
         };
-        let label =
-            if name == TIME { format!("{}s since the first row", self.data.time_unit) } else { name.to_owned() };
+        let label = if name == TIME {
+            format!("{}s since the first row", self.data.time_unit)
+        } else {
+            let declared = self.simulator.covariates().iter().find(|c| c.name == name).and_then(|c| c.unit.as_ref());
+            declared.map_or_else(|| name.to_owned(), |unit| format!("{name}, {unit}"))
+        };
         Axis { label, names, values }
     }
 

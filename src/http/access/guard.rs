@@ -38,7 +38,7 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
 
     let structure = structure_of(access, class.about, request).await?;
     let about = match (class.about, &structure) {
-        (route::Subject::Structure | route::Subject::Diagnosis, Some(id)) => About::Structure(id),
+        (route::Subject::Structure | route::Subject::Job, Some(id)) => About::Structure(id),
         (route::Subject::Filtered, _) => About::Filtered,
         _ => About::Service,
     };
@@ -57,7 +57,7 @@ async fn structure_of(
     about: route::Subject,
     request: &mut Request,
 ) -> Result<Option<String>, ApiError> {
-    if !matches!(about, route::Subject::Structure | route::Subject::Diagnosis) {
+    if !matches!(about, route::Subject::Structure | route::Subject::Job) {
         return Ok(None);
     }
     // A path that is not UTF-8 names no structure; the handler reports it.
@@ -65,7 +65,7 @@ async fn structure_of(
     let Some((_, first)) = parameters.iter().next() else { return Ok(None) };
     match about {
         route::Subject::Structure => Ok(Some(first.to_owned())),
-        _ => Ok(access.0.store.diagnoses().structure_of_diagnosis(first).await?),
+        _ => Ok(access.0.store.diagnoses().structure_of_job(first).await?),
     }
 }
 

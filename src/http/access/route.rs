@@ -23,8 +23,8 @@ const FILTERED: [&str; 4] = ["/v1/structures", "/v1/overview", "/v1/jobs", "/v1/
 pub enum Subject {
     /// The structure named by the first path parameter.
     Structure,
-    /// The structure of the diagnosis named by the first path parameter.
-    Diagnosis,
+    /// The structure of the diagnosis or training named by the first path parameter.
+    Job,
     /// A list that the handler filters.
     Filtered,
     /// The whole service.
@@ -63,7 +63,7 @@ pub fn classify(method: &Method, pattern: Option<&str>) -> Class {
     };
     let about = match (version, collection, id) {
         (Some("v1"), Some("structures"), Some(id)) if id.starts_with('{') => Subject::Structure,
-        (Some("v1"), Some("diagnoses"), Some(id)) if id.starts_with('{') => Subject::Diagnosis,
+        (Some("v1"), Some("diagnoses" | "trainings" | "jobs"), Some(id)) if id.starts_with('{') => Subject::Job,
         _ if reads && FILTERED.contains(&pattern) => Subject::Filtered,
         _ => Subject::Service,
     };

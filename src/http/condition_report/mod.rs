@@ -1,6 +1,8 @@
 //! `GET /v1/structures/{id}/report`: the condition of a structure over a period as one HTML page, made for print.
 
+mod alarms;
 mod page;
+mod words;
 
 use axum::extract::State;
 use axum::http::header;
@@ -74,7 +76,9 @@ pub async fn report(
     let period =
         Period { from: from.or(series.extent.measured.map(|m| m.0)), to: to.or(series.extent.measured.map(|m| m.1)) };
     let alarms = shared.monitor.alarms().episodes(&id, all).await?;
+    let handling = shared.monitor.alarms().handling(&id, &alarms).await?;
     let maintenance = shared.monitor.alarms().maintenance(&id).await?;
+    let notes = shared.monitor.alarms().notes(&id).await?;
     let judged = Judged::all(&shared.monitor).await?.into_iter().find(|judged| judged.found.id == id);
     let marks = drawing::marks(&shared, &id).await?;
     let simulator = active.simulator.clone();
@@ -86,6 +90,9 @@ pub async fn report(
         verdict: judged.map(|judged| judged.verdict.sentence).unwrap_or_default(),
         made_at: Timestamp::now(),
         alarms: alarms.into_iter().filter(|e| !e.withdrawn && period.overlaps(e.opened_at, e.ended_at)).collect(),
+        handling,
+        limits: shared.monitor.alarms().limits(),
+        notes: notes.into_iter().filter(|n| period.overlaps(n.from, Some(n.to.unwrap_or(n.from)))).collect(),
         maintenance: maintenance.into_iter().filter(|w| period.overlaps(w.from, Some(w.to))).collect(),
         model: active.baseline.clone(),
         period,

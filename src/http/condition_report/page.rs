@@ -4,9 +4,12 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
 
+use super::alarms;
+use super::words::{list, time};
+use crate::alarm::severity::SeverityLimits;
 use crate::baseline::Baseline;
 use crate::damage::UndamagedQuantity;
-use crate::monitor::stored::{Episode, MaintenanceWindow, QuantitySeries, ReferenceRecord};
+use crate::monitor::stored::{Episode, Handling, MaintenanceWindow, Note, QuantitySeries, ReferenceRecord};
 use crate::monitor::Series;
 use crate::plot::{escaped, figure, key, page, table_of_html, Curve, Panel, Swatch};
 use crate::quantity::{StructureId, Timestamp};
@@ -47,7 +50,12 @@ pub struct Contents {
     pub period: Period,
     pub series: Series,
     pub alarms: Vec<Episode>,
+    /// What people did with the alarms, by their numbers.
+    pub handling: BTreeMap<i64, Handling>,
+    /// Limits of the severity.
+    pub limits: SeverityLimits,
     pub maintenance: Vec<MaintenanceWindow>,
+    pub notes: Vec<Note>,
     /// The undamaged reference of the trained model in use.
     pub reference: Option<Arc<ReferenceRecord>>,
     pub model: Result<Arc<Baseline>, String>,
@@ -57,25 +65,17 @@ pub struct Contents {
 pub fn html(c: &Contents) -> String {
     let sections = [
         ("Verdict".to_owned(), verdict(c) + &structure(c)),
-        ("Alarms in the period".to_owned(), alarms(c)),
+        (
+            "Alarms in the period".to_owned(),
+            alarms::section(&c.alarms, &c.handling, c.limits) + &alarms::maintenance(&c.maintenance),
+        ),
+        ("Notes on the time line".to_owned(), alarms::notes(&c.notes)),
         ("Stiffnesses and other parameters".to_owned(), parameters(c)),
         ("Quality of the data".to_owned(), quality(c)),
         ("Undamaged reference and model".to_owned(), basis(c)),
         ("What is not known".to_owned(), list(&unknown(c))),
     ];
     page(&format!("Condition of {}", c.structure), &sections)
-}
-
-fn time(at: Timestamp) -> String {
-    at.to_string().chars().take(16).collect::<String>().replace('T', " ")
-}
-
-fn list(items: &[String]) -> String {
-    let mut text = "<ul>".to_owned();
-    for item in items {
-        let _ = write!(text, "<li>{}</li>", escaped(item));
-    }
-    text + "</ul>"
 }
 
 fn verdict(c: &Contents) -> String {
@@ -105,45 +105,6 @@ fn structure(c: &Contents) -> String {
     c.drawing.as_ref().map_or_else(String::new, |svg| {
         format!("<div class=\"plots\"><figure>{svg}<figcaption>{}</figcaption></figure></div>", escaped(caption))
     })
-}
-
-fn alarms(c: &Contents) -> String {
-    let mut text = if c.alarms.is_empty() { "<p>None.</p>".to_owned() } else { alarm_table(&c.alarms) };
-    if !c.maintenance.is_empty() {
-        let window = |w: &MaintenanceWindow| format!("{} to {}: {}", time(w.from), time(w.to), w.reason);
-        let windows: Vec<String> = c.maintenance.iter().map(window).collect();
-        let _ = write!(text, "<h3>Maintenance, in which batches raise no alarm</h3>{}", list(&windows));
-    }
-    text
-}
-
-fn alarm_table(alarms: &[Episode]) -> String {
-    let what = |e: &Episode| match (e.kind.as_str(), &e.change) {
-        ("damage", Some(change)) => change.sentence(),
-        ("damage", None) => format!("{} has shifted towards damage", e.series.trim_start_matches("group:")),
-        ("silence", _) => "no measurement within the configured time".to_owned(),
-        _ => "the simulation does not fit the measurements".to_owned(),
-    };
-    let noted = |e: &Episode| {
-        e.acknowledgement.as_ref().map_or_else(
-            || "not acknowledged".to_owned(),
-            |a| {
-                format!(
-                    "{}, {}{}",
-                    a.by,
-                    time(a.at),
-                    a.note.as_ref().map_or_else(String::new, |note| format!(": {note}"))
-                )
-            },
-        )
-    };
-    let row = |e: &Episode| {
-        let ended = e.ended_at.map_or_else(|| "still open".to_owned(), time);
-        [e.number.to_string(), time(e.opened_at), ended, what(e), noted(e)].map(|cell| escaped(&cell)).to_vec()
-    };
-    let rows: Vec<Vec<String>> = alarms.iter().map(row).collect();
-    let header = [("Alarm", false), ("Opened", true), ("Ended", true), ("What", true), ("Noted by", true)];
-    table_of_html("", &header, &rows)
 }
 
 fn undamaged<'a>(c: &'a Contents, name: &str) -> Option<&'a UndamagedQuantity> {

@@ -3,6 +3,7 @@
 import { ApiError, keepToken, onUnauthorized, token } from "./api.js";
 import { endCharts } from "./charts/base.js";
 import { themeChanged } from "./charts/theme.js";
+import { compare } from "./compare.js";
 import { condition } from "./condition.js";
 import { ask, fill, h, icon, notify, problem } from "./dom.js";
 import { follow } from "./events.js";
@@ -22,6 +23,7 @@ const ROUTES = [
   [/^#?\/?$/, "fleet", () => overview()],
   [/^#\/structures\/([^/?]+)(?:\?(.*))?$/, "fleet", (id, query) => structure(id, new URLSearchParams(query))],
   [/^#\/structures\/([^/?]+)\/report(?:\?(.*))?$/, "fleet", (id, query) => condition(id, new URLSearchParams(query))],
+  [/^#\/compare(?:\?(.*))?$/, "compare", (query) => compare(new URLSearchParams(query))],
   [/^#\/diagnoses\/([^/]+)$/, "fleet", (id) => report(id)],
   [/^#\/jobs$/, "jobs", () => jobs()],
 ];
@@ -48,7 +50,7 @@ async function route() {
     );
     return;
   }
-  const opened = open(...location.hash.match(pattern).slice(1).map((part) => part && decodeURIComponent(part)));
+  const opened = open(...location.hash.match(pattern).slice(1).map((part) => part && (part.includes("=") ? part : decodeURIComponent(part))));
   view = opened;
   document.title = `${opened.title} – modalwatch`;
   fill(main, h("p", { class: "loading" }, "Loading…"));

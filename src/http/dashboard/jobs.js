@@ -1,18 +1,27 @@
-// Background jobs (diagnoses and model extensions) with live progress.
+// Background jobs (diagnoses, trainings and model extensions) with live progress, their order and their end.
 
-import { read } from "./api.js";
-import { cell, fill, h, throttled } from "./dom.js";
+import { read, send } from "./api.js";
+import { ask, cell, fill, h, notify, refill, throttled } from "./dom.js";
 import { age, timeElement, words } from "./format.js";
 import { jobChip } from "./states.js";
 
-const KINDS = { diagnosis: "Diagnosis", extension: "Model extension" };
+const KINDS = { diagnosis: "Diagnosis", extension: "Model extension", training: "Training" };
 
-/** Progress as text, with a bar if it can be expressed as a fraction (a number, or text such as "epoch 3 of 80"). */
-export function progress(reported, label) {
-  if (reported === null || reported === undefined || reported === "") return "";
-  const share = typeof reported === "number" ? reported : shareOf(reported);
-  const text = typeof reported === "number" ? `${Math.round(100 * reported)} %` : words(reported);
-  const bar = share !== null && h("progress", { max: "1", value: share, "aria-label": `Progress of ${label}` });
+/** An estimated time in words, such as "about 3 min left"; empty where there is no estimate. */
+export function timeLeft(seconds) {
+  if (seconds === null || seconds === undefined) return "";
+  if (seconds < 60) return "less than a minute left";
+  const minutes = Math.round(seconds / 60);
+  if (minutes < 90) return `about ${minutes} min left`;
+  return `about ${(seconds / 3600).toFixed(1)} h left`;
+}
+
+/** What a job is doing in words, with a bar where the share is known, the time left, and its place in the queue. */
+export function progress(job, label) {
+  const share = job.share ?? shareOf(job.progress ?? "");
+  const place = job.place && (job.place === 1 ? "next in the queue" : `place ${job.place} in the queue`);
+  const text = [words(job.progress ?? "waiting"), place, timeLeft(job.time_left_s)].filter(Boolean).join(", ");
+  const bar = share !== null && !job.place && h("progress", { max: "1", value: share, "aria-label": `Progress of ${label}` });
   return h("span", { class: "progress" }, bar, h("span", null, text));
 }
 
@@ -21,15 +30,48 @@ function shareOf(text) {
   return counted && Number(counted[2]) > 0 ? Number(counted[1]) / Number(counted[2]) : null;
 }
 
-const isOpen = (job) => job.state === "running" || job.state === "waiting";
+export const isOpen = (job) => job.state === "running" || job.state === "waiting";
 
-function rows(items) {
+/** Buttons to end a job and, while others wait before it, to move it to the front. `changed` is called afterwards. */
+export function controls(id, job, label, changed) {
+  const end = async () => {
+    const done = await ask({
+      title: `End the ${label}?`,
+      body: h("p", null, "What it has computed is lost; nothing else changes. A job that runs ends at its next step."),
+      confirm: "End it",
+      cancel: "Keep it",
+      danger: true,
+      submit: () => send(`v1/jobs/${encodeURIComponent(id)}`, undefined, "DELETE"),
+    });
+    if (done) {
+      notify(`The end of the ${label} was requested.`);
+      changed();
+    }
+  };
+  const first = async () => {
+    try {
+      await send(`v1/jobs/${encodeURIComponent(id)}/first`);
+    } catch (error) {
+      notify(error.message, "error");
+    }
+    changed();
+  };
+  return h(
+    "span",
+    { class: "row" },
+    job.place > 1 && h("button", { type: "button", "aria-label": `Run the ${label} next`, onclick: first }, "Run next"),
+    h("button", { type: "button", "aria-label": `Cancel the ${label}`, onclick: end }, "Cancel"),
+  );
+}
+
+function rows(items, changed) {
   return items.map((job) => {
     const name = KINDS[job.kind] ?? words(job.kind);
+    const label = `${name.toLowerCase()} of ${job.structure}`;
     const page = job.kind === "diagnosis" && job.state === "done";
     return h(
       "tr",
-      { dataset: { job: job.job } },
+      { dataset: { job: job.job, key: `${job.kind} ${job.job}` } },
       cell("State", jobChip(job.state)),
       cell("Job", page ? h("a", { href: `#/diagnoses/${encodeURIComponent(job.job)}` }, `${name}: report`) : name),
       cell("Structure", h("a", { href: `#/structures/${encodeURIComponent(job.structure)}` }, job.structure)),
@@ -40,12 +82,13 @@ function rows(items) {
       ),
       cell(
         isOpen(job) ? "Progress" : "Ended",
-        isOpen(job) ? progress(job.progress, `${name} of ${job.structure}`) : timeElement(job.finished_at),
+        isOpen(job) ? progress(job, label) : timeElement(job.finished_at),
+        isOpen(job) && controls(job.job, job, label, changed),
       ),
       h(
         "td",
         { "data-label": "Outcome", class: "wide" },
-        job.verdict && h("strong", null, words(job.verdict), ". "),
+        job.verdict && job.kind === "diagnosis" && h("strong", null, words(job.verdict), ". "),
         job.summary ?? job.failure ?? (isOpen(job) ? "" : "–"),
       ),
     );
@@ -76,13 +119,18 @@ export function jobs() {
     h(
       "p",
       null,
-      "A diagnosis finds where the simulation disagrees with the measurements. To start one, open a structure and choose “Diagnose”.",
+      "A training makes the model of a structure; a diagnosis finds where the simulation disagrees with the measurements. To start one, open a structure: “Train a model” stands under “Model”, “Diagnose” under “Diagnosis”.",
     ),
   );
-  const element = h("div", { class: "view", dataset: { page: "jobs" } }, h("h1", null, "Jobs"), none, table);
+  const lanes = h(
+    "p",
+    { class: "fine" },
+    "One diagnosis and, beside it, one training or extension run at a time; the others wait in the order in which they were started.",
+  );
+  const element = h("div", { class: "view", dataset: { page: "jobs" } }, h("h1", null, "Jobs"), lanes, none, table);
   const load = async () => {
     const { items } = await read("v1/jobs");
-    fill(body, rows(items));
+    refill(body, rows(items, () => again()));
     none.hidden = items.length > 0;
     table.hidden = items.length === 0;
   };

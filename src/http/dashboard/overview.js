@@ -5,10 +5,18 @@ import { acknowledgeDialog, alarmWords } from "./sections/alarms.js";
 import { describe } from "./sections/describe.js";
 import { cell, fill, h, icon, refill, throttled } from "./dom.js";
 import { age, count, percent } from "./format.js";
+import { help } from "./help.js";
 import { EVERY_STATE, stateChip, stateWord, trustChip, urgency } from "./states.js";
 
 /** Maximum number of structures whose open alarms are listed at the top. */
 const MOST_ALARMING = 20;
+
+/** Help at the columns that a newcomer may not know. */
+const COLUMN_HELP = {
+  "Highest probability of damage": () => [" ", help("probability of damage")],
+  "Latest batch": () => [" ", help("trust")],
+  Model: () => [" ", help("calibration")],
+};
 
 export function overview() {
   const tiles = h("ul", { class: "tiles", "aria-label": "Structures by state" });
@@ -25,7 +33,7 @@ export function overview() {
         "tr",
         null,
         ["State", "Structure and verdict", "Last measured", "Alarms", "Highest probability of damage", "Latest batch", "Model"].map(
-          (c) => h("th", { scope: "col" }, c),
+          (c) => h("th", { scope: "col" }, c, COLUMN_HELP[c]?.()),
         ),
       ),
     ),

@@ -51,6 +51,7 @@ const JOB_STATES = {
   waiting: ["pending", "idle", "Waiting"],
   done: ["check", "good", "Done"],
   failed: ["cross", "bad", "Failed"],
+  cancelled: ["cross", "idle", "Cancelled"],
 };
 
 /** The state of a job as a chip. */

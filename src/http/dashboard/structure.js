@@ -5,16 +5,19 @@ import { TimeGroup, seconds } from "./charts/base.js";
 import { control } from "./charts/control.js";
 import { heat } from "./charts/heat.js";
 import { parameters } from "./charts/parameters.js";
+import { scatter } from "./charts/scatter.js";
 import { tracks } from "./charts/tracks.js";
 import { trust } from "./charts/trust.js";
 import { ask, fieldTime, fill, h, icon, throttled } from "./dom.js";
 import { age, count, local, percent, zone } from "./format.js";
+import { help } from "./help.js";
 import { alarms } from "./sections/alarms.js";
 import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
 import { drawing } from "./sections/drawing.js";
 import { maintenance } from "./sections/maintenance.js";
 import { declare, model, postLine } from "./sections/model.js";
+import { notes } from "./sections/notes.js";
 import { upload } from "./sections/upload.js";
 import { stateChip } from "./states.js";
 
@@ -39,7 +42,7 @@ const SECTIONS = [
   ["upload", "Upload"],
   ["model", "Model"],
   ["diagnosis", "Diagnosis"],
-  ["maintenance", "Maintenance"],
+  ["maintenance", "Maintenance and notes"],
 ];
 
 /** Sections that show the time span that is chosen. */
@@ -61,6 +64,7 @@ export function structure(id, query) {
     control: control(group, select),
     trust: trust(group, select),
     tracks: tracks(group),
+    scatter: scatter(),
   };
   const detail = batch(id, (chosen) => {
     state.batch = chosen;
@@ -72,6 +76,7 @@ export function structure(id, query) {
   });
   const alarmList = alarms(id);
   const windows = maintenance(id, () => refresh.series());
+  const noteList = notes(id, () => refresh.series());
   const diagnoses = diagnosis(id, () => refresh.all());
   const used = model(id, () => refresh.all());
   const spans = h("div", { class: "picker", role: "group", "aria-label": "Time span" });
@@ -89,19 +94,19 @@ export function structure(id, query) {
       drawn.element,
       figures.parameters.element,
       figures.control.element,
-      figures.heat.element,
-      figures.trust.element,
+      h("div", { class: "grid two" }, figures.heat.element, figures.trust.element),
     ),
-    tracks: section("tracks", "Frequencies", figures.tracks.element),
+    tracks: section("tracks", "Frequencies", figures.tracks.element, figures.scatter.element),
     batch: detail.element,
     upload: upload(id, () => refresh.all()).element,
     model: used.element,
     diagnosis: h("div", { class: "stack" }, diagnoses.card, diagnoses.element),
-    maintenance: windows.element,
+    maintenance: h("div", { class: "stack" }, windows.element, noteList.element),
   };
   let shown = SECTIONS.some(([name]) => name === query.get("section")) ? query.get("section") : "condition";
+  const compared = h("a", { class: "button", href: "#/compare" }, "Compare");
   const printed = h("a", { class: "button" }, "Condition report");
-  const spansRow = h("div", { class: "row spans" }, spans, spanText, asReference, printed);
+  const spansRow = h("div", { class: "row spans" }, spans, spanText, h("span", null, asReference, " ", help("undamaged reference")), printed, compared);
   const jumps = h(
     "nav",
     { class: "jumps", "aria-label": "Sections" },
@@ -271,9 +276,12 @@ export function structure(id, query) {
     figures.heat.update(series);
     figures.control.update(series);
     figures.trust.update(series);
+    compared.href = `#/compare?${new URLSearchParams({ a: `${id}/${series.parameters[0]?.name ?? ""}` })}`;
+    figures.scatter.update(series);
     figures.tracks.update({
       frequencies: series.frequencies,
       maintenance: series.maintenance,
+      notes: series.notes,
       reduced: series.reduced,
     });
   }
@@ -308,7 +316,7 @@ export function structure(id, query) {
     all: throttled(
       quietly(async () => {
         await loadInfo();
-        await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load()]);
+        await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load(), noteList.load()]);
         await detail.again();
       }),
       1500,
@@ -332,7 +340,7 @@ export function structure(id, query) {
       }
       showSpans();
       await loadInfo();
-      await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load()]);
+      await Promise.all([loadSeries(), alarmList.load(), diagnoses.load(), windows.load(), noteList.load()]);
       const wanted = query.get("batch");
       if (wanted && !state.empty) await detail.select(wanted);
     },
@@ -346,6 +354,7 @@ export function structure(id, query) {
         refresh.diagnoses();
         // An alarm links to the diagnosis that it started.
         if (data.trigger === "rejected_episode") refresh.alarms();
+        if (data.kind === "training") used.job(data);
         if (data.kind === "extension" && data.state === "done") refresh.all();
       } else if (name === "structure") refresh.all();
     },
@@ -364,7 +373,8 @@ function head(id, { info, item }) {
     facts.push("The latest batch was rejected; its probability of damage is withheld.");
   else if (latest && latest.max_probability_of_damage !== null && latest.max_probability_of_damage !== undefined)
     facts.push(
-      `Highest probability of damage in the latest batch: ${percent(latest.max_probability_of_damage)} (${latest.max_parameter}).`,
+      ["Highest probability of damage ", help("probability of damage")],
+      ` in the latest batch: ${percent(latest.max_probability_of_damage)} (${latest.max_parameter}).`,
     );
   if (item?.state === "not_judged") facts.push("Declare the undamaged reference below, under “Model”.");
   if (item?.state === "silent") facts.push("Check the data logger and its connection.");
@@ -376,8 +386,7 @@ function head(id, { info, item }) {
       h(
         "p",
         { class: "fine" },
-        facts.join(" "),
-        facts.length > 0 && " ",
+        facts.flatMap((fact) => [fact, " "]),
         "Last measured ",
         age(item.last_measured_at),
         ", last received ",

@@ -248,8 +248,10 @@ fn by_target(name: &str, target: &str, layout: &Layout<'_>, options: &TableOptio
     match &column.meaning {
         Meaning::Value(_, Column::Frequency(_) | Column::Std(_)) => with_unit(&mut column, unit.as_deref(), options)?,
         Meaning::Value(canonical, Column::Covariate(_, CovariateKind::Number)) => {
-            let canonical = canonical.clone();
-            convert(&mut column, &canonical, unit.as_deref())?;
+            let declared = layout.covariates.iter().find(|c| c.name == *canonical).cloned();
+            if let Some(covariate) = declared {
+                convert(&mut column, &covariate, unit.as_deref())?;
+            }
         }
         _ => {}
     }
@@ -342,28 +344,30 @@ fn covariate(name: &str, base: &str, unit: Option<&str>, layout: &Layout<'_>) ->
     let (Some(covariate), None) = (found.next(), found.next()) else { return Ok(None) };
     let meaning = Meaning::Value(covariate.name.clone(), Column::Covariate(covariate.name.clone(), covariate.kind));
     let mut column = HeaderColumn::new(name, meaning, "a covariate by its name");
-    convert(&mut column, &covariate.name, unit)?;
+    convert(&mut column, covariate, unit)?;
     Ok(Some(column))
 }
 
-/// Sets the conversion of a covariate from the unit in the header to the one in its name.
-fn convert(column: &mut HeaderColumn, covariate: &str, unit: Option<&str>) -> Result<(), String> {
+/// Sets the conversion of a covariate from the unit in the header to the stated one, or else the one in its name.
+fn convert(column: &mut HeaderColumn, covariate: &Covariate, unit: Option<&str>) -> Result<(), String> {
     let Some(unit) = unit else {
         column.add_reason("in the unit of the covariate, because the header names none");
         return Ok(());
     };
-    let (stated, lower) = (suffix(unit), covariate.to_lowercase());
-    if lower.ends_with(&format!("_{stated}")) {
+    let (stated, lower) = (suffix(unit), covariate.name.to_lowercase());
+    let own = covariate.unit.as_deref().map(suffix);
+    if own.as_ref().map_or_else(|| lower.ends_with(&format!("_{stated}")), |own| *own == stated) {
         column.add_reason(&format!("in {unit}, as the header says"));
         return Ok(());
     }
-    let own = lower.rsplit_once('_').map_or("", |(_, own)| own);
-    let Some(conversion) = between_temperatures(&stated, own) else {
+    let own = own.unwrap_or_else(|| lower.rsplit_once('_').map_or_else(String::new, |(_, own)| own.to_owned()));
+    let Some(conversion) = between_temperatures(&stated, &own) else {
         return Err(format!(
-            "column {}: its unit {} is not that of the covariate {covariate}; convert the column, or name it without a unit if the \
+            "column {}: its unit {} is not that of the covariate {}; convert the column, or name it without a unit if the \
              numbers are right",
             shown(&column.name),
-            shown(unit)
+            shown(unit),
+            covariate.name
         ));
     };
     column.conversion = conversion;

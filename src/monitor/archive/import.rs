@@ -17,7 +17,7 @@ use crate::monitor::replay::Replay;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::archive::{Acknowledged, ArchivedModel, Batch, Record};
+use crate::store::archive::{Acknowledged, ArchivedAction, ArchivedModel, Batch, Record};
 
 /// Lines buffered between the file and the store.
 const BUFFERED: usize = 64;
@@ -44,6 +44,10 @@ pub struct Imported {
     pub maintenance_windows: u64,
     /// Acknowledgements whose alarm exists and was not acknowledged before.
     pub acknowledgements: u64,
+    /// Comments, assignments, closings and reopenings of alarms that were new.
+    pub alarm_actions: u64,
+    /// Notes that were new.
+    pub notes: u64,
     /// Warnings for the user.
     pub warnings: Vec<String>,
 }
@@ -57,6 +61,7 @@ pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) ->
         assessor,
         replay,
         acknowledgements: Vec::new(),
+        actions: Vec::new(),
         waiting: Vec::new(),
         simulator: None,
         done: Imported {
@@ -68,6 +73,8 @@ pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) ->
             undamaged_states: 0,
             maintenance_windows: 0,
             acknowledgements: 0,
+            alarm_actions: 0,
+            notes: 0,
             warnings: Vec::new(),
         },
     };
@@ -108,6 +115,7 @@ struct Import<'a> {
     simulator: Option<Simulator>,
     waiting: Vec<(String, MeasurementBatch, Timestamp)>,
     acknowledgements: Vec<Acknowledged>,
+    actions: Vec<ArchivedAction>,
     done: Imported,
 }
 
@@ -147,6 +155,10 @@ impl Import<'_> {
                     u64::from(store.archive().import_maintenance(&structure, window).await?);
             }
             Record::Acknowledgement(note) => self.acknowledgements.push(note),
+            Record::AlarmAction(action) => self.actions.push(action),
+            Record::Note(note) => {
+                self.done.notes += u64::from(store.archive().import_note(&structure, note).await?);
+            }
         }
         Ok(())
     }
@@ -190,7 +202,7 @@ impl Import<'_> {
         Ok(())
     }
 
-    /// Assesses the batches with the imported trained baseline, and stores the acknowledgements of the alarms that this raises.
+    /// Assesses the batches with the imported trained baseline, and stores what people did with the alarms that this raises.
     async fn finish(mut self) -> Result<Imported, ImportError> {
         self.store_waiting().await?;
         let structure = self.done.structure.clone();
@@ -215,6 +227,18 @@ impl Import<'_> {
         for acknowledgement in acknowledgements {
             self.done.acknowledgements +=
                 u64::from(self.assessor.store.archive().import_acknowledgement(&structure, acknowledgement).await?);
+        }
+        let mut lost = 0;
+        for action in std::mem::take(&mut self.actions) {
+            match self.assessor.store.archive().import_action(&structure, action).await? {
+                Some(new) => self.done.alarm_actions += u64::from(new),
+                None => lost += 1,
+            }
+        }
+        if lost > 0 {
+            let warning =
+                format!("{lost} comments and other actions have no alarm here: alarms are computed again on import");
+            self.done.warnings.push(warning);
         }
         Ok(self.done)
     }

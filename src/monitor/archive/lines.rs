@@ -31,9 +31,9 @@ pub(super) fn check_whole(path: &Path) -> Result<Head, ImportError> {
             return Err(incomplete("something follows its last line"));
         }
         match (number, record) {
-            (1, Record::Archive(found)) if found.format == FORMAT => head = Some(found),
+            (1, Record::Archive(found)) if (1..=FORMAT).contains(&found.format) => head = Some(found),
             (1, Record::Archive(found)) => {
-                let reason = format!("it has format {}, but this program reads format {FORMAT}", found.format);
+                let reason = format!("it has format {}, but this program reads formats 1 to {FORMAT}", found.format);
                 return Err(ImportError::Line { line: 1, reason });
             }
             (1, _) => return Err(incomplete("its first line is missing")),

@@ -1,11 +1,13 @@
 //! The computations behind the jobs: the diagnosis of measurements, and the training of an extension.
 
 use std::collections::BTreeSet;
+use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
-use super::progress::Progress;
+use super::queue::Queue;
+use super::watch::Watch;
 use crate::baseline::extension::{ExtensionPlan, Progress as TrainingProgress};
 use crate::baseline::train::Trained;
 use crate::baseline::Baseline;
@@ -65,7 +67,7 @@ impl DiagnosisRequest {
 }
 
 /// How an extension is trained.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ExtensionTraining {
     /// Number of simulated pairs; `None` for a number that follows from the training of the present baseline.
     pub samples: Option<usize>,
@@ -87,7 +89,7 @@ pub(super) struct Study {
     /// Times of the measurements in the declared undamaged reference.
     pub(super) undamaged: BTreeSet<Timestamp>,
     pub(super) request: DiagnosisRequest,
-    pub(super) progress: Progress,
+    pub(super) queue: Queue,
 }
 
 /// A trained extension of a structure.
@@ -125,22 +127,17 @@ impl Study {
         let simulator = Simulator::new(definition).map_err(|e| e.to_string())?;
         let ExtensionTraining { samples, epochs, from_scratch, accept_uncalibrated: _, learned: _ } = training;
         let plan = ExtensionPlan { parent: before, from_scratch, samples, epochs, seed: self.request.seed };
-        let trained = plan.train(&simulator, &mut |progress| match progress {
-            TrainingProgress::Start(how) => {
-                info!(structure.id = %simulator.id(), diagnosis = %self.id, "Extension of {}: {how}", simulator.id());
+        let mut watch = Watch::new();
+        let trained = plan.train(&simulator, &mut |progress| {
+            if let TrainingProgress::Start(what) | TrainingProgress::Round(what) = &progress {
+                info!(structure.id = %simulator.id(), diagnosis = %self.id, "Extension of {}: {what}", simulator.id());
             }
-            TrainingProgress::Epoch { report, epochs } => {
-                self.progress.report(&self.id, format!("training: epoch {} of {epochs}", report.epoch));
-            }
-            TrainingProgress::Calibration { round } => {
-                self.progress.report(&self.id, format!("training: calibration of round {round}"));
-            }
-            TrainingProgress::Round(why) => {
-                info!(structure.id = %simulator.id(), diagnosis = %self.id, "Extension of {}: {why}", simulator.id());
-                self.progress.report(&self.id, format!("training: {why}"));
+            if let Some(mut report) = watch.report(&progress, Instant::now()) {
+                report.what = format!("training, {}", report.what);
+                self.queue.report(&self.id, report);
             }
         });
-        self.progress.report(&self.id, "switching");
+        self.queue.report(&self.id, "switching".to_owned());
         Ok(TrainedExtension { added, left_out, simulator, trained: trained.map_err(|e| e.to_string())? })
     }
 
@@ -148,7 +145,7 @@ impl Study {
         let ordered = Ordered::of(&self.measurements);
         let used: Vec<ModalMeasurement> = ordered.kept.iter().map(|index| self.measurements[*index].clone()).collect();
         let data = Data::new(&self.simulator, &used).with_undamaged(&self.undamaged);
-        let progress = |step: Step| self.progress.report(&self.id, step.to_string());
+        let progress = |step: Step| self.queue.report(&self.id, step.to_string());
         let outcome = diagnose(&self.simulator, &data, &self.request.holdout, self.request.seed, &progress);
         let mut outcome = outcome.map_err(|e| e.to_string())?;
         let notes = self.request.period_in_words().into_iter().chain(self.left_out(&ordered)).chain(ordered.notes);

@@ -46,7 +46,7 @@ type StateRow =
     (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>, Option<String>, Option<String>);
 
 /// The error of an export whose receiver was dropped while records were still to be sent.
-fn receiver_dropped<T>(_: T) -> Error {
+pub(super) fn receiver_dropped<T>(_: T) -> Error {
     Error::Row { what: "archive", detail: "the receiver of the export was dropped".to_owned() }
 }
 
@@ -89,7 +89,8 @@ impl Archive<'_> {
         }
         self.export_batches(structure, records).await?;
         self.export_states(structure, records).await?;
-        self.export_notes(structure, records).await
+        self.export_notes(structure, records).await?;
+        self.export_people(structure, records).await
     }
 
     async fn export_batches(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {

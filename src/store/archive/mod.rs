@@ -9,18 +9,23 @@
 //!  {"record":"undamaged_state", …}
 //!  {"record":"maintenance", …}
 //!  {"record":"acknowledgement", …}
+//!  {"record":"alarm_action", …}      comments, assignees, closings and reopenings, in their order
+//!  {"record":"note", …}              notes on the time line
 //!  {"record":"end", …}                count and SHA-256 of all lines before
 //! ```
+//!
+//! The first line states the version of the format: 2, or 1 for archives without actions and notes, which are read as well.
 //!
 //! Assessments, charts and alarms are not part of it, because the importing installation computes them again from these data
 //! with the same seeds.
 
 mod export;
 mod import;
+mod people;
 mod record;
 
 pub use export::Archive;
 pub use record::{
-    Acknowledged, ArchivedModel, Batch, End, Head, Maintenance, Measurement, Record, Structure, Undamaged,
-    UndamagedQuantity, Version, FORMAT, NOT_CARRIED,
+    Acknowledged, ArchivedAction, ArchivedModel, ArchivedNote, Batch, End, Head, Maintenance, Measurement, Record,
+    Structure, Undamaged, UndamagedQuantity, Version, FORMAT, NOT_CARRIED,
 };

@@ -10,8 +10,8 @@ use sqlx::FromRow;
 use crate::measurement::CovariateValue;
 use crate::quantity::StructureId;
 
-/// Version of the format.
-pub const FORMAT: u32 = 1;
+/// Version of the format. Version 2 added actions on alarms and notes; version 1 is read as well.
+pub const FORMAT: u32 = 2;
 
 /// What an archive does not contain, as its first line says.
 pub const NOT_CARRIED: &str =
@@ -38,6 +38,10 @@ pub enum Record {
     Maintenance(Maintenance),
     /// An acknowledgement of an alarm.
     Acknowledgement(Acknowledged),
+    /// An action of a person on an alarm.
+    AlarmAction(ArchivedAction),
+    /// A note on the time line.
+    Note(ArchivedNote),
     /// The last line.
     End(End),
 }
@@ -231,6 +235,54 @@ pub struct Acknowledged {
     pub by: String,
     /// Their note.
     pub note: Option<String>,
+}
+
+/// An action on an alarm, with the properties that identify the alarm.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ArchivedAction {
+    /// Kind of the alarm.
+    pub alarm_kind: String,
+    /// Series of the alarm.
+    pub series: String,
+    /// Batch that opened the alarm.
+    pub opened_batch: String,
+    /// When the alarm was opened.
+    pub opened_at: String,
+    /// When it ended.
+    pub ended_at: Option<String>,
+    /// Unique id of the action.
+    pub uid: String,
+    /// `comment`, `assignment`, `closing` or `reopening`.
+    pub kind: String,
+    /// When it was done.
+    pub at: String,
+    /// By whom.
+    pub author: String,
+    /// Comment or explanation.
+    pub text: Option<String>,
+    /// Reason of a closing.
+    pub reason: Option<String>,
+    /// Assignee of an assignment; none for nobody.
+    pub assignee: Option<String>,
+}
+
+/// A note on the time line.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ArchivedNote {
+    /// Its id.
+    pub note: String,
+    /// The moment, or the beginning of the period.
+    pub from: String,
+    /// End of the period; none for a moment.
+    pub to: Option<String>,
+    /// The text.
+    pub text: String,
+    /// Who wrote it.
+    pub author: String,
+    /// When it was written.
+    pub created_at: String,
 }
 
 /// The last line.

@@ -22,8 +22,8 @@ fn space() -> &'static ParameterSpace {
 
 fn covariates() -> [Covariate; 2] {
     [
-        Covariate { name: "temperature_c".to_owned(), kind: CovariateKind::Number },
-        Covariate { name: "Operator".to_owned(), kind: CovariateKind::Category },
+        Covariate::new("temperature_c", CovariateKind::Number),
+        Covariate::new("Operator", CovariateKind::Category),
     ]
 }
 

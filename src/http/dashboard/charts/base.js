@@ -36,7 +36,8 @@ const axis = (more) => ({
 
 /** The time axis; without labels if a chart below shows them. */
 export function timeAxis(labels = true) {
-  return axis({ values: labels ? timeLabels : () => [], size: labels ? 40 : 8, space: 74 });
+  const size = (u, words) => (words?.some((word) => word.includes("\n")) ? 40 : 26);
+  return axis({ values: labels ? timeLabels : () => [], size: labels ? size : 8, space: 74 });
 }
 
 /** An axis of numbers with its unit. */
@@ -137,17 +138,23 @@ export function chart(parent, options, data, keyboard = parent) {
   const place = document.createElement("div");
   parent.append(place);
   const { select, ...rest } = options;
+  const common = { legend: { show: false }, padding: [8, 10, 0, 0], ...rest };
   const u = new uPlot(
     {
+      ...common,
       width: Math.max(120, parent.clientWidth || 300),
-      legend: { show: false },
-      padding: [8, 10, 0, 0],
-      ...rest,
       cursor: { y: false, points: { size: 7 }, drag: { x: false, y: false }, ...rest.cursor },
     },
     data,
     place,
   );
+  /** The same chart once more, without cursor and outside the page, for a file. */
+  const copy = () => {
+    const { drawClear, draw } = rest.hooks ?? {};
+    const hooks = Object.fromEntries(Object.entries({ drawClear, draw }).filter(([, list]) => list));
+    const size = { width: u.width, height: u.height };
+    return new uPlot({ ...common, ...size, hooks, cursor: { show: false } }, data, document.createElement("div"));
+  };
   const resize = new ResizeObserver(() => {
     if (parent.clientWidth > 0 && Math.abs(parent.clientWidth - u.width) > 0.5)
       u.setSize({ width: parent.clientWidth, height: u.height });
@@ -181,14 +188,25 @@ export function chart(parent, options, data, keyboard = parent) {
   }
   const end = () => {
     if (!liveCharts.delete(end)) return;
+    place.remove();
+    drawn.delete(place);
     resize.disconnect();
     window.removeEventListener("theme", recolour);
     keyboard?.removeEventListener("keydown", move);
     u.destroy();
-    place.remove();
   };
+  drawn.set(place, { copy, u });
   liveCharts.add(end);
   return { u, end };
+}
+
+/** The charts by their elements. */
+const drawn = new Map();
+
+/** The charts of a plot from top to bottom, for a file: `{copy, width, height}`. */
+export function chartsIn(plot) {
+  const charts = [...plot.children].map((place) => drawn.get(place)).filter(Boolean);
+  return charts.map(({ copy, u }) => ({ copy, width: u.width, height: u.height }));
 }
 
 /** `end` functions of all charts on the page. */

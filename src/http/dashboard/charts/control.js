@@ -5,6 +5,7 @@ import { count, local, number, timeElement, words } from "../format.js";
 import { stateChip, urgency } from "../states.js";
 import { chart, curve, draw, mark, merged, rule, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
 import { figure } from "./figure.js";
+import { drawNotes } from "./notes.js";
 import { FIT_CHART, JOINT_CHART, alarmSpans } from "./parameters.js";
 import { colour } from "./theme.js";
 
@@ -18,6 +19,7 @@ const KEYS = [
   { mark: "ring", text: "chart not updated (rejected batch or maintenance)" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
+  { mark: "note-flag", text: "note" },
 ];
 
 const label = (chart) =>
@@ -49,6 +51,7 @@ export function control(group, selectBatch) {
   const frame = figure({
     name: "control",
     title: "Control chart",
+    term: "control chart",
     keys: KEYS,
     tools: picker,
   });
@@ -119,7 +122,7 @@ export function control(group, selectBatch) {
         });
       });
     const options = merged(group.options(), {
-      height: 260,
+      height: 230,
       select: (index) => filled.origin[index] >= 0 && selectBatch(c.batches[filled.origin[index]]),
       series: [
         {},
@@ -134,6 +137,7 @@ export function control(group, selectBatch) {
         drawClear: [
           (u) => {
             shade(u, windows, "maintenance");
+            drawNotes(u, series.notes);
             shade(u, alarms, "bad", { opacity: 0.16 });
             shade(u, filled.gaps, "ink-soft", { striped: true });
             for (const r of series.references) rule(u, seconds(r.from), "ink-soft", [2, 4], "x");
@@ -160,6 +164,26 @@ export function control(group, selectBatch) {
         `${number(c.shift[last], 3)} ${name.unit} (limit ${number(c.shift_limit[last], 3)}); ${count(alarms.length, "alarm")} in this time span. ` +
         "Use the arrow keys to read the values and Enter to open the batch.",
     );
+    frame.record(() => ({
+      columns: [
+        "time",
+        `${name.one} (${name.unit})`,
+        `limit of the ${name.one} (${name.unit})`,
+        `${name.several} (${name.unit})`,
+        `limit of the ${name.several} (${name.unit})`,
+        "state",
+        "batch",
+      ],
+      rows: c.times.map((time, i) => [
+        time,
+        c.shift[i],
+        c.shift_limit[i],
+        c.ewma[i],
+        c.ewma_limit[i],
+        stateOf(i),
+        c.batches[i],
+      ]),
+    }));
     frame.tabulate(() => ({
       columns: [
         "Time",

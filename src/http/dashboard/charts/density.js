@@ -4,26 +4,27 @@ import { h } from "../dom.js";
 import { number, quantity } from "../format.js";
 import { acrossAxis, band, chart, curve, draw, edge, rule, valueAxis } from "./base.js";
 import { figure, keyList } from "./figure.js";
+import { help } from "../help.js";
 import { colour } from "./theme.js";
 
 const KEYS = [
   { mark: "band-1", text: "this batch" },
   { mark: "line-3-dash", text: "undamaged reference" },
   { mark: "dash", text: "prior" },
-  { mark: "dash-bad", text: "threshold δ" },
+  { mark: "dash-bad", text: "damage threshold δ" },
 ];
 
 export function densities() {
   const grid = h("div", { class: "grid three", dataset: { figures: "densities" } });
   let charts = [];
   return {
-    element: h("div", { class: "stack" }, h("h3", null, "Probability densities"), keyList(KEYS), grid),
+    element: h("div", { class: "stack" }, h("div", { class: "figure-title" }, h("h3", null, "Probability densities"), help("posterior")), keyList(KEYS), grid),
     update(detail) {
       charts.forEach((c) => c.end());
       charts = [];
       grid.replaceChildren();
       for (const p of detail?.parameters ?? []) {
-        const frame = figure({ name: `density-${p.name}`, title: p.name, level: "h4" });
+        const frame = figure({ name: `density-${p.name}`, title: p.name, level: "h4", fileKeys: KEYS });
         grid.append(frame.element);
         if (p.grid.length === 0) {
           frame.empty("No samples for this parameter.");
@@ -81,6 +82,14 @@ function densityChart(frame, p) {
       `${p.undamaged ? `, the undamaged reference at ${quantity(peak(p.undamaged), unit)}` : ""}` +
       `${p.threshold === null || p.threshold === undefined ? "" : `; threshold δ ${quantity(p.threshold, unit)}`}. Use the arrow keys to read the values.`,
   );
+  const perUnit = unit ? `1/(${unit})` : "1";
+  frame.record(() => ({
+    columns: [
+      unit ? `${p.name} (${unit})` : p.name,
+      ...["this batch", "undamaged reference", "prior"].map((words) => `density of ${words} (${perUnit})`),
+    ],
+    rows: p.grid.map((x, i) => [x, p.posterior[i], undamaged[i], p.prior[i]]),
+  }));
   frame.tabulate(() => ({
     columns: [unit ? `${p.name} (${unit})` : p.name, "This batch", "Undamaged reference", "Prior"],
     rows: p.grid.map((x, i) => [

@@ -1,6 +1,9 @@
 // The frame of every chart: title, legend, plot, a line with the values at the cursor, and the data as a table.
 
-import { fill, h, icon } from "../dom.js";
+import { fill, h, icon, notify } from "../dom.js";
+import { help } from "../help.js";
+import { chartsIn } from "./base.js";
+import { csv, download, figureSvg, fileName, png } from "./save.js";
 
 /** Maximum number of rows of a table; a longer table is cut, and its caption says so. */
 const MOST_ROWS = 500;
@@ -19,9 +22,11 @@ export function keyList(keys) {
 /**
  * Creates a figure. `keys` are the legend entries `{mark, text}`; marks are classes of `figures.css`. Returns the `element`,
  * the `plot` to draw in, `explain(text)` (another hint), and `summarise(text)` (for screen readers), `read(nodes)` (values at the cursor), `empty(text)`
- * (why there is no plot, or `null`), `tabulate(() => ({columns, rows, newestLast}))`.
+ * (why there is no plot, or `null`), `tabulate(() => ({columns, rows, newestLast}))`, and `record(() => ({columns, rows}))`: exactly the
+ * numbers that are plotted, with units in the names of the columns, for a file. `term` is an entry of the glossary; `fileKeys` is the
+ * legend in files if the page shows it elsewhere.
  */
-export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
+export function figure({ title, hint, keys = [], fileKeys = keys, name, level = "h3", tools, term }) {
   numbering += 1;
   const id = `figure-${numbering}`;
   const plot = h("div", {
@@ -48,17 +53,51 @@ export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
     icon("table"),
     "Show as table",
   );
+  let makeRecord = null;
+  const save = (format) => async () => {
+    menu.open = false;
+    menu.firstChild.focus();
+    const structure = element.closest("[data-structure]")?.dataset.structure;
+    const heading = structure ? `${structure}: ${title}` : title;
+    const file = `${fileName(heading)}.${format}`;
+    try {
+      if (format === "csv") return download(file, "text/csv", csv(makeRecord()));
+      const svg = await figureSvg({ title: heading, keys: fileKeys, charts: chartsIn(plot) });
+      if (format === "svg") download(file, "image/svg+xml", svg);
+      else download(file, "image/png", await png(svg));
+    } catch (error) {
+      console.error(error);
+      notify(`The file could not be made: ${error.message}`, "error");
+    }
+  };
+  const choice = (format, words) =>
+    h("button", { type: "button", class: "quiet", dataset: { format }, onclick: save(format) }, words);
+  const menu = h(
+    "details",
+    { class: "menu" },
+    h("summary", null, icon("save"), "Save", h("span", { class: "hidden-text" }, ` ${title}`)),
+    h("div", { class: "menu-items" }, choice("png", "PNG"), choice("svg", "SVG"), choice("csv", "CSV (the plotted numbers)")),
+  );
+  menu.addEventListener("focusout", (event) => {
+    if (event.relatedTarget && !menu.contains(event.relatedTarget)) menu.open = false;
+  });
   const legend = keyList(keys);
   const explanation = h("p", { class: "fine", hidden: !hint }, hint ?? "");
   const element = h(
     "figure",
     { class: "figure", dataset: { figure: name } },
-    h("figcaption", null, h(level, { id: `${id}-title` }, title), explanation, tools),
+    h(
+      "figcaption",
+      null,
+      h("div", { class: "figure-title" }, h(level, { id: `${id}-title` }, title), term && help(term)),
+      explanation,
+      tools,
+    ),
     legend,
     note,
     plot,
     summary,
-    h("div", { class: "below" }, toggle, readout),
+    h("div", { class: "below" }, toggle, menu, readout),
     table,
   );
 
@@ -125,8 +164,10 @@ export function figure({ title, hint, keys = [], name, level = "h3", tools }) {
       plot.hidden = Boolean(text);
       legend.hidden = Boolean(text) || keys.length === 0;
       toggle.hidden = Boolean(text);
+      menu.hidden = Boolean(text);
       if (text) fill(plot);
     },
+    record: (make) => (makeRecord = make),
     tabulate: (make) => {
       makeTable = make;
       drawTable();

@@ -17,6 +17,7 @@ export function heat(group, selectBatch) {
   const frame = figure({
     name: "heat",
     title: "Probability of damage over time, all parameters",
+    term: "probability of damage",
     keys: [
       ...ends.map((end, i) => ({ mark: `heat-${i}`, text: i === 0 ? `up to ${end} %` : `${ends[i - 1]} to ${end} %` })),
       { mark: "cross", text: "withheld: batch rejected" },
@@ -123,6 +124,10 @@ export function heat(group, selectBatch) {
         `${count(rows.length, "parameter")} over ${count(columns.length, "batch", "batches")} to ${local(latest.time)}. ` +
           `Highest in the latest batch: ${rows[most].name} ${describe(latest, most)}. Use the arrow keys to read the values and Enter to open the batch.`,
       );
+      frame.record(() => ({
+        columns: ["time", ...rows.map((p) => `probability of damage of ${p.name} (1)`), "batch"],
+        rows: columns.map((c) => [c.time, ...rows.map((_, r) => c.values[r]), c.batch]),
+      }));
       frame.tabulate(() => ({
         columns: ["Time", ...rows.map((p) => p.name)],
         rows: columns.map((c) => [timeElement(c.time), ...rows.map((_, r) => describe(c, r))]),

@@ -80,6 +80,16 @@ export function modes() {
         return row ? `${label(row)}: ${describe(row)}` : "";
       }
       frame.summarise(`${rows.map((row) => `${label(row)}: ${describe(row)}`).join("; ")}.`);
+      frame.record(() => ({
+        columns: [
+          "mode",
+          "measurement",
+          "deviation from the prediction (%)",
+          "lower end of the predicted 90 % interval (%)",
+          "upper end of the predicted 90 % interval (%)",
+        ],
+        rows: rows.flatMap((row) => row.measured.map((value, n) => [row.mode, n + 1, value, row.low, row.high])),
+      }));
       frame.tabulate(() => ({
         columns: [
           "Mode",

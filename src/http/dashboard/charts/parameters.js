@@ -19,19 +19,22 @@ import {
   withGaps,
 } from "./base.js";
 import { figure, keyList } from "./figure.js";
+import { drawNotes } from "./notes.js";
+import { help } from "../help.js";
 import { colour } from "./theme.js";
 import { paddedRange } from "./tracks.js";
 
 const KEYS = [
   { mark: "line-1", text: "mean" },
   { mark: "band-1", text: "90 % interval" },
-  { mark: "dash-bad", text: "threshold δ" },
+  { mark: "dash-bad", text: "damage threshold δ" },
   { mark: "dash", text: "mean of the reference" },
   { mark: "line-2", text: "probability of damage" },
   { mark: "dash-2", text: "probability in the reference" },
   { mark: "cross", text: "withheld: batch rejected" },
   { mark: "alarm-span", text: "alarm" },
   { mark: "maintenance-span", text: "maintenance" },
+  { mark: "note-flag", text: "note" },
 ];
 
 /** Name of the control chart for the fit of the simulation; all other charts have the name of their parameter. */
@@ -64,7 +67,7 @@ export function parameters(group, selectBatch) {
   const grid = h("div", { class: "grid", dataset: { figures: "parameters" } });
   const made = new Map();
   return {
-    element: h("div", { class: "stack" }, h("h3", null, "Parameters and probability of damage"), keyList(KEYS), grid),
+    element: h("div", { class: "stack" }, h("div", { class: "figure-title" }, h("h3", null, "Parameters and probability of damage"), help("probability of damage")), keyList(KEYS), grid),
     update(series, usual) {
       const names = series.parameters.map((p) => p.name);
       for (const [name, one] of made) {
@@ -87,7 +90,7 @@ export function parameters(group, selectBatch) {
 }
 
 function parameterFigure(group, { name, unit }, selectBatch) {
-  const frame = figure({ name: `parameter-${name}`, title: name, level: "h4" });
+  const frame = figure({ name: `parameter-${name}`, title: name, level: "h4", fileKeys: KEYS });
   let charts = [];
   const end = () => {
     charts.forEach((c) => c.end());
@@ -113,6 +116,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
     const windows = series.maintenance.map((w) => [seconds(w.from), seconds(w.to)]);
     const background = (u) => {
       shade(u, windows, "maintenance");
+            drawNotes(u, series.notes);
       shade(u, alarms, "bad", { opacity: 0.16 });
       shade(u, filled.gaps, "ink-soft", { striped: true });
     };
@@ -121,7 +125,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
     const include = [p.threshold, p.undamaged_mean].filter((v) => v !== null && v !== undefined);
 
     const above = merged(group.options(), {
-      height: 190,
+      height: 175,
       select,
       series: [{}, curve("curve-1", { points }), edge(), edge()],
       bands: [band(3, 2, "curve-1", 0.22)],
@@ -146,7 +150,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
     const isWithheld = (row) => row >= 0 && rejected.has(p.batches[row]);
     const withheld = filled.times.filter((_, i) => pod[i] === null && isWithheld(filled.origin[i]));
     const below = merged(group.options(), {
-      height: 150,
+      height: 135,
       select,
       series: [{}, curve("curve-2", { points }), edge(), edge()],
       bands: [band(3, 2, "curve-2", 0.22)],
@@ -194,6 +198,33 @@ function parameterFigure(group, { name, unit }, selectBatch) {
         `${last === null || last === undefined ? "not available" : percent(last)}; withheld for ${count(withheld.length, "batch", "batches")}. ` +
         "Use the arrow keys to read the values and Enter to open the batch.",
     );
+    const inUnit = (words) => (p.unit ? `${words} (${p.unit})` : words);
+    frame.record(() => ({
+      columns: [
+        "time",
+        inUnit(`mean of ${name}`),
+        inUnit("lower end of its 90 % interval"),
+        inUnit("upper end of its 90 % interval"),
+        "probability of damage (1)",
+        "lower end of its 90 % interval (1)",
+        "upper end of its 90 % interval (1)",
+        inUnit("damage threshold"),
+        inUnit("mean of the undamaged reference"),
+        "batch",
+      ],
+      rows: p.times.map((time, i) => [
+        time,
+        p.mean[i],
+        p.low[i],
+        p.high[i],
+        p.probability_of_damage[i],
+        p.pod_low[i],
+        p.pod_high[i],
+        p.threshold,
+        p.undamaged_mean,
+        p.batches[i],
+      ]),
+    }));
     frame.tabulate(() => ({
       columns: [
         "Time",
@@ -222,7 +253,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
   return { element: frame.element, update, end };
 }
 
-const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;
+export const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;
 
 /** The values of a parameter in a unit with a prefix, so that they are easy to read. */
 function inReadableUnit(p, unit) {

@@ -3,11 +3,12 @@
 import { count, local, number, quantity, timeElement } from "../format.js";
 import { GAP_SHARE, chart, curve, draw, fewPoints, mark, merged, seconds, shade, timeAxis, valueAxis } from "./base.js";
 import { figure } from "./figure.js";
+import { drawNotes } from "./notes.js";
 import { colour } from "./theme.js";
 
 const LANE_PX = 112;
 
-/** Units by the suffix of the name of a covariate. */
+/** Units by the end of the name of a covariate, which is left out where the label names the unit. */
 const UNITS = {
   c: "°C",
   k: "K",
@@ -26,13 +27,14 @@ const UNITS = {
   s: "s",
 };
 
-function covariateLabel(name) {
+/** The label of a covariate with its unit, which is stated in the structure file or at the end of the name. */
+export function covariateLabel(name, unit) {
   const cut = name.lastIndexOf("_");
-  const unit = name.endsWith("m_per_s") ? "m/s" : UNITS[name.slice(cut + 1)];
+  const ending = name.endsWith("m_per_s") ? "m/s" : UNITS[name.slice(cut + 1)];
   const rest = name.endsWith("m_per_s") ? name.slice(0, -8) : name.slice(0, cut);
-  return unit && cut > 0
-    ? { label: `${rest.replaceAll("_", " ")} (${unit})`, unit }
-    : { label: name.replaceAll("_", " "), unit: "" };
+  const plain = cut > 0 && unit && unit === ending ? rest : name;
+  const words = plain.replaceAll("_", " ");
+  return { label: unit ? `${words} (${unit})` : words, unit: unit ?? "" };
 }
 
 /** Values of mode `m` in all measurements of the series. */
@@ -42,6 +44,7 @@ export function tracks(group) {
   const frame = figure({
     name: "tracks",
     title: "Measured frequencies and covariates",
+    term: "covariate",
     hint: "One panel per mode. Drag to zoom, double-click to reset.",
     keys: [
       { mark: "line-1", text: "frequency (Hz)" },
@@ -55,7 +58,7 @@ export function tracks(group) {
 
   return {
     element: frame.element,
-    update({ frequencies, maintenance, reduced }) {
+    update({ frequencies, maintenance, notes, reduced }) {
       charts.forEach((c) => c.end());
       charts = [];
       const times = frequencies?.times.map(seconds) ?? [];
@@ -63,6 +66,7 @@ export function tracks(group) {
       frame.empty(null);
       const modes = Array.from({ length: frequencies.modes }, (_, m) => lane(frequencies, m));
       const covariates = Object.entries(frequencies.covariates ?? {});
+      const units = frequencies.covariate_units ?? {};
       const isPause = times.map((_, i) =>
         [...modes, ...covariates.map(([, values]) => values)].every((values) => (values[i] ?? null) === null),
       );
@@ -83,7 +87,7 @@ export function tracks(group) {
           colour: "curve-1",
           missing: true,
         })),
-        ...covariates.map(([name, values]) => ({ ...covariateLabel(name), values, colour: "curve-3" })),
+        ...covariates.map(([name, values]) => ({ ...covariateLabel(name, units[name]), values, colour: "curve-3" })),
       ];
       lanes.forEach((one, index) => {
         const last = index === lanes.length - 1;
@@ -98,6 +102,7 @@ export function tracks(group) {
               (u) => {
                 shade(u, gaps, "ink-soft", { striped: true });
                 shade(u, windows, "maintenance");
+            drawNotes(u, notes);
               },
             ],
             draw: [
@@ -118,7 +123,7 @@ export function tracks(group) {
         const values = modes.map(
           (values, m) => `mode ${m + 1} ${values[row] === null ? "not identified" : quantity(values[row], "Hz", 5)}`,
         );
-        const covariateValues = covariates.map(([name, values]) => `${name} ${number(values[row])}`);
+        const covariateValues = covariates.map(([name, values]) => `${name} ${quantity(values[row], units[name])}`);
         return [timeElement(frequencies.times[row]), ` · ${[...values, ...covariateValues].join(" · ")}`];
       }
       const missing = modes.reduce((sum, values) => sum + values.filter((v, i) => v === null && !isPause[i]).length, 0);
@@ -127,8 +132,14 @@ export function tracks(group) {
           `${local(frequencies.times[0])} to ${local(frequencies.times.at(-1))}; ${count(missing, "value")} not identified, ` +
           `${count(gaps.length, "long pause")}. Use the arrow keys to read the values.`,
       );
+      frame.record(() => ({
+        columns: ["time", ...modes.map((_, m) => `mode ${m + 1} (Hz)`), ...covariates.map(([name]) => covariateLabel(name, units[name]).label)],
+        rows: frequencies.times.flatMap((time, i) =>
+          isPause[i] ? [] : [[time, ...modes.map((v) => v[i]), ...covariates.map(([, v]) => v[i])]],
+        ),
+      }));
       frame.tabulate(() => ({
-        columns: ["Time", ...modes.map((_, m) => `Mode ${m + 1} (Hz)`), ...covariates.map(([name]) => name)],
+        columns: ["Time", ...modes.map((_, m) => `Mode ${m + 1} (Hz)`), ...covariates.map(([name]) => covariateLabel(name, units[name]).label)],
         rows: frequencies.times.flatMap((time, i) =>
           isPause[i]
             ? []

@@ -3,6 +3,7 @@
 import { count, local, number, timeElement, words } from "../format.js";
 import { LEFT, chart, draw, mark, merged, seconds, shade, timeAxis, valueAxis } from "./base.js";
 import { figure } from "./figure.js";
+import { drawNotes } from "./notes.js";
 import { colour } from "./theme.js";
 
 const ROWS = ["rejected", "findings", "accepted"];
@@ -18,6 +19,7 @@ export function trust(group, selectBatch) {
   const frame = figure({
     name: "trust",
     title: "Trust and data quality",
+    term: "trust",
     keys: [
       { mark: "dot-good", text: "accepted" },
       { mark: "triangle-warn", text: "accepted, with findings" },
@@ -28,7 +30,7 @@ export function trust(group, selectBatch) {
 
   return {
     element: frame.element,
-    update({ trust: items, maintenance }) {
+    update({ trust: items, maintenance, notes }) {
       one?.end();
       one = null;
       if (items.length === 0) return frame.empty("No assessed batch in this time span.");
@@ -54,7 +56,7 @@ export function trust(group, selectBatch) {
         axes: [timeAxis(), valueAxis(null, { splits: () => [0.5, 1.5, 2.5], values: () => ROWS, size: LEFT })],
         scales: { y: { range: [0, 3] } },
         hooks: {
-          drawClear: [(u) => shade(u, windows, "maintenance")],
+          drawClear: [(u) => shade(u, windows, "maintenance"), (u) => drawNotes(u, notes)],
           draw: [paint],
           setCursor: [(u) => frame.read(readout(u))],
         },
@@ -76,6 +78,10 @@ export function trust(group, selectBatch) {
         `${count(items.length, "batch", "batches")} to ${local(items.at(-1).time)}: ${tally[2]} accepted, ${tally[1]} accepted with findings, ` +
           `${tally[0]} rejected. Use the arrow keys to read the values and Enter to open the batch.`,
       );
+      frame.record(() => ({
+        columns: ["time", "verdict", "findings", "p-value of the fit (1)", "batch"],
+        rows: items.map((item) => [item.time, item.verdict, item.findings.join(" "), item.p_value, item.batch]),
+      }));
       frame.tabulate(() => ({
         columns: ["Time", "Verdict", "Findings", "p-value of the fit"],
         rows: items.map((item) => [timeElement(item.time), item.verdict, findingText(item), number(item.p_value, 2)]),

@@ -5,7 +5,9 @@ import { densities } from "../charts/density.js";
 import { modes } from "../charts/modes.js";
 import { cell, fill, h, icon, problem } from "../dom.js";
 import { count, digest, local, number, percentWithin, quantity, timeElement, words } from "../format.js";
+import { help } from "../help.js";
 import { trustChip } from "../states.js";
+import { shapes } from "./shapes.js";
 
 const EFFECTS = {
   reject: ["cross", "bad", "batch rejected"],
@@ -21,7 +23,8 @@ export function batch(structure, onChoice) {
   const description = h("div", null);
   const density = densities();
   const mode = modes();
-  const drawn = h("div", { class: "stack" }, density.element, mode.element);
+  const shape = shapes(structure);
+  const drawn = h("div", { class: "stack" }, density.element, mode.element, shape.element);
   const element = h(
     "section",
     { id: "batch", class: "panel", "aria-labelledby": "batch-title" },
@@ -63,6 +66,7 @@ export function batch(structure, onChoice) {
       if (!detail.error) {
         density.update(detail);
         mode.update(detail);
+        await shape.update(id, detail.mode_shapes);
       }
     } catch (error) {
       if (id === chosen) fill(description, problem(error, show));
@@ -127,7 +131,7 @@ function describe(info) {
         "span",
         null,
         trustChip(a.trust, a.findings.length),
-        a.fit_p_value !== null ? ` p-value of the fit ${number(a.fit_p_value, 2)}` : "",
+        a.fit_p_value !== null ? [` fit: p = ${number(a.fit_p_value, 2)} `, help("p-value of the fit")] : "",
       ),
     ],
     a && ["Trained model", digest(a.model_digest)],
@@ -173,6 +177,13 @@ function finding(f) {
   );
 }
 
+/** Help at the columns that a newcomer may not know. */
+const COLUMN_HELP = {
+  "90 % interval": () => [" ", help("credible interval")],
+  "Damage threshold δ": () => [" ", help("damage threshold")],
+  "Probability of damage": () => [" ", help("probability of damage")],
+};
+
 function parameterTable(a) {
   const interval = (pair) => (pair ? `${number(pair[0])} to ${number(pair[1])}` : "–");
   const withheld = a.trust === "rejected";
@@ -183,7 +194,7 @@ function parameterTable(a) {
       h("th", { scope: "row" }, p.name),
       cell("Mean", quantity(p.mean, p.unit)),
       cell("90 % interval", interval(p.mean_interval)),
-      cell("Threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
+      cell("Damage threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
       cell("Change from reference", p.relative_change === null ? "–" : `${number(100 * p.relative_change, 3)} %`),
       cell(
         "Probability of damage",
@@ -198,7 +209,7 @@ function parameterTable(a) {
     "Parameter",
     "Mean",
     "90 % interval",
-    "Threshold δ",
+    "Damage threshold δ",
     "Change from reference",
     "Probability of damage",
   ];
@@ -212,7 +223,7 @@ function parameterTable(a) {
       h(
         "tr",
         null,
-        columns.map((c) => h("th", { scope: "col" }, c)),
+        columns.map((c) => h("th", { scope: "col" }, c, COLUMN_HELP[c]?.())),
       ),
     ),
     h("tbody", null, a.parameters.map(line)),

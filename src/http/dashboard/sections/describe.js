@@ -20,16 +20,24 @@ spring = [
     { name = "storey3", from = "floor2", to = "roof", n_per_m = 7.0e7 },
 ]
 
-# What is unknown. The prior is the range in which the value can lie, damaged or not, in N/m.
+# What is unknown: a factor of the nominal stiffness (scale = true). The prior is the range in which it can lie, damaged or not:
+# here 0.5 to 1.4 times n_per_m. Results are in per cent of the nominal stiffness.
 [[parameter]]
 name = "storey1"
-prior = { uniform = [5.0e7, 1.2e8] }
+scale = true
+prior = { uniform = [0.5, 1.4] }
 sets = { spring = "storey1" }
 
 [[parameter]]
 name = "storey2"
-prior = { uniform = [4.0e7, 1.1e8] }
+scale = true
+prior = { uniform = [0.5, 1.4] }
 sets = { spring = "storey2" }
+
+# What is noted beside the frequencies.
+[[covariate]]
+name = "temperature"
+unit = "°C"
 `;
 
 const BRIDGE = `# A bridge of two spans with an elastic bearing on the pier.
@@ -55,11 +63,13 @@ support = "pinned"
 name = "west"
 from = "abutment"
 to = "pier"
+bending_stiffness_n_m2 = 4.0e8             # EI, N·m²
 mass_kg_per_m = 900.0
 [[beam]]
 name = "east"
 from = "pier"
 to = "end"
+bending_stiffness_n_m2 = 4.0e8
 mass_kg_per_m = 800.0
 
 [[spring]]
@@ -67,18 +77,22 @@ name = "bearing"
 from = "ground"
 to = "pier"
 
-# What is unknown. The prior is the range in which the value can lie, damaged or not.
+# What is unknown. With scale = true it is a factor of the nominal stiffness above, and its results are in per cent of that. The
+# prior is the range in which the value can lie, damaged or not.
 [[parameter]]
 name = "west_ei"
-prior = { uniform = [2.0e8, 6.0e8] }       # N·m²
+scale = true
+prior = { uniform = [0.5, 1.5] }
 sets = { beam = "west" }
 [[parameter]]
 name = "east_ei"
-prior = { uniform = [2.0e8, 6.0e8] }
+scale = true
+prior = { uniform = [0.5, 1.5] }
 sets = { beam = "east" }
+# The bearing is hardly known: its stiffness itself, N/m, without a nominal value.
 [[parameter]]
 name = "bearing"
-prior = { uniform = [0.5e7, 3.0e7] }       # N/m
+prior = { uniform = [0.5e7, 3.0e7] }
 sets = { spring = "bearing" }
 `;
 
@@ -118,5 +132,7 @@ export async function describe() {
   });
   if (!stored) return;
   notify(`Structure ${stored.id} has been stored. Next: train its model.`);
+  // Doubts such as a prior in factors where a stiffness is expected.
+  (stored.notes ?? []).forEach((note) => notify(`Please check: ${note}`, "error"));
   location.hash = `#/structures/${encodeURIComponent(stored.id)}?section=model`;
 }

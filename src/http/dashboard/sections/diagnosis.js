@@ -3,7 +3,8 @@
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
 import { age, words } from "../format.js";
-import { progress } from "../jobs.js";
+import { help } from "../help.js";
+import { controls, progress } from "../jobs.js";
 import { jobChip } from "../states.js";
 import { gainWords, isExtendable, latest, triggerWords } from "./latest.js";
 
@@ -27,26 +28,39 @@ function requestOf({ from, to, share, since }) {
   return request;
 }
 
+/** The request of an extension: empty fields are left out. */
+function extensionOf(values) {
+  const request = { from_scratch: "from_scratch" in values, accept_uncalibrated: "accept_uncalibrated" in values };
+  for (const name of ["samples", "epochs"]) {
+    const text = values[name].trim();
+    if (text === "") continue;
+    if (!/^[0-9]+$/.test(text)) throw new Error(`“${text}” is not a whole number of ${name}.`);
+    request[name] = Number(text);
+  }
+  return request;
+}
+
 export function diagnosis(structure, changed) {
   const content = h("div", null);
   const begin = h("button", { type: "button", onclick: () => diagnose() }, "Diagnose");
+  const whyNot = h("span", { class: "fine" });
   const back = h("button", { type: "button", class: "danger", onclick: () => stepBack() }, "Undo last extension");
   const element = h(
     "section",
     { id: "diagnosis", class: "panel", "aria-labelledby": "diagnosis-title" },
-    h("h2", { id: "diagnosis-title" }, "Diagnosis of the model"),
+    h("div", { class: "figure-title" }, h("h2", { id: "diagnosis-title" }, "Diagnosis of the model"), help("diagnosis")),
     h(
       "p",
       { class: "fine" },
       "A diagnosis shows where the simulation deviates from the measurements, identifies the cause, and quantifies the gain from modelling it.",
     ),
     content,
-    h("p", { class: "buttons start" }, begin, back),
+    h("p", { class: "buttons start" }, begin, whyNot, back),
   );
 
   const load = async () => {
     try {
-      const [{ items }, { digest }] = await Promise.all([read(at(structure, "/diagnoses")), read(at(structure))]);
+      const [{ items, not_possible: reason }, { digest }] = await Promise.all([read(at(structure, "/diagnoses")), read(at(structure))]);
       // The list lacks progress and gain; they are read for the newest diagnosis and for those that are running.
       const full = await Promise.all(
         items
@@ -54,6 +68,8 @@ export function diagnosis(structure, changed) {
           .map(async (item) => (isBusy(item) || item === items[0] ? { ...item, ...(await details(item)) } : item)),
       );
       card.update(full[0], digest);
+      begin.disabled = reason !== null;
+      whyNot.textContent = reason === null ? "" : `Not possible yet: ${reason}.`;
       back.hidden = !items.some((item) => item.extension === "done" || item.extension?.state === "done");
       refill(
         content,
@@ -69,6 +85,9 @@ export function diagnosis(structure, changed) {
     const answer = await read(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}`);
     return {
       progress: answer.progress,
+      share: answer.share,
+      time_left_s: answer.time_left_s,
+      place: answer.place,
       failure: answer.failure ?? answer.extension?.failure,
       version: answer.structure_digest,
       finished_at: answer.finished_at,
@@ -92,7 +111,7 @@ export function diagnosis(structure, changed) {
         item.verdict && h("strong", null, words(item.verdict), ". "),
         item.summary,
         item.gain && h("span", { class: "fine" }, icon("chart"), `Gain: ${gainWords(item.gain)}.`),
-        isBusy(item) && progress(item.progress ?? "waiting", "diagnosis"),
+        isBusy(item) && progress(item, "diagnosis"),
         item.extension === "done" &&
           h(
             "span",
@@ -102,6 +121,8 @@ export function diagnosis(structure, changed) {
         item.failure && h("span", { class: "fine bad-text" }, item.failure),
         h("span", { class: "fine" }, "started ", age(item.created_at), `, ${triggerWords(item)}`),
       ),
+      isBusy(item) &&
+        controls(item.diagnosis, item, item.extension === "running" ? "extension" : "diagnosis", () => load()),
       done && h("a", { class: "button", href: `#/diagnoses/${encodeURIComponent(item.diagnosis)}` }, "Report"),
       isExtendable(item) && h("button", { type: "button", class: "primary", onclick: () => extend(item) }, "Extend the model"),
     );
@@ -160,8 +181,28 @@ export function diagnosis(structure, changed) {
           ].map((text) => h("li", null, text)),
         ),
       ],
+      fields: [
+        {
+          name: "samples",
+          label: "Simulated measurements (optional)",
+          hint: "Empty: as many as follow from the training of the present model. With this or the epochs given, there is one round.",
+        },
+        { name: "epochs", label: "Epochs (optional)", hint: "Empty: a number that follows from the training of the present model." },
+        {
+          name: "from_scratch",
+          type: "checkbox",
+          label: "Start from random weights",
+          hint: "Takes longer. Otherwise the training starts from the weights of the present model where they can be used.",
+        },
+        {
+          name: "accept_uncalibrated",
+          type: "checkbox",
+          label: "Use the new model even if it is overconfident",
+          hint: "Every assessment then has a finding about it.",
+        },
+      ],
       confirm: "Extend the model",
-      submit: () => send(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}/extension`, {}),
+      submit: (values) => send(`v1/diagnoses/${encodeURIComponent(item.diagnosis)}/extension`, extensionOf(values)),
     });
     if (done) {
       notify("The extension is running. Its progress is shown here and under “Jobs”.");

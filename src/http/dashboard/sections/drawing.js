@@ -1,17 +1,19 @@
 // The drawing of the structure: colours are changes, outlines are open alarms, a click on a part shows its charts.
 
 import { at, request } from "../api.js";
+import { motion } from "../charts/motion.js";
 import { fill, h } from "../dom.js";
 
 /** `choose(name)` is called with the name of a part that the user selects. */
 export function drawing(structure, choose) {
   const place = h("div", { class: "drawing" });
   const picker = h("select", { id: "drawing-mode", onchange: () => load() });
+  const moving = motion();
   const element = h(
     "div",
     { class: "figure", dataset: { drawing: structure }, hidden: true },
     h("h3", null, "Structure"),
-    h("p", { class: "row" }, h("label", { for: "drawing-mode" }, "Mode shape"), picker),
+    h("p", { class: "row" }, h("label", { for: "drawing-mode" }, "Mode shape"), picker, moving.button),
     place,
     h(
       "p",
@@ -23,7 +25,9 @@ export function drawing(structure, choose) {
     const mode = picker.value === "" ? "" : `?mode=${picker.value}`;
     const answer = await request(at(structure, `/drawing.svg${mode}`));
     const svg = new DOMParser().parseFromString(await answer.text(), "image/svg+xml").documentElement;
-    fill(place, document.importNode(svg, true));
+    const drawn = document.importNode(svg, true);
+    fill(place, drawn);
+    moving.watch(drawn);
     for (const part of place.querySelectorAll("[data-name]")) {
       part.addEventListener("click", () => choose(part.dataset.name));
     }

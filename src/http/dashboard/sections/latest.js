@@ -34,7 +34,7 @@ export function triggerWords({ trigger, alarm }) {
 
 /** Whether the model can be extended by a diagnosis that is done; `present` is the digest of the present version. */
 export function isExtendable(item, present) {
-  const free = item.extension === null || item.extension === "failed";
+  const free = item.extension === null || ["failed", "cancelled"].includes(item.extension);
   return item.state === "done" && EXTENDS.includes(item.verdict) && free && (!present || present === item.version);
 }
 
@@ -103,7 +103,8 @@ export function latest(extend) {
 
   const body = (item) => {
     if (item.state === "running")
-      return h("p", { class: "callout" }, progress(item.progress ?? "waiting", "the diagnosis"));
+      return h("p", { class: "callout" }, progress(item, "the diagnosis"));
+    if (item.state === "cancelled") return h("p", { class: "callout" }, icon("note"), "It was cancelled.");
     if (item.state === "failed")
       return h("p", { class: "callout bad" }, icon("cross"), `It could not be made: ${item.failure ?? "unknown reason"}`);
     const [kind, sign, text] = VERDICTS[item.verdict] ?? ["", "note", `${words(item.verdict)}.`];

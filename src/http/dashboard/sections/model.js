@@ -1,35 +1,42 @@
 // The trained model with its calibration, and the undamaged reference that batches are compared with.
 
 import { at, read, send } from "../api.js";
-import { ask, cell, fieldTime, fill, h, icon, notify } from "../dom.js";
+import { ask, cell, fieldTime, fill, h, icon, notify, throttled } from "../dom.js";
 import { count, digest, local, number, percent, quantity, zone } from "../format.js";
+import { training } from "./training.js";
+import { help } from "../help.js";
 
 export function model(structure, changed) {
   const content = h("div", null);
+  const trainings = training(structure, changed);
   const element = h(
     "section",
     { id: "model", class: "panel", "aria-labelledby": "model-title" },
     h("h2", { id: "model-title" }, "Trained model and undamaged reference"),
     content,
+    trainings.element,
   );
   let shown = null;
   return {
     element,
+    /** Shows the progress of a training. */
+    job: throttledJob(trainings),
     update(info, batches) {
       // Redraw only after a change, so that details opened by the user stay open when a batch arrives.
       const key = JSON.stringify([info, batches > 0]);
       if (key === shown) return;
       shown = key;
+      trainings.update(info);
       fill(
         content,
         h(
           "div",
           { class: "columns" },
-          h("div", null, h("h3", null, "Trained model"), info.model ? inUse(info) : missing(info)),
+          h("div", null, h("div", { class: "figure-title" }, h("h3", null, "Trained model"), help("calibration")), info.model ? inUse(info) : missing(info)),
           h(
             "div",
             null,
-            h("h3", null, "Undamaged reference"),
+            h("div", { class: "figure-title" }, h("h3", null, "Undamaged reference"), help("undamaged reference")),
             info.undamaged ? undamaged(info.undamaged) : firstStep(info, batches),
             info.model &&
               batches > 0 &&
@@ -56,11 +63,32 @@ export function model(structure, changed) {
   };
 }
 
+/** Events of a job, at most one a second; the last one is never lost. */
+function throttledJob(trainings) {
+  let newest = null;
+  const show = throttled(() => trainings.job(newest), 1000);
+  return (data) => {
+    newest = data;
+    show();
+  };
+}
+
+/** Help at the facts that a newcomer may not know. */
+const FACT_HELP = {
+  "Digest of the model": () => help("digest"),
+  "Trained noise range": () => help("noise range"),
+  Validation: () => help("validation"),
+  Emulator: () => help("emulator"),
+  "Damage threshold δ": () => help("damage threshold"),
+  "Movement in time": () => help("common factor"),
+  "Found with 90 %": () => help("detectable loss"),
+};
+
 const facts = (list) =>
   h(
     "dl",
     { class: "facts" },
-    list.filter(Boolean).map(([name, value]) => h("div", null, h("dt", null, name), h("dd", null, value))),
+    list.filter(Boolean).map(([name, value]) => h("div", null, h("dt", null, name, " ", FACT_HELP[name]?.()), h("dd", null, value))),
   );
 
 function missing(info) {
@@ -69,7 +97,7 @@ function missing(info) {
     h(
       "p",
       null,
-      "Batches are stored and wait for their assessment. Train a model for exactly this definition, copy it to the models folder and restart the service:",
+      "Batches are stored and wait for their assessment. Train a model below. Where another computer shall do it, train for exactly this definition there, copy the folder to the models folder and restart the service:",
     ),
     h("pre", { tabindex: 0 }, h("code", null, `modalwatch train --structure structure.toml --out models/${info.id}`)),
   ];
@@ -108,7 +136,7 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
         passed: `Calibration passed: ${count(calibration.cells.length, "case")}, ${calibration.simulations} simulated measurements each.`,
         cautious: `Calibration: the model can be used, and some of its intervals are wider than they need to be, so that a small change may be noticed later than possible. ${listed}.`,
       }[outcome] ??
-        `Calibration: some intervals are too narrow, so that the model claims to know more than it does. It is used only because it was accepted in the configuration. ${listed}.`,
+        `Calibration: some intervals are too narrow, so that the model claims to know more than it does. It is used only because this was accepted. ${listed}.`,
     ),
     calibrationTable(calibration.cells),
   ];
@@ -167,7 +195,7 @@ function undamaged(state) {
       ["Version", `${state.version}, declared ${local(state.created_at)}${state.extends ? `, extends version ${state.extends}` : ""}`],
       state.reason && ["Reason", state.reason],
       ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}`],
-      ["Threshold δ", `below it are ${percent(state.threshold_probability)} of the healthy values`],
+      ["Damage threshold δ", `below it are ${percent(state.threshold_probability)} of the healthy values`],
       conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
       state.process?.coverage && ["Months seen", state.process.coverage.months.map(monthName).join(", ")],
       ["Movement in time", seasonWords(state)],
@@ -191,7 +219,7 @@ function undamaged(state) {
         h(
           "tr",
           null,
-          ["Parameter", "Mean", "Standard deviation", "Threshold δ"].map((c) => h("th", { scope: "col" }, c)),
+          ["Parameter", "Mean", "Standard deviation", "Damage threshold δ"].map((c) => h("th", { scope: "col" }, c)),
         ),
       ),
       h(
@@ -204,7 +232,7 @@ function undamaged(state) {
             h("th", { scope: "row" }, p.name),
             cell("Mean", quantity(p.mean, p.unit)),
             cell("Standard deviation", quantity(p.std, p.unit, 3)),
-            cell("Threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
+            cell("Damage threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
           ),
         ),
       ),
@@ -323,7 +351,7 @@ export async function declare(structure, changed, { extend = false, period: prop
         // The minute of the last batch belongs to the period.
         value: proposed ? fieldTime(proposed[1] + 60) : "",
       },
-      !extend && { name: "p", label: "Share of healthy values below the threshold δ (%)", type: "text", required: true, value: "5" },
+      !extend && { name: "p", label: "Share of healthy values below the damage threshold δ (%)", type: "text", required: true, value: "5" },
       {
         name: "reason",
         label: "Reason (optional)",

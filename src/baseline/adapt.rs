@@ -1,0 +1,489 @@
+//! Adaptive importance sampling in the latent space of the flow, for measurements whose posterior the flow does not match.
+//!
+//! The flow maps z to parameters x, and its own draws have z ~ N(0, I). A flow that is wider than the posterior, or lies beside it,
+//! leaves few effective draws: accurate frequencies give a thin curved posterior. The posterior of z is then no longer N(0, I), but
+//! nearer to a normal distribution than that of x, because the flow has removed most of the curvature. Stage by stage, a Student
+//! distribution of z is fitted to the weighted draws of all stages before and proposes the next ones:
+//!
+//! ```text
+//!  q_0 = N(0, I),    q_t = t_ν(m_t, S_t),    q(z) = Σ_t n_t q_t(z) / Σ_t n_t
+//!  w(z) = p(y | x(z)) |∂x/∂z| / q(z) inside the prior, 0 outside
+//!  m_t, S_t: mean and covariance of z under the weights w^β, β ≤ 1 the largest exponent that leaves enough effective draws
+//! ```
+//!
+//! The draws of N(0, I) stay in the mixture q, so that no weight grows beyond that of a draw of the flow times the number of stages.
+//!
+//! Source: J.-M. Cornuet, J.-M. Marin, A. Mira, C. P. Robert (2012), Adaptive multiple importance sampling, Scandinavian Journal of
+//! Statistics 39, 798–812.
+
+use nalgebra::{Cholesky, DMatrix, DVector};
+use rand::Rng as _;
+use rand_distr::{ChiSquared, Distribution as _, StandardNormal};
+use rayon::prelude::*;
+use statrs::function::gamma::ln_gamma;
+
+use super::error::InferenceError;
+use super::model::Baseline;
+use super::observation::Observation;
+use super::real_line::from_real_line;
+use super::resample::log_likelihoods;
+use crate::stats::{self, Stream};
+
+/// Stages of a measurement, the first one included.
+const STAGES: usize = 8;
+
+/// Stages after which a measurement is given up that has not [`HOPEFUL`] of the effective draws it needs.
+const STAGES_BEFORE_DOUBT: usize = 4;
+
+/// Share of the effective draws needed, see [`STAGES_BEFORE_DOUBT`].
+const HOPEFUL: f64 = 0.15;
+
+/// Draws of a stage, as a multiple of those that are kept, and its range.
+const DRAWS_PER_STAGE: f64 = 2.0;
+const RANGE_PER_STAGE: [usize; 2] = [128, 512];
+
+/// Fewest effective draws for which the draws are resampled; and at least as many as are kept.
+const EFFECTIVE: f64 = 64.0;
+
+/// Effective draws for each number of a mean and each of its covariance, at which both can be estimated.
+const EFFECTIVE_PER_DIMENSION: f64 = 6.0;
+
+/// Degrees of freedom ν of the proposals: their heavy tails keep the weights bounded where the fit is too narrow.
+const DEGREES_OF_FREEDOM: f64 = 5.0;
+
+/// Smallest variance in any direction, as a share of the mean variance, so that the covariance can be inverted.
+const RIDGE: f64 = 1e-8;
+
+/// Measurements that are treated together, which bounds the memory.
+const AT_A_TIME: usize = 128;
+
+/// Samples of the measurements for which adaptive importance sampling found enough effective draws.
+pub(super) struct Adapted {
+    /// `[draws, d]`, parameter units, of each measurement; `None` where the effective draws do not suffice.
+    pub(super) theta: Vec<Option<DMatrix<f64>>>,
+    /// Simulations that were computed.
+    pub(super) simulations: usize,
+}
+
+impl Baseline {
+    /// `draws` samples of the posterior of each observation, by adaptive importance sampling.
+    ///
+    /// # Errors
+    /// [`InferenceError`] for another number of modes.
+    pub(super) fn adapt(
+        &self,
+        observations: &[Observation],
+        draws: usize,
+        seed: u64,
+    ) -> Result<Adapted, InferenceError> {
+        let [fewest, most] = RANGE_PER_STAGE;
+        let many = ((DRAWS_PER_STAGE * draws as f64) as usize).clamp(fewest, most);
+        // A stage of bounded size needs more stages where many draws are kept.
+        let stages = STAGES.max((4 * draws).div_ceil(many));
+        let needed = EFFECTIVE.max(draws as f64);
+        let mut adapted = Adapted { theta: Vec::with_capacity(observations.len()), simulations: 0 };
+        for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
+            let stream = |row: usize| stats::stream(seed, &format!("adapted proposals {}", chunk * AT_A_TIME + row));
+            let mut searches: Vec<Search> =
+                (0..part.len()).map(|row| Search::new(self.space().len(), stream(row))).collect();
+            let context = self.condition(part)?;
+            for stage in 0..stages {
+                let open: Vec<u32> = (0..part.len() as u32).filter(|&row| searches[row as usize].is_open()).collect();
+                if open.is_empty() {
+                    break;
+                }
+                adapted.simulations += self.next_stage((part, &context), &open, many, &mut searches)?;
+                let judge = |search: &mut Search| search.judge(stage + 1, needed);
+                searches.par_iter_mut().filter(|search| search.is_open()).for_each(judge);
+            }
+            adapted.theta.extend(searches.iter_mut().map(|search| search.resampled(draws)));
+        }
+        Ok(adapted)
+    }
+
+    /// Draws and weighs `many` further proposals of the measurements `open`. Returns the number of simulations.
+    fn next_stage(
+        &self,
+        (observations, context): (&[Observation], &candle_core::Tensor),
+        open: &[u32],
+        many: usize,
+        searches: &mut [Search],
+    ) -> Result<usize, InferenceError> {
+        let d = self.space().len();
+        let mut is_open = vec![false; searches.len()];
+        for &row in open {
+            is_open[row as usize] = true;
+        }
+        let mut active: Vec<&mut Search> =
+            searches.iter_mut().zip(&is_open).filter_map(|(search, open)| open.then_some(search)).collect();
+        let latent: Vec<f32> = active.par_iter_mut().flat_map_iter(|search| search.propose(many)).collect();
+        let rows = candle_core::Tensor::from_slice(open, open.len(), context.device())?;
+        let (mut real, mut log_jacobian) = self.map_latent(latent, &context.index_select(&rows, 0)?)?;
+        from_real_line(&mut real, &mut log_jacobian, &self.training_space);
+        let prior = self.space().as_slice();
+        let mut theta = DMatrix::zeros(open.len() * many, d);
+        let mut inside = vec![true; open.len() * many];
+        for (row, values) in real.chunks_exact(d).enumerate() {
+            for (column, (value, parameter)) in values.iter().zip(prior).enumerate() {
+                // A value that is not a number is not inside.
+                inside[row] &= parameter.prior().contains(value);
+                let middle = 0.5 * (parameter.lower + parameter.upper);
+                let finite = if value.is_finite() { *value } else { middle };
+                theta[(row, column)] = finite.clamp(parameter.lower, parameter.upper);
+            }
+        }
+        let of_open: Vec<Observation> = open.iter().map(|&row| observations[row as usize].clone()).collect();
+        let log_likelihoods = log_likelihoods(&self.simulator, &of_open, &theta);
+        active.par_iter_mut().enumerate().for_each(|(index, search)| {
+            for row in index * many..(index + 1) * many {
+                let log_target = log_likelihoods[row] - log_jacobian[row];
+                let usable = inside[row] && log_target.is_finite();
+                search.log_target.push(if usable { log_target } else { f64::NEG_INFINITY });
+                search.theta.extend(theta.row(row).iter());
+            }
+        });
+        Ok(theta.nrows())
+    }
+}
+
+/// Distribution of z from which a stage draws.
+struct Proposal {
+    mean: DVector<f64>,
+    /// Lower Cholesky factor of S.
+    root: DMatrix<f64>,
+    /// Logarithm of the density at the mean, plus that of the number of draws.
+    log_peak: f64,
+    /// ν of a Student distribution; `None` for a normal one.
+    degrees_of_freedom: Option<f64>,
+}
+
+impl Proposal {
+    /// N(0, I).
+    fn of_flow(d: usize) -> Self {
+        let log_peak = -0.5 * d as f64 * (2.0 * std::f64::consts::PI).ln();
+        Self { mean: DVector::zeros(d), root: DMatrix::identity(d, d), log_peak, degrees_of_freedom: None }
+    }
+
+    /// t_ν(m, S); `None` where S is not positive definite.
+    fn student(mean: DVector<f64>, covariance: DMatrix<f64>) -> Option<Self> {
+        let d = mean.len() as f64;
+        let nu = DEGREES_OF_FREEDOM;
+        let root = Cholesky::new(covariance)?.unpack();
+        let log_volume: f64 = root.diagonal().iter().map(|entry| entry.ln()).sum();
+        let log_peak =
+            ln_gamma(0.5 * (nu + d)) - ln_gamma(0.5 * nu) - 0.5 * d * (nu * std::f64::consts::PI).ln() - log_volume;
+        log_peak.is_finite().then_some(Self { mean, root, log_peak, degrees_of_freedom: Some(nu) })
+    }
+
+    /// Logarithm of the density at z, nats.
+    fn log_density(&self, z: &[f64]) -> f64 {
+        let d = self.mean.len();
+        let mut squares = 0.0;
+        let mut standard = [0.0; super::start::MANY_PARAMETERS];
+        for i in 0..d {
+            let known: f64 = (0..i).map(|j| self.root[(i, j)] * standard[j]).sum();
+            standard[i] = (z[i] - self.mean[i] - known) / self.root[(i, i)];
+            squares += standard[i] * standard[i];
+        }
+        match self.degrees_of_freedom {
+            None => self.log_peak - 0.5 * squares,
+            Some(nu) => self.log_peak - 0.5 * (nu + d as f64) * (squares / nu).ln_1p(),
+        }
+    }
+
+    fn draw(&self, stream: &mut Stream) -> DVector<f64> {
+        let d = self.mean.len();
+        let normal = DVector::from_fn(d, |_, _| stream.sample::<f64, _>(StandardNormal));
+        let stretch = self.degrees_of_freedom.map_or(1.0, |nu| {
+            let chi_squared: f64 = ChiSquared::new(nu).expect("ν is positive").sample(stream);
+            (nu / chi_squared).sqrt()
+        });
+        &self.mean + &self.root * normal * stretch
+    }
+}
+
+/// The draws of one measurement so far.
+struct Search {
+    d: usize,
+    stream: Stream,
+    proposals: Vec<Proposal>,
+    /// z of each draw, `[n·d]`.
+    latent: Vec<f64>,
+    /// Parameters of each draw, `[n·d]`.
+    theta: Vec<f64>,
+    /// ln p(y | x) |∂x/∂z| of each draw up to a constant, −∞ outside the prior, `[n]`.
+    log_target: Vec<f64>,
+    /// ln Σ_t q_t of each draw, `[n]`. Each stage has the same number of draws.
+    log_mixture: Vec<f64>,
+    state: State,
+}
+
+#[derive(PartialEq)]
+enum State {
+    Open,
+    /// The weights of the draws, which have enough effective ones.
+    Enough(Vec<f64>),
+    GivenUp,
+}
+
+impl Search {
+    fn new(d: usize, stream: Stream) -> Self {
+        Self {
+            d,
+            stream,
+            proposals: vec![Proposal::of_flow(d)],
+            latent: Vec::new(),
+            theta: Vec::new(),
+            log_target: Vec::new(),
+            log_mixture: Vec::new(),
+            state: State::Open,
+        }
+    }
+
+    fn is_open(&self) -> bool {
+        self.state == State::Open
+    }
+
+    /// Draws of the newest proposal, `[many·d]`, in the precision of the flow.
+    fn propose(&mut self, many: usize) -> Vec<f32> {
+        let newest = self.proposals.last().expect("there is one from the start");
+        let drawn: Vec<f32> = (0..many)
+            .flat_map(|_| newest.draw(&mut self.stream).iter().map(|value| *value as f32).collect::<Vec<f32>>())
+            .collect();
+        for (z, log_mixture) in self.latent.chunks_exact(self.d).zip(&mut self.log_mixture) {
+            *log_mixture = log_sum(*log_mixture, newest.log_density(z));
+        }
+        let first = self.latent.len();
+        // The densities are those of the numbers that pass through the flow.
+        self.latent.extend(drawn.iter().map(|value| f64::from(*value)));
+        for z in self.latent[first..].chunks_exact(self.d) {
+            let densities = self.proposals.iter().map(|proposal| proposal.log_density(z));
+            self.log_mixture.push(densities.fold(f64::NEG_INFINITY, log_sum));
+        }
+        drawn
+    }
+
+    /// Ends the search where the draws of `stages` stages suffice or give no hope, otherwise fits the next proposal.
+    fn judge(&mut self, stages: usize, needed: f64) {
+        let log_weights: Vec<f64> =
+            self.log_target.iter().zip(&self.log_mixture).map(|(target, mixture)| target - mixture).collect();
+        let Some(weights) = stats::weights(&log_weights, 0.0) else {
+            self.state = State::GivenUp;
+            return;
+        };
+        let effective = effective(&weights);
+        if effective >= needed {
+            self.state = State::Enough(weights);
+            return;
+        }
+        let hopeless = stages >= STAGES_BEFORE_DOUBT && effective < HOPEFUL * needed;
+        match self.fitted(&log_weights, weights).filter(|_| !hopeless) {
+            Some(proposal) => self.proposals.push(proposal),
+            None => self.state = State::GivenUp,
+        }
+    }
+
+    /// The Student distribution with the moments of the draws under w^β.
+    fn fitted(&self, log_weights: &[f64], weights: Vec<f64>) -> Option<Proposal> {
+        let weights = tempered(log_weights, weights, EFFECTIVE_PER_DIMENSION * (self.d + 1) as f64)?;
+        let total: f64 = weights.iter().sum();
+        let draws = || self.latent.chunks_exact(self.d).zip(&weights).filter(|(_, weight)| **weight > 0.0);
+        let mut mean = DVector::zeros(self.d);
+        for (z, weight) in draws() {
+            mean.iter_mut().zip(z).for_each(|(mean, z)| *mean += weight / total * z);
+        }
+        let mut covariance = DMatrix::zeros(self.d, self.d);
+        for (z, weight) in draws() {
+            let off = DVector::from_fn(self.d, |i, _| z[i] - mean[i]);
+            covariance.ger(weight / total, &off, &off, 1.0);
+        }
+        let ridge = RIDGE * covariance.trace() / self.d as f64;
+        for i in 0..self.d {
+            covariance[(i, i)] += ridge;
+        }
+        Proposal::student(mean, covariance)
+    }
+
+    /// `draws` samples by systematic resampling, `[draws, d]`; `None` where the effective draws do not suffice.
+    fn resampled(&mut self, draws: usize) -> Option<DMatrix<f64>> {
+        let State::Enough(weights) = &self.state else { return None };
+        let chosen = stats::systematic(weights, draws, &mut self.stream);
+        Some(DMatrix::from_fn(draws, self.d, |row, column| self.theta[chosen[row] * self.d + column]))
+    }
+}
+
+/// The weights w^β for the largest β ≤ 1 that leaves `wanted` effective draws, or as many as there are; `None` where the draws with a
+/// weight are fewer.
+fn tempered(log_weights: &[f64], weights: Vec<f64>, wanted: f64) -> Option<Vec<f64>> {
+    if effective(&weights) >= wanted {
+        return Some(weights);
+    }
+    if (log_weights.iter().filter(|weight| weight.is_finite()).count() as f64) < wanted {
+        return None;
+    }
+    let raised = |beta: f64| {
+        let raised: Vec<f64> = log_weights.iter().map(|weight| weight * beta).collect();
+        stats::weights(&raised, 0.0)
+    };
+    // The effective number falls with β, so that bisection in its logarithm finds the largest one.
+    let (mut low, mut high) = (-40.0_f64, 0.0_f64);
+    for _ in 0..24 {
+        let middle = 0.5 * (low + high);
+        let enough = raised(middle.exp()).is_some_and(|weights| effective(&weights) >= wanted);
+        *(if enough { &mut low } else { &mut high }) = middle;
+    }
+    raised(low.exp())
+}
+
+/// Effective number (Σ w)²/Σ w² of draws with the weights w.
+fn effective(weights: &[f64]) -> f64 {
+    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
+    sum * sum / squares
+}
+
+/// ln(eᵃ + eᵇ).
+fn log_sum(a: f64, b: f64) -> f64 {
+    let (low, high) = if a < b { (a, b) } else { (b, a) };
+    if low == f64::NEG_INFINITY {
+        return high;
+    }
+    high + (low - high).exp().ln_1p()
+}
+
+#[cfg(test)]
+mod tests {
+    use statrs::distribution::{Continuous as _, StudentsT};
+
+    use super::*;
+    use crate::baseline::observation::DEFAULT_NOISE_RANGE;
+    use crate::baseline::train::train;
+    use crate::flow::train::TrainSettings;
+    use crate::flow::FlowSettings;
+    use crate::simulator::definition::StructureDefinition;
+    use crate::simulator::Simulator;
+
+    /// Searches the target ln p(z) = `log_target`; the parameters are z itself.
+    fn search(d: usize, seed: u64, needed: usize, log_target: impl Fn(&[f64]) -> f64) -> Option<DMatrix<f64>> {
+        let mut search = Search::new(d, stats::stream(seed, "test"));
+        for stage in 0..STAGES {
+            if search.is_open() {
+                let drawn: Vec<f64> = search.propose(2 * needed).into_iter().map(f64::from).collect();
+                search.log_target.extend(drawn.chunks_exact(d).map(&log_target));
+                search.theta.extend(drawn);
+                search.judge(stage + 1, needed as f64);
+            }
+        }
+        search.resampled(needed)
+    }
+
+    #[test]
+    fn the_density_of_a_proposal_is_that_of_the_student_distribution() {
+        let proposal = Proposal::student(DVector::from_element(1, 2.0), DMatrix::from_element(1, 1, 0.09)).unwrap();
+        let student = StudentsT::new(2.0, 0.3, DEGREES_OF_FREEDOM).unwrap();
+        for z in [-1.0, 1.7, 2.0, 2.4, 9.0] {
+            assert!((proposal.log_density(&[z]) - student.ln_pdf(z)).abs() < 1e-10, "{z}");
+        }
+        // Two independent directions under a rotation: |z − m| in the metric of S is what counts.
+        let covariance = DMatrix::from_row_slice(2, 2, &[1.0, 0.6, 0.6, 1.0]);
+        let proposal = Proposal::student(DVector::zeros(2), covariance.clone()).unwrap();
+        let at = |z: [f64; 2]| {
+            let z = DVector::from_row_slice(&z);
+            let distance = z.dot(&(covariance.clone().try_inverse().unwrap() * &z));
+            // For two dimensions the normaliser is 1/(2π √|S|).
+            -(2.0 * std::f64::consts::PI).ln()
+                - 0.5 * covariance.determinant().ln()
+                - 0.5 * (DEGREES_OF_FREEDOM + 2.0) * (distance / DEGREES_OF_FREEDOM).ln_1p()
+        };
+        for z in [[0.0, 0.0], [1.0, -1.0], [3.0, 2.0]] {
+            assert!((proposal.log_density(&z) - at(z)).abs() < 1e-10, "{z:?}");
+        }
+    }
+
+    #[test]
+    fn a_narrow_target_beside_the_flow_is_found_with_its_moments() {
+        // N(m, S) with a correlation of 0.9, thirty times narrower than the flow and two of its standard deviations away.
+        let (mean, std, correlation) = ([2.0, -1.0], [0.03, 0.1], 0.9);
+        let log_target = |z: &[f64]| {
+            let [a, b] = [0, 1].map(|i| (z[i] - mean[i]) / std[i]);
+            -0.5 * (a * a - 2.0 * correlation * a * b + b * b) / (1.0 - correlation * correlation)
+        };
+        let (repeats, draws) = (100, 100);
+        let (mut off, mut squares, mut product) = ([0.0; 2], [0.0; 2], 0.0);
+        for seed in 0..repeats {
+            let found = search(2, seed, draws, log_target).expect("the target is within reach");
+            for row in found.row_iter() {
+                let [a, b] = [0, 1].map(|i| (row[i] - mean[i]) / std[i]);
+                off = [off[0] + a, off[1] + b];
+                squares = [squares[0] + a * a, squares[1] + b * b];
+                product += a * b;
+            }
+        }
+        let count = (repeats as usize * draws) as f64;
+        // Resampled draws repeat: at least half of them count, since as many effective draws were found as are kept. Four errors.
+        let error = 4.0 * (2.0 / count).sqrt();
+        for i in 0..2 {
+            assert!((off[i] / count).abs() < error, "mean {i}: {}", off[i] / count);
+            assert!((squares[i] / count - 1.0).abs() < error * 2.0_f64.sqrt(), "variance {i}: {}", squares[i] / count);
+        }
+        assert!((product / count - correlation).abs() < error * 2.0_f64.sqrt(), "correlation {}", product / count);
+    }
+
+    #[test]
+    fn a_target_outside_the_prior_is_given_up() {
+        assert!(search(2, 1, 100, |_| f64::NEG_INFINITY).is_none());
+        // A single draw inside is no sample either.
+        let number = std::cell::Cell::new(0);
+        let once = |_: &[f64]| {
+            number.set(number.get() + 1);
+            if number.get() == 1 {
+                0.0
+            } else {
+                f64::NEG_INFINITY
+            }
+        };
+        assert!(search(2, 1, 100, once).is_none());
+    }
+
+    #[test]
+    fn a_hardly_trained_flow_gives_the_posterior_of_a_grid() {
+        let text = "id = \"two\"\nmodes = 2\nmeasurement_noise = { relative = 0.002 }\n\
+                    [[mass]]\nname = \"a\"\nkg = 1.0\n[[mass]]\nname = \"b\"\nkg = 1.5\n\
+                    [[spring]]\nname = \"k1\"\nfrom = \"ground\"\nto = \"a\"\nn_per_m = 100.0\n\
+                    [[spring]]\nname = \"k2\"\nfrom = \"a\"\nto = \"b\"\nn_per_m = 60.0\n\
+                    [[parameter]]\nname = \"p1\"\nprior = { uniform = [50.0, 150.0] }\nsets = { spring = \"k1\" }\n\
+                    [[parameter]]\nname = \"p2\"\nprior = { uniform = [30.0, 90.0] }\nsets = { spring = \"k2\" }\n";
+        let simulator = Simulator::new(StructureDefinition::parse_toml(text).unwrap()).unwrap();
+        let settings = TrainSettings { epochs: 3, ..TrainSettings::default() };
+        let flow = FlowSettings::default();
+        let baseline = train(&simulator, 3_000, DEFAULT_NOISE_RANGE, &flow, &settings, |_| {}).unwrap().baseline;
+        let exact = simulator.frequencies_hz(&[104.0, 55.0]).unwrap();
+        let observation = Observation::complete(&exact);
+        let draws = 2_000;
+        let found = baseline.adapt(std::slice::from_ref(&observation), draws, 1).unwrap();
+        let found = found.theta[0].as_ref().expect("two parameters are within reach");
+        // Two frequencies of two masses have two solutions, so that the grid covers the whole prior. Its steps are smaller than a tenth of
+        // the width of each mode.
+        let steps = 901;
+        let grid = DMatrix::from_fn(steps * steps, 2, |row, column| {
+            let step = if column == 0 { row / steps } else { row % steps };
+            [50.0, 30.0][column] * (1.0 + 2.0 * step as f64 / (steps - 1) as f64)
+        });
+        let logs = log_likelihoods(&simulator, std::slice::from_ref(&observation), &grid);
+        let weights = stats::weights(&logs, 0.0).unwrap();
+        let total: f64 = weights.iter().sum();
+        for column in 0..2 {
+            let moment = |power: i32, about: f64| {
+                let terms = grid.column(column).into_iter().zip(&weights).map(|(x, w)| w * (x - about).powi(power));
+                terms.collect::<Vec<f64>>().iter().sum::<f64>() / total
+            };
+            let mean = moment(1, 0.0);
+            let std = moment(2, mean).sqrt();
+            let own: Vec<f64> = found.column(column).iter().copied().collect();
+            // As many effective draws as are kept, of which some repeat: five errors of half as many.
+            let error = 5.0 / (0.5 * draws as f64).sqrt();
+            assert!((stats::mean(&own) - mean).abs() < error * std, "{} {mean} ± {std}", stats::mean(&own));
+            let ratio = stats::sample_std(&own).unwrap() / std;
+            assert!((ratio - 1.0).abs() < error / 2.0_f64.sqrt(), "{ratio}");
+        }
+    }
+}

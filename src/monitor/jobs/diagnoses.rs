@@ -1,0 +1,198 @@
+//! Diagnoses as jobs.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::queue::{computed, JobStatus};
+use super::runner::{Jobs, MOST_JOBS};
+use super::study::{DiagnosisRequest, Study};
+use crate::discrepancy::{Holdout, FEWEST_ROWS};
+use crate::monitor::compute::QueueFull;
+use crate::monitor::error::{Error, JobError};
+use crate::monitor::own_task::in_own_task;
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::simulator::Simulator;
+use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis};
+
+/// Largest number of measurements of one diagnosis.
+const MOST_MEASUREMENTS: usize = 200_000;
+
+impl Jobs {
+    /// Starts a diagnosis of the requested batches, or of all batches if the request names none.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::QueueFull`], [`JobError`].
+    pub async fn start_diagnosis(
+        &self,
+        structure: &StructureId,
+        request: DiagnosisRequest,
+    ) -> Result<DiagnosisRecord, JobError> {
+        let (jobs, structure, why) = (self.clone(), structure.clone(), (DiagnosisTrigger::Requested, None));
+        in_own_task(async move { jobs.start_diagnosis_here(structure, request, why).await }).await
+    }
+
+    /// Why a structure cannot be diagnosed now, as a sentence; `None` where it can.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn no_diagnosis(&self, structure: &StructureId) -> Result<Option<String>, Error> {
+        let stored: usize = self.store.batches().batch_sizes(structure).await?.iter().map(|(_, count)| count).sum();
+        if stored < FEWEST_ROWS {
+            let measurements = if stored == 1 { "measurement is" } else { "measurements are" };
+            return Ok(Some(format!("{stored} {measurements} stored: a diagnosis needs at least {FEWEST_ROWS}")));
+        }
+        Ok((self.running() >= MOST_JOBS)
+            .then(|| format!("{MOST_JOBS} jobs run or wait: wait for one of them, or end one")))
+    }
+
+    /// The request for all batches of a structure, or for the newest ones if all have more measurements than a diagnosis can use.
+    /// `None` if the structure has too few measurements for a diagnosis.
+    pub(in crate::monitor) async fn request_for_all(
+        &self,
+        structure: &StructureId,
+        holdout: Holdout,
+    ) -> Result<Option<DiagnosisRequest>, Error> {
+        let stored = self.store.batches().batch_sizes(structure).await?;
+        let batches = newest(&stored);
+        Ok((!batches.is_empty()).then(|| DiagnosisRequest { batches, holdout, ..DiagnosisRequest::default() }))
+    }
+
+    /// Starts a diagnosis that nobody requested; `alarm` is the number of the alarm because of which it is started.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`], [`Error::QueueFull`], [`Error::Store`].
+    pub(in crate::monitor) async fn start_automatic_diagnosis(
+        &self,
+        structure: &StructureId,
+        request: DiagnosisRequest,
+        trigger: DiagnosisTrigger,
+        alarm: Option<i64>,
+    ) -> Result<DiagnosisRecord, JobError> {
+        let (jobs, structure) = (self.clone(), structure.clone());
+        in_own_task(async move { jobs.start_diagnosis_here(structure, request, (trigger, alarm)).await }).await
+    }
+
+    async fn start_diagnosis_here(
+        self,
+        structure: StructureId,
+        mut request: DiagnosisRequest,
+        (trigger, alarm): (DiagnosisTrigger, Option<i64>),
+    ) -> Result<DiagnosisRecord, JobError> {
+        let active = self.structures.get(&structure)?;
+        let stored = self.store.batches().batch_sizes(&structure).await?;
+        if request.batches.is_empty() {
+            request.batches = stored.iter().map(|(id, _)| id.clone()).collect();
+        }
+        check_batches(&structure, &stored, &request.batches)?;
+        if self.running() >= MOST_JOBS {
+            return Err(Error::QueueFull(QueueFull).into());
+        }
+        let id = uuid::Uuid::now_v7().to_string();
+        let simulator = active.simulator.clone();
+        let new = NewDiagnosis {
+            id: id.clone(),
+            structure: structure.clone(),
+            structure_digest: simulator.digest().clone(),
+            request: serde_json::to_string(&request).expect("a request is plain data"),
+            trigger,
+            alarm,
+        };
+        self.store.diagnoses().insert_diagnosis(new, Timestamp::now()).await?;
+        let (jobs, job) = (self.clone(), id.clone());
+        let diagnose = async move {
+            let study = jobs.study(job, &structure, simulator, request).await?;
+            computed("diagnosis", move || study.diagnose()).await
+        };
+        self.run(&id, active.simulator.id(), (JobKind::Diagnosis, Some(trigger)), diagnose);
+        Ok(self.diagnosis(&id).await?.0)
+    }
+
+    /// A diagnosis, and what its job is doing now.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownDiagnosis`], [`Error::Store`].
+    pub async fn diagnosis(&self, id: &str) -> Result<(DiagnosisRecord, Option<JobStatus>), JobError> {
+        let record = self.store.diagnoses().diagnosis(id).await?;
+        let record = record.ok_or_else(|| JobError::UnknownDiagnosis(shown(id)))?;
+        Ok((record, self.queue.status(id)))
+    }
+
+    /// Diagnoses of a structure, newest first, at most `limit`.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn diagnoses(&self, structure: &StructureId, limit: usize) -> Result<Vec<DiagnosisRecord>, Error> {
+        Ok(self.store.diagnoses().list(structure, limit).await?)
+    }
+
+    /// The report of a diagnosis as HTML; `None` where there is none yet.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownDiagnosis`], [`Error::Store`].
+    pub async fn report(&self, id: &str) -> Result<Option<String>, JobError> {
+        self.diagnosis(id).await?;
+        Ok(self.store.diagnoses().diagnosis_report(id).await?)
+    }
+
+    /// Reads the measurements on which a job computes.
+    pub(super) async fn study(
+        &self,
+        id: String,
+        structure: &StructureId,
+        simulator: Simulator,
+        request: DiagnosisRequest,
+    ) -> Result<Study, String> {
+        let batches = self.store.batches();
+        let text = |e: &dyn std::fmt::Display| e.to_string();
+        let mut measurements = batches.measurements_of(structure, &request.batches).await.map_err(|e| text(&e))?;
+        let all = measurements.len();
+        measurements.retain(|measurement| request.contains(measurement.measured_at));
+        if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
+            return Err(format!(
+                "{period}, and these are {} of {all}: a diagnosis needs at least {FEWEST_ROWS}",
+                measurements.len()
+            ));
+        }
+        let reference = self.store.reference().undamaged(structure).await.map_err(|e| text(&e))?;
+        let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
+        let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
+        let undamaged = batches.measurements_of(structure, &declared).await.map_err(|e| text(&e))?;
+        let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
+        Ok(Study { id, simulator, measurements, undamaged, request, queue: self.queue.clone() })
+    }
+}
+
+/// The newest of the stored batches, given with their sizes in the order of time, that one diagnosis can use; empty if they have too
+/// few measurements.
+fn newest(stored: &[(String, usize)]) -> Vec<String> {
+    let mut found = 0;
+    let fits = |(_, count): &&(String, usize)| {
+        found += count;
+        found <= MOST_MEASUREMENTS
+    };
+    let mut newest: Vec<(String, usize)> = stored.iter().rev().take_while(fits).cloned().collect();
+    newest.reverse();
+    let enough = newest.iter().map(|(_, count)| count).sum::<usize>() >= FEWEST_ROWS;
+    if enough {
+        newest.into_iter().map(|(id, _)| id).collect()
+    } else {
+        Vec::new()
+    }
+}
+
+/// Checks the batches of a request against those stored, with their sizes.
+fn check_batches(structure: &StructureId, stored: &[(String, usize)], batches: &[String]) -> Result<(), JobError> {
+    let sizes: BTreeMap<&String, usize> = stored.iter().map(|(id, count)| (id, *count)).collect();
+    let mut seen = BTreeSet::new();
+    let mut found = 0;
+    for id in batches {
+        if !seen.insert(id) {
+            return Err(JobError::RepeatedBatch(id.clone()));
+        }
+        let unknown = || Error::UnknownBatch { structure: structure.clone(), batch: shown(id) };
+        found += sizes.get(id).ok_or_else(unknown)?;
+    }
+    if found > MOST_MEASUREMENTS {
+        return Err(JobError::TooManyMeasurements { found, most: MOST_MEASUREMENTS });
+    }
+    Ok(())
+}

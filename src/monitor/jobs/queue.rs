@@ -1,0 +1,391 @@
+//! The jobs that run or wait: their order, their progress, and requests to end them.
+//!
+//! There are two lanes, in each of which one job runs at a time: short jobs (diagnoses) never wait behind long ones (trainings and
+//! extensions).
+//!
+//! A job that computes is ended cooperatively: [`Queue::report`], which it calls at each epoch, cell or step, unwinds its thread with
+//! [`Halt`] when somebody cancelled it or when the service stops. [`computed`] turns this into a value where the thread was
+//! started. Unwinding by `resume_unwind` leaves no trace in the log, and spares each loop of the computation a special result.
+
+use std::any::Any;
+use std::collections::BTreeMap;
+use std::panic::resume_unwind;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::{Duration, Instant};
+
+use tokio::sync::Notify;
+
+use crate::monitor::events::{Events, News};
+use crate::quantity::StructureId;
+use crate::store::{DiagnosisTrigger, JobKind, JobState};
+
+/// Least time between two events about the same job.
+const BETWEEN_EVENTS: Duration = Duration::from_millis(200);
+
+/// Why a job ends without a result.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Halt {
+    /// Somebody cancelled it.
+    Cancelled,
+    /// The service stops: the job begins again after the next start, or is marked as failed then.
+    Stopping,
+    /// It failed.
+    Failed(String),
+}
+
+impl From<String> for Halt {
+    fn from(failure: String) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+/// What a job is doing now.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JobStatus {
+    /// Whether it waits for its turn.
+    pub waits: bool,
+    /// Its place among the waiting jobs of its lane, from 1; `None` for one that runs.
+    pub place: Option<usize>,
+    /// What it is doing, in words.
+    pub progress: String,
+    /// The share that is done, 0 to 1, where it is known.
+    pub share: Option<f64>,
+    /// Estimated time left, s, where there is something to estimate it from.
+    pub time_left_s: Option<f64>,
+}
+
+/// What a job that computes reports.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Report {
+    pub(super) what: String,
+    pub(super) share: Option<f64>,
+    pub(super) time_left_s: Option<f64>,
+}
+
+impl From<String> for Report {
+    fn from(what: String) -> Self {
+        Self { what, ..Self::default() }
+    }
+}
+
+/// The jobs that run or wait, by id; cloning gives a handle on the same jobs.
+#[derive(Clone)]
+pub(super) struct Queue {
+    jobs: Arc<Mutex<Jobs>>,
+    changed: Arc<Notify>,
+    events: Events,
+}
+
+#[derive(Default)]
+struct Jobs {
+    by_id: BTreeMap<String, QueuedJob>,
+    /// Rank of the next job; a job with a smaller rank has its turn earlier.
+    next_rank: i64,
+    stopping: bool,
+}
+
+/// A job that runs or waits.
+struct QueuedJob {
+    structure: StructureId,
+    kind: JobKind,
+    trigger: Option<DiagnosisTrigger>,
+    rank: i64,
+    runs: bool,
+    cancelled: bool,
+    report: Report,
+    published: Option<Instant>,
+}
+
+impl QueuedJob {
+    const fn is_long(&self) -> bool {
+        matches!(self.kind, JobKind::Training | JobKind::Extension)
+    }
+}
+
+impl Jobs {
+    /// The id of the job that has the next turn in a lane, unless a job runs there.
+    fn next(&self, long: bool) -> Option<&String> {
+        let lane = || self.by_id.iter().filter(|(_, job)| job.is_long() == long);
+        if lane().any(|(_, job)| job.runs) {
+            return None;
+        }
+        lane().min_by_key(|(_, job)| job.rank).map(|(id, _)| id)
+    }
+
+    fn status(&self, id: &str) -> Option<JobStatus> {
+        let job = self.by_id.get(id)?;
+        let before = |other: &&QueuedJob| !other.runs && other.is_long() == job.is_long() && other.rank < job.rank;
+        let place = (!job.runs).then(|| 1 + self.by_id.values().filter(before).count());
+        let Report { what, share, time_left_s } = job.report.clone();
+        Some(JobStatus { waits: !job.runs, place, progress: what, share, time_left_s })
+    }
+
+    fn event(&self, id: &str, ended: Option<JobState>) -> Option<News> {
+        let job = self.by_id.get(id)?;
+        let status = self.status(id).filter(|_| ended.is_none());
+        let state = ended.unwrap_or(if job.runs { JobState::Running } else { JobState::Waiting });
+        Some(News::Job {
+            job: id.to_owned(),
+            structure: job.structure.clone(),
+            kind: job.kind,
+            state,
+            progress: status.as_ref().map(|status| status.progress.clone()),
+            share: status.as_ref().and_then(|status| status.share),
+            time_left_s: status.as_ref().and_then(|status| status.time_left_s),
+            place: status.and_then(|status| status.place),
+            trigger: job.trigger,
+        })
+    }
+}
+
+impl Queue {
+    pub(super) fn new(events: Events) -> Self {
+        Self { jobs: Arc::default(), changed: Arc::default(), events }
+    }
+
+    /// Adds a job that waits, behind all others. `trigger` is the reason of the start of a diagnosis.
+    pub(super) fn add(&self, id: &str, structure: &StructureId, kind: JobKind, trigger: Option<DiagnosisTrigger>) {
+        let mut jobs = self.lock();
+        let rank = jobs.next_rank;
+        jobs.next_rank += 1;
+        let report = Report::from("waiting".to_owned());
+        let structure = structure.clone();
+        let job = QueuedJob { structure, kind, trigger, rank, runs: false, cancelled: false, report, published: None };
+        jobs.by_id.insert(id.to_owned(), job);
+        self.publish(&jobs, id, None);
+    }
+
+    /// Waits for the turn of a job.
+    ///
+    /// # Errors
+    /// [`Halt`] when it is cancelled before, or when the service stops.
+    pub(super) async fn turn(&self, id: &str) -> Result<(), Halt> {
+        loop {
+            let changed = self.changed.notified();
+            tokio::pin!(changed);
+            // A change between the look and the wait is not missed.
+            changed.as_mut().enable();
+            {
+                let mut jobs = self.lock();
+                if jobs.stopping {
+                    return Err(Halt::Stopping);
+                }
+                let Some(job) = jobs.by_id.get(id) else { return Err(Halt::Cancelled) };
+                if job.cancelled {
+                    return Err(Halt::Cancelled);
+                }
+                if jobs.next(job.is_long()).is_some_and(|next| next == id) {
+                    if let Some(job) = jobs.by_id.get_mut(id) {
+                        job.runs = true;
+                        job.report = Report::from("starting".to_owned());
+                    }
+                    self.publish(&jobs, id, None);
+                    return Ok(());
+                }
+            }
+            changed.await;
+        }
+    }
+
+    /// Notes what a job that computes is doing now. Only for the thread that [`computed`] awaits: it is unwound when the job shall end.
+    pub(super) fn report(&self, id: &str, report: impl Into<Report>) {
+        let halt = {
+            let mut jobs = self.lock();
+            let stopping = jobs.stopping;
+            let Some(job) = jobs.by_id.get_mut(id) else { return };
+            job.report = report.into();
+            // A report that is not published is superseded by the next one or by the end of the job.
+            let due = job.published.is_none_or(|published| published.elapsed() >= BETWEEN_EVENTS);
+            let halt = if job.cancelled { Some(Halt::Cancelled) } else { stopping.then_some(Halt::Stopping) };
+            if due {
+                job.published = Some(Instant::now());
+                self.publish(&jobs, id, None);
+            }
+            halt
+        };
+        if let Some(halt) = halt {
+            resume_unwind(Box::new(halt));
+        }
+    }
+
+    /// Requests the end of a job. Returns false if it neither runs nor waits.
+    pub(super) fn cancel(&self, id: &str) -> bool {
+        let mut jobs = self.lock();
+        let Some(job) = jobs.by_id.get_mut(id) else { return false };
+        job.cancelled = true;
+        if job.runs {
+            "ending, as requested".clone_into(&mut job.report.what);
+            job.report.time_left_s = None;
+        }
+        self.publish(&jobs, id, None);
+        drop(jobs);
+        self.changed.notify_waiters();
+        true
+    }
+
+    /// Moves a waiting job before the others. Returns false if it does not wait.
+    pub(super) fn move_to_front(&self, id: &str) -> bool {
+        let mut jobs = self.lock();
+        let first = jobs.by_id.values().map(|job| job.rank).min().unwrap_or(0);
+        let Some(job) = jobs.by_id.get_mut(id).filter(|job| !job.runs) else { return false };
+        job.rank = first - 1;
+        let waiting: Vec<String> = jobs.by_id.iter().filter(|(_, job)| !job.runs).map(|(id, _)| id.clone()).collect();
+        for id in &waiting {
+            self.publish(&jobs, id, None);
+        }
+        drop(jobs);
+        self.changed.notify_waiters();
+        true
+    }
+
+    /// Ends all jobs, because the service stops.
+    pub(super) fn stop(&self) {
+        self.lock().stopping = true;
+        self.changed.notify_waiters();
+    }
+
+    /// Removes a job that has ended.
+    pub(super) fn end(&self, id: &str, state: JobState) {
+        let mut jobs = self.lock();
+        self.publish(&jobs, id, Some(state));
+        jobs.by_id.remove(id);
+        drop(jobs);
+        self.changed.notify_waiters();
+    }
+
+    /// Number of jobs that run or wait.
+    pub(super) fn count(&self) -> usize {
+        self.lock().by_id.len()
+    }
+
+    /// Whether a job of a structure runs or waits.
+    pub(super) fn has(&self, structure: &StructureId) -> bool {
+        self.lock().by_id.values().any(|job| job.structure == *structure)
+    }
+
+    /// The training of a structure that runs or waits.
+    pub(super) fn training_of(&self, structure: &StructureId) -> Option<String> {
+        let jobs = self.lock();
+        let found = jobs.by_id.iter().find(|(_, job)| job.structure == *structure && job.kind == JobKind::Training);
+        found.map(|(id, _)| id.clone())
+    }
+
+    /// What a job is doing now; `None` if it neither runs nor waits.
+    pub(super) fn status(&self, id: &str) -> Option<JobStatus> {
+        self.lock().status(id)
+    }
+
+    fn publish(&self, jobs: &Jobs, id: &str, ended: Option<JobState>) {
+        if let Some(event) = jobs.event(id, ended) {
+            self.events.publish(event);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Jobs> {
+        self.jobs.lock().expect("no holder of this lock panics")
+    }
+}
+
+/// Runs the computation of a job on a thread of its own.
+///
+/// # Errors
+/// Those of `work`; [`Halt`] where the job was ended; a panic as a failure.
+pub(super) async fn computed<T: Send + 'static>(
+    what: &str,
+    work: impl FnOnce() -> Result<T, String> + Send + 'static,
+) -> Result<T, Halt> {
+    let failure = match tokio::task::spawn_blocking(work).await {
+        Ok(found) => return found.map_err(Halt::Failed),
+        Err(failure) => failure,
+    };
+    let panic: Option<Box<dyn Any + Send>> = failure.try_into_panic().ok();
+    match panic.and_then(|panic| panic.downcast::<Halt>().ok()) {
+        Some(halt) => Err(*halt),
+        None => Err(Halt::Failed(format!("the {what} panicked"))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn queue() -> Queue {
+        Queue::new(Events::default())
+    }
+
+    fn add(queue: &Queue, id: &str, kind: JobKind) {
+        queue.add(id, &StructureId::parse("bridge").unwrap(), kind, None);
+    }
+
+    /// Whether a job gets its turn without waiting.
+    async fn has_turn(queue: &Queue, id: &str) -> bool {
+        tokio::time::timeout(Duration::from_millis(20), queue.turn(id)).await.is_ok_and(|turn| turn.is_ok())
+    }
+
+    #[tokio::test]
+    async fn a_short_job_does_not_wait_behind_a_long_one_and_long_ones_run_in_order() {
+        let queue = queue();
+        for (id, kind) in [("t1", JobKind::Training), ("x2", JobKind::Extension), ("d3", JobKind::Diagnosis)] {
+            add(&queue, id, kind);
+        }
+        add(&queue, "t4", JobKind::Training);
+        assert!(!has_turn(&queue, "x2").await, "t1 is before it");
+        assert!(has_turn(&queue, "t1").await);
+        assert!(has_turn(&queue, "d3").await, "a diagnosis has a lane of its own");
+        let place = |id: &str| queue.status(id).unwrap().place;
+        assert_eq!([place("t1"), place("x2"), place("t4")], [None, Some(1), Some(2)]);
+        assert!(queue.move_to_front("t4"));
+        assert_eq!([place("x2"), place("t4")], [Some(2), Some(1)]);
+        assert!(!queue.move_to_front("t1"), "it runs");
+        assert!(!has_turn(&queue, "t4").await, "t1 still runs");
+        queue.end("t1", JobState::Done);
+        assert!(!has_turn(&queue, "x2").await, "t4 was moved before it");
+        assert!(has_turn(&queue, "t4").await);
+    }
+
+    #[tokio::test]
+    async fn a_cancelled_job_ends_at_once_where_it_waits_and_at_its_next_report_where_it_computes() {
+        let queue = queue();
+        add(&queue, "t1", JobKind::Training);
+        add(&queue, "t2", JobKind::Training);
+        queue.turn("t1").await.unwrap();
+        let waiting = tokio::spawn({
+            let queue = queue.clone();
+            async move { queue.turn("t2").await }
+        });
+        tokio::time::sleep(Duration::from_millis(10)).await;
+        assert!(queue.cancel("t2") && !queue.cancel("unknown"));
+        assert_eq!(waiting.await.unwrap(), Err(Halt::Cancelled));
+
+        let (handle, (reported, reports)) = (queue.clone(), std::sync::mpsc::channel());
+        let work = tokio::spawn(computed("training", move || -> Result<(), String> {
+            loop {
+                handle.report("t1", "epoch".to_owned());
+                let _ = reported.send(());
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }));
+        tokio::task::spawn_blocking(move || reports.recv().unwrap()).await.unwrap();
+        assert!(queue.cancel("t1"));
+        assert_eq!(work.await.unwrap(), Err(Halt::Cancelled));
+    }
+
+    #[tokio::test]
+    async fn a_stop_ends_jobs_that_wait_and_jobs_that_compute_and_a_panic_is_a_failure() {
+        let queue = queue();
+        add(&queue, "t1", JobKind::Training);
+        queue.turn("t1").await.unwrap();
+        add(&queue, "t2", JobKind::Training);
+        queue.stop();
+        assert_eq!(queue.turn("t2").await, Err(Halt::Stopping));
+        let handle = queue.clone();
+        let ended = computed("training", move || -> Result<(), String> {
+            // As from within a parallel loop.
+            rayon::join(|| handle.report("t1", "epoch".to_owned()), || ());
+            Err("it went on".to_owned())
+        });
+        assert_eq!(ended.await, Err(Halt::Stopping));
+        let failed = computed::<()>("training", || panic!("on purpose"));
+        assert_eq!(failed.await, Err(Halt::Failed("the training panicked".to_owned())));
+    }
+}

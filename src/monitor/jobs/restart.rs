@@ -1,0 +1,62 @@
+//! Jobs that had not ended when the service last stopped.
+
+use tracing::{info, warn};
+
+use super::extensions::run_extension;
+use super::runner::Jobs;
+use super::study::ExtensionTraining;
+use super::trainings::{run_training, TrainingRequest};
+use crate::monitor::error::{Error, JobError};
+use crate::quantity::{StructureId, Timestamp};
+use crate::store::{JobEnd, TrainingJobRecord};
+
+impl Jobs {
+    /// Marks the diagnoses that were running when the service last stopped as failed, and begins its trainings and extensions again.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn resume(&self) -> Result<(), Error> {
+        let interrupted = self.store.diagnoses().end_interrupted_jobs(Timestamp::now()).await?;
+        if interrupted.failed > 0 {
+            let failed = interrupted.failed;
+            warn!("Marked {failed} jobs as failed, because they were running when the service stopped");
+        }
+        for (id, request) in interrupted.extensions {
+            if let Err(failure) = resume_extension(self, &id, &request).await {
+                let end = JobEnd::Failed(format!("it could not begin again after a stop of the service: {failure}"));
+                self.store.diagnoses().finish_extension(&id, end, Timestamp::now()).await?;
+            }
+        }
+        for record in self.store.trainings().unfinished().await? {
+            if let Err(failure) = resume_training(self, &record) {
+                let end = JobEnd::Failed(format!("it could not begin again after a stop of the service: {failure}"));
+                self.store.trainings().finish(&record.id, end, Timestamp::now()).await?;
+            }
+        }
+        Ok(())
+    }
+}
+
+async fn resume_extension(jobs: &Jobs, id: &str, request: &str) -> Result<(), JobError> {
+    let (record, _) = jobs.diagnosis(id).await?;
+    let active = jobs.structures.get(&record.structure)?;
+    let refuse = |reason: String| JobError::NoExtension { diagnosis: id.to_owned(), reason };
+    let training: ExtensionTraining = serde_json::from_str(request).map_err(|e| refuse(e.to_string()))?;
+    if record.structure_digest != *active.simulator.digest() {
+        return Err(refuse("the structure has another version now: diagnose the present version".to_owned()));
+    }
+    say("extension", id, &record.structure);
+    run_extension(jobs, record, active, training);
+    Ok(())
+}
+
+fn resume_training(jobs: &Jobs, record: &TrainingJobRecord) -> Result<(), String> {
+    let request: TrainingRequest = serde_json::from_str(&record.request).map_err(|e| e.to_string())?;
+    say("training", &record.id, &record.structure);
+    run_training(jobs, record, request);
+    Ok(())
+}
+
+fn say(what: &str, id: &str, structure: &StructureId) {
+    info!(structure.id = %structure, job = %id, "The {what} {id} of {structure}, which a stop interrupted, begins again");
+}

@@ -1,0 +1,171 @@
+//! Runs jobs, and reads and changes the list of them.
+
+use std::future::Future;
+use std::sync::Arc;
+
+use tracing::{error, info, warn};
+
+use super::queue::{Halt, JobStatus, Queue};
+use crate::monitor::error::{Error, JobError};
+use crate::monitor::events::Events;
+use crate::monitor::structures::ActiveStructures;
+use crate::monitor::versions::Versions;
+use crate::quantity::{shown, StructureId, Timestamp};
+use crate::store::{DiagnosisTrigger, JobEnd, JobKind, JobRecord, JobState, Store};
+
+/// Largest number of jobs that run or wait.
+pub(super) const MOST_JOBS: usize = 16;
+
+/// Result of a job as JSON, with the report of a diagnosis as HTML; or why there is none.
+pub(super) type JobOutput = Result<(String, Option<String>), Halt>;
+
+/// Starts jobs and reads their results.
+#[derive(Clone)]
+pub struct Jobs {
+    pub(super) store: Store,
+    pub(super) structures: Arc<ActiveStructures>,
+    pub(super) versions: Versions,
+    pub(super) queue: Queue,
+    /// Held while a training is started, so that two requests at once do not start two of the same structure.
+    pub(super) starting: Arc<tokio::sync::Mutex<()>>,
+}
+
+impl Jobs {
+    pub(in crate::monitor) fn new(
+        store: Store,
+        structures: Arc<ActiveStructures>,
+        versions: Versions,
+        events: Events,
+    ) -> Self {
+        Self { store, structures, versions, queue: Queue::new(events), starting: Arc::default() }
+    }
+
+    /// Runs a job in the background when its turn comes, and stores its end.
+    pub(super) fn run(
+        &self,
+        id: &str,
+        structure: &StructureId,
+        (kind, trigger): (JobKind, Option<DiagnosisTrigger>),
+        work: impl Future<Output = JobOutput> + Send + 'static,
+    ) {
+        self.queue.add(id, structure, kind, trigger);
+        let (jobs, id, name) = (self.clone(), id.to_owned(), kind_name(kind));
+        let work = {
+            let (queue, id) = (self.queue.clone(), id.clone());
+            async move {
+                queue.turn(&id).await?;
+                work.await
+            }
+        };
+        tokio::spawn(async move {
+            // In a task of its own, so that a panic does not leave the job in the queue for ever.
+            let output = tokio::spawn(work).await.unwrap_or_else(|_| Err(Halt::Failed(format!("the {name} panicked"))));
+            let (state, end) = match output {
+                Ok(output) => (JobState::Done, JobEnd::Done(output)),
+                Err(Halt::Cancelled) => {
+                    info!(job = %id, "The {name} {id} was cancelled");
+                    (JobState::Cancelled, JobEnd::Cancelled)
+                }
+                Err(Halt::Failed(failure)) => {
+                    warn!(job = %id, "The {name} {id} failed: {failure}");
+                    (JobState::Failed, JobEnd::Failed(failure))
+                }
+                // What is stored stays as it is: the next start finds the job there.
+                Err(Halt::Stopping) => return jobs.queue.end(&id, JobState::Waiting),
+            };
+            if let Err(failure) = store_end(&jobs, &id, kind, end).await {
+                error!(job = %id, "Could not store the result of the {name} {id}: {failure}");
+            }
+            jobs.queue.end(&id, state);
+        });
+    }
+
+    /// Jobs of all structures, newest first, at most `limit`, each with what it is doing now if it runs or waits.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn list(&self, limit: usize) -> Result<Vec<(JobRecord, Option<JobStatus>)>, Error> {
+        let records = self.store.diagnoses().jobs(limit).await?;
+        let with_status = |mut record: JobRecord| {
+            let open = matches!(record.state, JobState::Running | JobState::Waiting);
+            let status = open.then(|| self.queue.status(&record.id)).flatten();
+            if let Some(status) = &status {
+                record.state = if status.waits { JobState::Waiting } else { JobState::Running };
+            }
+            (record, status)
+        };
+        Ok(records.into_iter().map(with_status).collect())
+    }
+
+    /// Requests the end of a job: at once if it waits, otherwise at its next epoch, cell of the calibration, or step.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownJob`] if it neither runs nor waits.
+    pub fn cancel(&self, id: &str) -> Result<(), JobError> {
+        if self.queue.cancel(id) {
+            Ok(())
+        } else {
+            Err(JobError::UnknownJob(shown(id)))
+        }
+    }
+
+    /// Moves a waiting job before the others.
+    ///
+    /// # Errors
+    /// [`JobError::UnknownJob`] if it neither runs nor waits; [`JobError::NotWaiting`] if it runs.
+    pub fn move_to_front(&self, id: &str) -> Result<(), JobError> {
+        if self.queue.move_to_front(id) {
+            return Ok(());
+        }
+        Err(match self.queue.status(id) {
+            Some(_) => JobError::NotWaiting(shown(id)),
+            None => JobError::UnknownJob(shown(id)),
+        })
+    }
+
+    /// Ends all jobs, because the service stops. Trainings and extensions begin again after the next start.
+    pub async fn stop(&self) {
+        self.queue.stop();
+        if let Err(failure) = self.store.diagnoses().note_orderly_stop().await {
+            warn!("Could not note that this stop is an orderly one: {failure}");
+        }
+    }
+
+    /// What a job is doing now; `None` if it neither runs nor waits.
+    pub fn status(&self, id: &str) -> Option<JobStatus> {
+        self.queue.status(id)
+    }
+
+    /// Whether a job of a structure runs or waits, or no job can be added.
+    pub(in crate::monitor) fn is_busy(&self, structure: &StructureId) -> bool {
+        self.queue.has(structure) || self.running() >= MOST_JOBS
+    }
+
+    /// Number of jobs that run or wait.
+    pub fn running(&self) -> usize {
+        self.queue.count()
+    }
+}
+
+async fn store_end(jobs: &Jobs, id: &str, kind: JobKind, end: JobEnd<(String, Option<String>)>) -> Result<(), Error> {
+    let now = Timestamp::now();
+    let only_json = match end.clone() {
+        JobEnd::Done((json, _)) => JobEnd::Done(json),
+        JobEnd::Failed(failure) => JobEnd::Failed(failure),
+        JobEnd::Cancelled => JobEnd::Cancelled,
+    };
+    match kind {
+        JobKind::Diagnosis => jobs.store.diagnoses().finish_diagnosis(id, end, now).await?,
+        JobKind::Extension => jobs.store.diagnoses().finish_extension(id, only_json, now).await?,
+        JobKind::Training => jobs.store.trainings().finish(id, only_json, now).await?,
+    }
+    Ok(())
+}
+
+const fn kind_name(kind: JobKind) -> &'static str {
+    match kind {
+        JobKind::Diagnosis => "diagnosis",
+        JobKind::Extension => "extension by diagnosis",
+        JobKind::Training => "training",
+    }
+}

@@ -1,0 +1,97 @@
+//! Jobs that had not ended when the process did.
+
+use super::diagnosis::Diagnoses;
+use super::error::Error;
+use crate::quantity::Timestamp;
+
+/// Unexpected ends of the program after which a job is not begun again: it may be their cause.
+const MOST_INTERRUPTIONS: i64 = 3;
+
+/// What became of the jobs that had not ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Interrupted {
+    /// Number of jobs that were marked as failed.
+    pub failed: u64,
+    /// Extensions that begin again: id of the diagnosis, and the request as JSON.
+    pub extensions: Vec<(String, String)>,
+}
+
+impl Diagnoses<'_> {
+    /// Marks the diagnoses that were running when an earlier process ended as failed. Trainings and extensions, which are long, begin
+    /// again, unless the program ended unexpectedly several times in a row while they were running.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn end_interrupted_jobs(self, now: Timestamp) -> Result<Interrupted, Error> {
+        const WHY: &str = "the service stopped while it was running: request it again";
+        const TOO_OFTEN: &str =
+            "the service ended unexpectedly several times in a row while it was running; its log may say why";
+        let now = now.micros();
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let mut failed = 0;
+                    for (update, why) in [
+                        (
+                            "update diagnosis set state = 'failed', failure = $1, finished_at_us = $2 where state = 'running'",
+                            WHY,
+                        ),
+                        (
+                            "update diagnosis set extension_state = 'failed', extension_failure = $1, extended_at_us = $2
+                             where extension_state = 'running' and extension_request is null",
+                            WHY,
+                        ),
+                        (
+                            "update diagnosis set extension_state = 'failed', extension_failure = $1, extended_at_us = $2
+                             where extension_state = 'running' and extension_interruptions >= $3",
+                            TOO_OFTEN,
+                        ),
+                        (
+                            "update training set state = 'failed', failure = $1, finished_at_us = $2
+                             where state = 'waiting' and interruptions >= $3",
+                            TOO_OFTEN,
+                        ),
+                    ] {
+                        let query = sqlx::query(update).bind(why).bind(now);
+                        let query = if update.contains("$3") { query.bind(MOST_INTERRUPTIONS) } else { query };
+                        failed += query.execute(transaction.connection()).await?.rows_affected();
+                    }
+                    for update in [
+                        "update diagnosis set extension_interruptions = extension_interruptions + 1
+                         where extension_state = 'running'",
+                        "update training set interruptions = interruptions + 1 where state = 'waiting'",
+                    ] {
+                        sqlx::query(update).execute(transaction.connection()).await?;
+                    }
+                    let extensions = sqlx::query_as(
+                        "select diagnosis_id, extension_request from diagnosis
+                         where extension_state = 'running' order by extension_begun_at_us",
+                    )
+                    .fetch_all(transaction.connection())
+                    .await?;
+                    Ok(Interrupted { failed, extensions })
+                })
+            })
+            .await
+    }
+
+    /// Notes that the present end of the process is an orderly one, which no job has caused.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn note_orderly_stop(self) -> Result<(), Error> {
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    for update in [
+                        "update diagnosis set extension_interruptions = 0 where extension_state = 'running'",
+                        "update training set interruptions = 0 where state = 'waiting'",
+                    ] {
+                        sqlx::query(update).execute(transaction.connection()).await?;
+                    }
+                    Ok(())
+                })
+            })
+            .await
+    }
+}
