@@ -18,6 +18,11 @@ use crate::monitor::Monitor;
 /// messages.
 const WAITING: usize = 64;
 
+/// Requests that may wait to be sent to the broker, most of them acknowledgements: one for each packet id of the protocol, and some for
+/// subscriptions. The loop that sends them also hands messages over and waits while `WAITING` of them are there; an acknowledgement
+/// that then had to wait for a place in this queue would stop both for good.
+const REQUESTS: usize = u16::MAX as usize + WAITING;
+
 /// Maximum number of messages that are processed at a time.
 const AT_A_TIME: usize = 8;
 
@@ -54,7 +59,7 @@ pub fn run(
         return Ok(None);
     }
     let (options, topic) = (settings.options()?, settings.topic()?);
-    let (client, events) = AsyncClient::new(options, 2 * WAITING);
+    let (client, events) = AsyncClient::new(options, REQUESTS);
     status.set(false, None);
     let intake = Arc::new(Intake { monitor, topic: topic.clone(), max_payload_bytes: settings.max_payload_bytes });
     // Incremented with every connection: an acknowledgement is only valid on the connection on which its message
@@ -65,7 +70,8 @@ pub fn run(
     let (status, url) = (status.clone(), settings.url.clone());
     Ok(Some(tokio::spawn(async move {
         let working = tokio::spawn(work(to_work, in_work, intake));
-        let acknowledging = tokio::spawn(acknowledge(to_acknowledge, client.clone(), Arc::clone(&connection)));
+        let acknowledging =
+            tokio::spawn(acknowledge(to_acknowledge, client.clone(), Arc::clone(&connection), status.clone()));
         let link = Link { client, filter: topic.filter(), status, url, connection, arrived, trouble: None };
         link.hold(events, stop).await;
         // Unacknowledged messages are delivered again after the next start.
@@ -87,9 +93,16 @@ async fn work(mut arrived: mpsc::Receiver<Arrived>, in_work: mpsc::Sender<InWork
 }
 
 /// Acknowledges messages in the order of their arrival, as the protocol requires.
-async fn acknowledge(mut in_work: mpsc::Receiver<InWork>, client: AsyncClient, connection: Arc<AtomicU64>) {
+async fn acknowledge(
+    mut in_work: mpsc::Receiver<InWork>,
+    client: AsyncClient,
+    connection: Arc<AtomicU64>,
+    status: MqttStatus,
+) {
     while let Some(InWork { arrived, work }) = in_work.recv().await {
-        if let Err(panicked) = work.await {
+        let worked = work.await;
+        status.finished();
+        if let Err(panicked) = worked {
             // The message is not acknowledged, so the broker delivers it again on the next connection.
             error!(error = %panicked, "The processing of an MQTT message failed: {panicked}");
             continue;
@@ -170,6 +183,7 @@ impl Link {
             }
             Event::Incoming(Packet::Publish(publish)) => {
                 let connection = self.connection.load(Ordering::SeqCst);
+                self.status.arrived();
                 // Blocks while the queue is full; the receiver lives as long as this task.
                 let _ = self.arrived.send(Arrived { connection, publish }).await;
             }

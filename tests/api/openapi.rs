@@ -315,6 +315,18 @@ async fn the_answer_of_each_get_agrees_with_the_document() {
     })
     .await;
 
+    let recipe = json!({ "samples": 100, "epochs": 1, "units": 1, "rounds": 1 });
+    let training = service.post("/v1/structures/three-dof/trainings", &recipe).await;
+    assert_eq!(training.status(), 202);
+    let training: Value = training.json().await.unwrap();
+    let schema = response_schema(&document, "/v1/structures/{id}/trainings", "post", 202, "application/json");
+    assert!(validator(&document, &schema).is_valid(&training), "{training:#}");
+    let training = training["training"].as_str().unwrap();
+    eventually("the end of the training", async || {
+        (service.read(&format!("/v1/trainings/{training}")).await["state"] == "done").then_some(())
+    })
+    .await;
+
     let webhook = json!({ "url": "https://receiver.invalid/alarms", "enabled": false });
     let webhook = created(service.post("/v1/webhooks", &webhook).await).await;
     created(service.post("/v1/backups", &json!({})).await).await;
@@ -335,6 +347,8 @@ async fn the_answer_of_each_get_agrees_with_the_document() {
         }
         let concrete = if path.starts_with("/v1/diagnoses") {
             path.replace("{id}", diagnosis)
+        } else if path.starts_with("/v1/trainings") {
+            path.replace("{id}", training)
         } else if path.starts_with("/v1/webhooks") {
             path.replace("{id}", webhook["webhook"].as_str().unwrap())
         } else {
