@@ -3,7 +3,7 @@
 use crate::alarm::ALARM_KINDS;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
-const MEANINGS: [(&str, &str); 37] = [
+const MEANINGS: [(&str, &str); 38] = [
     ("modalwatch_alarms_total", "Alarms raised."),
     ("modalwatch_assessment_seconds", "Time of an assessment."),
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
@@ -25,6 +25,10 @@ const MEANINGS: [(&str, &str); 37] = [
     ("modalwatch_model_reloads_total", "Reloads of a trained baseline, by outcome."),
     ("modalwatch_mqtt_connected", "1 while the broker is connected."),
     ("modalwatch_mqtt_messages_total", "Messages from the broker, by outcome."),
+    (
+        "modalwatch_mqtt_waiting_messages",
+        "Messages from the broker that have arrived and are not stored or in quarantine yet.",
+    ),
     ("modalwatch_open_alarms", "Open alarms."),
     ("modalwatch_open_files", "Files open in this process."),
     ("modalwatch_pending_batches", "Batches that wait for their assessment."),

@@ -74,7 +74,6 @@ impl MqttStatus {
         inner.waiting = inner.waiting.saturating_sub(1);
         inner.progress = Some(Instant::now());
         metrics::gauge!("modalwatch_mqtt_waiting_messages").set(inner.waiting as f64);
-        metrics::counter!("modalwatch_mqtt_finished_total").increment(1);
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Inner> {

@@ -229,6 +229,7 @@ async fn from_an_empty_folder_to_an_alarm_and_a_printed_report_by_the_page_alone
     upload(&mut page, &german(&structure, folder.path()));
     mark_healthy(&mut page);
     alarm(&mut page, "before the extension");
+    page.evaluate("window.scrollTo(0, 0)");
     picture(&mut page, "5-alarm");
     diagnose_and_extend(&mut page);
     section(&mut page, "condition");

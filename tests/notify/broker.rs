@@ -29,8 +29,9 @@ impl Broker {
         let folder = tempfile::tempdir().unwrap();
         let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let config = format!(
-            "per_listener_settings true\npersistence false\nmax_queued_messages 0\nlistener {port} 127.0.0.1\n\
-             allow_anonymous true\n{more}"
+            "per_listener_settings true\nmax_queued_messages 0\nlistener {port} 127.0.0.1\nallow_anonymous true\n\
+             persistence_location {}/\n{more}",
+            folder.path().display()
         );
         std::fs::write(folder.path().join("broker.conf"), config).unwrap();
         let child = run(&program, folder.path());
@@ -65,19 +66,40 @@ impl Broker {
         panic!("mosquitto does not listen on port {}", self.port);
     }
 
+    /// A broker that keeps the messages of absent clients on disk, and delivers them without waiting for acknowledgements.
+    pub fn start_persistent() -> Option<Self> {
+        // Started by root, the broker becomes a user that cannot write to the temporary folder, unless it is told to stay root.
+        Self::start_with(
+            "user root\npersistence true\nautosave_interval 1\nautosave_on_changes true\nmax_inflight_messages 0\n",
+        )
+    }
+
+    /// Ends the broker in order, so that it writes what it keeps, and starts it again.
+    pub fn bounce(&mut self) {
+        let pid = rustix::process::Pid::from_child(&self.child);
+        rustix::process::kill_process(pid, rustix::process::Signal::TERM).unwrap();
+        self.child.wait().unwrap();
+        self.restart();
+    }
+
     /// Publishes messages and returns when the broker has them.
     pub async fn publish(&self, messages: &[(&str, Vec<u8>)]) {
+        self.publish_as(QoS::AtLeastOnce, messages).await;
+    }
+
+    /// As [`Broker::publish`], with a quality of service of 1 or 2.
+    pub async fn publish_as(&self, qos: QoS, messages: &[(&str, Vec<u8>)]) {
         let name = format!("gateway-{}", uuid::Uuid::now_v7().simple());
         let mut options = MqttOptions::new(name, "127.0.0.1", self.port);
         options.set_max_packet_size(8 << 20, 8 << 20);
         let (client, mut events) = AsyncClient::new(options, messages.len() + 10);
         for (topic, payload) in messages {
-            client.publish(*topic, QoS::AtLeastOnce, false, payload.clone()).await.unwrap();
+            client.publish(*topic, qos, false, payload.clone()).await.unwrap();
         }
         let mut missing = messages.len();
         while missing > 0 {
             let event = tokio::time::timeout(Duration::from_secs(10), events.poll()).await.unwrap().unwrap();
-            missing -= usize::from(matches!(event, Event::Incoming(Packet::PubAck(_))));
+            missing -= usize::from(matches!(event, Event::Incoming(Packet::PubAck(_) | Packet::PubComp(_))));
         }
     }
 }

@@ -3,7 +3,9 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::time::{Duration, Instant};
 
+use rumqttc::QoS;
 use serde_json::{json, Value};
 
 use crate::broker::Broker;
@@ -180,4 +182,73 @@ async fn every_message_is_stored_exactly_once_whenever_the_service_is_killed() {
     assert!(seen[0] < MESSAGES, "the service was killed after the last message: the test shows nothing");
     assert_eq!(service.read("/v1/quarantine").await["items"], json!([]));
     assert_eq!(service.stop("TERM").code(), Some(0));
+}
+
+/// Number of stored batches of the structure.
+async fn batches(service: &Service) -> usize {
+    let overview = service.read("/v1/overview").await;
+    let items = overview["items"].as_array().unwrap();
+    items.iter().find(|item| item["id"] == "three-dof").unwrap()["batches"].as_u64().unwrap() as usize
+}
+
+/// One measurement, at a time of its own: 100,000 of them lie in the months that [`measurements`] knows.
+fn single(number: usize) -> Vec<u8> {
+    json!({ "measurements": measurements([4.0, 5.0, 6.0], 1, number * 200) }).to_string().into_bytes()
+}
+
+/// Messages in the backlog of each quality of service.
+fn backlog() -> usize {
+    std::env::var("MODALWATCH_BACKLOG").map_or(600, |text| text.parse().unwrap())
+}
+
+/// A broker sends its backlog as fast as it can when the service comes back, before anything is acknowledged.
+///
+/// `MODALWATCH_BACKLOG=50000 cargo test --release --test notify backlog -- --nocapture` is the same with 100,000 messages.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_backlog_of_the_broker_is_taken_whole_although_the_broker_restarts_in_between() {
+    let each = backlog();
+    let Some(mut broker) = Broker::start_persistent() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let mut service = start(folder.path(), &broker);
+    connected(&service, true).await;
+    assert_eq!(service.stop("TERM").code(), Some(0));
+    for (half, qos) in [QoS::AtLeastOnce, QoS::ExactlyOnce].into_iter().enumerate() {
+        for first in (half * each..(half + 1) * each).step_by(1_000) {
+            let end = (first + 1_000).min((half + 1) * each);
+            let messages: Vec<(&str, Vec<u8>)> = (first..end).map(|number| (TOPIC, single(number))).collect();
+            broker.publish_as(qos, &messages).await;
+        }
+    }
+    let begun = Instant::now();
+    let service = start(folder.path(), &broker);
+    let (mut restarted, mut stored, mut progress) = (false, 0, Instant::now());
+    while stored < 2 * each {
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        let now = batches(&service).await;
+        if now > stored {
+            (stored, progress) = (now, Instant::now());
+        }
+        assert!(
+            progress.elapsed() < Duration::from_secs(60),
+            "stopped after {stored} of {} messages: {}",
+            2 * each,
+            service.read("/readyz").await
+        );
+        if !restarted && stored > each / 2 {
+            broker.bounce();
+            restarted = true;
+        }
+    }
+    let elapsed_s = begun.elapsed().as_secs_f64();
+    println!("{stored} messages in {elapsed_s:.0} s, {:.0} a second", stored as f64 / elapsed_s);
+    // Behind this message nothing is left that could be stored a second time.
+    broker.publish(&[(TOPIC, single(2 * each))]).await;
+    eventually("the last message", async || (batches(&service).await > 2 * each).then_some(())).await;
+    assert!(restarted);
+    assert_eq!(batches(&service).await, 2 * each + 1, "each message is stored once");
+    assert_eq!(service.read("/v1/quarantine").await["items"], json!([]));
+    eventually("no message waits", async || {
+        (metric(&service, "modalwatch_mqtt_waiting_messages").await < 0.5).then_some(())
+    })
+    .await;
 }
