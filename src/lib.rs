@@ -31,7 +31,7 @@
 //!  simulator                             from parameters to natural frequencies; the structure file
 //!  physics | emulator | gsa | flow       eigenproblems | emulators of finite-element runs | Sobol' indices | the invertible network
 //!  parameter · measurement               unknowns and their priors · measurements and their checks
-//!  quantity · stats · simd · plot · reduction · volume   units, statistics, vector arithmetic, SVG, data reduction, file systems
+//!  quantity · stats · simd · plot · reduction · volume · private   units, statistics, vector arithmetic, SVG, data reduction, file systems, permissions
 //! ```
 //!
 //! `docs/architecture.md` follows one batch through these modules.
@@ -121,6 +121,7 @@ pub mod parameter;
 pub mod physics;
 pub mod plot;
 pub mod posterior;
+pub mod private;
 pub mod process;
 pub mod quantity;
 pub mod reduction;

@@ -10,6 +10,7 @@ use serde_json::json;
 use super::remote::LocationArgs;
 use crate::baseline::library::Library;
 use crate::config::Config;
+use crate::private;
 use crate::quantity::Timestamp;
 use crate::store::backup::{self, BackupModel, Manifest, Restored};
 use crate::store::Error;
@@ -101,14 +102,15 @@ async fn by_service(args: &BackupArgs, config: &Config, out: &Path) -> anyhow::R
 /// Copies the two files of a backup to a temporary folder, which is renamed to `to` when it is complete.
 fn copy_folder(from: &Path, to: &Path) -> anyhow::Result<()> {
     let parent = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(parent)?;
-    let draft = tempfile::Builder::new().prefix(".draft-").tempdir_in(parent)?;
+    private::create_folder(parent)?;
+    let draft = private::temporary_folder(".draft-", parent)?;
     for entry in std::fs::read_dir(from)? {
         let entry = entry?;
         let copy = draft.path().join(entry.file_name());
         std::fs::copy(entry.path(), &copy)?;
         std::fs::File::open(&copy)?.sync_all()?;
     }
+    private::narrow(draft.path())?;
     std::fs::File::open(draft.path())?.sync_all()?;
     std::fs::rename(draft.keep(), to)?;
     std::fs::File::open(parent)?.sync_all()?;

@@ -1,5 +1,7 @@
 //! Full and failing disks, recovery, and the deletion of old batches.
 
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
 use std::process::Command;
 
 use reqwest::Response;
@@ -158,4 +160,62 @@ async fn batches_are_deleted_only_on_request_and_never_those_of_references_and_a
     assert_eq!(still["items"].as_array().unwrap().len(), alarms["items"].as_array().unwrap().len(), "{still}");
     let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 86_400 * 40)).await;
     assert_eq!(batch["assessment"]["undamaged_version"], 1, "{batch}");
+}
+
+/// Everything below a folder that others than its owner may use in any way.
+fn open_to_others(folder: &Path) -> Vec<String> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let mode = std::fs::symlink_metadata(&path).unwrap().permissions().mode() & 0o777;
+        if mode & 0o077 != 0 {
+            found.push(format!("{} {mode:o}", path.display()));
+        }
+        if path.is_dir() {
+            found.extend(open_to_others(&path));
+        }
+    }
+    found
+}
+
+/// The command with a mask that takes no permission from new files.
+fn without_mask(command: &Command) -> Command {
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "umask 000; exec \"$0\" \"$@\""]).arg(command.get_program()).args(command.get_args());
+    shell.envs(command.get_envs().filter_map(|(name, value)| Some((name, value?))));
+    shell
+}
+
+#[tokio::test]
+async fn the_files_of_the_service_are_its_owners_only_whatever_the_mask_says() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = folder.path().join("data");
+    // What an earlier version has left: a lock file for everybody, and a backup that was killed.
+    let draft = data.join("backups/.draft-killed");
+    std::fs::create_dir_all(&draft).unwrap();
+    std::fs::set_permissions(data.join("backups"), std::fs::Permissions::from_mode(0o755)).unwrap();
+    std::fs::write(data.join("modalwatch.lock"), "").unwrap();
+    std::fs::set_permissions(data.join("modalwatch.lock"), std::fs::Permissions::from_mode(0o666)).unwrap();
+
+    let mut service = Service::spawn(&mut without_mask(&command(&data)));
+    with_past(&service, 2).await;
+    assert_eq!(service.post("/v1/backups", &json!({ "name": "one" })).await.status(), 201);
+    assert_eq!(open_to_others(&data), Vec::<String>::new());
+    assert!(!draft.exists(), "the folder of a killed backup is removed at the start");
+    service.stop("TERM");
+
+    let program = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+        command.args(args);
+        let output = without_mask(&command).output().unwrap();
+        assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    };
+    let (out, restored) = (folder.path().join("kept/out"), folder.path().join("restored"));
+    program(&["backup", "--data-dir", text(&data), "--out", text(&out)]);
+    std::fs::create_dir(&restored).unwrap();
+    program(&["restore", "--from", text(&out), "--data-dir", text(&restored)]);
+    program(&["restore", "--from", text(&out), "--data-dir", text(&restored), "--replace"]);
+    for folder in [&data, &out, &restored] {
+        assert_eq!(open_to_others(folder), Vec::<String>::new());
+    }
 }

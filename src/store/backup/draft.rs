@@ -12,6 +12,7 @@ use super::super::file::{refuse_foreign, take_lock, DATABASE_FILE};
 use super::copy::{read_contents, sha256, sync_folder, Contents};
 use super::error::{at, Error};
 use super::manifest::{check_name, read_manifest, BackupModel, Manifest, FOLDER, FORMAT, MANIFEST_FILE};
+use crate::private;
 use crate::quantity::Timestamp;
 use crate::volume;
 
@@ -100,12 +101,12 @@ impl Draft {
             return Err(Error::Exists(target.display().to_string()));
         }
         let parent = target.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        fs::create_dir_all(parent).map_err(at(parent))?;
+        private::create_folder(parent).map_err(at(parent))?;
         let free = volume::free_bytes(parent).map_err(at(parent))?;
         if free < needed {
             return Err(Error::NoRoom { needed, free, path: parent.to_owned() });
         }
-        let folder = tempfile::Builder::new().prefix(".draft-").tempdir_in(parent).map_err(at(parent))?;
+        let folder = private::temporary_folder(".draft-", parent).map_err(at(parent))?;
         Ok(Self { folder, target: target.to_owned() })
     }
 
@@ -139,6 +140,7 @@ impl Draft {
             let text = serde_json::to_vec_pretty(&manifest).expect("a manifest is plain data");
             fs::write(&record, text).map_err(at(&record))?;
             File::open(&record).and_then(|file| file.sync_all()).map_err(at(&record))?;
+            private::narrow(self.folder.path()).map_err(at(self.folder.path()))?;
             sync_folder(self.folder.path())?;
             let draft = self.folder.keep();
             // A rename never replaces a folder that is not empty, so two backups with the same name cannot mix.

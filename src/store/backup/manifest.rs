@@ -11,8 +11,7 @@ use crate::quantity::Timestamp;
 
 /// Name of the manifest inside a backup.
 pub const MANIFEST_FILE: &str = "manifest.json";
-/// Folder of the backups that the service makes, inside its data folder.
-pub const FOLDER: &str = "backups";
+pub use super::super::file::BACKUP_FOLDER as FOLDER;
 /// Version of the format.
 pub(super) const FORMAT: u32 = 1;
 /// The manifest of a backup.

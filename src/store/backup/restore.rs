@@ -11,6 +11,7 @@ use super::super::file::{take_lock, DATABASE_FILE};
 use super::copy::{check_copy, sync_folder, verify};
 use super::error::{at, Error};
 use super::manifest::{name_of, Manifest};
+use crate::private;
 use crate::quantity::Timestamp;
 use crate::volume;
 
@@ -31,7 +32,7 @@ pub struct Restored {
 /// [`Error::NotEmpty`] without `replace`; [`Error::Damaged`], [`Error::TooNew`]; [`StoreError::Locked`].
 pub async fn restore(backup: &Path, data_dir: &Path, replace: bool, now: Timestamp) -> Result<Restored, Error> {
     let manifest = verify(backup).await?;
-    fs::create_dir_all(data_dir).map_err(at(data_dir))?;
+    private::create_folder(data_dir).map_err(at(data_dir))?;
     let _lock = take_lock(data_dir)?;
     let database = data_dir.join(DATABASE_FILE);
     let there = fs::metadata(&database).is_ok_and(|file| file.len() > 0);
@@ -42,7 +43,7 @@ pub async fn restore(backup: &Path, data_dir: &Path, replace: bool, now: Timesta
     if free < manifest.bytes {
         return Err(Error::NoRoom { needed: manifest.bytes, free, path: data_dir.to_owned() });
     }
-    let draft = tempfile::Builder::new().prefix(".restore-").tempdir_in(data_dir).map_err(at(data_dir))?;
+    let draft = private::temporary_folder(".restore-", data_dir).map_err(at(data_dir))?;
     let copy = draft.path().join(DATABASE_FILE);
     let (from, to) = (backup.join(&manifest.database), copy.clone());
     let copied = tokio::task::spawn_blocking(move || {
@@ -51,6 +52,7 @@ pub async fn restore(backup: &Path, data_dir: &Path, replace: bool, now: Timesta
         let mut permissions = fs::metadata(&to).map_err(at(&to))?.permissions();
         make_writable(&mut permissions);
         fs::set_permissions(&to, permissions).map_err(at(&to))?;
+        private::narrow(&to).map_err(at(&to))?;
         File::options().write(true).open(&to).and_then(|file| file.sync_all()).map_err(at(&to))
     });
     copied.await.map_err(|_| Error::Store(StoreError::Panicked))??;
@@ -87,6 +89,10 @@ async fn keep_aside(database: &Path, now: Timestamp) -> Result<PathBuf, Error> {
             fs::copy(&from, &to).map_err(at(&to))?;
             File::open(&to).and_then(|file| file.sync_all()).map_err(at(&to))?;
         }
+    }
+    for suffix in ["-wal", ""] {
+        let path = with_suffix(&aside, suffix);
+        private::narrow(&path).map_err(at(&path))?;
     }
     sync_folder(database.parent().unwrap_or(Path::new(".")))?;
     Ok(aside)

@@ -5,8 +5,8 @@ mod identity;
 mod opening;
 mod settings;
 
-pub use folder::DATABASE_FILE;
 pub(super) use folder::{prepare_folder, take_lock};
+pub use folder::{BACKUP_FOLDER, DATABASE_FILE};
 #[cfg(test)]
 pub(super) use identity::APPLICATION_ID;
 pub(super) use identity::{refuse_foreign, OpenedFile};
