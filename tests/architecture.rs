@@ -39,7 +39,7 @@ const EXCEPTIONS: [(&str, &str); 0] = [];
 const FOUNDATION: [&str; 5] = ["quantity", "stats", "parameter", "measurement", "fault"];
 
 /// Module, the modules it may use besides itself, and whether the whole foundation is among them.
-const TABLE: [(&str, &[&str], bool); 35] = [
+const TABLE: [(&str, &[&str], bool); 36] = [
     // A macro for fault injection in tests; it uses no other module.
     ("fault", &[], false),
     ("quantity", &[], false),

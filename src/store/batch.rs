@@ -136,7 +136,7 @@ impl Batches<'_> {
         .fetch_optional(&self.database.reader)
         .await?;
         let Some(row) = row else { return Ok(None) };
-        fault_point!("store::read", |_| Err(bad_row("batch")(&"a fault")));
+        fault_point!("store::read", |_| Err(super::error::unreadable()));
         let measurements: Vec<MeasurementRow> = sqlx::query_as(
             "select measured_at_us, frequency_hz, std_hz, mode_shapes, covariates, settings
              from measurement where structure_id = $1 and batch_id = $2 order by ordinal",
@@ -177,7 +177,7 @@ impl Batches<'_> {
         source: &str,
         before: Timestamp,
     ) -> Result<Option<Vec<Option<Hertz>>>, Error> {
-        fault_point!("store::read", |_| Err(bad_row("measurement")(&"a fault")));
+        fault_point!("store::read", |_| Err(super::error::unreadable()));
         let row: Option<(Vec<u8>,)> = sqlx::query_as(
             "select frequency_hz from measurement where structure_id = $1 and source = $2 and measured_at_us < $3
              order by measured_at_us desc limit 1",

@@ -164,6 +164,12 @@ impl Error {
     }
 }
 
+/// What a disk that fails for a moment causes, for fault points.
+#[cfg(test)]
+pub(super) fn unreadable() -> Error {
+    Error::from(sqlx::Error::Io(std::io::Error::other("a fault")))
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::{Store, StoreSettings};

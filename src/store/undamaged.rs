@@ -163,7 +163,7 @@ impl References<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
-        fault_point!("store::read", |_| Err(bad_row("undamaged reference")(&"a fault")));
+        fault_point!("store::read", |_| Err(super::error::unreadable()));
         let (newest,): (Option<u32>,) =
             sqlx::query_as("select max(version) from undamaged_state where structure_id = $1")
                 .bind(structure.as_str())

@@ -114,8 +114,19 @@ async fn without_a_token_only_this_machine_is_served_and_the_first_token_closes_
     }
     problem(with("host", "evil.example").await.unwrap(), 403, "forbidden_origin").await;
     problem(with("origin", "https://evil.example").await.unwrap(), 403, "forbidden_origin").await;
-    problem(with("origin", "null.example").await.unwrap(), 403, "forbidden_origin").await;
-    assert_eq!(with("origin", "http://localhost:3000").await.unwrap().status(), 200);
+    for origin in ["null", "null.example", "http://evil", "chrome-extension://abc", "http://localhost:3000"] {
+        problem(with("origin", origin).await.unwrap(), 403, "forbidden_origin").await;
+    }
+    for host in ["evil", "[::1].evil.example"] {
+        problem(with("host", host).await.unwrap(), 403, "forbidden_origin").await;
+    }
+    problem(with("sec-fetch-site", "cross-site").await.unwrap(), 403, "forbidden_origin").await;
+    let own = format!("http://{}", service.address());
+    assert_eq!(service.get(LIST).header("origin", own).send().await.unwrap().status(), 200);
+    assert_eq!(with("sec-fetch-site", "same-origin").await.unwrap().status(), 200);
+    // As nginx asks with a bare `proxy_pass`.
+    let old = service.get(LIST).version(reqwest::Version::HTTP_10).send().await.unwrap();
+    problem(old, 401, "unauthorized").await;
 
     let weak = json!({ "name": "gateway", "scopes": ["ingest"] });
     problem(service.post("/v1/tokens", &weak).await, 422, "first_token_must_be_admin").await;

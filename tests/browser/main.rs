@@ -13,6 +13,7 @@ mod firefox;
 #[allow(dead_code, reason = "of the helpers of tests/api some are enough here")]
 #[path = "../api/helpers.rs"]
 mod helpers;
+mod hostile;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;

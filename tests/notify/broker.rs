@@ -69,9 +69,7 @@ impl Broker {
     /// A broker that keeps the messages of absent clients on disk, and delivers them without waiting for acknowledgements.
     pub fn start_persistent() -> Option<Self> {
         // Started by root, the broker becomes a user that cannot write to the temporary folder, unless it is told to stay root.
-        Self::start_with(
-            "user root\npersistence true\nautosave_interval 1\nautosave_on_changes true\nmax_inflight_messages 0\n",
-        )
+        Self::start_with("user root\npersistence true\nmax_inflight_messages 0\n")
     }
 
     /// Ends the broker in order, so that it writes what it keeps, and starts it again.

@@ -1,7 +1,7 @@
 //! The address of a client, with or without proxies.
 
 use std::convert::Infallible;
-use std::net::{IpAddr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use axum::extract::{ConnectInfo, FromRequestParts, Request};
 use axum::http::request::Parts;
@@ -110,18 +110,27 @@ impl Proxies {
     }
 }
 
-/// Whether a `Host` names this machine: a loopback address, `localhost`, or a name without a dot, which no public name
-/// server resolves.
+/// Whether a `Host` names this machine: a loopback address, `localhost`, or a name below `localhost`, with or without a port.
+///
+/// Other names, also those without a dot, may be resolved by the name server of a network to this machine for the page of somebody
+/// else (DNS rebinding).
 pub(super) fn is_local_name(host: &str) -> bool {
-    if let Some(rest) = host.strip_prefix('[') {
-        let address = rest.split(']').next().unwrap_or_default();
-        return address.parse::<Ipv6Addr>().is_ok_and(|a| a.to_canonical().is_loopback());
+    let is_port =
+        |text: &str| text.is_empty() || text.strip_prefix(':').is_some_and(|port| port.parse::<u16>().is_ok());
+    if let Some((address, port)) = host.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        return is_port(port) && address.parse::<Ipv6Addr>().is_ok_and(|a| a.to_canonical().is_loopback());
     }
-    let name = host.split(':').next().unwrap_or_default();
-    match name.parse::<IpAddr>() {
-        Ok(address) => address.is_loopback(),
-        Err(_) => !name.contains('.') || name.ends_with(".localhost"),
-    }
+    let (name, port) = host.split_at(host.find(':').unwrap_or(host.len()));
+    let is_loopback = || name.parse::<Ipv4Addr>().is_ok_and(|address| address.is_loopback());
+    let name_of_this_machine =
+        name.eq_ignore_ascii_case("localhost") || name.to_ascii_lowercase().ends_with(".localhost");
+    is_port(port) && (name_of_this_machine || is_loopback())
+}
+
+/// Whether an `Origin` is the service itself, which has answered under the name `host`.
+pub(super) fn is_same_origin(origin: &str, host: &str) -> bool {
+    let place = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
+    place.is_some_and(|place| place.eq_ignore_ascii_case(host))
 }
 
 #[cfg(test)]
@@ -172,11 +181,41 @@ mod tests {
 
     #[test]
     fn names_from_outside_are_not_this_machine() {
-        for local in ["localhost", "localhost:8080", "127.0.0.1:1", "127.8.8.8", "[::1]:80", "x", "a.localhost"] {
+        for local in ["localhost", "LocalHost:8080", "127.0.0.1:1", "127.8.8.8", "[::1]:80", "[::1]", "a.localhost"] {
             assert!(is_local_name(local), "{local}");
         }
-        for foreign in ["evil.example", "evil.example:8080", "192.0.2.1", "[2001:db8::1]", "localhost.evil.example"] {
+        for foreign in [
+            "",
+            "evil",
+            "evil.example",
+            "evil.example:8080",
+            "192.0.2.1",
+            "[2001:db8::1]",
+            "localhost.evil.example",
+            "[::1].evil.example",
+            "[::1]:80.evil.example",
+            "127.0.0.1.evil.example",
+            "localhost:80@evil.example",
+            "127.1",
+        ] {
             assert!(!is_local_name(foreign), "{foreign}");
+        }
+    }
+
+    #[test]
+    fn only_the_service_itself_is_the_same_origin() {
+        let same = |origin: &str| is_same_origin(origin, "localhost:8080");
+        assert!(same("http://localhost:8080") && same("https://LOCALHOST:8080"));
+        for foreign in [
+            "null",
+            "",
+            "localhost:8080",
+            "http://localhost",
+            "http://localhost:3000",
+            "chrome-extension://localhost:8080",
+            "http://evil",
+        ] {
+            assert!(!same(foreign), "{foreign}");
         }
     }
 }

@@ -4,10 +4,10 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::Path;
 use std::sync::{Arc, RwLock};
 
-use axum::http::{header, HeaderMap, HeaderValue, StatusCode};
+use axum::http::{header, HeaderMap, HeaderValue, StatusCode, Version};
 use tracing::{info, warn};
 
-use super::client::{is_local_name, Client, NotANetwork, Proxies};
+use super::client::{is_local_name, is_same_origin, Client, NotANetwork, Proxies};
 use super::limit::Limits;
 use crate::access::{
     read_admin_token, AccessSettings, Actor, AdminFileError, Grant, Refused, TokenRecord, TokenTable, TokenText,
@@ -153,9 +153,14 @@ impl AccessControl {
         self.0.limits.take_measurements(&client.key, count)
     }
 
-    pub(super) fn grant(&self, headers: &HeaderMap, client: Option<IpAddr>) -> Result<Grant, ApiError> {
+    pub(super) fn grant(
+        &self,
+        headers: &HeaderMap,
+        version: Version,
+        client: Option<IpAddr>,
+    ) -> Result<Grant, ApiError> {
         if self.is_open() {
-            return if self.0.insecure_public { Ok(Grant::local()) } else { directly_from_here(headers) };
+            return if self.0.insecure_public { Ok(Grant::local()) } else { directly_from_here(headers, version) };
         }
         let mut given = headers.get_all(header::AUTHORIZATION).iter();
         let (Some(value), None) = (given.next(), given.next()) else {
@@ -191,20 +196,28 @@ impl AccessControl {
 }
 
 /// Grant of a request to an open service: only for programs on this machine, and not for pages of other web sites in a
-/// browser on it.
-fn directly_from_here(headers: &HeaderMap) -> Result<Grant, ApiError> {
+/// browser on it, nor for a frame without an origin.
+///
+/// A proxy that adds no header and speaks HTTP/1.1 cannot be told from a program on this machine; nginx speaks HTTP/1.0 unless it is
+/// configured otherwise, which programs of today do not.
+fn directly_from_here(headers: &HeaderMap, version: Version) -> Result<Grant, ApiError> {
     let forwarded = ["forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via"];
-    if forwarded.into_iter().any(|name| headers.contains_key(name)) {
+    if version < Version::HTTP_11 || forwarded.into_iter().any(|name| headers.contains_key(name)) {
         let detail =
             "this request came through a proxy, and without tokens only this machine is served: create a token first \
                       (modalwatch token create)";
         return Err(unauthorized(detail, None));
     }
-    let host = |name: header::HeaderName| headers.get(name).map(|value| value.to_str().unwrap_or(".").to_owned());
-    // `Host` differs if the page's domain name resolves to this machine (DNS rebinding), `Origin` for any other page.
-    let foreign = host(header::HOST).is_some_and(|host| !is_local_name(&host))
-        || host(header::ORIGIN).is_some_and(|origin| !is_local_name(origin.split("//").last().unwrap_or(".")));
-    if foreign {
+    let text = |name: &str| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
+    // `Host` differs if the page's domain name resolves to this machine (DNS rebinding), `Origin` for any other page; a browser states
+    // in `Sec-Fetch-Site` where a request without `Origin` comes from.
+    let host = text("host").unwrap_or_default();
+    let from_elsewhere = text("sec-fetch-site").is_some_and(|site| !["same-origin", "none"].contains(&site));
+    let by_address = text("sec-fetch-mode") == Some("navigate");
+    if !is_local_name(host)
+        || text("origin").is_some_and(|origin| !is_same_origin(origin, host))
+        || (from_elsewhere && !by_address)
+    {
         let detail =
             "this request comes from a page of another web site or uses another host name than localhost, and without tokens \
              only this machine is served: create a token first (modalwatch token create)";

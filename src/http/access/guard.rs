@@ -31,7 +31,7 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
     let class = route::classify(request.method(), pattern.as_deref());
     let grant = match class.need {
         Need::Nothing => Grant::nobody(),
-        Need::Scope(_) => access.grant(request.headers(), address)?,
+        Need::Scope(_) => access.grant(request.headers(), request.version(), address)?,
     };
     let client = Client::new(&grant, address);
     access.0.limits.take_request(&client.key)?;
