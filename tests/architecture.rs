@@ -120,6 +120,7 @@ const TABLE: [(&str, &[&str], bool); 36] = [
     (
         "cli",
         &[
+            "private",
             "access",
             "alarm",
             "assessment",

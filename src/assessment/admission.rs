@@ -114,14 +114,14 @@ impl Reservations {
                 self.above_noise_range,
                 format!(
                     "measurements have modes with more noise than {} times that of the structure, the most that the trained \
-                     baseline covers: those modes are left out",
+                     baseline covers: their intervals are widened to the stated noise; check that std_hz is a standard deviation in Hz",
                     range[1]
                 ),
             ),
             (
                 FindingCode::NotUsable,
                 self.unusable,
-                "measurements are left out: they lack a mode that the trained baseline needs, or have no mode within its noise range"
+                "measurements are left out: they lack a mode that the trained baseline needs"
                     .to_owned(),
             ),
         ];

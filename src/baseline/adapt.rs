@@ -32,15 +32,14 @@ use crate::stats::{self, Stream};
 /// Stages of a measurement, the first one included.
 const STAGES: usize = 8;
 
-/// Stages after which a measurement is given up that has not [`HOPEFUL`] of the effective draws it needs.
+/// Stages after which a measurement is given up of whose draws less than [`HOPEFUL`] are effective.
 const STAGES_BEFORE_DOUBT: usize = 4;
 
-/// Share of the effective draws needed, see [`STAGES_BEFORE_DOUBT`].
-const HOPEFUL: f64 = 0.15;
+/// Share of the draws, see [`STAGES_BEFORE_DOUBT`].
+const HOPEFUL: f64 = 0.01;
 
-/// Draws of a stage, as a multiple of those that are kept, and its range.
-const DRAWS_PER_STAGE: f64 = 2.0;
-const RANGE_PER_STAGE: [usize; 2] = [128, 512];
+/// Draws of a stage.
+const DRAWS_PER_STAGE: usize = 512;
 
 /// Fewest effective draws for which the draws are resampled; and at least as many as are kept.
 const EFFECTIVE: f64 = 64.0;
@@ -57,12 +56,21 @@ const RIDGE: f64 = 1e-8;
 /// Measurements that are treated together, which bounds the memory.
 const AT_A_TIME: usize = 128;
 
-/// Samples of the measurements for which adaptive importance sampling found enough effective draws.
+/// Samples of measurements by adaptive importance sampling.
 pub(super) struct Adapted {
-    /// `[draws, d]`, parameter units, of each measurement; `None` where the effective draws do not suffice.
-    pub(super) theta: Vec<Option<DMatrix<f64>>>,
+    /// The samples of each measurement; `None` where no draw has a weight.
+    pub(super) found: Vec<Option<Found>>,
     /// Simulations that were computed.
     pub(super) simulations: usize,
+}
+
+/// Samples of one measurement.
+pub(super) struct Found {
+    /// `[draws, d]`, parameter units.
+    pub(super) theta: DMatrix<f64>,
+    /// Whether the weights left enough effective draws. Otherwise the samples have the weights w^β of [`tempered`]: they lie about the
+    /// posterior, wider than it, and the conformal factors of the model apply to them.
+    pub(super) complete: bool,
 }
 
 impl Baseline {
@@ -76,16 +84,15 @@ impl Baseline {
         draws: usize,
         seed: u64,
     ) -> Result<Adapted, InferenceError> {
-        let [fewest, most] = RANGE_PER_STAGE;
-        let many = ((DRAWS_PER_STAGE * draws as f64) as usize).clamp(fewest, most);
-        // A stage of bounded size needs more stages where many draws are kept.
-        let stages = STAGES.max((4 * draws).div_ceil(many));
+        let many = DRAWS_PER_STAGE;
+        // Where many draws are kept, more stages are needed.
+        let stages = STAGES.max((8 * draws).div_ceil(many));
         let needed = EFFECTIVE.max(draws as f64);
-        let mut adapted = Adapted { theta: Vec::with_capacity(observations.len()), simulations: 0 };
+        let mut adapted = Adapted { found: Vec::with_capacity(observations.len()), simulations: 0 };
         for (chunk, part) in observations.chunks(AT_A_TIME).enumerate() {
             let stream = |row: usize| stats::stream(seed, &format!("adapted proposals {}", chunk * AT_A_TIME + row));
             let mut searches: Vec<Search> =
-                (0..part.len()).map(|row| Search::new(self.space().len(), stream(row))).collect();
+                (part.iter().enumerate()).map(|(row, one)| self.search(one, stream(row))).collect();
             let context = self.condition(part)?;
             for stage in 0..stages {
                 let open: Vec<u32> = (0..part.len() as u32).filter(|&row| searches[row as usize].is_open()).collect();
@@ -96,9 +103,18 @@ impl Baseline {
                 let judge = |search: &mut Search| search.judge(stage + 1, needed);
                 searches.par_iter_mut().filter(|search| search.is_open()).for_each(judge);
             }
-            adapted.theta.extend(searches.iter_mut().map(|search| search.resampled(draws)));
+            adapted.found.extend(searches.iter_mut().map(|search| search.resampled(draws)));
         }
         Ok(adapted)
+    }
+
+    /// A search that begins with the draws of the flow; for noise beyond the training, for which these are too narrow, with draws that
+    /// are wider in proportion. Too narrow ones would have nearly equal weights and hide what they miss.
+    fn search(&self, observation: &Observation, stream: Stream) -> Search {
+        let (d, beyond) = (self.space().len(), self.noise_beyond_training(observation));
+        let wide = || Proposal::student(DVector::zeros(d), DMatrix::identity(d, d) * beyond.powi(2));
+        let first = if beyond > 1.0 { wide() } else { None };
+        Search::new(first.unwrap_or_else(|| Proposal::of_flow(d)), stream)
     }
 
     /// Draws and weighs `many` further proposals of the measurements `open`. Returns the number of simulations.
@@ -227,11 +243,11 @@ enum State {
 }
 
 impl Search {
-    fn new(d: usize, stream: Stream) -> Self {
+    fn new(first: Proposal, stream: Stream) -> Self {
         Self {
-            d,
+            d: first.mean.len(),
             stream,
-            proposals: vec![Proposal::of_flow(d)],
+            proposals: vec![first],
             latent: Vec::new(),
             theta: Vec::new(),
             log_target: Vec::new(),
@@ -276,7 +292,7 @@ impl Search {
             self.state = State::Enough(weights);
             return;
         }
-        let hopeless = stages >= STAGES_BEFORE_DOUBT && effective < HOPEFUL * needed;
+        let hopeless = stages >= STAGES_BEFORE_DOUBT && effective < HOPEFUL * weights.len() as f64;
         match self.fitted(&log_weights, weights).filter(|_| !hopeless) {
             Some(proposal) => self.proposals.push(proposal),
             None => self.state = State::GivenUp,
@@ -304,11 +320,22 @@ impl Search {
         Proposal::student(mean, covariance)
     }
 
-    /// `draws` samples by systematic resampling, `[draws, d]`; `None` where the effective draws do not suffice.
-    fn resampled(&mut self, draws: usize) -> Option<DMatrix<f64>> {
-        let State::Enough(weights) = &self.state else { return None };
-        let chosen = stats::systematic(weights, draws, &mut self.stream);
-        Some(DMatrix::from_fn(draws, self.d, |row, column| self.theta[chosen[row] * self.d + column]))
+    /// `draws` samples by systematic resampling.
+    fn resampled(&mut self, draws: usize) -> Option<Found> {
+        let (weights, complete) = match &self.state {
+            State::Enough(weights) => (weights.clone(), true),
+            State::Open | State::GivenUp => {
+                // The densities of the last proposal are not in the mixture where it has not been drawn from.
+                let log_weights: Vec<f64> =
+                    self.log_target.iter().zip(&self.log_mixture).map(|(target, mixture)| target - mixture).collect();
+                let weights = stats::weights(&log_weights, 0.0)?;
+                let usable = weights.iter().filter(|weight| **weight > 0.0).count() as f64;
+                (tempered(&log_weights, weights, EFFECTIVE.max(draws as f64).min(0.5 * usable))?, false)
+            }
+        };
+        let chosen = stats::systematic(&weights, draws, &mut self.stream);
+        let theta = DMatrix::from_fn(draws, self.d, |row, column| self.theta[chosen[row] * self.d + column]);
+        Some(Found { theta, complete })
     }
 }
 
@@ -364,7 +391,7 @@ mod tests {
 
     /// Searches the target ln p(z) = `log_target`; the parameters are z itself.
     fn search(d: usize, seed: u64, needed: usize, log_target: impl Fn(&[f64]) -> f64) -> Option<DMatrix<f64>> {
-        let mut search = Search::new(d, stats::stream(seed, "test"));
+        let mut search = Search::new(Proposal::of_flow(d), stats::stream(seed, "test"));
         for stage in 0..STAGES {
             if search.is_open() {
                 let drawn: Vec<f64> = search.propose(2 * needed).into_iter().map(f64::from).collect();
@@ -373,7 +400,7 @@ mod tests {
                 search.judge(stage + 1, needed as f64);
             }
         }
-        search.resampled(needed)
+        search.resampled(needed).filter(|found| found.complete).map(|found| found.theta)
     }
 
     #[test]
@@ -445,6 +472,34 @@ mod tests {
     }
 
     #[test]
+    fn samples_about_a_target_that_is_not_reached_are_wider_than_it_and_in_its_place() {
+        // A thin shell about a point: no Student distribution is near it.
+        let centre = [1.5, -0.5, 0.8, 0.0, -1.0, 0.5];
+        let radius = |z: &[f64]| z.iter().zip(&centre).map(|(z, c)| (z - c).powi(2)).sum::<f64>().sqrt();
+        let log_target = |z: &[f64]| -0.5 * ((radius(z) - 2.0) / 1e-3).powi(2);
+        let mut search = Search::new(Proposal::of_flow(6), stats::stream(7, "test"));
+        for stage in 0..STAGES {
+            if search.is_open() {
+                let drawn: Vec<f64> = search.propose(256).into_iter().map(f64::from).collect();
+                search.log_target.extend(drawn.chunks_exact(6).map(log_target));
+                search.theta.extend(drawn);
+                search.judge(stage + 1, 256.0);
+            }
+        }
+        let found = search.resampled(256).unwrap();
+        assert!(!found.complete);
+        let radii: Vec<f64> =
+            found.theta.row_iter().map(|row| radius(&row.iter().copied().collect::<Vec<f64>>())).collect();
+        // The draws of N(0, I) alone have a mean radius of about 3.2 about this point, with a standard deviation of 0.9.
+        let off = |radii: &[f64]| stats::mean(&radii.iter().map(|r| (r - 2.0).abs()).collect::<Vec<f64>>());
+        let mut stream = stats::stream(8, "test");
+        let flow = Proposal::of_flow(6);
+        let of_flow: Vec<f64> = (0..256).map(|_| radius(flow.draw(&mut stream).as_slice())).collect();
+        assert!(off(&radii) < 0.5 * off(&of_flow), "{} against {}", off(&radii), off(&of_flow));
+        assert!(off(&radii) > 1e-3, "they are wider than the target");
+    }
+
+    #[test]
     fn a_hardly_trained_flow_gives_the_posterior_of_a_grid() {
         let text = "id = \"two\"\nmodes = 2\nmeasurement_noise = { relative = 0.002 }\n\
                     [[mass]]\nname = \"a\"\nkg = 1.0\n[[mass]]\nname = \"b\"\nkg = 1.5\n\
@@ -460,7 +515,9 @@ mod tests {
         let observation = Observation::complete(&exact);
         let draws = 2_000;
         let found = baseline.adapt(std::slice::from_ref(&observation), draws, 1).unwrap();
-        let found = found.theta[0].as_ref().expect("two parameters are within reach");
+        let found = found.found[0].as_ref().expect("the flow draws inside the prior");
+        assert!(found.complete, "two parameters are within reach");
+        let found = &found.theta;
         // Two frequencies of two masses have two solutions, so that the grid covers the whole prior. Its steps are smaller than a tenth of
         // the width of each mode.
         let steps = 901;

@@ -13,7 +13,7 @@ pub struct Admitted {
     pub observation: Option<Observation>,
     /// Some mode had less noise than the model was trained for.
     pub below_range: bool,
-    /// Some mode had more noise than the model was trained for, and was dropped.
+    /// Some mode had more noise than the model was trained for.
     pub above_range: bool,
     /// Covariates that an effect needs and the measurement lacks.
     pub covariates_missing: Vec<String>,
@@ -29,8 +29,9 @@ impl Baseline {
     /// Prepares a measurement for the inference: it is corrected by the learned discrepancy of the structure, and the structure's
     /// noise is used where none is given.
     ///
-    /// A mode with less noise than the model was trained for gets the smallest trained noise, and a mode with more is
-    /// treated as missing. Both make the posterior wider than necessary; neither extrapolates.
+    /// A mode with less noise than the model was trained for gets the smallest trained noise, which makes the posterior wider than
+    /// necessary. More noise is kept as stated: the flow is asked as for the largest trained noise, and its draws are weighted by the
+    /// likelihood under the stated one, or stretched in proportion where that does not succeed.
     pub fn admit(&self, measurement: &ModalMeasurement) -> Admitted {
         let (inputs_missing, inputs_beyond) = self.simulator.discrepancy_reservations(measurement);
         let measurement = &*self.simulator.corrected(measurement);
@@ -40,18 +41,16 @@ impl Baseline {
         let (mut below_range, mut above_range) = (false, false);
         match &self.manifest.conditions.noise_range {
             Some(range) => {
-                for (mode, frequency) in frequencies_hz.iter_mut().enumerate() {
+                for (mode, frequency) in frequencies_hz.iter().enumerate() {
                     let given = measurement.std_hz.as_ref().and_then(|stds| stds[mode]);
                     let own = frequency.map(|f| self.simulator.std_hz(mode, f));
                     let given = given.zip(*frequency).map(|(std, f)| self.simulator.with_emulator_error(mode, f, std));
                     let multiple = given.zip(own).map_or(1.0, |(given, own)| given / own);
                     // The tolerance keeps the limits inside the range in spite of rounding.
                     below_range |= frequency.is_some() && multiple < range.lowest * (1.0 - 1e-6);
-                    if frequency.is_some() && multiple > range.highest * (1.0 + 1e-6) {
-                        above_range = true;
-                        *frequency = None;
-                    } else if frequency.is_some() {
-                        noise_multiple[mode] = multiple.clamp(range.lowest, range.highest);
+                    above_range |= frequency.is_some() && multiple > range.highest * (1.0 + 1e-6);
+                    if frequency.is_some() {
+                        noise_multiple[mode] = multiple.max(range.lowest);
                     }
                 }
             }

@@ -93,7 +93,7 @@ impl Baseline {
         if self.is_resampled() && !observations.iter().any(Observation::is_marginalised) {
             return Ok(resample::log_likelihoods(&self.simulator, observations, theta));
         }
-        if self.manifest.spread.is_empty() {
+        if self.manifest.spread.is_empty() && !observations.iter().any(|one| self.noise_beyond_training(one) > 1.0) {
             return self.log_density_of_draws(theta, observations);
         }
         let (before, log_stretch) = self.before_stretching(theta, observations)?;
@@ -159,7 +159,7 @@ impl Baseline {
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
         let Corrected { samples, weighted } = self.infer_unstretched(observations, draws, proposals, seed)?;
-        if self.manifest.spread.is_empty() {
+        if self.manifest.spread.is_empty() && !observations.iter().any(|one| self.noise_beyond_training(one) > 1.0) {
             return Ok(samples);
         }
         let simulations = samples.simulations();
@@ -221,15 +221,19 @@ impl Baseline {
         let Resampled { mut theta, mut weighted } =
             resample::resample(&self.simulator, observations, &first, draws, seed);
         // Draws that were moved to the bounds of the prior tell of a measurement outside it, which has no posterior to adapt to.
-        let poor: Vec<usize> = (0..observations.len()).filter(|&row| !weighted[row] && !first.moved[row]).collect();
+        // The draws of the flow are too narrow for noise beyond its training, whatever their weights say.
+        let is_poor = |row: &usize| {
+            (!weighted[*row] && !first.moved[*row]) || self.noise_beyond_training(&observations[*row]) > 1.0
+        };
+        let poor: Vec<usize> = (0..observations.len()).filter(is_poor).collect();
         if !poor.is_empty() {
             let of_poor: Vec<Observation> = poor.iter().map(|row| observations[*row].clone()).collect();
             let adapted = self.adapt(&of_poor, draws, seed)?;
             simulations += adapted.simulations;
-            for (row, found) in poor.into_iter().zip(adapted.theta) {
+            for (row, found) in poor.into_iter().zip(adapted.found) {
                 if let Some(found) = found {
-                    weighted[row] = true;
-                    theta.rows_mut(row * draws, draws).copy_from(&found);
+                    weighted[row] = found.complete;
+                    theta.rows_mut(row * draws, draws).copy_from(&found.theta);
                 }
             }
         }

@@ -1,5 +1,7 @@
 //! The trained model itself: a flow, the standardisation of its inputs, its structure, and its manifest.
 
+use std::borrow::Cow;
+
 use candle_core::{DType, Tensor};
 
 use super::conditions::Conditions;
@@ -122,6 +124,7 @@ impl Baseline {
     /// [`InferenceError::Modes`] for another number of modes.
     pub(super) fn condition(&self, observations: &[Observation]) -> Result<Tensor, InferenceError> {
         self.check_modes(observations)?;
+        let observations = &*self.within_training(observations);
         Ok(self.flow.summarise(&self.encoder.encode(observations)?.to_dtype(self.flow.dtype())?)?)
     }
 
@@ -131,11 +134,34 @@ impl Baseline {
     /// [`InferenceError`] for another number of modes or a simulation that fails.
     pub(super) fn locate(&self, observations: &[Observation]) -> Result<(Vec<Located>, Tensor), InferenceError> {
         self.check_modes(observations)?;
+        let observations = &*self.within_training(observations);
         let located =
             locate_all(&self.simulator, observations).map_err(|e| InferenceError::Simulation(e.to_string()))?;
         let (conditions, width) = (&self.manifest.conditions, self.manifest.architecture.fixed_context);
         let context = fit_condition(&located, observations, conditions, width)?.to_dtype(self.flow.dtype())?;
         Ok((located, context))
+    }
+
+    /// Noise of an observation as a multiple of the largest that the flow was trained for, geometric mean over the modes present; at
+    /// least 1.
+    pub(super) fn noise_beyond_training(&self, observation: &Observation) -> f64 {
+        let Some(range) = &self.manifest.conditions.noise_range else { return 1.0 };
+        let present = observation.frequencies_hz.iter().zip(&observation.noise_multiple).filter(|(f, _)| f.is_some());
+        let logs: f64 = present.map(|(_, multiple)| (multiple / range.highest).max(1.0).ln()).sum();
+        (logs / observation.modes_present().max(1) as f64).exp()
+    }
+
+    /// The observations as the flow is asked about them: noise beyond what it was trained for is replaced by the largest trained one.
+    fn within_training<'a>(&self, observations: &'a [Observation]) -> Cow<'a, [Observation]> {
+        let Some(range) = &self.manifest.conditions.noise_range else { return Cow::Borrowed(observations) };
+        if observations.iter().all(|one| one.noise_multiple.iter().all(|multiple| *multiple <= range.highest)) {
+            return Cow::Borrowed(observations);
+        }
+        let within = |one: &Observation| {
+            let noise_multiple = one.noise_multiple.iter().map(|multiple| multiple.min(range.highest)).collect();
+            Observation { noise_multiple, ..one.clone() }
+        };
+        Cow::Owned(observations.iter().map(within).collect())
     }
 
     fn check_modes(&self, observations: &[Observation]) -> Result<(), InferenceError> {

@@ -23,6 +23,10 @@ use crate::quantity::{shown, StructureId};
 /// Largest number of masses: a dense eigenproblem of this size takes about three seconds.
 const MOST_MASSES: usize = 2_000;
 
+/// Largest numbers of springs (or beams) and of unknown parameters.
+const MOST_SPRINGS: usize = 20_000;
+const MOST_PARAMETERS: usize = 100;
+
 /// The parts of a checked structure.
 #[derive(Debug, Clone)]
 pub(super) struct Checked {
@@ -190,6 +194,15 @@ fn check_counts_and_noise(definition: &StructureDefinition, problems: &mut Probl
     if definition.parameters.is_empty() {
         problems
             .push(DefinitionProblem::new("/parameter", "no [[parameter]]: at least one unknown parameter is needed"));
+    }
+    for (section, count, most) in [
+        ("spring", definition.springs.len(), MOST_SPRINGS),
+        ("parameter", definition.parameters.len(), MOST_PARAMETERS),
+    ] {
+        if count > most {
+            let message = format!("{count} [[{section}]]: a structure has at most {most}");
+            problems.push(DefinitionProblem::new(format!("/{section}"), message));
+        }
     }
 }
 

@@ -3,10 +3,15 @@
 use std::ops::Range;
 
 use serde::de::DeserializeOwned;
+use toml::de::{DeTable, DeValue};
+use toml::Spanned;
 
 use super::check;
 use super::definition::{DefinitionError, DefinitionProblem, StructureDefinition};
 use crate::quantity::{json_pointer, shown};
+
+/// Mistakes of a structure file that are listed; the others are counted.
+const MOST_PROBLEMS: usize = 100;
 
 impl StructureDefinition {
     /// Reads and checks a TOML text.
@@ -86,8 +91,16 @@ impl StructureDefinition {
         match check::check(&self) {
             Ok(_) => Ok(self),
             Err(mut problems) => {
+                let more = problems.len().saturating_sub(MOST_PROBLEMS);
+                problems.truncate(MOST_PROBLEMS);
+                let document = toml.and_then(|text| Some((text, DeTable::parse(text).ok()?)));
                 for problem in &mut problems {
-                    problem.line = toml.and_then(|text| toml_line(text, &problem.pointer));
+                    problem.line =
+                        document.as_ref().map(|(text, document)| toml_line(text, document, &problem.pointer));
+                }
+                if more > 0 {
+                    let message = format!("{more} further mistakes are not listed: mend these first");
+                    problems.push(DefinitionProblem::new("", message));
                 }
                 Err(DefinitionError { problems })
             }
@@ -154,25 +167,26 @@ fn line_at(text: &str, offset: usize) -> usize {
     text.as_bytes()[..offset.min(text.len())].split(|b| *b == b'\n').count()
 }
 
-/// Line of the value at a JSON pointer in a TOML text; if there is no such value, line of its nearest ancestor.
-fn toml_line(text: &str, pointer: &str) -> Option<usize> {
-    use toml::de::{DeTable, DeValue};
-    let document = DeTable::parse(text).ok()?;
-    let mut value = DeValue::Table(document.get_ref().clone());
-    let mut span: Range<usize> = document.span();
-    for segment in pointer.split('/').skip(1) {
-        let next = match &value {
-            DeValue::Table(table) => {
-                table.iter().find(|(key, _)| key.get_ref() == segment).map(|(key, value)| (key.span(), value.clone()))
-            }
+/// Line of the value at a JSON pointer in a TOML document; if there is no such value, line of its nearest ancestor.
+fn toml_line(text: &str, document: &Spanned<DeTable<'_>>, pointer: &str) -> usize {
+    let mut segments = pointer.split('/').skip(1);
+    let first = segments.next().and_then(|segment| within_entry(document.get_ref(), segment));
+    let Some((mut span, mut value)) = first else { return line_at(text, document.span().start) };
+    for segment in segments {
+        let next = match value.get_ref() {
+            DeValue::Table(table) => within_entry(table, segment),
             DeValue::Array(items) => {
-                segment.parse::<usize>().ok().and_then(|i| items.get(i)).map(|item| (item.span(), item.clone()))
+                segment.parse().ok().and_then(|i: usize| items.get(i)).map(|item| (item.span(), item))
             }
             _ => None,
         };
         let Some((next_span, next_value)) = next else { break };
-        span = next_span;
-        value = next_value.into_inner();
+        (span, value) = (next_span, next_value);
     }
-    Some(line_at(text, span.start))
+    line_at(text, span.start)
+}
+
+/// Place of a key in a table, and its value.
+fn within_entry<'a, 'i>(table: &'a DeTable<'i>, key: &str) -> Option<(Range<usize>, &'a Spanned<DeValue<'i>>)> {
+    table.iter().find(|(name, _)| name.get_ref() == key).map(|(name, value)| (name.span(), value))
 }

@@ -209,8 +209,7 @@ impl References<'_> {
                 .fetch_optional(&self.database.reader)
                 .await?;
         let Some((process, without)) = row else { return Ok((None, None)) };
-        let read = |text: String| serde_json::from_str(&text).map_err(|e| bad_row("undamaged process")(&e));
-        Ok((process.map(read).transpose()?.map(Arc::new), without))
+        Ok((process.map(|text| stored_process(&text)).transpose()?.map(Arc::new), without))
     }
 
     async fn read_undamaged(self, structure: &StructureId) -> Result<Option<ReferenceRecord>, Error> {
@@ -383,17 +382,23 @@ async fn requeue(transaction: &mut Transaction<'_>, (structure, version): Key<'_
 }
 
 #[derive(FromRow)]
-struct ReferenceQuantityRow {
-    quantity: String,
-    mean: f64,
-    std: f64,
-    threshold: Option<f64>,
-    detail: Option<String>,
-    mean_draws: Option<Vec<u8>>,
-    std_draws: Option<Vec<u8>>,
+pub(super) struct ReferenceQuantityRow {
+    pub quantity: String,
+    pub mean: f64,
+    pub std: f64,
+    pub threshold: Option<f64>,
+    pub detail: Option<String>,
+    pub mean_draws: Option<Vec<u8>>,
+    pub std_draws: Option<Vec<u8>>,
 }
 
-fn quantity(row: ReferenceQuantityRow, measurements: usize) -> Result<UndamagedQuantity, Error> {
+/// The stored process of a reference.
+pub(super) fn stored_process(text: &str) -> Result<ReferenceProcess, Error> {
+    serde_json::from_str(text).map_err(|e| bad_row("undamaged process")(&e))
+}
+
+/// A quantity of a reference from its stored row.
+pub(super) fn quantity(row: ReferenceQuantityRow, measurements: usize) -> Result<UndamagedQuantity, Error> {
     let what = "undamaged quantity";
     let Some(detail) = row.detail else {
         // References of versions without the population model have no uncertainty.

@@ -46,7 +46,7 @@ pub enum FindingCode {
     NoiseBelowRange,
     /// Measurements that lack modes which the trained baseline needs; they are left out.
     NotUsable,
-    /// Modes have more noise than the trained baseline covers; these modes are left out.
+    /// Modes have more noise than the trained baseline covers; the intervals are widened to it.
     NoiseAboveRange,
     /// Covariates outside those of the undamaged reference, or outside the range from which an effect was learnt.
     Extrapolated,

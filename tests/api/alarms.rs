@@ -138,3 +138,31 @@ async fn notes_mark_moments_and_periods_of_the_time_line() {
     problem(delete().await, 404, "unknown_note").await;
     assert_eq!(service.read(path).await["items"], json!([period]));
 }
+
+/// A gateway that states ten times the noise that its measurements have, and more than any model was trained for.
+#[tokio::test]
+async fn a_loss_is_found_although_the_stated_noise_is_far_too_large() {
+    let (service, _folder) = spawn();
+    let mut healthy = Vec::new();
+    for day in 0..6 {
+        let batch = service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, day * 86_400)).await;
+        healthy.push(batch["batch"].clone());
+    }
+    created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": healthy })).await).await;
+    for day in 6..9 {
+        let mut damaged = measurements([3.2, 5.0, 6.0], 20, day * 86_400);
+        for measurement in &mut damaged {
+            let hz: Vec<f64> = serde_json::from_value(measurement["frequencies_hz"].clone()).unwrap();
+            measurement["std_hz"] = json!(hz.iter().map(|f| 0.01 * f).collect::<Vec<f64>>());
+        }
+        let batch = service.post_batch("three-dof", &damaged).await;
+        assert_eq!(batch["state"], "assessed", "{batch}");
+        let findings = batch["assessment"]["findings"].as_array().unwrap();
+        assert!(findings.iter().any(|finding| finding["code"] == "noise_above_range"), "{findings:?}");
+        let k1 = &batch["assessment"]["parameters"][0];
+        assert!(k1["probability_of_damage"].as_f64().unwrap() > 0.99, "{k1}");
+    }
+    let alarms = service.read("/v1/structures/three-dof/alarms").await;
+    let of_k1 = |alarm: &Value| alarm["kind"] == "damage" && alarm.to_string().contains("k1");
+    assert!(alarms["items"].as_array().unwrap().iter().any(of_k1), "{alarms}");
+}

@@ -315,15 +315,17 @@ async fn the_answer_of_each_get_agrees_with_the_document() {
     })
     .await;
 
-    let recipe = json!({ "samples": 100, "epochs": 1, "units": 1, "rounds": 1 });
+    let recipe = json!({ "samples": 1_000, "epochs": 2_000, "units": 1, "rounds": 1 });
     let training = service.post("/v1/structures/three-dof/trainings", &recipe).await;
     assert_eq!(training.status(), 202);
     let training: Value = training.json().await.unwrap();
     let schema = response_schema(&document, "/v1/structures/{id}/trainings", "post", 202, "application/json");
     assert!(validator(&document, &schema).is_valid(&training), "{training:#}");
     let training = training["training"].as_str().unwrap();
+    let cancelled = service.request(reqwest::Method::DELETE, &format!("/v1/jobs/{training}")).send().await.unwrap();
+    assert_eq!(cancelled.status(), 200);
     eventually("the end of the training", async || {
-        (service.read(&format!("/v1/trainings/{training}")).await["state"] == "done").then_some(())
+        (service.read(&format!("/v1/trainings/{training}")).await["state"] == "cancelled").then_some(())
     })
     .await;
 

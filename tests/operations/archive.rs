@@ -1,6 +1,7 @@
 //! Export of a structure and import into another installation.
 
 use serde_json::Value;
+use sha2::Digest as _;
 
 use crate::helpers::{problem, spawn, Service};
 use crate::world::{answers, fails, run, text, with_past, without};
@@ -106,6 +107,21 @@ async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
     assert!(refused(dropped).await.contains("incomplete or was changed"));
     let empty = refused(String::new()).await;
     assert!(empty.contains("incomplete or was changed"), "{empty}");
+
+    // Changed by somebody who also adapts the checksum: what cannot be read is refused before anything is stored.
+    let changed = |from: &str, to: &str| {
+        assert!(whole.contains(from), "{from} is not in the archive");
+        let body: String = lines[..lines.len() - 1].iter().map(|line| line.replace(from, to) + "\n").collect();
+        let mut end: serde_json::Value = serde_json::from_str(lines[lines.len() - 1]).unwrap();
+        end["sha256"] = serde_json::json!(data_encoding::HEXLOWER.encode(&sha2::Sha256::digest(body.as_bytes())));
+        body + &end.to_string() + "\n"
+    };
+    let intact = changed("\"record\":\"archive\"", "\"record\":\"archive\"");
+    assert_eq!(intact.lines().count(), lines.len());
+    for (from, to) in [("\"doubts\":\"[", "\"doubts\":\"}{["), ("\"conditions\":\"{", "\"conditions\":\"[{")] {
+        let said = refused(changed(from, to)).await;
+        assert!(said.contains("line ") && said.contains("undamaged reference"), "{said}");
+    }
 
     let unknown = service.get("/v1/structures/bridge/export").send().await.unwrap();
     problem(unknown, 404, "unknown_structure").await;

@@ -277,3 +277,26 @@ fn a_population_must_name_every_parameter_once() {
     assert!(refused(&[("p12", 0.05, 0.01), ("p12", 0.05, 0.01)]).contains("twice"));
     assert!(refused(&[("p12", 0.05, -0.01)]).contains("not negative"));
 }
+
+/// A text of a hundred thousand mistakes is answered by the first hundred and the number of the others.
+#[test]
+fn of_very_many_mistakes_the_first_are_listed_with_their_lines_and_the_others_are_counted() {
+    const SPRINGS: usize = 15_000;
+    let mut text = "id = \"bad\"\nmodes = 1\n[[mass]]\nname = \"m\"\nkg = 1\n".to_owned();
+    for _ in 0..SPRINGS {
+        text += "[[spring]]\nname = \"s\"\nfrom = \"x\"\nto = \"y\"\nn_per_m = -1\n";
+    }
+    let problems = StructureDefinition::parse_toml(&text).unwrap_err().problems;
+    assert_eq!(problems.len(), 101);
+    let last = problems.last().unwrap();
+    assert_eq!((last.pointer.as_str(), last.line), ("", None));
+    let further: usize = last.message.split(' ').next().unwrap().parse().unwrap();
+    // Each spring has two unknown ends and a negative stiffness, and each but the first a name that is taken.
+    assert!(further + 100 >= 4 * SPRINGS - 1, "{last}");
+    for problem in &problems[..100] {
+        let Some(rest) = problem.pointer.strip_prefix("/spring/") else { continue };
+        let (index, key) = rest.split_once('/').unwrap();
+        let place = ["name", "from", "to", "n_per_m"].iter().position(|name| *name == key).unwrap();
+        assert_eq!(problem.line, Some(6 + 5 * index.parse::<usize>().unwrap() + 1 + place), "{problem}");
+    }
+}

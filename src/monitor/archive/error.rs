@@ -31,6 +31,18 @@ pub enum ImportError {
     Monitor(#[from] Error),
 }
 
+impl ImportError {
+    /// The error with the line whose record it is about.
+    pub(super) fn at_line(self, line: u64) -> Self {
+        match self {
+            Self::Monitor(Error::Store(crate::store::Error::Row { what, detail })) => {
+                Self::Line { line, reason: format!("{what}: {detail}") }
+            }
+            other => other,
+        }
+    }
+}
+
 impl From<crate::store::Error> for ImportError {
     fn from(error: crate::store::Error) -> Self {
         Self::Monitor(error.into())

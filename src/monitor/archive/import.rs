@@ -14,7 +14,7 @@ use crate::measurement::MeasurementBatch;
 use crate::monitor::assessor::Assessor;
 use crate::monitor::error::Error;
 use crate::monitor::replay::Replay;
-use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::quantity::{shown, Digest, StructureId, Timestamp};
 use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::archive::{Acknowledged, ArchivedAction, ArchivedModel, Batch, Record};
@@ -55,7 +55,11 @@ pub struct Imported {
 /// Imports an archive.
 pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) -> Result<Imported, ImportError> {
     let file = path.to_owned();
-    let checked = tokio::task::spawn_blocking(move || check_whole(&file)).await;
+    let checked = tokio::task::spawn_blocking(move || {
+        let mut simulator = None;
+        check_whole(&file, |head, record| check_record(&head.structure, record, &mut simulator))
+    });
+    let checked = checked.await;
     let head = checked.map_err(|_| Error::Panicked)??;
     let mut import = Import {
         assessor,
@@ -92,12 +96,7 @@ pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) ->
         each_line(&file, |number, record| sender.blocking_send((number, record)).map_err(|_| stopped(number)))
     });
     while let Some((number, record)) = lines.recv().await {
-        import.take(record).await.map_err(|error| match error {
-            ImportError::Monitor(Error::Store(crate::store::Error::Row { what, detail })) => {
-                ImportError::Line { line: number, reason: format!("{what}: {detail}") }
-            }
-            other => other,
-        })?;
+        import.take(record).await.map_err(|error| error.at_line(number))?;
     }
     reader.await.map_err(|_| Error::Panicked)??;
     import.finish().await
@@ -242,6 +241,34 @@ impl Import<'_> {
         }
         Ok(self.done)
     }
+}
+
+/// Checks the content of one record before anything of the archive is stored; `simulator` is that of the structure, once its record has
+/// come.
+fn check_record(
+    structure: &StructureId,
+    record: &Record,
+    simulator: &mut Option<Simulator>,
+) -> Result<(), ImportError> {
+    let time = |text: &str| Timestamp::parse(text).map(drop).map_err(|e| invalid(&format!("{}: {e}", shown(text))));
+    match record {
+        Record::Archive(_) | Record::End(_) => {}
+        Record::Structure(present) => *simulator = Some(simulator_of(structure, &present.digest, &present.definition)?),
+        Record::Version(version) => {
+            simulator_of(structure, &version.digest, &version.definition)?;
+            time(&version.created_at)?;
+        }
+        Record::Model(model) => drop(model.weights().map_err(|e| invalid(&e))?),
+        Record::Batch(batch) => {
+            let simulator = simulator.as_ref().ok_or_else(|| invalid(&"a batch comes before the structure"))?;
+            checked_batch(batch, simulator)?;
+        }
+        Record::UndamagedReference(state) => state.check()?,
+        Record::Maintenance(window) => [&window.from, &window.to].into_iter().try_for_each(|text| time(text))?,
+        Record::Acknowledgement(_) | Record::AlarmAction(_) => {}
+        Record::Note(note) => time(&note.from)?,
+    }
+    Ok(())
 }
 
 fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Result<Simulator, ImportError> {

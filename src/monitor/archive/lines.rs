@@ -20,11 +20,14 @@ pub(super) fn line_of(record: &Record) -> Vec<u8> {
     line
 }
 
-/// Reads a whole archive and returns its head; checks the first and the last line, the number of lines, the SHA-256, and that each
-/// line is a record.
-pub(super) fn check_whole(path: &Path) -> Result<Head, ImportError> {
+/// Reads a whole archive and returns its head; checks the first and the last line, the number of lines, the SHA-256, and each record
+/// by `check`.
+pub(super) fn check_whole(
+    path: &Path,
+    mut check: impl FnMut(&Head, &Record) -> Result<(), ImportError>,
+) -> Result<Head, ImportError> {
     let incomplete = |what: &str| ImportError::NotWhole(what.to_owned());
-    let mut head = None;
+    let mut head: Option<Head> = None;
     let mut ended = false;
     each_line(path, |number, record| {
         if ended {
@@ -38,7 +41,10 @@ pub(super) fn check_whole(path: &Path) -> Result<Head, ImportError> {
             }
             (1, _) => return Err(incomplete("its first line is missing")),
             (_, Record::End(_)) => ended = true,
-            _ => {}
+            (_, record) => {
+                let head = head.as_ref().ok_or_else(|| incomplete("its first line is missing"))?;
+                check(head, &record).map_err(|error| error.at_line(number))?;
+            }
         }
         Ok(())
     })?;

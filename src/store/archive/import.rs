@@ -1,13 +1,56 @@
 //! Storing the lines of an archive.
 
+use std::collections::BTreeMap;
+
 use super::super::batch::import_batch;
-use super::super::column::{bad_row, from_blob};
+use super::super::column::bad_row;
 use super::super::error::Error;
+use super::super::reference_content::stored_origin;
 use super::super::transaction::Transaction;
+use super::super::undamaged::{quantity, stored_process, ReferenceQuantityRow};
 use super::export::Archive;
 use super::record::{Acknowledged, ArchivedModel, Maintenance, Undamaged, Version};
+use crate::damage::{JointReference, SeenCovariate};
 use crate::measurement::MeasurementBatch;
 use crate::quantity::{StructureId, Timestamp};
+
+impl Undamaged {
+    /// Checks that the reference can be read once it is stored: every text in it is parsed, and its numbers are finite.
+    ///
+    /// # Errors
+    /// [`Error::Row`] with what cannot be read.
+    pub fn check(&self) -> Result<(), Error> {
+        let bad = bad_row("undamaged reference of the archive");
+        Timestamp::parse(&self.created_at).map_err(|e| bad(&e))?;
+        let _: BTreeMap<String, SeenCovariate> = serde_json::from_str(&self.conditions).map_err(|e| bad(&e))?;
+        let _: Vec<String> = serde_json::from_str(&self.doubts).map_err(|e| bad(&e))?;
+        let _: Option<JointReference> =
+            self.joint.as_deref().map(serde_json::from_str).transpose().map_err(|e| bad(&e))?;
+        stored_origin(self.origin.as_deref())?;
+        self.process.as_deref().map(stored_process).transpose()?;
+        for q in &self.quantities {
+            let row = ReferenceQuantityRow {
+                quantity: q.quantity.clone(),
+                mean: q.mean,
+                std: q.std,
+                threshold: q.threshold,
+                detail: q.detail.clone(),
+                mean_draws: q.mean_draws.clone(),
+                std_draws: q.std_draws.clone(),
+            };
+            let read = quantity(row, usize::try_from(self.measurements).unwrap_or_default())?;
+            let finite = read.mean_draws.iter().all(|draw| draw.is_finite())
+                && read.std_draws.iter().all(|draw| draw.is_finite() && *draw >= 0.0);
+            if !finite {
+                return Err(bad(&format!(
+                    "the draws of {} are not finite, or a standard deviation is negative",
+                    q.quantity
+                )));
+            }
+        }
+        Ok(())
+    }
+}
 
 impl Archive<'_> {
     /// Stores batches of an archive under their own ids in one transaction. Batches that are stored already are skipped. Returns
@@ -95,13 +138,9 @@ impl Archive<'_> {
     /// [`Error::Row`] if that version is a different reference here.
     pub async fn import_undamaged(self, structure: &StructureId, state: Undamaged) -> Result<bool, Error> {
         let structure = structure.to_string();
-        let wrong = |detail: &dyn std::fmt::Display| bad_row("undamaged reference of the archive")(detail);
-        let created = Timestamp::parse(&state.created_at).map_err(|e| wrong(&e))?;
-        for quantity in &state.quantities {
-            for draws in [&quantity.mean_draws, &quantity.std_draws].into_iter().flatten() {
-                from_blob("undamaged quantity of the archive", draws)?;
-            }
-        }
+        state.check()?;
+        let created =
+            Timestamp::parse(&state.created_at).map_err(|e| bad_row("undamaged reference of the archive")(&e))?;
         self.database.write(move |transaction| {
             Box::pin(async move {
                 let known: Option<(String, i64)> = sqlx::query_as(
