@@ -155,7 +155,9 @@ impl Baseline {
             }
         }
         let beyond = self.noise_beyond_training(observation);
-        scales.iter_mut().for_each(|scale| *scale *= beyond);
+        for scale in &mut scales {
+            *scale *= beyond;
+        }
         scales
     }
 }

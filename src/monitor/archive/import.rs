@@ -252,7 +252,7 @@ fn check_record(
 ) -> Result<(), ImportError> {
     let time = |text: &str| Timestamp::parse(text).map(drop).map_err(|e| invalid(&format!("{}: {e}", shown(text))));
     match record {
-        Record::Archive(_) | Record::End(_) => {}
+        Record::Archive(_) | Record::End(_) | Record::Acknowledgement(_) | Record::AlarmAction(_) => {}
         Record::Structure(present) => *simulator = Some(simulator_of(structure, &present.digest, &present.definition)?),
         Record::Version(version) => {
             simulator_of(structure, &version.digest, &version.definition)?;
@@ -265,7 +265,6 @@ fn check_record(
         }
         Record::UndamagedReference(state) => state.check()?,
         Record::Maintenance(window) => [&window.from, &window.to].into_iter().try_for_each(|text| time(text))?,
-        Record::Acknowledgement(_) | Record::AlarmAction(_) => {}
         Record::Note(note) => time(&note.from)?,
     }
     Ok(())
