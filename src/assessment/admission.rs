@@ -114,14 +114,15 @@ impl Reservations {
                 self.above_noise_range,
                 format!(
                     "measurements have modes with more noise than {} times that of the structure, the most that the trained \
-                     baseline covers: their intervals are widened to the stated noise; check that std_hz is a standard deviation in Hz",
+                     baseline covers: their intervals are widened to the stated noise, and modes with more than ten times as much are left out; \
+                     check that std_hz is a standard deviation in Hz",
                     range[1]
                 ),
             ),
             (
                 FindingCode::NotUsable,
                 self.unusable,
-                "measurements are left out: they lack a mode that the trained baseline needs"
+                "measurements are left out: they lack a mode that the trained baseline needs, or have no mode with a usable noise"
                     .to_owned(),
             ),
         ];

@@ -6,6 +6,10 @@ use crate::measurement::shape::unit_shape;
 use crate::measurement::ModalMeasurement;
 use crate::quantity::Hertz;
 
+/// Noise of a mode as a multiple of the largest that the model was trained for, above which the mode is treated as missing: it says
+/// hardly more than the prior, and the number is most likely a mistake.
+const MOST_BEYOND: f64 = 10.0;
+
 /// A measurement as a model accepts it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Admitted {
@@ -31,7 +35,8 @@ impl Baseline {
     ///
     /// A mode with less noise than the model was trained for gets the smallest trained noise, which makes the posterior wider than
     /// necessary. More noise is kept as stated: the flow is asked as for the largest trained noise, and its draws are weighted by the
-    /// likelihood under the stated one, or stretched in proportion where that does not succeed.
+    /// likelihood under the stated one, or stretched in proportion where that does not succeed. A mode with more than ten times the
+    /// largest trained noise is treated as missing.
     pub fn admit(&self, measurement: &ModalMeasurement) -> Admitted {
         let (inputs_missing, inputs_beyond) = self.simulator.discrepancy_reservations(measurement);
         let measurement = &*self.simulator.corrected(measurement);
@@ -41,7 +46,7 @@ impl Baseline {
         let (mut below_range, mut above_range) = (false, false);
         match &self.manifest.conditions.noise_range {
             Some(range) => {
-                for (mode, frequency) in frequencies_hz.iter().enumerate() {
+                for (mode, frequency) in frequencies_hz.iter_mut().enumerate() {
                     let given = measurement.std_hz.as_ref().and_then(|stds| stds[mode]);
                     let own = frequency.map(|f| self.simulator.std_hz(mode, f));
                     let given = given.zip(*frequency).map(|(std, f)| self.simulator.with_emulator_error(mode, f, std));
@@ -49,7 +54,9 @@ impl Baseline {
                     // The tolerance keeps the limits inside the range in spite of rounding.
                     below_range |= frequency.is_some() && multiple < range.lowest * (1.0 - 1e-6);
                     above_range |= frequency.is_some() && multiple > range.highest * (1.0 + 1e-6);
-                    if frequency.is_some() {
+                    if multiple > MOST_BEYOND * range.highest {
+                        *frequency = None;
+                    } else if frequency.is_some() {
                         noise_multiple[mode] = multiple.max(range.lowest);
                     }
                 }

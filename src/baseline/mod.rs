@@ -52,6 +52,7 @@ mod model;
 pub mod nearest;
 pub mod observation;
 mod project;
+mod proposal;
 mod propose;
 mod real_line;
 pub mod recipe;

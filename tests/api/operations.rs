@@ -91,7 +91,7 @@ async fn a_client_that_never_ends_its_header_is_cut_off_and_does_not_keep_the_se
     let mut command = command(folder.path());
     let mut service = Service::spawn(command.env("MODALWATCH__HTTP__HEADER_TIMEOUT_S", "1"));
     let mut slow = std::net::TcpStream::connect(service.address()).unwrap();
-    slow.write_all(b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: ").unwrap();
+    slow.write_all(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Slow: ").unwrap();
     slow.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
     let started = Instant::now();
     let mut answer = Vec::new();
@@ -111,7 +111,7 @@ async fn a_client_that_never_ends_its_body_is_answered_408() {
     let mut command = command(folder.path());
     let service = Service::spawn(command.env("MODALWATCH__HTTP__BODY_TIMEOUT_S", "1"));
     let mut slow = std::net::TcpStream::connect(service.address()).unwrap();
-    let head = "POST /v1/structures/three-dof/batches HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 100\r\n\r\n{";
+    let head = "POST /v1/structures/three-dof/batches HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 100\r\n\r\n{";
     slow.write_all(head.as_bytes()).unwrap();
     slow.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
     let mut answer = [0; 12];

@@ -19,7 +19,7 @@ fn request(number: usize) -> Vec<u8> {
     let text = body(&batch("gone", number, 10)).to_string();
     let length = text.len();
     let head = format!(
-        "POST {BATCHES} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: {length}\r\n\r\n"
+        "POST {BATCHES} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: {length}\r\n\r\n"
     );
     [head.into_bytes(), text.into_bytes()].concat()
 }
@@ -64,7 +64,7 @@ async fn idle_and_slow_connections_are_cut_off_and_others_are_served() {
         let mut stream = TcpStream::connect(service.address()).unwrap();
         match number % 3 {
             0 => {}
-            1 => stream.write_all(b"GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: ").unwrap(),
+            1 => stream.write_all(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Slow: ").unwrap(),
             _ => stream.write_all(&request(number)[..300]).unwrap(),
         }
         held.push(stream);

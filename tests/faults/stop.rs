@@ -13,7 +13,7 @@ use crate::kit::{audit, batch, body, post, Acknowledged, BATCHES};
 fn hanging(service: &Service) -> TcpStream {
     let mut stream = TcpStream::connect(service.address()).unwrap();
     let head = format!(
-        "POST {BATCHES} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n\
+        "POST {BATCHES} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n\
          Expect: 100-continue\r\n\r\n"
     );
     stream.write_all(head.as_bytes()).unwrap();
