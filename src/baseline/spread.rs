@@ -130,7 +130,8 @@ impl Baseline {
 
     /// The factor of each parameter for one observation, `[d]`: that of the cells with its missing modes, or the mean of several such
     /// cells; interpolated in the logarithm of the noise. Where the noise is larger than any that the flow was trained for, it draws as
-    /// for the largest, and the factor is multiplied by the ratio of the two: to first order the posterior widens in that proportion.
+    /// for the largest, and the factor is multiplied by the ratio of the two: to first order the posterior widens in that proportion. Where
+    /// draws are weighted by the likelihood, they have the width of the stated noise already.
     fn spread_of(&self, observation: &Observation) -> Vec<f64> {
         let shapes = observation.has_shapes();
         let cells: Vec<&SpreadCell> =
@@ -154,7 +155,7 @@ impl Baseline {
                 *scale += interpolated(&of_group, column, noise) / groups.len() as f64;
             }
         }
-        let beyond = self.noise_beyond_training(observation);
+        let beyond = if self.is_resampled() { 1.0 } else { self.noise_beyond_training(observation) };
         for scale in &mut scales {
             *scale *= beyond;
         }
