@@ -50,7 +50,7 @@ pub fn temporary_folder(prefix: &str, parent: &Path) -> io::Result<tempfile::Tem
 /// else stay as they are.
 ///
 /// # Errors
-/// A folder that cannot be listed, or permissions that cannot be changed.
+/// Permissions that cannot be changed, or a folder that cannot be listed, although they belong to this user.
 #[cfg(unix)]
 pub fn narrow(path: &Path) -> io::Result<()> {
     use std::os::unix::fs::PermissionsExt as _;
@@ -69,10 +69,16 @@ pub fn narrow(path: &Path) -> io::Result<()> {
             changed => changed?,
         }
     }
-    if metadata.is_dir() {
-        for entry in fs::read_dir(path)? {
-            narrow(&entry?.path())?;
-        }
+    if !metadata.is_dir() {
+        return Ok(());
+    }
+    let entries = match fs::read_dir(path) {
+        // A backup that another user has made.
+        Err(refused) if refused.kind() == io::ErrorKind::PermissionDenied => return Ok(()),
+        entries => entries?,
+    };
+    for entry in entries {
+        narrow(&entry?.path())?;
     }
     Ok(())
 }

@@ -218,10 +218,14 @@ impl Search {
         drawn
     }
 
+    /// Logarithm of the importance weight of each draw, up to a constant, `[n]`.
+    fn log_weights(&self) -> Vec<f64> {
+        self.log_target.iter().zip(&self.log_mixture).map(|(target, mixture)| target - mixture).collect()
+    }
+
     /// Ends the search where the draws of `stages` stages suffice or give no hope, otherwise fits the next proposal.
     fn judge(&mut self, stages: usize, needed: f64) {
-        let log_weights: Vec<f64> =
-            self.log_target.iter().zip(&self.log_mixture).map(|(target, mixture)| target - mixture).collect();
+        let log_weights = self.log_weights();
         let Some(weights) = stats::weights(&log_weights, 0.0) else {
             self.state = State::GivenUp;
             return;
@@ -264,9 +268,7 @@ impl Search {
         let (weights, complete) = match &self.state {
             State::Enough(weights) => (weights.clone(), true),
             State::Open | State::GivenUp => {
-                // The densities of the last proposal are not in the mixture where it has not been drawn from.
-                let log_weights: Vec<f64> =
-                    self.log_target.iter().zip(&self.log_mixture).map(|(target, mixture)| target - mixture).collect();
+                let log_weights = self.log_weights();
                 let weights = stats::weights(&log_weights, 0.0)?;
                 let usable = weights.iter().filter(|weight| **weight > 0.0).count() as f64;
                 (tempered(&log_weights, weights, EFFECTIVE.max(draws as f64).min(0.5 * usable))?, false)

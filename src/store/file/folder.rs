@@ -3,7 +3,7 @@
 use std::fs::{File, TryLockError};
 use std::path::Path;
 
-use tracing::info;
+use tracing::{info, warn};
 
 use super::super::error::Error;
 use crate::private;
@@ -27,8 +27,7 @@ pub(in super::super) fn prepare_folder(data_dir: &Path, database: &Path) -> Resu
             return Err(Error::ReadOnly(path.to_owned()));
         }
     }
-    // SQLite gives its log files the permissions of the database.
-    private::open(File::options().create(true).truncate(false).write(true), database).map_err(failed(database))?;
+    create_database(database).map_err(failed(database))?;
     let lock = take_lock(data_dir)?;
     remove_drafts(data_dir)?;
     keep_private(data_dir)?;
@@ -45,6 +44,15 @@ pub(in super::super) fn take_lock(data_dir: &Path) -> Result<File, Error> {
         Ok(()) => Ok(lock),
         Err(TryLockError::WouldBlock) => Err(Error::Locked(data_dir.to_owned())),
         Err(TryLockError::Error(source)) => Err(Error::Folder { path: lock_path, source }),
+    }
+}
+
+/// Creates the database file if it is missing; SQLite gives its log files the same permissions. A file that exists is not opened: closing
+/// it again would release the locks that SQLite holds on it in this process.
+fn create_database(database: &Path) -> std::io::Result<()> {
+    match private::open(File::options().write(true).create_new(true), database) {
+        Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => Err(error),
+        _ => Ok(()),
     }
 }
 
@@ -66,18 +74,26 @@ fn keep_private(data_dir: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// Removes what broken-off backups and restorations have left. The lock of the folder is held, so none of them is being made.
+/// Removes what broken-off backups and restorations have left. The lock of the folder is held, so none of them is being made. What cannot
+/// be removed, because another user has made it, stays.
 fn remove_drafts(data_dir: &Path) -> Result<(), Error> {
     for folder in [data_dir.to_owned(), data_dir.join(BACKUP_FOLDER)] {
         if !folder.is_dir() {
             continue;
         }
         for entry in std::fs::read_dir(&folder).map_err(failed(&folder))? {
-            let path = entry.map_err(failed(&folder))?.path();
-            let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-            if DRAFTS.iter().any(|draft| name.starts_with(draft)) && path.is_dir() {
-                std::fs::remove_dir_all(&path).map_err(failed(&path))?;
-                info!(folder = %path.display(), "Removed what a broken-off backup has left: {}", path.display());
+            let entry = entry.map_err(failed(&folder))?;
+            let (name, path) = (entry.file_name().to_string_lossy().into_owned(), entry.path());
+            let is_folder = entry.file_type().is_ok_and(|kind| kind.is_dir());
+            if !is_folder || !DRAFTS.iter().any(|draft| name.starts_with(draft)) {
+                continue;
+            }
+            let shown = path.display();
+            match std::fs::remove_dir_all(&path) {
+                Ok(()) => info!(folder = %shown, "Removed what a broken-off backup has left: {shown}"),
+                Err(error) => {
+                    warn!(folder = %shown, %error, "Could not remove what a broken-off backup has left: {shown}: {error}");
+                }
             }
         }
     }
