@@ -35,8 +35,8 @@ impl Baseline {
     ///
     /// A mode with less noise than the model was trained for gets the smallest trained noise, which makes the posterior wider than
     /// necessary. More noise is kept as stated: the flow is asked as for the largest trained noise, and its draws are weighted by the
-    /// likelihood under the stated one, or stretched in proportion where that does not succeed. A mode with more than ten times the
-    /// largest trained noise is treated as missing.
+    /// likelihood under the stated one, or stretched in proportion where a model's draws are not weighted. A mode with more than ten times
+    /// the largest trained noise is treated as missing.
     pub fn admit(&self, measurement: &ModalMeasurement) -> Admitted {
         let (inputs_missing, inputs_beyond) = self.simulator.discrepancy_reservations(measurement);
         let measurement = &*self.simulator.corrected(measurement);

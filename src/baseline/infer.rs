@@ -93,7 +93,7 @@ impl Baseline {
         if self.is_resampled() && !observations.iter().any(Observation::is_marginalised) {
             return Ok(resample::log_likelihoods(&self.simulator, observations, theta));
         }
-        if self.manifest.spread.is_empty() && !observations.iter().any(|one| self.noise_beyond_training(one) > 1.0) {
+        if !self.stretches(observations) {
             return self.log_density_of_draws(theta, observations);
         }
         let (before, log_stretch) = self.before_stretching(theta, observations)?;
@@ -159,7 +159,7 @@ impl Baseline {
         seed: u64,
     ) -> Result<PosteriorSamples, InferenceError> {
         let Corrected { samples, weighted } = self.infer_unstretched(observations, draws, proposals, seed)?;
-        if self.manifest.spread.is_empty() && !observations.iter().any(|one| self.noise_beyond_training(one) > 1.0) {
+        if !self.stretches(observations) {
             return Ok(samples);
         }
         let simulations = samples.simulations();

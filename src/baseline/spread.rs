@@ -86,6 +86,11 @@ fn learn_cell(baseline: &Baseline, situation: &Situation, seed: u64) -> Result<V
 }
 
 impl Baseline {
+    /// Whether draws of the flow are stretched for any of the observations.
+    pub(super) fn stretches(&self, observations: &[Observation]) -> bool {
+        !self.manifest().spread.is_empty() || observations.iter().any(|one| self.noise_beyond_training(one) > 1.0)
+    }
+
     /// Stretches draws of the flow for one observation, `[draws, d]` in parameter units, about their medians and within the prior.
     pub(super) fn stretch(&self, observation: &Observation, mut theta: DMatrixViewMut<'_, f64>) {
         let scales = self.spread_of(observation);

@@ -204,8 +204,8 @@ fn directly_from_here(headers: &HeaderMap, version: Version) -> Result<Grant, Ap
     let forwarded = ["forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via"];
     if version < Version::HTTP_11 || forwarded.into_iter().any(|name| headers.contains_key(name)) {
         let detail =
-            "this request came through a proxy, and without tokens only this machine is served: create a token first \
-                      (modalwatch token create)";
+            "this request came through a proxy, or by HTTP/1.0 as from one, and without tokens only this machine is served: create a \
+             token first (modalwatch token create)";
         return Err(unauthorized(detail, None));
     }
     let text = |name: &str| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
