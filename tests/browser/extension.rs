@@ -136,7 +136,8 @@ async fn a_diagnosis_extends_the_model_with_live_progress_and_the_extension_can_
     let newest = listed["items"][0]["diagnosis"].as_str().unwrap();
     let result = service.read(&format!("/v1/diagnoses/{newest}")).await["result"].clone();
     assert_eq!((&result["training_rows"], &result["holdout_rows"]), (&json!(224), &json!(96)), "{result}");
-    press_and_confirm(&mut page, "latest-diagnosis", "Extend the model");
+    // Long enough that the page, which reads its jobs once a second, shows the training while it runs.
+    press_and_fill(&mut page, "latest-diagnosis", "Extend the model", &[("epochs", "150")]);
 
     // The progress bar of the job grows while the page is shown.
     page.evaluate("location.hash = '#/jobs'");
