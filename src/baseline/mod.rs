@@ -47,6 +47,7 @@ mod infer;
 mod judge;
 pub mod library;
 mod load;
+mod local;
 pub mod manifest;
 mod model;
 pub mod nearest;
