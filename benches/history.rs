@@ -214,6 +214,7 @@ async fn queries(folder: &Path, large: usize) {
         .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
         .arg(folder)
         .env("MODALWATCH__LOG__LEVEL", "error")
+        .env("MODALWATCH__HTTP__RATE_LIMIT__REQUESTS_PER_S", "0")
         .stdout(Stdio::piped())
         .spawn()
         .expect("the service starts");

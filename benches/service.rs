@@ -79,6 +79,7 @@ impl Service {
             .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
             .arg(folder.path())
             .env("MODALWATCH__LOG__LEVEL", "warn")
+            .env("MODALWATCH__HTTP__RATE_LIMIT__REQUESTS_PER_S", "0")
             .stdout(Stdio::piped())
             .spawn()
             .expect("the service starts");

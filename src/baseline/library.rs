@@ -12,7 +12,7 @@ use std::sync::Arc;
 use super::model::Baseline;
 use crate::flow::checkpoint::LARGEST_FILE_BYTES;
 use crate::quantity::{Digest, StructureId};
-use crate::simulator::definition::{DefinitionError, StructureDefinition};
+use crate::simulator::definition::DefinitionError;
 use crate::simulator::Simulator;
 
 #[derive(rust_embed::Embed)]
@@ -261,12 +261,11 @@ fn read_definition(
 ) -> Result<Simulator, DefinitionError> {
     let text = String::from_utf8_lossy(bytes);
     let is_json = Path::new(name).extension().is_some_and(|e| e.eq_ignore_ascii_case("json"));
-    let definition = if is_json {
-        StructureDefinition::parse_json_beside(&text, beside)
+    if is_json {
+        Simulator::parse_json_beside(&text, beside)
     } else {
-        StructureDefinition::parse_toml_beside(&text, beside)
-    }?;
-    Simulator::new(definition)
+        Simulator::parse_toml_beside(&text, beside)
+    }
 }
 
 fn has_extension(name: &str, extension: &str) -> bool {

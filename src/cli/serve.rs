@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{signal, SignalKind};
-use tokio::sync::{watch, Notify};
+use tokio::sync::{oneshot, watch, Notify};
 use tracing::{error, info};
 
 use super::reload::Reloading;
@@ -16,7 +16,8 @@ use super::supervisor;
 use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::http::access::AccessControl;
-use crate::http::{router, server, Service};
+use crate::http::server::Routes;
+use crate::http::{router, server, HttpSettings, Service};
 use crate::monitor::{declare_metrics, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
 use crate::notify::{Mailer, Notifier};
@@ -35,20 +36,40 @@ pub struct Running {
     pub monitor: Monitor,
 }
 
+/// The server, which answers supervisors while structures and models are read.
+struct Listening {
+    address: SocketAddr,
+    /// Receives the routes when the service is ready.
+    publish: watch::Sender<Option<Routes>>,
+    /// Ends the server when it is dropped.
+    end: oneshot::Sender<()>,
+    server: tokio::task::JoinHandle<()>,
+}
+
+impl Listening {
+    async fn begin(http: &HttpSettings) -> anyhow::Result<Self> {
+        let listener = TcpListener::bind(&http.listen).await.with_context(|| {
+            let listen = &http.listen;
+            format!("cannot listen on {listen}: if another program uses the port, choose another with --listen")
+        })?;
+        let address = listener.local_addr()?;
+        let (publish, routes) = watch::channel(None);
+        let (end, ended) = oneshot::channel::<()>();
+        let settings = http.clone();
+        let server = async move { server::run(listener, routes, &settings, async { drop(ended.await) }).await };
+        Ok(Self { address, publish, end, server: tokio::spawn(server) })
+    }
+}
+
 /// Starts the service; it stops when `shutdown` completes.
 ///
 /// # Errors
 /// A data folder, database, models folder or address that cannot be used, with a remedy.
 pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + 'static) -> anyhow::Result<Running> {
-    let library = Library::open(config.models_dir.as_deref())?;
     // Listening comes first, so that a second instance reports the used port rather than the locked database.
-    let listener = TcpListener::bind(&config.http.listen).await.with_context(|| {
-        format!(
-            "cannot listen on {}: if another program uses the port, choose another with --listen",
-            config.http.listen
-        )
-    })?;
-    let address = listener.local_addr()?;
+    let Listening { address, publish, end, server } = Listening::begin(&config.http).await?;
+    let models_dir = config.models_dir.clone();
+    let library = tokio::task::spawn_blocking(move || Library::open(models_dir.as_deref())).await??;
     let store = Store::open_with(&config.data_dir, &config.store).await?;
     let (place, largest_batch) = ((address, config.data_dir.as_path()), config.monitor.max_measurements);
     let access = AccessControl::open(store.clone(), &config.access, &config.http, place, largest_batch).await?;
@@ -83,24 +104,28 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         let mails = mailer.finding().map(|it| Reason::new("mail_failing", it));
         broker.into_iter().chain(webhooks).chain(mails).collect()
     });
-    let router = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
+    let routes = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
     declare_metrics(store.file().sqlite_version());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
     let (events, jobs) = (monitor.events().clone(), monitor.jobs().clone());
+    publish.send_replace(Some(routes));
     let task = tokio::spawn(async move {
-        let shutdown = async {
-            shutdown.await;
-            supervisor::stopping();
-            // Jobs that compute end at their next epoch or step, while open requests finish.
-            jobs.stop().await;
-            // Event streams do not end by themselves and would delay the shutdown up to its time limit.
-            events.close();
-            // Sending fails only if all background tasks have ended already.
-            let _ = stop.send(true);
-        };
-        server::run(listener, router, &config.http, shutdown).await;
+        shutdown.await;
+        supervisor::stopping();
+        // Jobs that compute end at their next epoch or step, while open requests finish.
+        jobs.stop().await;
+        // Event streams do not end by themselves and would delay the shutdown up to its time limit.
+        events.close();
+        // Sending fails only if all background tasks, or the server, have ended already.
+        let _ = stop.send(true);
+        drop(end);
         let mut failed = 0;
+        if let Err(failure) = server.await {
+            error!(error = %failure, "The server panicked: {failure}");
+            failed += 1;
+        }
+        drop(publish);
         for task in background {
             if let Err(failure) = task.await {
                 error!(error = %failure, "A background task panicked: {failure}");

@@ -6,10 +6,12 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
+use super::access::Client;
 use super::error::ApiError;
-use super::openapi::{Invalid, StructurePath, Unknown};
+use super::openapi::{Computed, Invalid, StructurePath, Unknown};
 use super::request::{structure_id, ApiPath, ApiQuery};
 use super::shared::Shared;
+use super::views::share;
 use crate::assessment::Assessment;
 use crate::monitor::stored::LatestQuantity;
 use crate::parameter::Parameter;
@@ -36,7 +38,8 @@ pub struct DrawingQuery {
 /// `GET /v1/structures/{id}/drawing.svg`: masses, springs, beams and supports with their names.
 ///
 /// # Errors
-/// 404 for the structure; 422 for a mode that is not measured, and for a table of finite-element runs, which has no geometry.
+/// 404 for the structure; 422 for a mode that is not measured, and for a table of finite-element runs, which has no geometry;
+/// 503 when too many computations wait.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/drawing.svg", tag = "structures", operation_id = "draw_structure",
     summary = "Drawing of a structure",
@@ -44,14 +47,16 @@ pub struct DrawingQuery {
                    the undamaged reference, outlines are open damage alarms. Beams along their axis in metres, masses as many storeys \
                    above the ground as springs lead there. A table of finite-element runs has no geometry and is answered 422.",
     params(StructurePath, DrawingQuery),
-    responses((status = 200, description = "The drawing", body = String, content_type = "image/svg+xml"), Unknown, Invalid)
+    responses((status = 200, description = "The drawing", body = String, content_type = "image/svg+xml"), Unknown, Invalid, Computed)
 )]
 pub async fn drawing(
     State(shared): State<Shared>,
+    client: Client,
     ApiPath(id): ApiPath<String>,
     ApiQuery(query): ApiQuery<DrawingQuery>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
+    let _share = share(&shared, &client)?;
     let simulator = shared.monitor.structure(&id)?.simulator.clone();
     let wrong = |text: &str| {
         let message = format!("{} is not a mode from 1 to {}", shown(text), simulator.modes());
@@ -68,7 +73,8 @@ pub async fn drawing(
     };
     let marks = marks(&shared, &id).await?;
     // The shape needs an eigenproblem, which takes time for large structures.
-    let draw = move || {
+    let turn = shared.monitor.readers().turn().await.map_err(crate::monitor::Error::from)?;
+    let draw = move |_: &_| {
         let nominal = simulator.nominal_parameters();
         match (mode, batch) {
             (Some(mode), Some(view)) => {
@@ -78,7 +84,7 @@ pub async fn drawing(
             (mode, _) => simulator.drawing(&marks, mode.map(|mode| (mode, nominal.as_slice()))),
         }
     };
-    let drawn = tokio::task::spawn_blocking(draw).await.map_err(|e| ApiError::internal(&e))?;
+    let drawn = turn.run(draw).await.map_err(|e| ApiError::internal(&e))?;
     let drawing = drawn.map_err(|error| match error {
         Error::NoMode { .. } => ApiError::invalid_field("query/mode", error.to_string()),
         Error::NoGeometry => ApiError::invalid_field("path/id", error.to_string()),

@@ -14,6 +14,9 @@ use crate::monitor;
 /// Value of `Retry-After` when the queue is full, seconds. The service assesses some hundred batches per second.
 const RETRY_AFTER_SECONDS: u32 = 1;
 
+/// Value of `Retry-After` when too many computations for readers wait, seconds.
+const RETRY_AFTER_READERS_SECONDS: u32 = 5;
+
 /// Value of `Retry-After` when the disk fails, seconds.
 const RETRY_AFTER_DISK_SECONDS: u32 = 30;
 
@@ -129,6 +132,7 @@ impl From<monitor::Error> for ApiError {
             E::NoModel { .. } => Self::new(StatusCode::CONFLICT, "no_model", detail),
             E::StructureInUse(_) => Self::new(StatusCode::CONFLICT, "structure_in_use", detail),
             E::QueueFull(_) => Self::unavailable("queue_full", detail, RETRY_AFTER_SECONDS),
+            E::TooManyReaders(_) => Self::unavailable("too_many_computations", detail, RETRY_AFTER_READERS_SECONDS),
             E::Store(error) => error.into(),
             E::DefinitionRefused { .. } => Self::new(StatusCode::CONFLICT, "definition_refused", detail),
             E::Definition(_) | E::Panicked => Self::internal(&detail),

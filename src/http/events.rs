@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::State;
-use axum::http::{HeaderName, StatusCode};
+use axum::http::{HeaderMap, HeaderName, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::{self, Stream};
@@ -13,11 +13,11 @@ use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
 use utoipa::ToSchema;
 
-use super::access::AccessControl;
+use super::access::{presented, AccessControl, Client};
 use super::error::ApiError;
 use super::openapi::StreamBusy;
 use super::shared::Shared;
-use crate::access::Grant;
+use crate::access::{Actor, Grant, TokenText};
 use crate::monitor::events::News;
 use crate::quantity::StructureId;
 
@@ -26,6 +26,12 @@ pub const MOST_STREAMS: usize = 64;
 
 /// Interval of the comments that keep proxies from closing an idle stream.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
+
+/// Maximum number of open streams of one token.
+pub const MOST_STREAMS_OF_A_TOKEN: usize = 16;
+
+/// Interval at which the token of a stream is looked at again.
+const CHECK_TOKEN: Duration = Duration::from_millis(500);
 
 /// Value of `Retry-After` when all streams are in use, seconds.
 const RETRY_AFTER_S: u32 = 10;
@@ -47,23 +53,38 @@ struct StreamedEvent {
 }
 
 /// `GET /v1/events`: events of the structures that the token may see. The stream ends when the token expires or is
-/// revoked, or when the service stops. A client that is too slow loses events, receives the event `resync`, and
+/// revoked, when its secret is no longer valid, or when the service stops. A client that is too slow loses events, receives the event `resync`, and
 /// continues with new ones.
 ///
 /// # Errors
-/// 503 when the maximum number of streams is open, or when the service stops.
+/// 503 when the maximum number of streams is open, in all or by this token, or when the service stops.
 #[utoipa::path(
     get, path = "/v1/events", tag = "results", operation_id = "watch_events",
     summary = "Event stream",
     description = "Server-sent events of the structures that the token may see: `batch`, `alarm`, `job` and `structure`, each with \
                    one line of JSON, and `resync` for a client that was too slow and lost events. A comment is sent every 15 s. \
-                   The stream ends when the token expires or is revoked, or when the service stops.",
+                   The stream ends within a second after its token has expired or was revoked or its secret is no longer valid, and when the \
+                   service stops. 64 streams are open at a time, 16 of one token.",
     responses(
         (status = 200, description = "The events; the schema describes one event", body = StreamedEvent, content_type = "text/event-stream"),
         StreamBusy
     )
 )]
-pub async fn events(State(shared): State<Shared>, grant: Grant) -> Result<Response, ApiError> {
+pub async fn events(
+    State(shared): State<Shared>,
+    grant: Grant,
+    client: Client,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
+    let share = match grant.actor() {
+        Actor::Token { .. } => Some(shared.token_streams.take(&client.key).ok_or_else(|| {
+            let detail = format!(
+                "this token has {MOST_STREAMS_OF_A_TOKEN} event streams open, which is the maximum: close one, or try again later"
+            );
+            ApiError::unavailable("too_many_streams", detail, RETRY_AFTER_S)
+        })?),
+        Actor::Local | Actor::Nobody => None,
+    };
     let permit = Arc::clone(&shared.streams).try_acquire_owned().map_err(|_| {
         let detail =
             format!("{MOST_STREAMS} event streams are open, which is the maximum: close one, or try again later");
@@ -72,7 +93,9 @@ pub async fn events(State(shared): State<Shared>, grant: Grant) -> Result<Respon
     let news = shared.monitor.events().watch().ok_or_else(|| {
         ApiError::unavailable("stopping", "the service is stopping: try again when it is running", RETRY_AFTER_STOP_S)
     })?;
-    let body = Sse::new(stream_of(news, move |about| holds(&shared.access, &grant, about), permit))
+    let presented = presented(&headers);
+    let may_see = move |about: Option<&StructureId>| holds(&shared.access, &grant, presented.as_ref(), about);
+    let body = Sse::new(stream_of(news, may_see, (permit, share)))
         .keep_alive(KeepAlive::new().interval(KEEP_ALIVE).text("still here"));
     Ok((StatusCode::OK, [NO_BUFFERING], body).into_response())
 }
@@ -86,7 +109,7 @@ fn stream_of<P: Send>(
 ) -> impl Stream<Item = Result<Event, Infallible>> + Send {
     stream::unfold((news, may_see, permit), |(mut news, may_see, permit)| async move {
         let event = loop {
-            let Ok(received) = tokio::time::timeout(KEEP_ALIVE, news.recv()).await else {
+            let Ok(received) = tokio::time::timeout(CHECK_TOKEN, news.recv()).await else {
                 may_see(None)?;
                 continue;
             };
@@ -103,9 +126,14 @@ fn stream_of<P: Send>(
     })
 }
 
-/// Whether the token may see the structure; `None` once it is revoked or expired.
-fn holds(access: &AccessControl, grant: &Grant, structure: Option<&StructureId>) -> Option<bool> {
-    access.still_holds(grant).then(|| structure.is_none_or(|id| grant.may_see(id)))
+/// Whether the token may see the structure; `None` once it is revoked or expired, or its secret replaced.
+fn holds(
+    access: &AccessControl,
+    grant: &Grant,
+    presented: Option<&TokenText>,
+    structure: Option<&StructureId>,
+) -> Option<bool> {
+    access.still_holds(grant, presented).then(|| structure.is_none_or(|id| grant.may_see(id)))
 }
 
 #[cfg(test)]

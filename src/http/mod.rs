@@ -10,6 +10,7 @@ mod batches;
 mod bulk;
 mod cell;
 mod condition_report;
+mod connections;
 mod dashboard;
 mod diagnoses;
 mod docs;
@@ -29,6 +30,7 @@ mod operations;
 #[cfg(feature = "parquet")]
 mod parquet;
 mod people;
+mod presence;
 mod problem;
 mod quarantine;
 mod reference;
@@ -39,6 +41,8 @@ mod series;
 pub mod server;
 mod settings;
 mod shared;
+mod slow_reader;
+mod starting;
 mod structure_metrics;
 mod structures;
 mod table;
@@ -59,9 +63,9 @@ use std::time::Duration;
 
 use axum::extract::DefaultBodyLimit;
 use axum::http::StatusCode;
+use axum::middleware;
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
-use axum::{middleware, Router};
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::Semaphore;
 use tower_http::catch_panic::CatchPanicLayer;
@@ -71,9 +75,10 @@ use utoipa_axum::routes;
 
 use crate::monitor::Monitor;
 use crate::notify::Notifier;
-use access::AccessControl;
+use access::{AccessControl, Shares};
 use error::ApiError;
 use request::BodyLimits;
+use server::Routes;
 pub use settings::{HttpSettings, RateLimitSettings};
 use shared::Shared;
 
@@ -155,7 +160,7 @@ fn api() -> OpenApiRouter<Shared> {
 }
 
 /// All routes of the service.
-pub fn router(service: Service, settings: &HttpSettings) -> Router {
+pub fn router(service: Service, settings: &HttpSettings) -> Routes {
     let Service { monitor, notifier, access, metrics } = service;
     let limits = BodyLimits {
         bytes: settings.max_body_bytes,
@@ -168,13 +173,15 @@ pub fn router(service: Service, settings: &HttpSettings) -> Router {
         metrics: Arc::new(metrics),
         limits,
         streams: Arc::new(Semaphore::new(events::MOST_STREAMS)),
+        token_streams: Arc::new(Shares::new(events::MOST_STREAMS_OF_A_TOKEN)),
+        computations: Arc::new(Shares::new(views::MOST_COMPUTATIONS)),
         series: Arc::new(Semaphore::new(series::MOST_AT_A_TIME)),
         access: access.clone(),
         metrics_structures: settings.metrics_structures,
     };
     let (operations, mut document) = api().split_for_parts();
     openapi::complete(&mut document);
-    operations
+    let router = operations
         .merge(docs::router(&document))
         .route("/", get(dashboard::index))
         .route("/assets/{*path}", get(dashboard::asset))
@@ -182,11 +189,12 @@ pub fn router(service: Service, settings: &HttpSettings) -> Router {
         .fallback(not_found)
         // Bodies are read by `request::read_body`, which has its own limit and its own error.
         .layer(DefaultBodyLimit::disable())
-        .layer(middleware::from_fn_with_state(access, access::guard))
+        .layer(middleware::from_fn_with_state(access.clone(), access::guard))
         .layer(CatchPanicLayer::custom(panicked))
         .layer(middleware::from_fn(access::headers::secure))
         .layer(middleware::from_fn(observe::with_id_and_log))
-        .with_state(shared)
+        .with_state(shared);
+    Routes { router, access }
 }
 
 async fn not_found() -> ApiError {

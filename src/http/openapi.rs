@@ -227,6 +227,14 @@ problems! {
     Busy {
         "503": "`queue_full`: try again after the seconds of `Retry-After`."
     }
+    /// Too many computations for readers wait.
+    Computed {
+        "503": "`too_many_computations`: try again after the seconds of `Retry-After`."
+    }
+    /// Too many definitions wait to be checked.
+    Checked {
+        "503": "`too_many_structures`: try again after the seconds of `Retry-After`."
+    }
     /// The maximum number of streams is open.
     StreamBusy {
         "503": "`too_many_streams`, `stopping`: try again after the seconds of `Retry-After`."

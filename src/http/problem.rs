@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 74] = [
+pub const CODES: [(&str, StatusCode, &str); 79] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -29,6 +29,7 @@ pub const CODES: [(&str, StatusCode, &str); 74] = [
         StatusCode::FORBIDDEN,
         "without tokens the service answers only this machine, and no pages of other web sites",
     ),
+    ("client_left", StatusCode::BAD_REQUEST, "the client left before its request was done, and nothing was changed"),
     ("unknown_route", StatusCode::NOT_FOUND, "this path does not exist"),
     ("unknown_structure", StatusCode::NOT_FOUND, "there is no structure with this id"),
     ("unknown_batch", StatusCode::NOT_FOUND, "the structure has no such batch"),
@@ -106,7 +107,23 @@ pub const CODES: [(&str, StatusCode, &str); 74] = [
     ),
     ("internal", StatusCode::INTERNAL_SERVER_ERROR, "an internal error; the log has its cause under the request id"),
     ("queue_full", StatusCode::SERVICE_UNAVAILABLE, "the queue of assessments is full; see Retry-After"),
-    ("too_many_streams", StatusCode::SERVICE_UNAVAILABLE, "the maximum number of event streams is open"),
+    (
+        "too_many_computations",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "too many computations for readers wait; see Retry-After",
+    ),
+    ("too_many_connections", StatusCode::SERVICE_UNAVAILABLE, "all connections are in use; see Retry-After"),
+    (
+        "too_many_structures",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "too many definitions wait to be checked; see Retry-After",
+    ),
+    (
+        "too_many_streams",
+        StatusCode::SERVICE_UNAVAILABLE,
+        "the maximum number of event streams is open, in all or by this token",
+    ),
+    ("starting", StatusCode::SERVICE_UNAVAILABLE, "the service is starting"),
     ("stopping", StatusCode::SERVICE_UNAVAILABLE, "the service is stopping"),
     ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; nothing was stored"),
     ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing was stored"),

@@ -1,64 +1,73 @@
 //! The accept loop. `axum::serve` 0.8 is not used because it has no time limit for the header of a request: a client
 //! that never completes its header would keep its connection open for ever and prevent the service from stopping.
+//!
+//! `connections` limits how many are served, `slow_reader` ends those that take no answer.
 
+use std::convert::Infallible;
 use std::future::Future;
 use std::net::SocketAddr;
+use std::pin::pin;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Duration;
 
+use axum::body::Body;
 use axum::extract::ConnectInfo;
-use axum::http::Request;
+use axum::http::{header, HeaderMap, HeaderValue, Request, Response};
+use axum::response::IntoResponse as _;
 use axum::Router;
+use hyper::body::Incoming;
 use hyper::server::conn::http1::Builder;
+use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::graceful::GracefulShutdown;
-use hyper_util::service::TowerToHyperService;
-use rustix::process::{getrlimit, Resource};
-use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
-use tower::Service;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{watch, Mutex};
+use tower::Service as _;
 use tracing::{debug, info, warn};
 
+use super::access::route::PROBES;
+use super::access::{AccessControl, Key};
+use super::connections::{Connections, Eviction, ReservePlace, Slot, PATIENCE};
+use super::error::ApiError;
+use super::presence::Presence;
 use super::settings::HttpSettings;
+use super::slow_reader::{Backlog, TimedWrites};
+use super::starting;
 
 /// Pause after a failed accept: if the process has no free file descriptor, an immediate retry would loop.
 const PAUSE_AFTER_FAILED_ACCEPT: Duration = Duration::from_millis(50);
 
-/// File descriptors reserved for other uses than connections: database, log, model files, outgoing requests.
-const RESERVED_FILES: usize = 64;
+/// Time in which a connection that has to leave the reserve may receive its refusal.
+const LAST_WORDS: Duration = Duration::from_millis(250);
 
-/// Maximum number of open connections: `wanted`, or fewer if the process may not open so many files. Otherwise idle
-/// connections could use the last descriptor, and the database could not be opened for the next reader.
-fn most_connections(wanted: usize, files: Option<usize>) -> usize {
-    let Some(files) = files else { return wanted };
-    let possible = files.saturating_sub(RESERVED_FILES).max(files / 4).max(1);
-    if possible < wanted {
-        warn!("The limit of open files is {files}: at most {possible} connections are accepted at a time instead of {wanted}; raise the limit with `ulimit -n`");
-    }
-    wanted.min(possible)
+/// Value of `Retry-After` when no place became free, seconds.
+const RETRY_AFTER_S: u32 = 5;
+
+/// The routes of the service, and who may use them.
+#[derive(Clone)]
+pub struct Routes {
+    pub(super) router: Router,
+    pub(super) access: AccessControl,
 }
 
-/// Soft limit of open files; `None` if there is no limit.
-fn open_files_limit() -> Option<usize> {
-    getrlimit(Resource::Nofile).current.and_then(|files| usize::try_from(files).ok())
-}
-
-/// Serves until `shutdown` completes, then lets open requests finish within the drain time.
-pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings, shutdown: impl Future<Output = ()>) {
+/// Serves until `shutdown` completes, then lets open requests finish within the drain time. Until there are routes, only the probes of
+/// supervisors are answered.
+pub async fn run(
+    listener: TcpListener,
+    routes: watch::Receiver<Option<Routes>>,
+    settings: &HttpSettings,
+    shutdown: impl Future<Output = ()>,
+) {
     let mut builder = Builder::new();
     builder
         .timer(TokioTimer::new())
         .header_read_timeout(Duration::from_secs(settings.header_timeout_s))
         .keep_alive(true);
-    let connections = Arc::new(Semaphore::new(most_connections(settings.max_connections, open_files_limit())));
+    let connections = Arc::new(Connections::new(settings));
     let graceful = GracefulShutdown::new();
-    let mut shutdown = std::pin::pin!(shutdown);
+    let mut shutdown = pin!(shutdown);
     loop {
-        let permit = tokio::select! {
-            permit = Arc::clone(&connections).acquire_owned() => permit.expect("the semaphore is never closed"),
-            () = &mut shutdown => break,
-        };
         let (stream, peer) = tokio::select! {
             accepted = listener.accept() => match accepted {
                 Ok(accepted) => accepted,
@@ -72,14 +81,31 @@ pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings,
         };
         // Answers are small; waiting to fill a packet (Nagle) would only add latency.
         let _ = stream.set_nodelay(true);
-        let service = TowerToHyperService::new(WithPeer { router: router.clone(), peer });
-        let connection = graceful.watch(builder.serve_connection(TokioIo::new(stream), service));
-        tokio::spawn(async move {
-            if let Err(error) = connection.await {
-                debug!(%error, "A connection ended early: {error}");
-            }
-            drop(permit);
+        let key = match &*routes.borrow() {
+            Some(routes) => routes.access.connection_key(peer.ip()),
+            None => Some(Key::of_address(Some(peer.ip().to_canonical()))),
+        };
+        let place = tokio::select! {
+            place = place(&connections, key.as_ref()) => place,
+            () = &mut shutdown => break,
+        };
+        let eviction = match &place {
+            Place::Reserve(place) => Some(place.eviction()),
+            Place::Served(_) => None,
+        };
+        let connection = Arc::new(Connection {
+            peer,
+            key,
+            place: Mutex::new(place),
+            eviction,
+            is_served: AtomicBool::new(false),
+            is_waiting: AtomicBool::new(false),
+            backlog: Arc::default(),
+            connections: Arc::clone(&connections),
+            routes: routes.clone(),
         });
+        let limit = Duration::from_secs(settings.write_timeout_s);
+        tokio::spawn(serve(stream, connection, &builder, &graceful, limit));
     }
     drop(listener);
     info!("Stopping: no new connections are accepted, open requests have {} s to finish", settings.drain_s);
@@ -88,27 +114,132 @@ pub async fn run(listener: TcpListener, router: Router, settings: &HttpSettings,
     }
 }
 
-/// The router; adds the peer address to the extensions of each request.
-#[derive(Clone)]
-struct WithPeer {
-    router: Router,
-    peer: SocketAddr,
+/// Where a connection is.
+enum Place {
+    Served(#[expect(dead_code, reason = "held until the connection ends")] Slot),
+    Reserve(ReservePlace),
 }
 
-impl<B> Service<Request<B>> for WithPeer
-where
-    Router: Service<Request<B>>,
-{
-    type Response = <Router as Service<Request<B>>>::Response;
-    type Error = <Router as Service<Request<B>>>::Error;
-    type Future = <Router as Service<Request<B>>>::Future;
+/// A place among the served connections if one is free, otherwise one in the reserve.
+async fn place(connections: &Connections, key: Option<&Key>) -> Place {
+    match connections.try_slot(key) {
+        Some(slot) => Place::Served(slot),
+        None => Place::Reserve(connections.reserve_place().await),
+    }
+}
 
-    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
-        self.router.poll_ready(context)
+/// Serves one connection until it ends, or until its place in the reserve is needed.
+fn serve(
+    stream: TcpStream,
+    connection: Arc<Connection>,
+    builder: &Builder,
+    graceful: &GracefulShutdown,
+    limit: Duration,
+) -> impl Future<Output = ()> + Send + 'static {
+    let service = {
+        let connection = Arc::clone(&connection);
+        service_fn(move |request| {
+            let connection = Arc::clone(&connection);
+            async move { Ok::<_, Infallible>(connection.answer(request).await) }
+        })
+    };
+    let stream = TokioIo::new(TimedWrites::new(stream, limit, Arc::clone(&connection.backlog)));
+    let serving = graceful.watch(builder.serve_connection(stream, service));
+    async move {
+        let mut serving = pin!(serving);
+        let ended = tokio::select! {
+            ended = &mut serving => Some(ended),
+            () = connection.is_evicted() => {
+                if connection.is_served.load(Ordering::Acquire) {
+                    Some(serving.await)
+                } else if connection.is_waiting.load(Ordering::Acquire) {
+                    tokio::time::timeout(LAST_WORDS, serving).await.ok()
+                } else {
+                    None
+                }
+            }
+        };
+        if let Some(Err(error)) = ended {
+            debug!(%error, "A connection ended early: {error}");
+        }
+    }
+}
+
+/// A connection, as its requests see it.
+struct Connection {
+    peer: SocketAddr,
+    /// The address for which it counts; `None` for a trusted proxy.
+    key: Option<Key>,
+    place: Mutex<Place>,
+    /// `None` for a connection that was served from the beginning.
+    eviction: Option<Eviction>,
+    is_served: AtomicBool,
+    /// Whether a request waits, or was refused, in the reserve.
+    is_waiting: AtomicBool,
+    backlog: Arc<Backlog>,
+    connections: Arc<Connections>,
+    routes: watch::Receiver<Option<Routes>>,
+}
+
+impl Connection {
+    async fn is_evicted(&self) {
+        match self.eviction.clone() {
+            Some(mut eviction) => eviction.happens().await,
+            None => std::future::pending().await,
+        }
     }
 
-    fn call(&mut self, mut request: Request<B>) -> Self::Future {
+    async fn answer(&self, mut request: Request<Incoming>) -> Response<Body> {
+        // A client that sends further requests without taking the answers to the earlier ones is not worked for.
+        self.backlog.taken().await;
+        let routes = self.routes.borrow().clone();
+        let is_probe = PROBES.contains(&request.uri().path());
+        if !is_probe {
+            if let Err(refusal) = self.served(request.headers(), routes.as_ref()).await {
+                return closing(refusal.into_response());
+            }
+        }
+        let (_awaited, presence) = Presence::begin();
+        let Some(Routes { mut router, .. }) = routes else {
+            return closing(starting::answer(request.uri().path()));
+        };
         request.extensions_mut().insert(ConnectInfo(self.peer));
-        self.router.call(request)
+        request.extensions_mut().insert(presence);
+        let answer = router.call(request).await.unwrap_or_else(|never| match never {});
+        if is_probe && matches!(*self.place.lock().await, Place::Reserve(_)) {
+            return closing(answer);
+        }
+        answer
     }
+
+    /// Waits until this connection is among the served ones. A request with a valid token does not count for its address.
+    async fn served(&self, headers: &HeaderMap, routes: Option<&Routes>) -> Result<(), ApiError> {
+        let mut place = self.place.lock().await;
+        if matches!(*place, Place::Served(_)) {
+            return Ok(());
+        }
+        let is_known = routes.is_some_and(|routes| routes.access.knows(headers));
+        let key = self.key.as_ref().filter(|_| !is_known);
+        self.is_waiting.store(true, Ordering::Release);
+        let slot = tokio::select! {
+            slot = self.connections.slot(key) => Some(slot),
+            () = self.is_evicted() => None,
+            () = tokio::time::sleep(PATIENCE) => None,
+        };
+        let Some(slot) = slot else {
+            metrics::counter!("modalwatch_connections_refused_total").increment(1);
+            let detail =
+                "all connections are in use, in all or by this address: try again, and keep fewer connections open";
+            return Err(ApiError::unavailable("too_many_connections", detail, RETRY_AFTER_S));
+        };
+        self.is_served.store(true, Ordering::Release);
+        *place = Place::Served(slot);
+        Ok(())
+    }
+}
+
+/// An answer after which the connection is closed.
+fn closing(mut answer: Response<Body>) -> Response<Body> {
+    answer.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
+    answer
 }

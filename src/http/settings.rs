@@ -16,8 +16,12 @@ pub struct HttpSettings {
     pub header_timeout_s: u64,
     /// Time limit for receiving the body of a request, seconds.
     pub body_timeout_s: u64,
-    /// Maximum number of open connections; further connections wait to be accepted.
+    /// Time limit for a client to take what waits for it of an answer, seconds.
+    pub write_timeout_s: u64,
+    /// Maximum number of connections that are served; requests on further ones wait 10 s for a place.
     pub max_connections: usize,
+    /// The same for each address (for IPv6, each /64 network) that is not a trusted proxy.
+    pub max_connections_per_address: usize,
     /// Time that open requests are given to finish when the service stops, seconds.
     pub drain_s: u64,
     /// Addresses and networks of the proxies whose `X-Forwarded-For` header is trusted.
@@ -36,7 +40,9 @@ impl Default for HttpSettings {
             max_bulk_bytes: 32 << 20,
             header_timeout_s: 10,
             body_timeout_s: 30,
+            write_timeout_s: 20,
             max_connections: 1_024,
+            max_connections_per_address: 256,
             drain_s: 30,
             trusted_proxies: Vec::new(),
             metrics_structures: 100,
@@ -62,6 +68,6 @@ pub struct RateLimitSettings {
 
 impl Default for RateLimitSettings {
     fn default() -> Self {
-        Self { requests_per_s: 0, burst: 200, measurements_per_s: 0, failed_authentications_per_min: 10 }
+        Self { requests_per_s: 500, burst: 2_000, measurements_per_s: 0, failed_authentications_per_min: 10 }
     }
 }

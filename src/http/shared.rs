@@ -5,7 +5,7 @@ use std::sync::Arc;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::Semaphore;
 
-use super::access::AccessControl;
+use super::access::{AccessControl, Shares};
 use super::request::BodyLimits;
 use crate::monitor::Monitor;
 use crate::notify::Notifier;
@@ -19,6 +19,10 @@ pub struct Shared {
     pub(super) limits: BodyLimits,
     /// Permits for event streams.
     pub(super) streams: Arc<Semaphore>,
+    /// Event streams of each token.
+    pub(super) token_streams: Arc<Shares>,
+    /// Computations of each client that run or wait.
+    pub(super) computations: Arc<Shares>,
     /// Permits for reading a series.
     pub(super) series: Arc<Semaphore>,
     pub(super) access: AccessControl,

@@ -1,6 +1,6 @@
 //! `/v1/structures`: defines and reads structures.
 
-use axum::body::Body;
+use axum::body::{Body, Bytes};
 use axum::extract::State;
 use axum::http::{header, HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
@@ -10,7 +10,8 @@ use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::error::ApiError;
-use super::openapi::{BodyRefused, Conflict, Invalid, StructurePath, Unknown};
+use super::openapi::{BodyRefused, Checked, Conflict, Invalid, StructurePath, Unknown};
+use super::presence::Presence;
 use super::request::{media_type, parse_json, read_body, structure_id, unsupported_media_type, ApiPath};
 use super::shared::Shared;
 use crate::access::Grant;
@@ -20,6 +21,13 @@ use crate::monitor::stored::PutStructure;
 use crate::monitor::ActiveStructure;
 use crate::quantity::{StructureId, Timestamp};
 use crate::simulator::definition::{DefinitionError, StructureDefinition};
+use crate::simulator::Simulator;
+
+/// Value of `Retry-After` when too many definitions wait to be checked, seconds.
+const RETRY_AFTER_S: u32 = 5;
+
+/// Reads and checks the text of a definition.
+type Parse = fn(&[u8]) -> Result<Simulator, ApiError>;
 
 /// A structure with its trained model and its undamaged reference.
 #[derive(Debug, Serialize, ToSchema)]
@@ -139,7 +147,8 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 /// definition.
 ///
 /// # Errors
-/// 400 and 422 with the location in the file; 409 if the structure has batches under another definition.
+/// 400 and 422 with the location in the file; 409 if the structure has batches under another definition; 503 if many other
+/// definitions wait to be checked.
 #[utoipa::path(
     put, path = "/v1/structures/{id}", tag = "structures", operation_id = "put_structure",
     summary = "Define a structure",
@@ -161,31 +170,34 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
          headers(("Location" = String, description = "Path of the structure"))),
         (status = 201, description = "It is new", body = StructureBody,
          headers(("Location" = String, description = "Path of the structure"))),
-        BodyRefused, Conflict
+        BodyRefused, Conflict, Checked
     )
 )]
 pub async fn put(
     State(shared): State<Shared>,
     ApiPath(id): ApiPath<String>,
+    presence: Presence,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
     let bytes = read_body(body, &headers, shared.limits).await?;
     let kind = media_type(&headers);
-    let parse: fn(&[u8]) -> Result<StructureDefinition, ApiError> = match kind.as_deref() {
+    let parse: Parse = match kind.as_deref() {
         Some("application/json") => parse_definition_json,
-        Some("application/toml") => |bytes| StructureDefinition::parse_toml(utf8(bytes)?).map_err(refused),
+        Some("application/toml") => |bytes| Simulator::parse_toml(utf8(bytes)?).map_err(refused),
         other => return Err(unsupported_media_type(other, "application/json or application/toml")),
     };
-    // The check solves the eigenproblem and fits tables of runs, which takes time for large structures.
-    let parsed = tokio::task::spawn_blocking(move || parse(&bytes)).await.map_err(|e| ApiError::internal(&e))?;
-    let definition = parsed?;
-    if definition.id != id.as_str() {
-        let message = format!("the id in the body is {}, in the path {id}", crate::quantity::shown(&definition.id));
+    // A change goes on when its client leaves; the check of a large definition, which nobody waits for any more, does not.
+    let simulator = tokio::select! {
+        checked = checked(&shared, bytes, parse) => checked?,
+        () = presence.ends() => return Err(client_left()),
+    };
+    if *simulator.id() != id {
+        let message = format!("the id in the body is {}, in the path {id}", simulator.id());
         return Err(ApiError::invalid_field("/id", message));
     }
-    let outcome = shared.monitor.structures().put(definition).await?;
+    let outcome = shared.monitor.structures().put(simulator).await?;
     let status = if outcome == PutStructure::Created { StatusCode::CREATED } else { StatusCode::OK };
     let active = shared.monitor.structure(&id)?;
     let undamaged = shared.monitor.records().reference(&id).await?.map(|u| super::answer::Undamaged::new(&id, &u));
@@ -193,10 +205,23 @@ pub async fn put(
     Ok((status, location, Json(self::body(&id, &active, undamaged))).into_response())
 }
 
+/// Checks a definition in its turn: the check solves the eigenproblem and fits tables of runs, which takes seconds and some 200 MB for a
+/// large structure.
+async fn checked(shared: &Shared, bytes: Bytes, parse: Parse) -> Result<Simulator, ApiError> {
+    let turn = shared.monitor.checks().turn().await;
+    let turn = turn.map_err(|full| ApiError::unavailable("too_many_structures", full.to_string(), RETRY_AFTER_S))?;
+    turn.run(move |_| parse(&bytes)).await.map_err(|e| ApiError::internal(&e))?
+}
+
+fn client_left() -> ApiError {
+    let detail = "the client left before its definition was checked: nothing was changed";
+    ApiError::new(StatusCode::BAD_REQUEST, "client_left", detail)
+}
+
 /// Malformed JSON is answered 400, JSON that does not define a structure 422.
-fn parse_definition_json(bytes: &[u8]) -> Result<StructureDefinition, ApiError> {
+fn parse_definition_json(bytes: &[u8]) -> Result<Simulator, ApiError> {
     parse_json::<Value>(bytes)?;
-    StructureDefinition::parse_json(utf8(bytes)?).map_err(refused)
+    Simulator::parse_json(utf8(bytes)?).map_err(refused)
 }
 
 fn utf8(bytes: &[u8]) -> Result<&str, ApiError> {

@@ -6,9 +6,10 @@ use axum::Json;
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::access::{Client, Share};
 use super::error::ApiError;
 use super::mode_shapes::ShapeComparisonBody;
-use super::openapi::{BatchPath, Busy, Conflict, Invalid, Unknown};
+use super::openapi::{BatchPath, Computed, Conflict, Invalid, Unknown};
 use super::request::{structure_id, ApiPath};
 use super::shared::Shared;
 use super::verdict::{Condition, Judged};
@@ -17,6 +18,12 @@ use crate::assessment::{BatchDetail, ModeDetail, ParameterDetail};
 use crate::monitor::stored::LatestAssessment;
 use crate::quantity::{Hertz, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
+
+/// Computations that one client may have running or waiting.
+pub const MOST_COMPUTATIONS: usize = 32;
+
+/// Value of `Retry-After` when a client has all of them, seconds.
+const RETRY_AFTER_S: u32 = 5;
 
 /// Overview of all structures.
 #[derive(Debug, Serialize, ToSchema)]
@@ -174,21 +181,36 @@ fn latest(found: LatestAssessment) -> Latest {
 /// assessment.
 ///
 /// # Errors
-/// 404 for structure or batch, 409 if the batch is not assessed, 503 when the queue is full.
+/// 404 for structure or batch, 409 if the batch is not assessed, 503 when too many computations wait.
 #[utoipa::path(
     get, path = "/v1/structures/{id}/batches/{batch}/detail", tag = "results", operation_id = "read_batch_detail",
     summary = "Details of a batch",
     description = "Densities of the parameters, and the predicted frequencies beside the measured ones.",
     params(BatchPath),
-    responses((status = 200, description = "The densities", body = DetailBody), Unknown, Invalid, Conflict, Busy)
+    responses((status = 200, description = "The densities", body = DetailBody), Unknown, Invalid, Conflict, Computed)
 )]
 pub async fn detail(
     State(shared): State<Shared>,
+    client: Client,
     ApiPath((id, batch)): ApiPath<(String, String)>,
 ) -> Result<Response, ApiError> {
     let id = structure_id(&id)?;
+    let _share = share(&shared, &client)?;
     let detail = shared.monitor.records().batch_detail(&id, &batch).await?;
-    Ok(Json(detail_body(id, batch, detail)).into_response())
+    Ok(Json(detail_body(id, batch, BatchDetail::clone(&detail))).into_response())
+}
+
+/// One of the computations that a client may have at a time.
+///
+/// # Errors
+/// 503 when it has all of them.
+pub(super) fn share(shared: &Shared, client: &Client) -> Result<Share, ApiError> {
+    shared.computations.take(&client.key).ok_or_else(|| {
+        let most = shared.computations.most();
+        let detail =
+            format!("{most} computations of this client run or wait, which is the maximum: ask for fewer at a time");
+        ApiError::unavailable("too_many_computations", detail, RETRY_AFTER_S)
+    })
 }
 
 fn detail_body(structure: StructureId, batch: String, detail: BatchDetail) -> DetailBody {

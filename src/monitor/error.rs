@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::compute::QueueFull;
+use super::readers::TooManyReaders;
 use crate::assessment;
 use crate::damage;
 use crate::quantity::{StructureId, Timestamp};
@@ -42,6 +43,9 @@ pub enum Error {
     /// The queue is full; nothing was stored.
     #[error(transparent)]
     QueueFull(#[from] QueueFull),
+    /// Too many computations for readers run or wait.
+    #[error(transparent)]
+    TooManyReaders(#[from] TooManyReaders),
     /// The structure has batches under another definition.
     #[error("structure {0} has batches that were measured under another definition; use another id for the new one")]
     StructureInUse(StructureId),

@@ -3,7 +3,7 @@
 use crate::alarm::ALARM_KINDS;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
-const MEANINGS: [(&str, &str); 38] = [
+const MEANINGS: [(&str, &str); 40] = [
     ("modalwatch_alarms_total", "Alarms raised."),
     ("modalwatch_assessment_seconds", "Time of an assessment."),
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
@@ -12,6 +12,7 @@ const MEANINGS: [(&str, &str); 38] = [
     ("modalwatch_baselines_in_use", "Structures with a trained baseline in use."),
     ("modalwatch_batches_received_total", "New batches stored."),
     ("modalwatch_build_info", "Program and SQLite; always 1."),
+    ("modalwatch_connections_refused_total", "Requests that found no free connection."),
     ("modalwatch_database_bytes", "Size of the database file."),
     ("modalwatch_disk_free_bytes", "Free bytes on the volume of the database."),
     ("modalwatch_findings", "Findings of GET /readyz."),
@@ -36,6 +37,7 @@ const MEANINGS: [(&str, &str); 38] = [
     ("modalwatch_ready", "1 when batches are taken and assessed."),
     ("modalwatch_resident_memory_bytes", "Memory of this process."),
     ("modalwatch_retention_deleted_batches_total", "Batches deleted by retention."),
+    ("modalwatch_slow_readers_total", "Connections ended because their client took no answer."),
     ("modalwatch_structures", "Structures defined."),
     ("modalwatch_unacknowledged_alarms", "Open alarms that nobody has acknowledged."),
     ("modalwatch_uptime_seconds", "Time since the start."),
@@ -67,6 +69,8 @@ pub fn declare_metrics(sqlite_version: &str) {
         "modalwatch_assessments_total",
         "modalwatch_assessments_failed_total",
         "modalwatch_retention_deleted_batches_total",
+        "modalwatch_connections_refused_total",
+        "modalwatch_slow_readers_total",
     ] {
         metrics::counter!(name).increment(0);
     }

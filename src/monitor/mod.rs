@@ -20,6 +20,7 @@ mod assessor;
 pub mod automatic_diagnoses;
 mod backups;
 pub mod compute;
+mod details;
 mod error;
 pub mod events;
 mod ingest;
@@ -28,6 +29,7 @@ mod metrics;
 mod models;
 mod own_task;
 mod probe;
+mod readers;
 mod reason;
 mod records;
 mod references;
@@ -61,6 +63,7 @@ pub use self::jobs::{
 pub use self::metrics::declare_metrics;
 pub use self::models::{Models, Reloaded};
 use self::probe::WriterProbe;
+pub use self::readers::{Readers, TooManyReaders};
 pub use self::reason::Reason;
 pub use self::records::{BatchView, Missing, Records, Series};
 use self::references::References;
@@ -84,6 +87,8 @@ pub struct Monitor {
     structures: Arc<ActiveStructures>,
     alarms: Arc<Alarms>,
     records: Records,
+    readers: Readers,
+    checks: Readers,
     ingest: Ingest,
     replay: Replay,
     versions: Versions,
@@ -121,7 +126,8 @@ impl Monitor {
         });
         let references = Arc::new(References::new(Arc::clone(&assessor)));
         let replay = Replay::new(Arc::clone(&assessor), Arc::clone(&references));
-        let records = Records::new(Arc::clone(&assessor));
+        let readers = Readers::of_details();
+        let records = Records::new(Arc::clone(&assessor), readers.clone());
         let versions = Versions::new(store.clone(), Arc::clone(&structures), Arc::clone(&references), replay.clone());
         let jobs = Jobs::new(store.clone(), Arc::clone(&structures), versions.clone(), events.clone());
         let models = Models::new(store.clone(), Arc::clone(&structures), references, replay.clone());
@@ -139,8 +145,24 @@ impl Monitor {
             started: Instant::now(),
         };
         let ingest = Ingest::new(Arc::clone(&assessor), replay.clone(), records.clone());
+        let checks = Readers::of_checks();
         let archive = Archive::new(assessor, replay.clone());
-        Ok(Self { store, events, structures, alarms, records, ingest, replay, versions, jobs, models, upkeep, archive })
+        Ok(Self {
+            store,
+            events,
+            structures,
+            alarms,
+            records,
+            readers,
+            checks,
+            ingest,
+            replay,
+            versions,
+            jobs,
+            models,
+            upkeep,
+            archive,
+        })
     }
 
     /// A structure in use.
@@ -169,6 +191,16 @@ impl Monitor {
     /// Reads stored batches, their assessments, and time series.
     pub fn records(&self) -> &Records {
         &self.records
+    }
+
+    /// Turns for what has to be computed for a reader.
+    pub fn readers(&self) -> &Readers {
+        &self.readers
+    }
+
+    /// Turns for the check of a definition.
+    pub fn checks(&self) -> &Readers {
+        &self.checks
     }
 
     /// Reads and acknowledges alarms, and reads alarm charts and maintenance windows.

@@ -4,8 +4,10 @@ use std::fmt;
 use std::sync::Arc;
 
 use super::assessor::Assessor;
+use super::details::Details;
 use super::error::Error;
-use crate::assessment::{detail, draw, Assessment, BatchDetail, BatchState};
+use super::readers::Readers;
+use crate::assessment::{Assessment, BatchDetail};
 use crate::quantity::{Digest, StructureId};
 use crate::reduction::Reduced;
 use crate::store::{
@@ -76,11 +78,13 @@ pub struct Series {
 #[derive(Clone)]
 pub struct Records {
     assessor: Arc<Assessor>,
+    details: Details,
 }
 
 impl Records {
-    pub(super) fn new(assessor: Arc<Assessor>) -> Self {
-        Self { assessor }
+    pub(super) fn new(assessor: Arc<Assessor>, readers: Readers) -> Self {
+        let details = Details::new(Arc::clone(&assessor), readers);
+        Self { assessor, details }
     }
 
     /// All stored structures.
@@ -231,30 +235,8 @@ impl Records {
     ///
     /// # Errors
     /// [`Error::UnknownStructure`], [`Error::UnknownBatch`], [`Error::NoModel`], [`Error::NotAssessed`],
-    /// [`Error::QueueFull`].
-    pub async fn batch_detail(&self, structure: &StructureId, batch_id: &str) -> Result<BatchDetail, Error> {
-        let Assessor { store, structures, compute, .. } = &*self.assessor;
-        let active = structures.get(structure)?;
-        let record = self.assessor.stored(structure, batch_id).await?;
-        let baseline = active.trained_baseline()?;
-        let not_assessed = |reason: String| Error::NotAssessed { batch: batch_id.to_owned(), reason };
-        match record.state {
-            BatchState::Assessed => {}
-            BatchState::Received => return Err(not_assessed("it still waits for its assessment".to_owned())),
-            BatchState::Failed => return Err(not_assessed(record.failure.unwrap_or_default())),
-        }
-        let place = compute.reserve()?;
-        let draws = self.assessor.draws(&baseline, &record);
-        let (source, from) = (&record.batch.source, record.batch.time_span().0);
-        let previous = store.batches().frequencies_before(structure, source, from).await?;
-        let reference = store.reference().undamaged(structure).await?.filter(|u| u.model_digest == *baseline.digest());
-        let work = move || {
-            let measurements = &record.batch.measurements;
-            let samples = draw(&baseline, measurements, previous.as_deref(), draws)?;
-            let reference = reference.as_ref().map(|record| &record.state);
-            detail(&baseline, measurements, &samples, draws.per_measurement, reference)
-        };
-        let done = place.run(work).await.map_err(|_| Error::Panicked)?;
-        done.map_err(|error| not_assessed(error.to_string()))
+    /// [`Error::TooManyReaders`].
+    pub async fn batch_detail(&self, structure: &StructureId, batch_id: &str) -> Result<Arc<BatchDetail>, Error> {
+        self.details.of_batch(structure, batch_id).await
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, RwLock, RwLockReadGuard};
 
+use futures_util::{stream, StreamExt as _, TryStreamExt as _};
 use tracing::{error, warn};
 
 use super::error::Error;
@@ -12,7 +13,7 @@ use crate::baseline::library::Library;
 use crate::baseline::manifest::Outcome;
 use crate::baseline::Baseline;
 use crate::quantity::{Digest, StructureId, Timestamp};
-use crate::simulator::definition::StructureDefinition;
+use crate::simulator::definition::DefinitionError;
 use crate::simulator::Simulator;
 use crate::store::{NewVersion, PutStructure, Store};
 use crate::trust::calibration_in_words;
@@ -79,10 +80,12 @@ impl ActiveStructures {
         let library = RwLock::new(Arc::new(library));
         let (active, refused) = (RwLock::default(), BTreeMap::new());
         let mut structures = Self { store, events, accept_uncalibrated, library, active, refused };
-        for summary in structures.store.structures().list().await? {
-            let id = summary.id;
-            let Some(record) = structures.store.structures().structure(&id).await? else { continue };
-            match StructureDefinition::parse_json(&record.definition_json).and_then(Simulator::new) {
+        let ids = structures.store.structures().list().await?.into_iter().map(|summary| summary.id);
+        let at_a_time = std::thread::available_parallelism().map_or(1, usize::from);
+        let read = stream::iter(ids).map(|id| read_stored(&structures, id)).buffered(at_a_time);
+        let read: Vec<_> = read.try_collect().await?;
+        for (id, simulator) in read.into_iter().flatten() {
+            match simulator {
                 Ok(simulator) => {
                     let baseline = structures.baseline_for(&simulator).await?;
                     structures.activate(simulator, baseline);
@@ -137,9 +140,7 @@ impl ActiveStructures {
     ///
     /// # Errors
     /// [`Error::StructureInUse`] when it has batches under another definition.
-    pub async fn put(&self, definition: StructureDefinition) -> Result<PutStructure, Error> {
-        let built = tokio::task::spawn_blocking(move || Simulator::new(definition)).await;
-        let simulator = built.unwrap_or_else(|e| std::panic::resume_unwind(e.into_panic()))?;
+    pub async fn put(&self, simulator: Simulator) -> Result<PutStructure, Error> {
         let (id, json) = (simulator.id().clone(), simulator.definition().canonical_json());
         let outcome = self.store.structures().put_structure(&id, &json, simulator.digest(), Timestamp::now()).await?;
         match outcome {
@@ -254,6 +255,22 @@ impl ActiveStructures {
     fn read(&self) -> RwLockReadGuard<'_, BTreeMap<StructureId, Arc<ActiveStructure>>> {
         self.active.read().expect("no holder of this lock panics")
     }
+}
+
+/// A stored structure, or why this version of the program refuses it; `None` for one that was removed in the meantime. A definition
+/// that the library has was checked there.
+async fn read_stored(
+    structures: &ActiveStructures,
+    id: StructureId,
+) -> Result<Option<(StructureId, Result<Simulator, DefinitionError>)>, Error> {
+    let Some(record) = structures.store.structures().structure(&id).await? else { return Ok(None) };
+    let library = structures.library();
+    let is_same = |simulator: &Simulator| simulator.definition().canonical_json() == record.definition_json;
+    if let Some(entry) = library.get(&id).filter(|entry| is_same(&entry.simulator)) {
+        return Ok(Some((id, Ok(entry.simulator.clone()))));
+    }
+    let parsed = tokio::task::spawn_blocking(move || Simulator::parse_json(&record.definition_json)).await;
+    Ok(Some((id, parsed.map_err(|_| Error::Panicked)?)))
 }
 
 /// Code and sentence of a finding about a baseline that did not pass its calibration; `None` for one that passed.

@@ -11,7 +11,6 @@ use super::replay::Replay;
 use super::structures::ActiveStructures;
 use crate::baseline::Baseline;
 use crate::quantity::{Digest, StructureId};
-use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::{NewVersion, Store};
 
@@ -53,7 +52,7 @@ impl Versions {
         let parent = parent.ok_or_else(not_extended)?;
         let (definition, grandparent) =
             self.store.structures().structure_version(structure, &parent).await?.ok_or_else(not_extended)?;
-        let simulator = Simulator::new(StructureDefinition::parse_json(&definition)?)?;
+        let simulator = Simulator::parse_json(&definition)?;
         let missing = |reason| Error::NoModel { structure: structure.clone(), reason };
         let baseline = self.structures.baseline_for(&simulator).await?.map_err(missing)?;
         let version = NewVersion {

@@ -10,7 +10,7 @@ use crate::physics::{AttachmentPoint, Form, Mass, Node};
 use crate::quantity::shown;
 
 /// Largest number of finite elements: the rounding error of the lowest frequency grows with the fourth power of their number.
-const MOST_ELEMENTS: usize = 200;
+pub(super) const MOST_ELEMENTS: usize = 200;
 
 /// Degrees of freedom of a node, deflection and rotation; `None` where the support fixes them.
 type NodeDofs = [Option<usize>; 2];

@@ -1,6 +1,6 @@
 //! Checks the contents of a structure definition, which is well-formed already, and builds the parts of a simulator.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 
 use super::definition::{
     CovariateDefinition, DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Prior, Sets,
@@ -12,20 +12,13 @@ use super::effect::{self, SimulationEffect};
 use super::instrumented::{self, Instrumented};
 use super::layout::{check_kg, check_names, check_spring, Layout, Problems};
 use super::model::{Binding, SimulationModel, StiffnessForm};
-use super::{beam, covariates, table};
+use super::{beam, counts, covariates, table};
 use crate::measurement::Covariate;
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::physics::{
     self, floating_mass, natural_frequencies_hz, AttachmentPoint, Form, Mass, Node, Spring, Structure,
 };
 use crate::quantity::{shown, StructureId};
-
-/// Largest number of masses: a dense eigenproblem of this size takes about three seconds.
-const MOST_MASSES: usize = 2_000;
-
-/// Largest numbers of springs (or beams) and of unknown parameters.
-const MOST_SPRINGS: usize = 20_000;
-const MOST_PARAMETERS: usize = 100;
 
 /// The parts of a checked structure.
 #[derive(Debug, Clone)]
@@ -43,6 +36,10 @@ pub(super) struct Checked {
 /// Checks a definition in several stages. All mistakes of a stage are reported together; a stage runs only if the stages before
 /// it found none.
 pub(super) fn check(definition: &StructureDefinition) -> Result<Checked, Problems> {
+    let too_many = counts::too_many(definition);
+    if !too_many.is_empty() {
+        return Err(too_many);
+    }
     let mut problems = Problems::new();
     let id =
         StructureId::parse(&definition.id).map_err(|e| problems.push(DefinitionProblem::new("/id", e.to_string())));
@@ -171,8 +168,8 @@ fn check_sections(definition: &StructureDefinition, problems: &mut Problems) {
 fn check_counts_and_noise(definition: &StructureDefinition, problems: &mut Problems) {
     let masses = definition.masses.len();
     let bodies = definition.simulation == SimulationKind::SpringMass;
-    if bodies && (masses == 0 || masses > MOST_MASSES) {
-        let message = format!("{masses} masses: a structure has 1 to {MOST_MASSES} [[mass]]");
+    if bodies && masses == 0 {
+        let message = format!("0 masses: a structure has 1 to {} [[mass]]", counts::MOST_MASSES);
         problems.push(DefinitionProblem::new("/mass", message));
     } else if definition.modes == 0 || (bodies && definition.modes > masses) {
         let message = if bodies {
@@ -194,15 +191,6 @@ fn check_counts_and_noise(definition: &StructureDefinition, problems: &mut Probl
     if definition.parameters.is_empty() {
         problems
             .push(DefinitionProblem::new("/parameter", "no [[parameter]]: at least one unknown parameter is needed"));
-    }
-    for (section, count, most) in [
-        ("spring", definition.springs.len(), MOST_SPRINGS),
-        ("parameter", definition.parameters.len(), MOST_PARAMETERS),
-    ] {
-        if count > most {
-            let message = format!("{count} [[{section}]]: a structure has at most {most}");
-            problems.push(DefinitionProblem::new(format!("/{section}"), message));
-        }
     }
 }
 
@@ -251,6 +239,8 @@ fn check_springs(
 fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -> Vec<Binding> {
     check_names("parameter", definition.parameters.iter().map(|p| &p.name), problems);
     let mut bindings: Vec<Binding> = Vec::new();
+    let stiffnesses = Stiffnesses::of(definition);
+    let mut set_by: HashMap<usize, usize> = HashMap::new();
     for (index, parameter) in definition.parameters.iter().enumerate() {
         let Prior::Uniform([lower, upper]) = parameter.prior;
         if !(lower.is_finite() && upper.is_finite() && lower < upper) {
@@ -280,21 +270,24 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
                 );
                 continue;
             }
-            let spring = match stiffness_index(definition, sets) {
+            let spring = match stiffnesses.index(sets) {
                 Ok(spring) => spring,
                 Err(message) => {
                     wrong(message);
                     continue;
                 }
             };
-            if let Some(other) = bindings.iter().find(|b| b.spring == spring) {
-                let other = shown(&definition.parameters[other.parameter].name);
+            if let Some(other) = set_by.get(&spring) {
+                let other = shown(&definition.parameters[*other].name);
                 let name = sets.spring.as_ref().or(sets.beam.as_ref()).map_or("", String::as_str);
                 wrong(format!("{key} {} is set by parameter {other} already", shown(name)));
                 continue;
             }
-            match form(definition, parameter, sets) {
-                Ok(form) => bindings.push(Binding { parameter: index, spring, form }),
+            match form(definition, parameter, (sets, spring)) {
+                Ok(form) => {
+                    set_by.insert(spring, index);
+                    bindings.push(Binding { parameter: index, spring, form });
+                }
                 Err(message) => wrong(message),
             }
         }
@@ -324,11 +317,11 @@ fn check_factor(definition: &StructureDefinition, index: usize, problems: &mut P
     }
 }
 
-/// Stiffness that an entry of `sets` describes, as a function of its parameter.
+/// Stiffness that an entry of `sets` describes, as a function of its parameter; `spring` is the index of the stiffness.
 fn form(
     definition: &StructureDefinition,
     parameter: &ParameterDefinition,
-    sets: &Sets,
+    (sets, spring): (&Sets, usize),
 ) -> Result<StiffnessForm, String> {
     let kind = if sets.beam.is_some() { "beam" } else { "spring" };
     let name = || shown(sets.spring.as_ref().or(sets.beam.as_ref()).map_or("", String::as_str));
@@ -348,7 +341,11 @@ fn form(
         }
         (None, true) => {
             let key = if sets.beam.is_some() { "bending_stiffness_n_m2" } else { "n_per_m or n_m_per_rad" };
-            let nominal = definition.stated_stiffness(sets).filter(|k| *k > 0.0);
+            let stated = match definition.springs.get(spring) {
+                Some(spring) => spring.stiffness(),
+                None => definition.beams[spring - definition.springs.len()].bending_stiffness_n_m2,
+            };
+            let nominal = stated.filter(|k| *k > 0.0);
             nominal.map(StiffnessForm::PercentOf).ok_or_else(|| {
                 format!(
                     "parameter {} is a factor (scale = true) of the nominal stiffness of {kind} {}, which must be stated and above 0: \
@@ -361,18 +358,37 @@ fn form(
     }
 }
 
-/// Index of the stiffness that an entry of `sets` names: springs come first, then beam spans.
-fn stiffness_index(definition: &StructureDefinition, sets: &Sets) -> Result<usize, String> {
-    match (&sets.spring, &sets.beam) {
-        (Some(name), None) => {
-            let index = definition.springs.iter().position(|s| s.name == *name);
-            index.ok_or_else(|| format!("there is no spring {}", shown(name)))
+/// The stiffnesses by their names: springs come first, then beam spans. The first of equal names counts.
+struct Stiffnesses<'a> {
+    springs: HashMap<&'a str, usize>,
+    beams: HashMap<&'a str, usize>,
+}
+
+impl<'a> Stiffnesses<'a> {
+    fn of(definition: &'a StructureDefinition) -> Self {
+        let (mut springs, mut beams) = (HashMap::new(), HashMap::new());
+        for (index, spring) in definition.springs.iter().enumerate() {
+            springs.entry(spring.name.as_str()).or_insert(index);
         }
-        (None, Some(name)) => {
-            let index = definition.beams.iter().position(|b| b.name == *name);
-            index.map(|i| definition.springs.len() + i).ok_or_else(|| format!("there is no beam {}", shown(name)))
+        for (index, beam) in definition.beams.iter().enumerate() {
+            beams.entry(beam.name.as_str()).or_insert(definition.springs.len() + index);
         }
-        _ => Err("name either one spring or one beam".to_owned()),
+        Self { springs, beams }
+    }
+
+    /// Index of the stiffness that an entry of `sets` names.
+    fn index(&self, sets: &Sets) -> Result<usize, String> {
+        match (&sets.spring, &sets.beam) {
+            (Some(name), None) => {
+                let index = self.springs.get(name.as_str()).copied();
+                index.ok_or_else(|| format!("there is no spring {}", shown(name)))
+            }
+            (None, Some(name)) => {
+                let index = self.beams.get(name.as_str()).copied();
+                index.ok_or_else(|| format!("there is no beam {}", shown(name)))
+            }
+            _ => Err("name either one spring or one beam".to_owned()),
+        }
     }
 }
 
@@ -400,8 +416,9 @@ fn springs(
 ) -> Vec<Spring> {
     let springs = definition.springs.iter().map(|s| (&s.name, s.stiffness()));
     let spans = definition.beams.iter().map(|b| (&b.name, b.bending_stiffness_n_m2));
+    let by_spring: HashMap<usize, &Binding> = bindings.iter().map(|binding| (binding.spring, binding)).collect();
     let nominal = |(index, ((name, value), form)): (usize, ((&String, Option<f64>), Form))| {
-        let binding = bindings.iter().find(|b| b.spring == index);
+        let binding = by_spring.get(&index);
         let middle = binding.map(|b| {
             let [lower, upper] = definition.parameters[b.parameter].bounds();
             b.stiffness(f64::midpoint(lower, upper))

@@ -34,6 +34,7 @@ mod batched;
 mod beam;
 mod changed;
 mod check;
+mod counts;
 mod covariates;
 pub mod definition;
 pub mod discrepancy;

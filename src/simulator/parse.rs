@@ -8,6 +8,7 @@ use toml::Spanned;
 
 use super::check;
 use super::definition::{DefinitionError, DefinitionProblem, StructureDefinition};
+use super::simulate::Simulator;
 use crate::quantity::{json_pointer, shown};
 
 /// Mistakes of a structure file that are listed; the others are counted.
@@ -19,7 +20,7 @@ impl StructureDefinition {
     /// # Errors
     /// [`DefinitionError`] with the line and the JSON pointer of each mistake.
     pub fn parse_toml(text: &str) -> Result<Self, DefinitionError> {
-        Self::from_toml(text)?.check(Some(text))
+        Self::from_toml(text)?.checked(Some(text)).map(|(definition, _)| definition)
     }
 
     fn from_toml(text: &str) -> Result<Self, DefinitionError> {
@@ -47,7 +48,7 @@ impl StructureDefinition {
     ) -> Result<Self, DefinitionError> {
         let mut definition = Self::from_toml(text)?;
         definition.read_table(read)?;
-        definition.check(Some(text))
+        definition.checked(Some(text)).map(|(definition, _)| definition)
     }
 
     /// Reads and checks a JSON text.
@@ -55,7 +56,7 @@ impl StructureDefinition {
     /// # Errors
     /// [`DefinitionError`] with the JSON pointer of each mistake.
     pub fn parse_json(text: &str) -> Result<Self, DefinitionError> {
-        from_json::<Self>(text)?.check(None)
+        from_json::<Self>(text)?.checked(None).map(|(definition, _)| definition)
     }
 
     /// Reads and checks a JSON text. If its table of runs is in a separate file, `read` returns the text of that file by its name.
@@ -68,7 +69,7 @@ impl StructureDefinition {
     ) -> Result<Self, DefinitionError> {
         let mut definition: Self = from_json(text)?;
         definition.read_table(read)?;
-        definition.check(None)
+        definition.checked(None).map(|(definition, _)| definition)
     }
 
     /// Replaces the name of the file with the runs by the text of that file.
@@ -87,9 +88,9 @@ impl StructureDefinition {
     }
 
     /// Checks the contents; adds the line of each mistake in the text `toml`, if it is given.
-    fn check(self, toml: Option<&str>) -> Result<Self, DefinitionError> {
+    fn checked(self, toml: Option<&str>) -> Result<(Self, check::Checked), DefinitionError> {
         match check::check(&self) {
-            Ok(_) => Ok(self),
+            Ok(checked) => Ok((self, checked)),
             Err(mut problems) => {
                 let more = problems.len().saturating_sub(MOST_PROBLEMS);
                 problems.truncate(MOST_PROBLEMS);
@@ -105,6 +106,54 @@ impl StructureDefinition {
                 Err(DefinitionError { problems })
             }
         }
+    }
+}
+
+/// Reading a definition for use. The check solves an eigenproblem, which takes seconds for a large structure: here it is done once,
+/// while [`StructureDefinition::parse_json`] and then [`Simulator::new`] do it twice.
+impl Simulator {
+    /// Reads a TOML text, checks it and builds its simulator; `read` returns the text of a file of runs by its name.
+    ///
+    /// # Errors
+    /// As [`StructureDefinition::parse_toml_beside`].
+    pub fn parse_toml_beside(
+        text: &str,
+        read: impl Fn(&str) -> std::io::Result<String>,
+    ) -> Result<Self, DefinitionError> {
+        let mut definition = StructureDefinition::from_toml(text)?;
+        definition.read_table(read)?;
+        definition.checked(Some(text)).map(|(definition, checked)| Self::of_checked(definition, checked))
+    }
+
+    /// Reads a JSON text, checks it and builds its simulator; `read` returns the text of a file of runs by its name.
+    ///
+    /// # Errors
+    /// As [`StructureDefinition::parse_json_beside`].
+    pub fn parse_json_beside(
+        text: &str,
+        read: impl Fn(&str) -> std::io::Result<String>,
+    ) -> Result<Self, DefinitionError> {
+        let mut definition: StructureDefinition = from_json(text)?;
+        definition.read_table(read)?;
+        definition.checked(None).map(|(definition, checked)| Self::of_checked(definition, checked))
+    }
+
+    /// Reads a TOML text, checks it and builds its simulator.
+    ///
+    /// # Errors
+    /// As [`StructureDefinition::parse_toml`].
+    pub fn parse_toml(text: &str) -> Result<Self, DefinitionError> {
+        let checked = StructureDefinition::from_toml(text)?.checked(Some(text));
+        checked.map(|(definition, checked)| Self::of_checked(definition, checked))
+    }
+
+    /// Reads a JSON text, checks it and builds its simulator.
+    ///
+    /// # Errors
+    /// As [`StructureDefinition::parse_json`].
+    pub fn parse_json(text: &str) -> Result<Self, DefinitionError> {
+        let checked = from_json::<StructureDefinition>(text)?.checked(None);
+        checked.map(|(definition, checked)| Self::of_checked(definition, checked))
     }
 }
 

@@ -90,9 +90,14 @@ impl Simulator {
     /// [`DefinitionError`] with every mistake and its JSON pointer.
     pub fn new(definition: StructureDefinition) -> Result<Self, DefinitionError> {
         let checked = check::check(&definition).map_err(|problems| DefinitionError { problems })?;
+        Ok(Self::of_checked(definition, checked))
+    }
+
+    /// The simulator of a definition that was just checked.
+    pub(super) fn of_checked(definition: StructureDefinition, checked: check::Checked) -> Self {
         let digest = definition.digest();
         let sizes = effect::typical_sizes(&checked.effects).into();
-        Ok(Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes })
+        Self { parts: Arc::new(Parts { definition, digest, checked, batched: OnceLock::new() }), sizes }
     }
 
     /// Sizes of the effects over which a measurement with missing covariates is marginalised: one entry `[sizes]` for each value

@@ -21,12 +21,12 @@ pub struct Client {
     /// Address of the client, behind trusted proxies.
     pub address: Option<IpAddr>,
     /// Key under which its requests are counted.
-    pub(super) key: Key,
+    pub(in crate::http) key: Key,
 }
 
 /// Key under which requests are counted: the token, otherwise the address.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) enum Key {
+pub enum Key {
     /// A token by its id.
     Token(String),
     /// An address; for IPv6 its /64 network, which usually belongs to one customer.
@@ -36,7 +36,8 @@ pub(super) enum Key {
 }
 
 impl Key {
-    pub(super) fn of_address(address: Option<IpAddr>) -> Self {
+    /// The key of an address.
+    pub fn of_address(address: Option<IpAddr>) -> Self {
         match address {
             None => Self::Others,
             Some(IpAddr::V6(address)) => {
@@ -85,7 +86,7 @@ impl Proxies {
         self.0.is_empty()
     }
 
-    fn trust(&self, address: IpAddr) -> bool {
+    pub(super) fn trust(&self, address: IpAddr) -> bool {
         self.0.iter().any(|network| network.contains(&address.to_canonical()))
     }
 

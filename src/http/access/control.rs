@@ -7,7 +7,7 @@ use std::sync::{Arc, RwLock};
 use axum::http::{header, HeaderMap, HeaderValue, StatusCode, Version};
 use tracing::{info, warn};
 
-use super::client::{is_local_name, is_same_origin, Client, NotANetwork, Proxies};
+use super::client::{is_local_name, is_same_origin, Client, Key, NotANetwork, Proxies};
 use super::limit::Limits;
 use crate::access::{
     read_admin_token, AccessSettings, Actor, AdminFileError, Grant, Refused, TokenRecord, TokenTable, TokenText,
@@ -135,14 +135,26 @@ impl AccessControl {
         from_file.or(stored)
     }
 
-    /// Whether a grant is still valid: for answers that continue, such as an event stream.
-    pub fn still_holds(&self, grant: &Grant) -> bool {
-        let Actor::Token { id, .. } = grant.actor() else {
-            return *grant == Grant::nobody() || self.is_open();
-        };
-        let now = Timestamp::now();
-        let active = |tokens: &TokenTable| tokens.records().any(|t| t.id.as_str() == id && t.is_active(now));
-        active(&self.0.file_token) || self.read_tokens(active)
+    /// Whether a grant is still valid that was given for `presented`, the token of the request: for answers that continue, such as an
+    /// event stream. The token is looked at again, because its secret may have been replaced.
+    pub fn still_holds(&self, grant: &Grant, presented: Option<&TokenText>) -> bool {
+        match (grant.actor(), presented) {
+            (Actor::Token { .. }, Some(text)) => self.holder(text).is_ok(),
+            (Actor::Token { .. }, None) => false,
+            (Actor::Local | Actor::Nobody, _) => *grant == Grant::nobody() || self.is_open(),
+        }
+    }
+
+    /// Whether a request has a valid token. A failure is not counted.
+    pub fn knows(&self, headers: &HeaderMap) -> bool {
+        presented(headers).is_some_and(|text| self.holder(&text).is_ok())
+    }
+
+    /// Key under which the connections of an address are counted; `None` for a trusted proxy, whose connections are those of many
+    /// clients.
+    pub fn connection_key(&self, peer: IpAddr) -> Option<Key> {
+        let peer = peer.to_canonical();
+        (!self.0.proxies.trust(peer)).then(|| Key::of_address(Some(peer)))
     }
 
     /// Counts measurements against the rate limit of the client.
@@ -193,6 +205,12 @@ impl AccessControl {
         }
         unauthorized(&refused.to_string(), Some(code))
     }
+}
+
+/// The token that a request presents, if it has the form of one.
+pub fn presented(headers: &HeaderMap) -> Option<TokenText> {
+    let (scheme, text) = headers.get(header::AUTHORIZATION)?.to_str().ok()?.split_once(' ')?;
+    scheme.eq_ignore_ascii_case("bearer").then(|| TokenText::parse(text.trim()).ok()).flatten()
 }
 
 /// Grant of a request to an open service: only for programs on this machine, and not for pages of other web sites in a

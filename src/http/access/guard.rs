@@ -34,7 +34,10 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
         Need::Scope(_) => access.grant(request.headers(), request.version(), address)?,
     };
     let client = Client::new(&grant, address);
-    access.0.limits.take_request(&client.key)?;
+    // A supervisor must not be told that an attacker on its machine asks too often.
+    if !pattern.as_deref().is_some_and(|pattern| route::PROBES.contains(&pattern)) {
+        access.0.limits.take_request(&client.key)?;
+    }
 
     let structure = structure_of(access, class.about, request).await?;
     let about = match (class.about, &structure) {
@@ -42,7 +45,7 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
         (route::Subject::Filtered, _) => About::Filtered,
         _ => About::Service,
     };
-    allow(&grant, class.need, about).map_err(forbidden)?;
+    allow(&grant, class.need, about).map_err(|denied| forbidden(denied, class.about))?;
 
     let pattern = pattern.filter(|_| route::is_change(request.method(), class));
     let entry = pattern.map(|pattern| journal::entry(&grant, &client, request, &pattern, structure));
@@ -81,9 +84,14 @@ fn refuse_token_in_address(uri: &Uri) -> Result<(), ApiError> {
     Ok(())
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "the signature that map_err requires")]
-fn forbidden(denied: Denied) -> ApiError {
-    let detail = denied.to_string();
+fn forbidden(denied: Denied, about: route::Subject) -> ApiError {
+    let detail = match (&denied, about) {
+        // The client has named a diagnosis or training: it must not learn from it which other structures exist.
+        (Denied::Structure { .. }, route::Subject::Job) => {
+            "this token is limited to structures other than that of this diagnosis or training".to_owned()
+        }
+        _ => denied.to_string(),
+    };
     match denied {
         Denied::Scope { needed, .. } => {
             let challenge = format!("Bearer realm=\"modalwatch\", error=\"insufficient_scope\", scope=\"{needed}\"");

@@ -16,7 +16,9 @@ mod issue;
 mod journal;
 mod limit;
 pub mod route;
+mod shares;
 
-pub use client::{Client, NotANetwork};
-pub use control::{AccessControl, Error};
+pub use client::{Client, Key, NotANetwork};
+pub use control::{presented, AccessControl, Error};
 pub use guard::guard;
+pub use shares::{Share, Shares};

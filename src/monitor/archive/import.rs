@@ -15,7 +15,6 @@ use crate::monitor::assessor::Assessor;
 use crate::monitor::error::Error;
 use crate::monitor::replay::Replay;
 use crate::quantity::{shown, Digest, StructureId, Timestamp};
-use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
 use crate::store::archive::{Acknowledged, ArchivedAction, ArchivedModel, Batch, Record};
 
@@ -128,7 +127,7 @@ impl Import<'_> {
             Record::Archive(_) | Record::End(_) => {}
             Record::Structure(present) => {
                 let simulator = simulator_of(&structure, &present.digest, &present.definition)?;
-                self.assessor.structures.put(simulator.definition().clone()).await?;
+                self.assessor.structures.put(simulator.clone()).await?;
                 self.simulator = Some(simulator);
             }
             Record::Version(version) => {
@@ -271,8 +270,7 @@ fn check_record(
 }
 
 fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Result<Simulator, ImportError> {
-    let definition = StructureDefinition::parse_json(definition).map_err(Error::from)?;
-    let simulator = Simulator::new(definition).map_err(Error::from)?;
+    let simulator = Simulator::parse_json(definition).map_err(Error::from)?;
     if simulator.id() != structure || simulator.digest().as_str() != digest {
         return Err(invalid(&format!("the definition of {structure} does not match its digest {digest}")).into());
     }

@@ -1,0 +1,15 @@
+//! Attacks on the running program: each test does what an attacker did, and measures that others are served.
+//!
+//! By default the program of this build is attacked. `MODALWATCH_BINARY=/path/to/modalwatch cargo test --release --test redteam` attacks
+//! another build; settings that it does not know are left at its defaults.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
+
+mod details;
+#[path = "../api/helpers.rs"]
+#[allow(dead_code, reason = "shared with tests/api, which uses all of it")]
+mod helpers;
+mod slow_readers;
+mod streams;
+mod structures;
+mod target;
