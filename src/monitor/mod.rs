@@ -27,6 +27,7 @@ mod jobs;
 mod metrics;
 mod models;
 mod own_task;
+mod patience;
 mod probe;
 mod reason;
 mod records;
@@ -35,6 +36,8 @@ mod replay;
 pub mod retention;
 mod settings;
 mod silence;
+#[cfg(test)]
+mod simulation;
 pub mod stored;
 mod structures;
 mod supervise;
