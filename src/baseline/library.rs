@@ -143,6 +143,13 @@ impl Library {
         self.entries.get(id)
     }
 
+    /// The library with one of its structures.
+    #[cfg(test)]
+    pub(crate) fn only(mut self, id: &StructureId) -> Self {
+        self.entries.retain(|own, _| own == id);
+        self
+    }
+
     /// All structures in the order of their ids.
     pub fn iter(&self) -> impl Iterator<Item = (&StructureId, &Entry)> {
         self.entries.iter()

@@ -175,7 +175,8 @@ impl Assessor {
             Ok((assessment, points)) => {
                 metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                 log_assessment(structure, id, &assessment, seconds);
-                let insert = self.store.assessments().insert_assessment(structure, id, &assessment, points);
+                let charted = (points, Some(newest_undamaged));
+                let insert = self.store.assessments().insert_computed(structure, id, &assessment, charted);
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {

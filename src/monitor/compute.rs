@@ -6,6 +6,8 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{oneshot, OwnedSemaphorePermit, Semaphore};
 
+use crate::fault::carried;
+
 /// Limits of the queue of assessments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -106,10 +108,10 @@ impl Place {
         let (found, answer) = oneshot::channel();
         // `work` runs on the thread pool of rayon, which its parallel loops use: a loop that starts on another thread would first
         // have to be handed over to the pool.
-        rayon::spawn(move || {
+        rayon::spawn(carried(move || {
             // Sending fails if the caller was dropped.
             let _ = found.send(catch_unwind(AssertUnwindSafe(work)));
-        });
+        }));
         answer.await.ok().and_then(Result::ok).ok_or(Panicked)
     }
 }

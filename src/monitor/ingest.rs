@@ -168,7 +168,13 @@ impl Ingest {
             }
         };
         let (inserted, begun) = tokio::join!(insert, compute);
-        match inserted? {
+        let inserted = inserted.inspect_err(|error| {
+            // The batch may be stored nevertheless, and its sender may not send it again.
+            if error.is_temporary() {
+                self.replay.resume_until_done(structure.clone());
+            }
+        })?;
+        match inserted {
             InsertBatch::Inserted { content_digest, .. } => {
                 metrics::counter!("modalwatch_batches_received_total").increment(1);
                 metrics::counter!("modalwatch_measurements_received_total").increment(batch.measurements.len() as u64);
@@ -201,6 +207,10 @@ impl Ingest {
             Ok(Begun::Computed(computed)) => self.assessor.finish_computed(*computed).await,
             Ok(Begun::NotComputed(_)) => {
                 self.assessor.events.batch_changed(&structure, &record.batch_id, record.state);
+                // A trained baseline that was put into use meanwhile has not found the batch among those that wait.
+                if self.assessor.structures.get(&structure)?.baseline.is_ok() {
+                    self.replay.resume_later(structure);
+                }
                 return self.records.view(record).await;
             }
             Err(failure) => Err(failure),

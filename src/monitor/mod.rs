@@ -28,6 +28,7 @@ mod jobs;
 mod metrics;
 mod models;
 mod own_task;
+mod patience;
 mod probe;
 mod readers;
 mod reason;
@@ -37,6 +38,8 @@ mod replay;
 pub mod retention;
 mod settings;
 mod silence;
+#[cfg(test)]
+mod simulation;
 pub mod stored;
 mod structures;
 mod supervise;

@@ -16,6 +16,7 @@ use super::replay::Replay;
 use super::structures::{ActiveStructure, ActiveStructures};
 use crate::baseline::library::{Entry, Library};
 use crate::baseline::Baseline;
+use crate::fault::carried;
 use crate::quantity::{Digest, StructureId};
 use crate::store::Store;
 
@@ -114,7 +115,8 @@ impl Models {
             return Err(refused(reason.to_owned()));
         }
         let library = self.structures.library();
-        let read = tokio::task::spawn_blocking(move || library.read_again()).await.map_err(|_| Error::Panicked)?;
+        let read = tokio::task::spawn_blocking(carried(move || library.read_again()));
+        let read = read.await.map_err(|_| Error::Panicked)?;
         let library = read.map_err(|e| refused(e.to_string()))?;
         let baseline = candidate(&library, structure, &active).map_err(refused)?;
         self.structures.usable(&baseline).map_err(refused)?;
@@ -125,16 +127,12 @@ impl Models {
             info!(structure.id = %structure, model.digest = %model_digest, "Swapped the trained baseline of {structure}");
         }
         self.structures.set_library(library);
-        let (mut undamaged_version, mut reference_outdated) = (None, false);
-        if changed && self.store.reference().undamaged(structure).await?.is_some() {
-            if renew {
-                undamaged_version = self.references.renew(structure).await;
-            }
-            reference_outdated = undamaged_version.is_none();
-        }
-        if changed {
+        let renewed = self.renewed(structure, &model_digest, renew).await;
+        // Also if the reference could not be renewed: batches wait for this trained baseline.
+        if changed || !matches!(renewed, Ok((None, _))) {
             self.replay.resume_later(structure.clone());
         }
+        let (undamaged_version, reference_outdated) = renewed?;
         Ok(Reloaded {
             structure: structure.clone(),
             model_digest,
@@ -143,6 +141,17 @@ impl Models {
             undamaged_version,
             reference_outdated,
         })
+    }
+
+    /// Renews the undamaged reference for the trained baseline in use, if it was made with another one and this is wanted. Returns its
+    /// version, and whether it still has to be declared again. A reload that failed here is completed by the next one.
+    async fn renewed(&self, structure: &StructureId, used: &Digest, renew: bool) -> Result<(Option<u32>, bool), Error> {
+        let newest = self.store.reference().undamaged(structure).await?;
+        if newest.is_none_or(|newest| newest.model_digest == *used) {
+            return Ok((None, false));
+        }
+        let version = if renew { self.references.renew(structure).await? } else { None };
+        Ok((version, version.is_none()))
     }
 }
 

@@ -84,27 +84,32 @@ impl References {
     /// Renews the newest reference of a structure if it was made with another trained baseline than the one of the version in use.
     /// This is the case after a switch of versions, including one that was interrupted by a stop of the service. Returns the
     /// version of the new reference.
-    pub(super) async fn renew_if_outdated(&self, structure: &StructureId) -> Option<u32> {
+    ///
+    /// # Errors
+    /// [`Error::Store`], after which it should be attempted again.
+    pub(super) async fn renew_if_outdated(&self, structure: &StructureId) -> Result<Option<u32>, Error> {
         let Assessor { store, structures, .. } = &*self.assessor;
-        let newest = store.reference().undamaged(structure).await.ok()??;
-        let active = structures.get(structure).ok()?;
-        let baseline = active.baseline.as_ref().ok()?;
-        let version = store.structures().structure_version(structure, active.simulator.digest()).await.ok()?;
+        let Ok(active) = structures.get(structure) else { return Ok(None) };
+        let Ok(baseline) = &active.baseline else { return Ok(None) };
+        let Some(newest) = store.reference().undamaged(structure).await? else { return Ok(None) };
+        if newest.model_digest == *baseline.digest() {
+            return Ok(None);
+        }
         // Only after a switch to a version made by an extension is the reference renewed automatically; after a trained baseline
         // was replaced, the user decides.
-        if newest.model_digest == *baseline.digest() || version.is_none() {
-            return None;
+        match store.structures().structure_version(structure, active.simulator.digest()).await? {
+            Some(_) => self.renew(structure).await,
+            None => Ok(None),
         }
-        self.renew(structure).await
     }
 
     /// Computes the newest reference of a structure again from its batches, with the trained baseline in use. Batches that cannot
-    /// be trusted with this trained baseline are left out. Returns the version of the new reference.
-    pub(super) async fn renew(&self, structure: &StructureId) -> Option<u32> {
-        let failed = |error: &dyn std::fmt::Display| {
-            warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
-        };
-        let newest = self.assessor.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
+    /// be trusted with this trained baseline are left out. Returns the version of the new reference; `None` if none can be made.
+    ///
+    /// # Errors
+    /// [`Error::Store`], after which it should be attempted again.
+    pub(super) async fn renew(&self, structure: &StructureId) -> Result<Option<u32>, Error> {
+        let Some(newest) = self.assessor.store.reference().undamaged(structure).await? else { return Ok(None) };
         let request = ReferenceRequest {
             choice: ReferenceChoice::Batches(newest.batches.clone()),
             leave_out_doubtful: true,
@@ -113,11 +118,18 @@ impl References {
         };
         let place = self.assessor.compute.wait().await;
         let origin = newest.state.origin.clone();
-        let declared = self.declare_as(structure, request, origin, place).await.map_err(|e| failed(&e)).ok()?;
+        let declared = match self.declare_as(structure, request, origin, place).await {
+            Ok(declared) => declared,
+            Err(DeclareError::Monitor(Error::Store(error))) => return Err(error.into()),
+            Err(error) => {
+                warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
+                return Ok(None);
+            }
+        };
         for LeftOutBatch { batch, reason } in &declared.left_out {
             warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged reference of {structure}: {reason}");
         }
-        Some(declared.record.state.version)
+        Ok(Some(declared.record.state.version))
     }
 
     /// Makes a reference from stored batches, and stores it. Other batches are compared with it when they are assessed again.
@@ -247,14 +259,19 @@ impl References {
         })?;
         batch_ids.retain(|id| doubtful.iter().all(|left_out| left_out.batch != *id));
         left_out.extend(doubtful);
+        let created_at = Timestamp::now();
         let version =
-            store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
+            store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, created_at).await?;
         let (batches, without) = (batch_ids.len(), left_out.len());
         info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");
         alarms.publish_changes(structure).await;
         events.structure_changed(structure);
-        let stored = store.reference().undamaged(structure).await?;
-        Ok(DeclaredReference { record: stored.expect("it was stored a moment ago and is never deleted"), left_out })
+        // It is returned as it was stored, without reading it from the database, which might fail.
+        let state = UndamagedReference { version, ..state };
+        Ok(DeclaredReference {
+            record: Arc::new(ReferenceRecord { state, model_digest, created_at, batches: batch_ids }),
+            left_out,
+        })
     }
 
     /// The ids of the chosen batches, and those that cannot be used whatever they contain.

@@ -4,11 +4,10 @@
 //! They are computed on all cores and stored in the order of their arrival. The results do not depend on the number of threads,
 //! because each batch has its own seed.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::pin::pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use futures_util::{stream, StreamExt as _, TryStreamExt as _};
 use tracing::{error, warn};
@@ -16,13 +15,11 @@ use tracing::{error, warn};
 use super::assessor::{Assessor, Computed, Finished, Settled};
 use super::error::{DeclareError, Error};
 use super::own_task::in_own_task;
+use super::patience::pause;
 use super::references::{DeclaredReference, ExtensionRequest, ReferenceRequest, References};
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
 use crate::store;
-
-/// Pause between two attempts to store results that could not be stored, for example on a full disk.
-const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
 
 /// Number of waiting batches that are read from the store at a time.
 const PAGE: usize = 500;
@@ -43,8 +40,8 @@ pub struct Replay {
     references: Arc<References>,
     /// For each structure, held while its waiting batches are assessed.
     turns: Arc<Mutex<BTreeMap<StructureId, Arc<tokio::sync::Mutex<()>>>>>,
-    /// Structures whose waiting batches are attempted repeatedly.
-    recovering: Arc<Mutex<BTreeSet<StructureId>>>,
+    /// Structures whose waiting batches are attempted repeatedly, each with whether this was requested again meanwhile.
+    recovering: Arc<Mutex<BTreeMap<StructureId, bool>>>,
 }
 
 impl Replay {
@@ -72,9 +69,9 @@ impl Replay {
         let (replay, structure) = (self.clone(), structure.clone());
         let place = self.assessor.compute.reserve().map_err(Error::from)?;
         in_own_task(async move {
-            let declared = replay.references.declare(&structure, request, place).await?;
-            replay.resume_later(structure);
-            Ok(declared)
+            let declared = replay.references.declare(&structure, request, place).await;
+            replay.resume_behind(structure, &declared);
+            declared
         })
         .await
     }
@@ -91,19 +88,25 @@ impl Replay {
         let (replay, structure) = (self.clone(), structure.clone());
         let place = self.assessor.compute.reserve().map_err(Error::from)?;
         in_own_task(async move {
-            let extended = replay.references.extend(&structure, request, place).await?;
-            replay.resume_later(structure);
-            Ok(extended)
+            let extended = replay.references.extend(&structure, request, place).await;
+            replay.resume_behind(structure, &extended);
+            extended
         })
         .await
+    }
+
+    /// Assesses what waits for a comparison with a reference that was made or, if the store failed, may have been.
+    fn resume_behind(&self, structure: StructureId, made: &Result<DeclaredReference, DeclareError>) {
+        if matches!(made, Ok(_) | Err(DeclareError::Monitor(Error::Store(_)))) {
+            self.resume_later(structure);
+        }
     }
 
     /// Renews an outdated reference and assesses the waiting batches of a structure, in the background.
     pub(super) fn resume_later(&self, structure: StructureId) {
         let replay = self.clone();
         tokio::spawn(async move {
-            replay.references.renew_if_outdated(&structure).await;
-            if let Err(error) = replay.resume(&structure).await {
+            if let Err(error) = replay.renew_and_resume(&structure).await {
                 error!(structure.id = %structure, %error, "Could not assess the waiting batches of {structure}: {error}");
                 replay.resume_until_done(structure);
             }
@@ -113,23 +116,46 @@ impl Replay {
     /// Attempts to assess the waiting batches of a structure until none is left, in the background. This is needed after a full
     /// disk, for example, because their senders may not send them again.
     pub(super) fn resume_until_done(&self, structure: StructureId) {
-        if !self.recovering.lock().expect("no holder of this lock panics").insert(structure.clone()) {
-            return;
+        {
+            let mut recovering = self.recovering.lock().expect("no holder of this lock panics");
+            if let Some(again) = recovering.get_mut(&structure) {
+                // The attempt that runs now may have read what waits before the batch of this request was stored.
+                *again = true;
+                return;
+            }
+            recovering.insert(structure.clone(), false);
         }
         let replay = self.clone();
         tokio::spawn(async move {
             loop {
-                tokio::time::sleep(BETWEEN_ATTEMPTS).await;
-                match replay.resume(&structure).await {
-                    Ok(()) => break,
-                    Err(_) if replay.assessor.store.file().is_closed() => break,
+                pause().await;
+                match replay.renew_and_resume(&structure).await {
+                    Ok(()) => {
+                        let mut recovering = replay.recovering.lock().expect("no holder of this lock panics");
+                        if recovering.insert(structure.clone(), false) != Some(true) {
+                            recovering.remove(&structure);
+                            return;
+                        }
+                    }
+                    Err(_) if replay.assessor.store.file().is_closed() => return,
                     Err(error) => {
                         warn!(structure.id = %structure, %error, "Could not assess the waiting batches of {structure}, trying again: {error}");
                     }
                 }
             }
-            replay.recovering.lock().expect("no holder of this lock panics").remove(&structure);
         });
+    }
+
+    /// Follows a switch of versions that was stored without being put into use, renews an outdated reference and assesses the waiting
+    /// batches; in a task of its own, so that a panic is an error.
+    async fn renew_and_resume(&self, structure: &StructureId) -> Result<(), Error> {
+        let (replay, structure) = (self.clone(), structure.clone());
+        in_own_task(async move {
+            replay.assessor.structures.follow_stored(&structure).await?;
+            replay.references.renew_if_outdated(&structure).await?;
+            replay.resume(&structure).await
+        })
+        .await
     }
 
     /// Assesses the waiting batches of a structure.
@@ -202,7 +228,9 @@ impl Replay {
             return Ok(Waiting::NoBaseline);
         }
         let record = match self.assessor.stored(structure, &batch_id).await {
-            // One damaged row must not block the batches after it.
+            // Retention has deleted it meanwhile.
+            Err(Error::UnknownBatch { .. }) => return Ok(Waiting::Done),
+            // One damaged row must not block the batches after it. Any other error may pass, and the batch is attempted again.
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
                 error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
                 let version = active.simulator.digest();

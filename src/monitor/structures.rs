@@ -150,9 +150,28 @@ impl ActiveStructures {
                 self.activate(simulator, baseline);
                 self.events.structure_changed(&id);
             }
-            PutStructure::Unchanged => {}
+            // An earlier call may have failed between the store and this.
+            PutStructure::Unchanged => self.follow_stored(&id).await?,
         }
         Ok(outcome)
+    }
+
+    /// Puts the stored version of a structure into use if another one is in use or none, which is the case after a call that failed
+    /// although its transaction was committed.
+    ///
+    /// # Errors
+    /// [`Error::Store`], [`Error::Definition`].
+    pub(super) async fn follow_stored(&self, id: &StructureId) -> Result<(), Error> {
+        let Some(stored) = self.store.structures().structure(id).await? else { return Ok(()) };
+        let in_use = |active: &Arc<ActiveStructure>| *active.simulator.digest() == stored.digest;
+        if self.refused.contains_key(id) || self.read().get(id).is_some_and(in_use) {
+            return Ok(());
+        }
+        let simulator = Simulator::new(StructureDefinition::parse_json(&stored.definition_json)?)?;
+        let baseline = self.baseline_for(&simulator).await?;
+        self.activate(simulator, baseline);
+        self.events.structure_changed(id);
+        Ok(())
     }
 
     /// Puts a structure into use, in place of its present version if there is one.
@@ -187,9 +206,15 @@ impl ActiveStructures {
         simulator: Simulator,
         baseline: Arc<Baseline>,
     ) -> Result<(), Error> {
-        let structure = simulator.id().clone();
-        if !self.store.structures().switch_version(&structure, expected, version, Timestamp::now()).await? {
-            return Err(Error::VersionChanged(structure));
+        let (structure, digest) = (simulator.id().clone(), version.digest.clone());
+        let switched = self.store.structures().switch_version(&structure, expected, version, Timestamp::now()).await;
+        if !matches!(switched, Ok(true)) {
+            // A transaction that was committed may have been reported as failed, to this call or to an earlier one.
+            let present = self.store.structures().structure(&structure).await?.map(|stored| stored.digest);
+            if digest == *expected || present != Some(digest) {
+                switched?;
+                return Err(Error::VersionChanged(structure));
+            }
         }
         self.activate(simulator, Ok(baseline));
         self.events.structure_changed(&structure);

@@ -6,14 +6,16 @@ use std::sync::OnceLock;
 
 use super::compute::ComputeSettings;
 use super::events::News;
+use super::structures::ActiveStructure;
 use super::{Error, IngestError, Ingested, Monitor, MonitorSettings, ReferenceChoice, ReferenceRequest};
 use crate::assessment::BatchState;
 use crate::baseline::library::Library;
 use crate::fault::Faults;
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
 use crate::quantity::{Hertz, StructureId, Timestamp};
+use crate::simulator::definition::StructureDefinition;
 use crate::simulator::Simulator;
-use crate::store::{self, HistoryQuery, Store};
+use crate::store::{self, HistoryQuery, NewVersion, Store};
 
 fn structure() -> StructureId {
     StructureId::parse("three-dof").unwrap()
@@ -159,7 +161,7 @@ async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent
     faults.set("store::commit", "1*off->return");
     assert!(monitor.ingest().take(batch(0)).await.is_err());
     faults.clear("store::commit");
-    for _ in 0..100 {
+    for _ in 0..600 {
         tokio::time::sleep(std::time::Duration::from_millis(100)).await;
         let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
         let items = monitor.store().history().page(&structure(), &query).await.unwrap();
@@ -168,6 +170,140 @@ async fn a_batch_whose_assessment_could_not_be_stored_gets_it_without_being_sent
         }
     }
     panic!("the batch still waits");
+}
+
+/// What a batch that waits goes through when reads fail.
+#[tokio::test]
+async fn no_error_of_a_read_marks_a_batch_as_failed() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    let (id, state) = (structure(), async |batch: &str| {
+        let record = monitor.store().batches().batch(&structure(), batch).await.unwrap().unwrap();
+        record.state
+    });
+    let mut number = 0;
+    for kind in ["", "(busy)", "(interrupted)"] {
+        for in_a_row in ["1*", "3*", ""] {
+            let mut call = 0;
+            loop {
+                let batch_id = format!("b{number}");
+                let (batches, given) = (monitor.store().batches(), batch(number));
+                batches.insert_batch(&given, &batch_id, Timestamp::now()).await.unwrap();
+                number += 1;
+                faults.set("store::query", &format!("{call}*off->{in_a_row}return{kind}"));
+                let resumed = monitor.replay.resume(&id).await;
+                faults.clear("store::query");
+                let left = state(&batch_id).await;
+                if resumed.is_ok() {
+                    assert_eq!(left, BatchState::Assessed);
+                    break;
+                }
+                assert_ne!(left, BatchState::Failed, "call {call} fails {in_a_row}{kind}");
+                monitor.replay.resume(&id).await.unwrap();
+                assert_eq!(state(&batch_id).await, BatchState::Assessed);
+                call += 1;
+                assert!(call < 50, "the reads never run out");
+            }
+            assert!(call >= 4, "only {call} reads failed");
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_batch_that_was_stored_although_the_call_failed_is_assessed_without_being_sent_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    faults.set("store::committed", "1*return");
+    assert!(monitor.ingest().take(batch(0)).await.is_err());
+    for _ in 0..600 {
+        let query = HistoryQuery { limit: 10, ..HistoryQuery::default() };
+        let items = monitor.store().history().page(&structure(), &query).await.unwrap();
+        if items.len() == 1 && items[0].state == BatchState::Assessed {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(100)).await;
+    }
+    panic!("the batch still waits");
+}
+
+#[tokio::test]
+async fn batches_are_compared_with_a_reference_that_was_stored_although_its_declaration_failed() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    let mut ids = Vec::new();
+    for number in 0..4 {
+        ids.push(monitor.ingest().take(batch(number)).await.unwrap().view.record.batch_id);
+    }
+    faults.set("store::committed", "1*return");
+    assert!(monitor.replay().declare_reference(&structure(), reference(&ids[..3])).await.is_err());
+    faults.clear("store::committed");
+    for _ in 0..1_200 {
+        let view = monitor.records().batch(&structure(), &ids[3]).await.unwrap();
+        if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
+            return;
+        }
+        tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+    }
+    panic!("the batch still waits for the comparison");
+}
+
+#[tokio::test]
+async fn a_definition_that_was_stored_although_the_call_failed_is_used_after_the_next_call() {
+    let folder = tempfile::tempdir().unwrap();
+    let faults = Faults::arm();
+    let monitor = open(folder.path()).await;
+    let active = monitor.structure(&structure()).unwrap();
+    let other = || StructureDefinition { id: "other".to_owned(), ..active.simulator.definition().clone() };
+    let id = StructureId::parse("other").unwrap();
+    faults.set("store::committed", "1*return");
+    assert!(monitor.structures().put(other()).await.is_err());
+    faults.clear("store::committed");
+    monitor.structures().put(other()).await.unwrap();
+    assert_eq!(monitor.structure(&id).unwrap().simulator.id(), &id);
+}
+
+/// Another version of the structure, as an extension makes it.
+fn another_version(of: &ActiveStructure) -> (NewVersion, Simulator) {
+    let description = Some("another version".to_owned());
+    let definition = StructureDefinition { description, ..of.simulator.definition().clone() };
+    let simulator = Simulator::new(definition).unwrap();
+    let version = NewVersion {
+        digest: simulator.digest().clone(),
+        definition_json: simulator.definition().canonical_json(),
+        parent: Some(of.simulator.digest().clone()),
+        diagnosis: None,
+        baseline: None,
+    };
+    (version, simulator)
+}
+
+#[tokio::test]
+async fn a_switch_of_versions_that_was_stored_although_it_failed_is_followed() {
+    for reads_fail in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        let faults = Faults::arm();
+        let monitor = open(folder.path()).await;
+        let before = monitor.structure(&structure()).unwrap();
+        let (version, simulator) = another_version(&before);
+        let digest = version.digest.clone();
+        assert_ne!(digest, *before.simulator.digest());
+        faults.set("store::committed", "1*return");
+        if reads_fail {
+            faults.set("store::query", "1*return");
+        }
+        let baseline = before.trained_baseline().unwrap();
+        let switched = monitor.structures.switch_version(before.simulator.digest(), version, simulator, baseline).await;
+        assert_eq!(switched.is_err(), reads_fail, "{switched:?}");
+        for point in ["store::committed", "store::query"] {
+            faults.clear(point);
+        }
+        // As every attempt to assess waiting batches does.
+        monitor.structures.follow_stored(&structure()).await.unwrap();
+        assert_eq!(*monitor.structure(&structure()).unwrap().simulator.digest(), digest);
+    }
 }
 
 #[tokio::test]
@@ -197,7 +333,7 @@ async fn what_is_decided_after_the_clock_was_set_back_is_the_current_answer() {
     // A year back.
     faults.set("clock", &format!("return({})", Timestamp::now().micros() - 365 * 86_400_000_000));
     monitor.replay().declare_reference(&structure(), reference(&ids[..5])).await.unwrap();
-    for _ in 0..100 {
+    for _ in 0..1_200 {
         let view = monitor.records().batch(&structure(), &ids[5]).await.unwrap();
         if view.assessment.is_some_and(|a| a.undamaged_version == Some(1)) {
             return;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use tracing::info;
+use tracing::{info, warn};
 
 use super::error::Error;
 use super::own_task::in_own_task;
@@ -79,7 +79,11 @@ impl Versions {
         let structure = simulator.id().clone();
         self.structures.switch_version(expected, version, simulator, baseline).await?;
         let renewed = self.references.renew_if_outdated(&structure).await;
-        self.replay.resume_later(structure);
-        Ok(renewed)
+        // Renews the reference as well if that failed now.
+        self.replay.resume_later(structure.clone());
+        Ok(renewed.unwrap_or_else(|error| {
+            warn!(structure.id = %structure, %error, "Could not renew the undamaged reference of {structure}, trying again: {error}");
+            None
+        }))
     }
 }

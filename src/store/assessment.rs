@@ -115,6 +115,22 @@ impl Assessments<'_> {
         assessment: &Assessment,
         charted: NewCharts,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
+        self.insert_computed(structure, batch_id, assessment, (charted, None))
+    }
+
+    /// As [`Self::insert_assessment`], for an assessment that was computed when `seen` was the version of the newest undamaged reference,
+    /// 0 if there was none. If there is a newer one now, with which the batch can be compared, the batch continues to wait for an
+    /// assessment: whatever happens to the caller, it gets one.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub fn insert_computed(
+        self,
+        structure: &StructureId,
+        batch_id: &str,
+        assessment: &Assessment,
+        (charted, seen): (NewCharts, Option<u32>),
+    ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.database.write(move |transaction| {
             Box::pin(async move {
@@ -126,6 +142,9 @@ impl Assessments<'_> {
                     remove(transaction, &structure, &id, &a).await?;
                 }
                 insert(transaction, &structure, &id, &a, slot.assessed_at_us).await?;
+                if seen.is_some_and(|seen| seen != slot.newest_undamaged) {
+                    wait_for_comparison(transaction, &structure, &id, &a).await?;
+                }
                 let batch = Charted {
                     structure: &structure,
                     position: (slot.measured_to_us, id.clone()),
@@ -264,6 +283,31 @@ async fn slot_of(
     let after = others_us.map_or(given, |latest| given.max(latest + 1));
     let assessed_at_us = if own_us == Some(given) { given } else { after };
     Ok(Some(Slot { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
+}
+
+/// Marks a batch as waiting if the newest undamaged reference would be compared with it otherwise than its assessment was.
+async fn wait_for_comparison(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    batch_id: &str,
+    a: &Assessment,
+) -> Result<(), Error> {
+    sqlx::query(
+        "update measurement_batch set state = 'received'
+         where structure_id = $1 and batch_id = $2
+           and $4 <> coalesce((select version from undamaged_state u
+               where u.structure_id = $1 and u.model_digest = $3
+                 and u.version = (select max(version) from undamaged_state where structure_id = $1)
+                 and not exists (select 1 from undamaged_batch b
+                     where b.structure_id = $1 and b.version = u.version and b.batch_id = $2)), 0)",
+    )
+    .bind(structure)
+    .bind(batch_id)
+    .bind(a.model_digest.as_str())
+    .bind(a.undamaged_version.unwrap_or(0))
+    .execute(transaction.connection())
+    .await?;
+    Ok(())
 }
 
 /// Removes the stored assessment for the same trained baseline and undamaged reference.

@@ -127,6 +127,15 @@ impl Batches<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn batch(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
+        match self.read_batch(structure, batch_id).await {
+            // A batch that is deleted between the two statements looks like one without measurements, and a page that was read wrongly
+            // may be right the next time: only what is wrong twice is damaged.
+            Err(Error::Row { .. }) => self.read_batch(structure, batch_id).await,
+            read => read,
+        }
+    }
+
+    async fn read_batch(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
         let row: Option<BatchRow> = sqlx::query_as(
             "select source, idempotency_key, content_digest, received_at_us, state, failure
              from measurement_batch where structure_id = $1 and batch_id = $2",

@@ -5,11 +5,11 @@ use std::future::Future;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use sqlx::sqlite::SqlitePool;
 use tracing::{info_span, Instrument as _};
 
 use super::error::Error;
 use super::file::Limits;
+use super::reader::Reader;
 use super::transaction::Transaction;
 use super::writer::{Work, Writer};
 use crate::volume;
@@ -17,7 +17,7 @@ use crate::volume;
 /// The open database of a data folder.
 pub(super) struct Database {
     /// Connections that only read.
-    pub reader: SqlitePool,
+    pub reader: Reader,
     /// The connection that writes.
     pub writer: Arc<Writer>,
     /// The database file.

@@ -120,8 +120,14 @@ impl From<sqlx::Error> for Error {
             Some(10 | 14) => Self::Disk(error.to_string()),
             Some(8) => Self::BecameReadOnly(error.to_string()),
             Some(5 | 6) => Self::Busy(error.to_string()),
-            _ if matches!(error, sqlx::Error::PoolTimedOut) => Self::Busy(error.to_string()),
-            _ => Self::Sqlite(Arc::new(error)),
+            _ => match error {
+                sqlx::Error::PoolTimedOut => Self::Busy(error.to_string()),
+                // A column with a value of another type: reading it again returns the same.
+                sqlx::Error::ColumnDecode { .. } | sqlx::Error::Decode(_) => {
+                    Self::Row { what: "row", detail: error.to_string() }
+                }
+                error => Self::Sqlite(Arc::new(error)),
+            },
         }
     }
 }
@@ -142,6 +148,21 @@ impl Error {
             Self::Busy(_) => Some("database_busy"),
             Self::Gone(_) => Some("database_gone"),
             _ => None,
+        }
+    }
+
+    /// Whether the same call may succeed later without anybody repairing anything: a disk that is full or fails, a busy database, a
+    /// statement that was interrupted.
+    pub fn is_temporary(&self) -> bool {
+        // SQLITE_ABORT, SQLITE_NOMEM, SQLITE_INTERRUPT.
+        const ENDED_EARLY: [i32; 3] = [4, 7, 9];
+        match self {
+            Self::DiskFull(_) | Self::Disk(_) | Self::BecameReadOnly(_) | Self::Busy(_) => true,
+            Self::Sqlite(error) => {
+                matches!(**error, sqlx::Error::Io(_) | sqlx::Error::WorkerCrashed)
+                    || primary_code(error).is_some_and(|code| ENDED_EARLY.contains(&code))
+            }
+            _ => false,
         }
     }
 
@@ -213,6 +234,19 @@ mod tests {
         store.file().set_limits(&StoreSettings::default());
         put(&store, "after", 10).await.unwrap();
         assert_eq!(store.structures().list().await.unwrap().len(), 2);
+    }
+
+    #[test]
+    fn what_may_pass_is_distinguished_from_what_stays() {
+        for passes in
+            [sqlx::Error::PoolTimedOut, sqlx::Error::WorkerCrashed, sqlx::Error::Io(std::io::Error::other("a"))]
+        {
+            assert!(Error::from(passes).is_temporary());
+        }
+        // A value that cannot be decoded is a damaged row, which must not block the batches after it for ever.
+        let damaged = Error::from(sqlx::Error::ColumnDecode { index: "a".to_owned(), source: "not a number".into() });
+        assert!(matches!(damaged, Error::Row { .. }) && !damaged.is_temporary());
+        assert!(!Error::from(sqlx::Error::RowNotFound).is_temporary());
     }
 
     #[tokio::test]

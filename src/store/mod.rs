@@ -42,6 +42,7 @@ mod overview;
 mod plotted;
 mod process;
 mod quarantine;
+mod reader;
 mod reference_content;
 mod reference_version;
 mod retention;
@@ -63,6 +64,7 @@ use std::sync::Arc;
 
 use crate::volume;
 use database::Database;
+use reader::Reader;
 use undamaged::Newest;
 use writer::Writer;
 
@@ -137,7 +139,7 @@ impl Store {
         let opened = file::OpenedFile::of(path.clone())?;
         let database = Database {
             writer: Arc::new(Writer::new(writer, opened)),
-            reader,
+            reader: Reader::new(reader),
             path,
             sqlite_version,
             limits: file::Limits::of(settings),

@@ -260,6 +260,47 @@ async fn a_comparison_with_an_earlier_trained_baseline_does_not_prevent_the_next
 }
 
 #[tokio::test]
+async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() {
+    let (store, _folder) = open().await;
+    for id in ["b0", "b1"] {
+        store.batches().insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
+    }
+    // The reference is declared between the computation and the transaction that stores its result.
+    let digest = Digest::of(&[b"m"]);
+    let declared =
+        store.reference().insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap();
+    let insert = async |id: &str, model: &str, compared: Option<u32>, seen: u32| {
+        let (assessment, charted) = (assessment(model, compared, at(2)), (NewCharts::default(), Some(seen)));
+        store.assessments().insert_computed(&bridge(), id, &assessment, charted).await.unwrap().unwrap();
+        store.batches().pending(&bridge(), 9).await.unwrap()
+    };
+    assert_eq!(insert("b0", "m", None, 0).await, ["b1"], "a batch of the reference is not compared with it");
+    assert_eq!(insert("b1", "m", None, 0).await, ["b1"]);
+    assert_eq!(insert("b1", "m", Some(declared), declared).await, [""; 0]);
+    assert_eq!(insert("b1", "other", None, 0).await, [""; 0], "the reference is of another trained baseline");
+}
+
+#[tokio::test]
+async fn a_batch_that_is_deleted_while_it_is_read_is_gone_and_not_damaged() {
+    let (store, folder) = open().await;
+    store.batches().insert_batch(&batch("s", 0, None), "b", at(0)).await.unwrap();
+    let faults = crate::fault::Faults::arm();
+    let path = folder.path().join(DATABASE_FILE);
+    let delete = async |path: &Path| {
+        let mut other = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(path)).await.unwrap();
+        sqlx::query("delete from measurement; delete from measurement_batch").execute(&mut other).await.unwrap();
+        other.close().await.unwrap();
+    };
+    // Between the statement that reads the batch and the one that reads its measurements.
+    faults.call("store::read", move || {
+        let path = path.clone();
+        let runtime = || tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        std::thread::spawn(move || runtime().block_on(delete(&path))).join().unwrap();
+    });
+    assert_eq!(store.batches().batch(&bridge(), "b").await.unwrap(), None);
+}
+
+#[tokio::test]
 async fn pages_of_exceedances_contain_each_current_one_once_and_newest_first() {
     let (store, _folder) = open().await;
     for i in 0..12 {

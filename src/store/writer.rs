@@ -256,7 +256,9 @@ async fn run_in_savepoint(
 /// Runs a task and turns a panic into an error.
 async fn run(task: Task, connection: &mut SqliteConnection) -> Result<(), Error> {
     let mut transaction = Transaction::of(connection);
-    AssertUnwindSafe(task(&mut transaction)).catch_unwind().await.unwrap_or(Err(Error::Panicked))
+    let outcome = AssertUnwindSafe(task(&mut transaction)).catch_unwind().await.unwrap_or(Err(Error::Panicked));
+    fault_point!("store::task", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
+    outcome
 }
 
 #[cfg(test)]

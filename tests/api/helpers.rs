@@ -103,7 +103,7 @@ impl Service {
     /// Sends a signal by name and waits for the end; returns the exit status.
     pub fn stop(&mut self, signal: &str) -> ExitStatus {
         self.signal(signal);
-        self.wait(Duration::from_secs(40))
+        self.wait(PATIENCE)
     }
 
     pub fn signal(&self, signal: &str) {
@@ -139,7 +139,7 @@ pub fn exit_within(child: &mut Child, limit: Duration) -> Option<ExitStatus> {
 /// Output of a command that must not start; if it starts nevertheless, it is ended.
 pub fn refusal(command: &mut Command) -> String {
     let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let Some(status) = exit_within(&mut child, Duration::from_secs(20)) else {
+    let Some(status) = exit_within(&mut child, PATIENCE) else {
         child.kill().unwrap();
         panic!("it should have refused to start: {command:?}");
     };
@@ -149,9 +149,13 @@ pub fn refusal(command: &mut Command) -> String {
     text
 }
 
-/// Repeats `found` until it returns a value, and returns this; panics with `what` after 20 s.
+/// How long is waited for what a machine without other work does in seconds: a test that waits for a condition claims nothing about the time
+/// that it takes, and other programs may need the processors.
+pub const PATIENCE: Duration = Duration::from_mins(1);
+
+/// Repeats `found` until it returns a value, and returns this; panics with `what` after [`PATIENCE`].
 pub async fn eventually<T>(what: &str, found: impl AsyncFnMut() -> Option<T>) -> T {
-    within(Duration::from_secs(20), what, found).await
+    within(PATIENCE, what, found).await
 }
 
 /// As [`eventually`], with another time limit.

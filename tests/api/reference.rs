@@ -2,7 +2,7 @@
 
 use serde_json::{json, Value};
 
-use crate::helpers::{created, eventually, measurements, problem, spawn, time, Service};
+use crate::helpers::{created, eventually, measurements, problem, spawn, time, Service, PATIENCE};
 
 const REFERENCE: &str = "/v1/structures/three-dof/reference";
 const UNDAMAGED: [f64; 3] = [4.0, 5.0, 6.0];
@@ -162,7 +162,7 @@ async fn references_declared_in_quick_succession_do_not_block_the_service() {
     for _ in 0..8 {
         created(service.post(REFERENCE, &json!({ "batches": ids[..2] })).await).await;
     }
-    let posted = tokio::time::timeout(std::time::Duration::from_secs(20), day(&service, 24, untouched));
+    let posted = tokio::time::timeout(PATIENCE, day(&service, 24, untouched));
     posted.await.expect("a batch is assessed while others are assessed again");
     eventually("all batches are compared with the last reference", async || {
         let history = service.read("/v1/structures/three-dof/history?limit=100").await;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use reqwest::{Method, StatusCode};
 use serde_json::{json, Value};
 
-use crate::helpers::{command, problem, spawn, time, within, Service};
+use crate::helpers::{command, problem, spawn, time, within, Service, PATIENCE};
 
 /// Two masses on two springs: small, so that a model is trained in seconds.
 fn structure(id: &str) -> String {
@@ -105,7 +105,8 @@ async fn a_training_survives_a_stop_gives_the_model_of_the_command_line_and_puts
     let stopped = Instant::now();
     let status = service.stop("TERM");
     assert!(status.success(), "{status}");
-    assert!(stopped.elapsed() < Duration::from_secs(3), "the drain time is 1 s, and it took {:?}", stopped.elapsed());
+    // The drain time is 1 s, and that of the defaults 30 s; that the training has not ended is seen below.
+    assert!(stopped.elapsed() < Duration::from_secs(20), "it took {:?}", stopped.elapsed());
 
     let mut service = start();
     let begun = read(&service, &training).await;
@@ -131,7 +132,7 @@ async fn a_training_survives_a_stop_gives_the_model_of_the_command_line_and_puts
 
     let path = format!("/v1/structures/tiny/batches/{}", batch["batch"].as_str().unwrap());
     let assessed = async |service: &Service| {
-        within(Duration::from_secs(30), "the assessment of the batch", async || {
+        within(PATIENCE, "the assessment of the batch", async || {
             Some(service.read(&path).await).filter(|batch| batch["state"] == "assessed")
         })
         .await

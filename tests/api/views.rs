@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use reqwest::{Method, Response};
 use serde_json::{json, Value};
 
-use crate::helpers::{created, eventually, measurements, problem, spawn, three_dof_hz, time, Service};
+use crate::helpers::{created, eventually, measurements, problem, spawn, three_dof_hz, time, Service, PATIENCE};
 
 const SERIES: &str = "/v1/structures/three-dof/series";
 
@@ -308,7 +308,7 @@ impl Watcher {
                 let Some(event) = field("event: ") else { continue };
                 return Some((event, serde_json::from_str(&field("data: ").unwrap()).unwrap()));
             }
-            let wait = tokio::time::timeout(Duration::from_secs(30), self.response.chunk());
+            let wait = tokio::time::timeout(PATIENCE, self.response.chunk());
             let chunk = wait.await.expect("an event comes within 30 s").unwrap()?;
             self.text.push_str(std::str::from_utf8(&chunk).unwrap());
         }
@@ -397,9 +397,9 @@ async fn sigterm_ends_an_open_stream_of_events_and_does_not_wait_for_it() {
     let started = Instant::now();
     service.signal("TERM");
     assert_eq!(watcher.next().await, None, "the stream ends regularly and the connection does not break");
-    assert!(service.wait(Duration::from_secs(20)).success());
+    assert!(service.wait(PATIENCE).success());
     // If the stream did not end by itself, it would be aborted after the 30 s that open requests have.
-    assert!(started.elapsed() < Duration::from_secs(15), "stopping took {:?}", started.elapsed());
+    assert!(started.elapsed() < Duration::from_secs(25), "stopping took {:?}", started.elapsed());
 }
 
 #[tokio::test]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::helpers::{command, problem, spawn, Service};
+use crate::helpers::{command, problem, spawn, Service, PATIENCE};
 use crate::kit::{
     all_assessed, audit, batch, body, history, open_files, post, ready, resident_mib, Acknowledged, BATCHES,
 };
@@ -46,7 +46,7 @@ async fn clients_that_disconnect_midway_leave_complete_batches_and_a_working_wri
     // Complete posts are stored although the client did not wait for the answer; incomplete ones are not.
     let stored = history(&service).await.len();
     assert!((20..=40).contains(&stored), "{stored} stored of 10 and 30 whole ones");
-    all_assessed(&service, Duration::from_secs(20)).await;
+    all_assessed(&service).await;
     assert!(ready(&service).await.0);
     assert!(service.stop("TERM").success());
     audit(folder.path(), &acknowledged).await;
@@ -74,10 +74,11 @@ async fn idle_and_slow_connections_are_cut_off_and_others_are_served() {
     let started = Instant::now();
     let (status, answer) = post(&service, &given).await.unwrap();
     assert_eq!(status, 201, "{answer}");
-    assert!(started.elapsed() < Duration::from_secs(20), "it waited for {:?}", started.elapsed());
+    // Three rounds of connections are before it, each of which would hold its place for 10 s and more with the time limits of the defaults.
+    assert!(started.elapsed() < Duration::from_secs(28), "it waited for {:?}", started.elapsed());
     // The service ended each connection: a read returns the end or an answer and does not block.
     for mut stream in held {
-        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let mut answer = Vec::new();
         let ended = stream.read_to_end(&mut answer);
         let reset = ended.as_ref().is_err_and(|e| e.kind() == std::io::ErrorKind::ConnectionReset);
@@ -106,7 +107,7 @@ async fn a_burst_is_answered_with_201_429_or_503_and_nothing_accepted_is_lost() 
         .collect();
     let started = Instant::now();
     let page = service.read("/v1/structures/three-dof/history?limit=10").await;
-    assert!(page["items"].is_array() && started.elapsed() < Duration::from_secs(10), "{:?}", started.elapsed());
+    assert!(page["items"].is_array() && started.elapsed() < Duration::from_secs(20), "{:?}", started.elapsed());
     let (mut acknowledged, mut counts) = (Acknowledged::default(), BTreeMap::<u16, usize>::new());
     for task in tasks {
         let (given, status, retry_after, answer) = task.await.unwrap();
@@ -119,7 +120,7 @@ async fn a_burst_is_answered_with_201_429_or_503_and_nothing_accepted_is_lost() 
     }
     println!("answers: {counts:?}");
     assert!(counts[&201] >= 20, "{counts:?}");
-    all_assessed(&service, Duration::from_secs(30)).await;
+    all_assessed(&service).await;
     assert_eq!(history(&service).await, acknowledged.0.keys().cloned().collect());
     let mut service = Arc::into_inner(service).unwrap();
     assert!(service.stop("TERM").success());

@@ -34,7 +34,7 @@ async fn filled(folder: &Path) -> Acknowledged {
             created(service.post("/v1/structures/three-dof/reference", &json!({ "batches": ids })).await).await;
         }
     }
-    all_assessed(&service, Duration::from_secs(20)).await;
+    all_assessed(&service).await;
     assert!(service.stop("TERM").success());
     acknowledged
 }

@@ -100,7 +100,7 @@ async fn full_and_healed(service: &Service, acknowledged: &mut Acknowledged, hea
     refusal(status, &answer);
 
     heal();
-    ready_again(service, Duration::from_secs(20)).await;
+    ready_again(service).await;
     // The batch that was refused is now stored, once, and batches whose assessment could not be stored are assessed without a
     // further request.
     for given in [plain_batch("filler", refused, 150), batch("during", 0, 10), batch("after", 0, 10)] {
@@ -113,7 +113,7 @@ async fn full_and_healed(service: &Service, acknowledged: &mut Acknowledged, hea
         );
         acknowledged.add(&given, &answer);
     }
-    all_assessed(service, Duration::from_secs(30)).await;
+    all_assessed(service).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -181,7 +181,7 @@ async fn a_database_that_is_deleted_while_open_acknowledges_nothing_more() {
         assert_eq!(service.get("/healthz").send().await.unwrap().status(), 200);
         // If the file is put back before anything is written, the service continues.
         std::fs::rename(&away, folder.path().join(file)).unwrap();
-        ready_again(&service, Duration::from_secs(10)).await;
+        ready_again(&service).await;
     }
     // The file is replaced by another one of the same name.
     std::fs::copy(database(folder.path()), &away).unwrap();

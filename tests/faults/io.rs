@@ -1,10 +1,10 @@
 //! Writes and syncs that fail: `fiu` makes the system calls of the unmodified program fail, once, at random, or always.
 
+use std::io::{BufRead as _, BufReader};
 use std::path::Path;
-use std::process::Command;
-use std::time::Duration;
+use std::process::{Child, Command, ExitStatus};
 
-use crate::helpers::{command, exit_within, Service};
+use crate::helpers::{command, exit_within, Service, PATIENCE};
 use crate::kit::{all_assessed, audit, batch, post, ready, ready_again, Acknowledged};
 use crate::needs;
 
@@ -19,6 +19,22 @@ fn controlled(data_dir: &Path, control: &Path) -> Command {
     command.env("LD_PRELOAD", PRELOAD).env("FIU_ENABLE", "").env("FIU_CTRL_FIFO", control);
     command.env("MODALWATCH__LOG__LEVEL", "error");
     command
+}
+
+/// The status of a program that ends by itself; `None` for one that listens.
+fn ended_by_itself(child: &mut Child) -> Option<ExitStatus> {
+    let stdout = child.stdout.take().unwrap();
+    let (said, line) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        let mut text = String::new();
+        // Without a line the program has closed its output, because it ends.
+        let _ = BufReader::new(stdout).read_line(&mut text);
+        let _ = said.send(text);
+    });
+    match line.recv_timeout(PATIENCE) {
+        Ok(text) if !text.is_empty() => None,
+        _ => exit_within(child, PATIENCE),
+    }
 }
 
 /// Sets the system calls of the running program that fail.
@@ -75,7 +91,7 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
         }
         control(&service, &fifo, &format!("disable name={point}"));
         // The service recovers without a restart, and a retry stores one batch.
-        ready_again(&service, Duration::from_secs(10)).await;
+        ready_again(&service).await;
         failed += refused.len();
         println!("{point} {how}: {} of {PER_CASE} refused", refused.len());
         for given in refused {
@@ -85,10 +101,10 @@ async fn what_is_acknowledged_while_writes_and_syncs_fail_is_there_afterwards() 
         }
     }
     assert!(failed >= 3 * PER_CASE, "only {failed} posts had a fault: the test shows little");
-    all_assessed(&service, Duration::from_secs(30)).await;
+    all_assessed(&service).await;
     service.kill();
     let mut service = Service::start(&data);
-    all_assessed(&service, Duration::from_secs(30)).await;
+    all_assessed(&service).await;
     assert!(service.stop("TERM").success());
     let audit = audit(&data, &acknowledged).await;
     assert_eq!((audit.stored, audit.unassessed), (cases.len() * PER_CASE, 0), "each batch once");
@@ -114,10 +130,10 @@ async fn a_start_on_a_failing_disk_says_so_or_works_and_loses_nothing() {
         let point = if point.contains('/') { format!("posix/io/{point}") } else { format!("posix/io/rw/{point}") };
         let mut command = controlled(folder.path(), Path::new(""));
         command.env("FIU_ENABLE", format!("enable_random name={point},probability={probability},failinfo=5"));
-        command.stdout(std::process::Stdio::null()).stderr(std::process::Stdio::piped());
+        command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
         let mut child = command.spawn().unwrap();
         // The program either stops by itself with a reason or starts; in the second case it is killed.
-        if let Some(status) = exit_within(&mut child, Duration::from_secs(2)) {
+        if let Some(status) = ended_by_itself(&mut child) {
             let mut said = String::new();
             std::io::Read::read_to_string(&mut child.stderr.take().unwrap(), &mut said).unwrap();
             assert!(!status.success() && said.contains("modalwatch: "), "{point} {probability}: {status} {said}");

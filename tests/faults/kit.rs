@@ -3,14 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::OnceLock;
-use std::time::Duration;
 
 use modalwatch::measurement::{MeasurementBatch, ModalMeasurement};
 use modalwatch::quantity::{Hertz, StructureId, Timestamp};
 use modalwatch::store::Store;
 use serde_json::{json, Value};
 
-use crate::helpers::{repository, within, Service};
+use crate::helpers::{eventually, repository, Service};
 
 pub const BATCHES: &str = "/v1/structures/three-dof/batches";
 pub const STRUCTURE: &str = "three-dof";
@@ -179,8 +178,8 @@ pub async fn history_of(service: &Service, structure: &str) -> BTreeSet<String> 
 }
 
 /// Waits until no batch of the history waits for its assessment.
-pub async fn all_assessed(service: &Service, limit: Duration) {
-    within(limit, "the assessment of all batches", async || {
+pub async fn all_assessed(service: &Service) {
+    eventually("the assessment of all batches", async || {
         let page = service.read(&format!("/v1/structures/{STRUCTURE}/history?limit=1000")).await;
         let items = page["items"].as_array().unwrap();
         assert!(page["next"].is_null(), "more batches than one page");
@@ -203,8 +202,8 @@ pub async fn ready(service: &Service) -> (bool, Value) {
 }
 
 /// Waits until the service is ready.
-pub async fn ready_again(service: &Service, limit: Duration) {
-    within(limit, "ready", async || ready(service).await.0.then_some(())).await;
+pub async fn ready_again(service: &Service) {
+    eventually("ready", async || ready(service).await.0.then_some(())).await;
 }
 
 /// Resident memory of a process, MiB.

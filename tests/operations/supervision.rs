@@ -61,7 +61,7 @@ async fn a_hangup_applies_a_valid_configuration_and_refuses_an_invalid_one() {
     let wait_for = |what: &str| {
         let mut seen = Vec::new();
         loop {
-            let line = lines.recv_timeout(Duration::from_secs(15)).unwrap_or_else(|_| panic!("no {what} in {seen:#?}"));
+            let line = lines.recv_timeout(Duration::from_mins(1)).unwrap_or_else(|_| panic!("no {what} in {seen:#?}"));
             if line.contains(what) {
                 return line;
             }

@@ -9,6 +9,7 @@ use crate::discrepancy::{Holdout, FEWEST_ROWS};
 use crate::monitor::compute::QueueFull;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::own_task::in_own_task;
+use crate::monitor::patience::patiently;
 use crate::quantity::{shown, StructureId, Timestamp};
 use crate::simulator::Simulator;
 use crate::store::{DiagnosisRecord, DiagnosisTrigger, JobKind, NewDiagnosis};
@@ -143,7 +144,9 @@ impl Jobs {
     ) -> Result<Study, String> {
         let batches = self.store.batches();
         let text = |e: &dyn std::fmt::Display| e.to_string();
-        let mut measurements = batches.measurements_of(structure, &request.batches).await.map_err(|e| text(&e))?;
+        let all = || batches.measurements_of(structure, &request.batches);
+        let all = patiently(&self.store, "read the measurements of a job", all).await;
+        let mut measurements = all.map_err(|e| text(&e))?;
         let all = measurements.len();
         measurements.retain(|measurement| request.contains(measurement.measured_at));
         if let (true, Some(period)) = (measurements.len() < FEWEST_ROWS, request.period_in_words()) {
@@ -152,10 +155,14 @@ impl Jobs {
                 measurements.len()
             ));
         }
-        let reference = self.store.reference().undamaged(structure).await.map_err(|e| text(&e))?;
+        let reference = || self.store.reference().undamaged(structure);
+        let reference =
+            patiently(&self.store, "read the reference for a job", reference).await.map_err(|e| text(&e))?;
         let declared = reference.map_or_else(Vec::new, |reference| reference.batches.clone());
         let declared: Vec<String> = declared.into_iter().filter(|id| request.batches.contains(id)).collect();
-        let undamaged = batches.measurements_of(structure, &declared).await.map_err(|e| text(&e))?;
+        let undamaged = || batches.measurements_of(structure, &declared);
+        let undamaged = patiently(&self.store, "read the measurements of a job", undamaged).await;
+        let undamaged = undamaged.map_err(|e| text(&e))?;
         let undamaged = undamaged.iter().map(|measurement| measurement.measured_at).collect();
         Ok(Study { id, simulator, measurements, undamaged, request, queue: self.queue.clone() })
     }

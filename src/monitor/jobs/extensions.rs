@@ -112,7 +112,7 @@ async fn extend(
             accepted,
         }),
     };
-    let switched = jobs.versions.switch(&parent, version, extended.simulator, Arc::new(baseline)).await;
+    let switched = jobs.switch(&parent, version, extended.simulator, Arc::new(baseline)).await;
     let result = ExtensionResult {
         added: extended.added,
         left_out: extended.left_out,
@@ -120,7 +120,7 @@ async fn extend(
         parent_digest: parent.to_string(),
         model_digest,
         trained_from,
-        undamaged_version: switched.map_err(|e| text(&e))?,
+        undamaged_version: switched?,
     };
     info!(structure.id = %structure, diagnosis = %record.id, "Extended {structure}: {}", result.added.join("; "));
     Ok((serde_json::to_string(&result).expect("a result is plain data"), None))

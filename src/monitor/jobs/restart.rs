@@ -23,6 +23,10 @@ impl Jobs {
         }
         for (id, request) in interrupted.extensions {
             if let Err(failure) = resume_extension(self, &id, &request).await {
+                // A read that failed for a moment is no reason to give up an extension: the start fails and is repeated.
+                if let JobError::Monitor(Error::Store(failure)) = failure {
+                    return Err(failure.into());
+                }
                 let end = JobEnd::Failed(format!("it could not begin again after a stop of the service: {failure}"));
                 self.store.diagnoses().finish_extension(&id, end, Timestamp::now()).await?;
             }

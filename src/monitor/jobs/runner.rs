@@ -6,12 +6,15 @@ use std::sync::Arc;
 use tracing::{error, info, warn};
 
 use super::queue::{Halt, JobStatus, Queue};
+use crate::baseline::Baseline;
 use crate::monitor::error::{Error, JobError};
 use crate::monitor::events::Events;
+use crate::monitor::patience::{is_worth_another, patiently, pause};
 use crate::monitor::structures::ActiveStructures;
 use crate::monitor::versions::Versions;
-use crate::quantity::{shown, StructureId, Timestamp};
-use crate::store::{DiagnosisTrigger, JobEnd, JobKind, JobRecord, JobState, Store};
+use crate::quantity::{shown, Digest, StructureId, Timestamp};
+use crate::simulator::Simulator;
+use crate::store::{self, DiagnosisTrigger, JobEnd, JobKind, JobRecord, JobState, NewVersion, Store};
 
 /// Largest number of jobs that run or wait.
 pub(super) const MOST_JOBS: usize = 16;
@@ -73,11 +76,34 @@ impl Jobs {
                 // What is stored stays as it is: the next start finds the job there.
                 Err(Halt::Stopping) => return jobs.queue.end(&id, JobState::Waiting),
             };
-            if let Err(failure) = store_end(&jobs, &id, kind, end).await {
+            // The result of hours must not be lost to a disk that is full for minutes.
+            let stored = patiently(&jobs.store, "store the end of a job", || store_end(&jobs, &id, kind, end.clone()));
+            if let Err(failure) = stored.await {
                 error!(job = %id, "Could not store the result of the {name} {id}: {failure}");
             }
             jobs.queue.end(&id, state);
         });
+    }
+
+    /// Puts a version of a structure into use that a job has made, in place of `expected`; attempted again while the database fails for a
+    /// moment. Returns the version of the renewed reference.
+    pub(super) async fn switch(
+        &self,
+        expected: &Digest,
+        version: NewVersion,
+        simulator: Simulator,
+        baseline: Arc<Baseline>,
+    ) -> Result<Option<u32>, String> {
+        loop {
+            let parts = (version.clone(), simulator.clone(), Arc::clone(&baseline));
+            match self.versions.switch(expected, parts.0, parts.1, parts.2).await {
+                Err(Error::Store(error)) if is_worth_another(&error, &self.store) => {
+                    warn!(%error, "Could not put the result of a job into use, trying again: {error}");
+                    pause().await;
+                }
+                outcome => return outcome.map_err(|e| e.to_string()),
+            }
+        }
     }
 
     /// Jobs of all structures, newest first, at most `limit`, each with what it is doing now if it runs or waits.
@@ -147,7 +173,12 @@ impl Jobs {
     }
 }
 
-async fn store_end(jobs: &Jobs, id: &str, kind: JobKind, end: JobEnd<(String, Option<String>)>) -> Result<(), Error> {
+async fn store_end(
+    jobs: &Jobs,
+    id: &str,
+    kind: JobKind,
+    end: JobEnd<(String, Option<String>)>,
+) -> Result<(), store::Error> {
     let now = Timestamp::now();
     let only_json = match end.clone() {
         JobEnd::Done((json, _)) => JobEnd::Done(json),

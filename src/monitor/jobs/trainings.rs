@@ -201,7 +201,7 @@ async fn put_into_use(
         diagnosis: None,
         baseline: Some(StoredBaseline { model_digest, manifest: manifest_json, weights, accepted }),
     };
-    jobs.versions.switch(&digest, version, simulator, Arc::new(baseline)).await.map_err(|e| e.to_string())
+    jobs.switch(&digest, version, simulator, Arc::new(baseline)).await
 }
 
 /// The result of a training, without its duration and the renewed reference.
