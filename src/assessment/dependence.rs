@@ -68,7 +68,8 @@ pub(super) fn within_batch(
     let mut effective = count as f64;
     for (sample, own) in samples.iter_mut().zip(found) {
         let both = [own, known(&sample.name)];
-        let strongest = both.into_iter().flatten().max_by(|a, b| a.inefficiency(count).total_cmp(&b.inefficiency(count)));
+        let strongest =
+            both.into_iter().flatten().max_by(|a, b| a.inefficiency(count).total_cmp(&b.inefficiency(count)));
         sample.correlate(strongest, &[count]);
         if strongest.is_some() && sample.is_judged() {
             effective = effective.min(sample.effective(&[count]).of_mean);

@@ -5,7 +5,7 @@ use statrs::distribution::{ContinuousCDF as _, FisherSnedecor};
 use super::pool::QuantitySamples;
 use crate::stats;
 
-/// Share of references of independent healthy measurements in which these tests raise a doubt, for each of the two tests.
+/// Share of references of independent healthy measurements in which drift and step raise a doubt, at most, for each of the two.
 const LEVEL: f64 = 0.001;
 
 /// Fewest measurements of a batch from which a drift or a step is judged.

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 
-use super::joint::JointReference;
 use super::doubts::doubts;
+use super::joint::JointReference;
 use super::pool::{Hyperparameters, QuantitySamples};
 use super::threshold::threshold;
 use crate::hierarchy::{interval, Serial};
@@ -134,7 +134,7 @@ pub enum Error {
     #[error(
         "{measurements} measurements that are worth only {effective:.1} independent ones, because successive measurements of {quantity} \
          are correlated ({correlation:.2}): an undamaged reference needs at least {least} independent ones. Declare batches of further \
-         days, or measurements that are further apart in time"
+         days, or measurements that are further apart in time{seen}"
     )]
     TooDependent {
         /// Measurements given.
@@ -147,6 +147,8 @@ pub enum Error {
         correlation: f64,
         /// Fewest allowed.
         least: usize,
+        /// What else is suspicious about the measurements: empty, or sentences that begin with a full stop.
+        seen: String,
     },
     /// A threshold probability outside (0, 0.5].
     #[error("threshold probability {0} must be above 0 and at most 0.5")]
@@ -181,6 +183,7 @@ impl UndamagedReference {
         if measurements < MINIMUM_MEASUREMENTS {
             return Err(too_few);
         }
+        let mut doubts = doubts(samples, sizes);
         for sample in samples.iter().filter(|sample| sample.is_judged()) {
             let effective = sample.effective(sizes).of_mean;
             if let Some(serial) = sample.serial.filter(|_| effective < MINIMUM_MEASUREMENTS as f64) {
@@ -190,10 +193,10 @@ impl UndamagedReference {
                     quantity: sample.name.clone(),
                     correlation: serial.correlation * serial.share,
                     least: MINIMUM_MEASUREMENTS,
+                    seen: doubts.iter().map(|doubt| format!(". {doubt}")).collect(),
                 });
             }
         }
-        let mut doubts = doubts(samples, sizes);
         let mut quantity = |sample: &QuantitySamples| {
             let pooled = Hyperparameters::from_pool(&sample.pool, sample.draws);
             let population = &sample.population;

@@ -25,13 +25,13 @@ const SHARES: [f64; 7] = [0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0];
 const SHORTEST: f64 = 0.5;
 const FACTOR: f64 = 1.5157;
 
-/// Evidence of correlation, as a Bayes factor for each of the quantities that are tested together: 0.2 % of independent series of three
-/// quantities reach it (Monte Carlo, 3,000 to 10,000 series of 5 to 200 measurements).
-const EVIDENCE: f64 = 7.0;
+/// Evidence of correlation, as a Bayes factor for each of the quantities that are tested together: below 0.5 % of independent batches reach
+/// it in one of three quantities (`tests/posterior/dependence.rs`).
+const EVIDENCE: f64 = 12.0;
 
 /// Where the evidence is just enough, the estimate is moved towards independence as if that were this much more probable beforehand, as
 /// a share of [`EVIDENCE`].
-const SHRINKAGE: f64 = 0.22;
+const SHRINKAGE: f64 = 0.13;
 
 /// Fewest measurements, beyond one for each batch, that can show a correlation.
 const FEWEST: usize = 7;
@@ -109,7 +109,8 @@ impl Serial {
         if evidence.is_nan() || evidence < needed {
             return None;
         }
-        let mean = |of: &dyn Fn(&(f64, f64)) -> f64| grid.iter().zip(&weights).map(|(g, w)| of(g) * w).sum::<f64>() / total;
+        let mean =
+            |of: &dyn Fn(&(f64, f64)) -> f64| grid.iter().zip(&weights).map(|(g, w)| of(g) * w).sum::<f64>() / total;
         let certainty = if evidence.is_finite() { evidence / (evidence + SHRINKAGE * needed) } else { 1.0 };
         let correlation = (-1.0 / mean(&|(t, _)| t.ln()).exp()).exp();
         Some(Self { correlation, share: certainty * mean(&|(_, s)| *s), step_s })
@@ -135,7 +136,8 @@ impl Serial {
     pub fn effective(&self, sizes: &[usize]) -> Effective {
         let n: f64 = sizes.iter().sum::<usize>() as f64;
         let squared = Self { correlation: self.correlation.powi(2), share: self.share.powi(2), step_s: None };
-        let weighed = |serial: &Self| sizes.iter().filter(|n| **n > 0).map(|n| *n as f64 * serial.inefficiency(*n)).sum::<f64>();
+        let weighed =
+            |serial: &Self| sizes.iter().filter(|n| **n > 0).map(|n| *n as f64 * serial.inefficiency(*n)).sum::<f64>();
         Effective { of_mean: n * n / weighed(self), of_spread: n * n / weighed(&squared), measurements: n }
     }
 }

@@ -145,13 +145,17 @@ impl Spread {
     }
 
     /// Numbers of pairs within some squared distances.
-    fn pairs<const COUNT: usize>(&self, thresholds: [f64; COUNT]) -> [usize; COUNT] {
-        let mut found = [0; COUNT];
+    fn pairs(&self, thresholds: &[f64]) -> Vec<usize> {
+        let largest = thresholds.iter().copied().fold(0.0, f64::max);
+        let mut found = vec![0; thresholds.len()];
         for a in 1..self.rows.len() {
             for b in 0..a {
                 let squared = self.distance(a, b);
-                for (found, threshold) in found.iter_mut().zip(thresholds) {
-                    *found += usize::from(squared < threshold);
+                // Most pairs are further apart than all of them.
+                if squared < largest {
+                    for (found, threshold) in found.iter_mut().zip(thresholds) {
+                        *found += usize::from(squared < *threshold);
+                    }
                 }
             }
         }
@@ -163,21 +167,25 @@ impl Spread {
         let (n, modes) = (self.rows.len(), self.wider.len());
         let by_chance = SHARES_BY_CHANCE.map(|share| small_quantile(share / (n as f64 - 1.0), modes));
         let groups = GROUP_DISTANCES.map(|share| share * large_quantile(modes));
-        let wide = groups.map(|threshold| 4.0 * threshold);
-        let close = self.pairs(by_chance);
-        let copies = (0..SHARES_BY_CHANCE.len()).filter(|place| {
-            poisson_tail(close[*place], 0.5 * n as f64 * SHARES_BY_CHANCE[*place]) < CHANCE
-        });
+        let thresholds: Vec<f64> =
+            by_chance.into_iter().chain(groups).chain(groups.map(|threshold| 4.0 * threshold)).collect();
+        let pairs = self.pairs(&thresholds);
+        let (close, rest) = pairs.split_at(by_chance.len());
+        let (within, around) = rest.split_at(groups.len());
+        let copies = (0..SHARES_BY_CHANCE.len())
+            .filter(|place| poisson_tail(close[*place], 0.5 * n as f64 * SHARES_BY_CHANCE[*place]) < CHANCE);
         let mut kept = copies.last().map_or_else(|| (0..n).collect(), |place| self.leaders(by_chance[place]));
-        let (within, around) = (self.pairs(groups), self.pairs(wide));
         for (place, threshold) in groups.into_iter().enumerate() {
             let all = n * (n - 1) / 2;
             if within[place] < 10 || within[place] as f64 > 0.6 * all as f64 {
                 continue;
             }
+            if !self.is_grouped(threshold, within[place], around[place]) {
+                continue;
+            }
             let leaders = self.leaders(threshold);
             let few = leaders.len() >= FEWEST_GROUPS && (leaders.len() as f64) < MOST_LEFT * n as f64;
-            if few && leaders.len() < kept.len() && self.is_grouped(threshold, within[place], around[place]) {
+            if few && leaders.len() < kept.len() {
                 kept = leaders;
             }
         }
@@ -198,8 +206,9 @@ impl Spread {
     /// Whether the pairs within a distance, and within twice that distance, are those of groups.
     fn is_grouped(&self, squared: f64, within: usize, around: usize) -> bool {
         let mut stream = stats::stream(1, "pairs of a normal distribution");
-        let mut draw =
-            || self.wider.iter().map(|variance| variance * stream.sample::<f64, _>(StandardNormal).powi(2)).sum::<f64>();
+        let mut draw = || {
+            self.wider.iter().map(|variance| variance * stream.sample::<f64, _>(StandardNormal).powi(2)).sum::<f64>()
+        };
         let draws: Vec<f64> = (0..DRAWS).map(|_| draw()).collect();
         let all = (self.rows.len() * (self.rows.len() - 1) / 2) as f64;
         // One of the draws at least, so that the growth is not overestimated.
@@ -247,9 +256,14 @@ pub fn noise_overstated(kept: &[(usize, ModalMeasurement)]) -> Option<Finding> {
             Some((frequency.ln(), m.std_hz.as_ref()?.get(mode).copied()?? / frequency))
         };
         let all: Vec<(f64, f64)> = kept.iter().filter_map(stated).collect();
+        if all.len() < 2 {
+            continue;
+        }
         let logs: Vec<f64> = all.iter().map(|(log, _)| *log).collect();
         let noise = stats::quantile(&all.iter().map(|(_, noise)| *noise).collect::<Vec<_>>(), 0.5);
-        let Some(scatter) = stats::sample_std(&logs).filter(|scatter| *scatter < OVERSTATED_RATIO * noise) else { continue };
+        let Some(scatter) = stats::sample_std(&logs).filter(|scatter| *scatter < OVERSTATED_RATIO * noise) else {
+            continue;
+        };
         let degrees = all.len() - 1;
         let bound = small_quantile(OVERSTATED_CHANCE / modes as f64, degrees);
         if degrees as f64 * (scatter / noise).powi(2) < bound {

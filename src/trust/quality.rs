@@ -106,14 +106,18 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
     }
 }
 
-/// Whether sorted values lie on a grid: the difference of neighbours is a multiple of the smallest one, to a thousandth of it. Copies of
-/// a few measurements take few values too, but at arbitrary distances.
-fn on_grid(sorted: &[f64], step: f64) -> bool {
-    let off = |pair: &[f64]| {
-        let steps = (pair[1] - pair[0]) / step;
-        (steps - steps.round()).abs()
+/// Whether sorted values lie on a grid: the differences of neighbours are multiples of the smallest one or of a half, a third or a quarter
+/// of it, to a thousandth. Copies of a few measurements take few values too, but at arbitrary distances.
+fn on_grid(sorted: &[f64], smallest: f64) -> bool {
+    let fits = |parts: u8| {
+        let step = smallest / f64::from(parts);
+        let off = |pair: &[f64]| {
+            let steps = (pair[1] - pair[0]) / step;
+            (steps - steps.round()).abs() < 1e-3 + 1e-12 * pair[1].abs() / step
+        };
+        sorted.windows(2).all(off)
     };
-    sorted.windows(2).all(|pair| off(pair) < 1e-3 + 1e-12 * pair[1].abs() / step)
+    (1..=4).any(fits)
 }
 
 /// True when every mode that varies is rounded to coarse steps; each such mode is reported.
