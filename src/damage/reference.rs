@@ -161,8 +161,8 @@ pub enum Error {
 /// Fewest measurements of an undamaged reference: with 10, the standard error of the standard deviation is 24 %.
 pub const MINIMUM_MEASUREMENTS: usize = 10;
 
-/// Significance level at which the data of an undamaged reference raise a doubt.
-const CONTAMINATION_LEVEL: f64 = 0.001;
+/// Significance level at which the data of an undamaged reference raise a doubt, for each of two tests over all quantities together.
+const CONTAMINATION_LEVEL: f64 = 0.002;
 
 /// Significance level at which the scatter between batches enters the charts.
 const BETWEEN_LEVEL: f64 = 0.01;
@@ -183,6 +183,8 @@ impl UndamagedReference {
         if measurements < MINIMUM_MEASUREMENTS {
             return Err(too_few);
         }
+        let judged = samples.iter().filter(|sample| sample.is_judged()).count();
+        let contamination = CONTAMINATION_LEVEL / judged.max(1) as f64;
         let mut doubts = doubts(samples, sizes);
         for sample in samples.iter().filter(|sample| sample.is_judged()) {
             let effective = sample.effective(sizes).of_mean;
@@ -207,7 +209,7 @@ impl UndamagedReference {
                 .zip(&population.std_draws)
                 .filter_map(|(m, s)| threshold(*m, *s, sample.damage, level))
                 .collect();
-            let (reference, doubt) = ChartReference::new(sample, sizes);
+            let (reference, doubt) = ChartReference::new(sample, sizes, contamination);
             doubts.extend(doubt.map(|doubt| format!("{}: {doubt}", sample.name)));
             Some(UndamagedQuantity {
                 name: sample.name.clone(),
@@ -254,12 +256,12 @@ impl ChartReference {
 
     /// The reference of the alarm charts, and a doubt about its data if there is one.
     ///
-    /// If the batches differ (p < 0.01), the scatter between them enters the charts. If they differ strongly (p < 0.001), or if one
+    /// If the batches differ (p < 0.01), the scatter between them enters the charts. If they differ strongly (p < `level`), or if one
     /// measurement lies far from the others, a doubt warns that the reference may contain more than random scatter.
-    fn new(sample: &QuantitySamples, sizes: &[usize]) -> (Self, Option<String>) {
+    fn new(sample: &QuantitySamples, sizes: &[usize], level: f64) -> (Self, Option<String>) {
         let means = sample.means();
-        let analysis = Scatter::of(&means, sizes, sample.serial);
-        let doubt = analysis.contamination.clone().or_else(|| outlier(&means));
+        let analysis = Scatter::of(&means, sizes, sample.serial, level);
+        let doubt = analysis.contamination.clone().or_else(|| outlier(&means, level));
         let within = Hyperparameters::from_pool(&sample.pool, sample.draws).within;
         let (count, batches) = (means.len(), analysis.batches);
         let degrees_of_freedom = match (analysis.between_batches_std > 0.0, count > batches) {
@@ -302,7 +304,7 @@ impl Scatter {
     ///
     /// For independent measurements τ_b = 1 and N_e = N. Correlated ones scatter less about the mean of their batch than about that of
     /// the population, and the mean of a batch is less precise: only what this does not explain is scatter between batches.
-    fn of(means: &[f64], sizes: &[usize], serial: Option<Serial>) -> Self {
+    fn of(means: &[f64], sizes: &[usize], serial: Option<Serial>, level: f64) -> Self {
         let mut start = 0;
         let mut batches = Vec::new();
         for &size in sizes.iter().filter(|size| **size > 0) {
@@ -338,7 +340,7 @@ impl Scatter {
             if p < BETWEEN_LEVEL {
                 found.between_batches_std = ((between / (b - 1.0) - of_means) / size).max(0.0).sqrt();
             }
-            if p < CONTAMINATION_LEVEL {
+            if p < level {
                 found.contamination = Some(format!(
                     "its batches differ by more than their scatter ({}): damage, weather or a changed set-up may be the cause",
                     stats::p_value_text(p)
@@ -350,7 +352,7 @@ impl Scatter {
 }
 
 /// A doubt when one value lies far from the others, by Grubbs' test in its t approximation, two-sided.
-fn outlier(means: &[f64]) -> Option<String> {
+fn outlier(means: &[f64], level: f64) -> Option<String> {
     let n = means.len() as f64;
     let (mean, total) = (stats::mean(means), squares(means) / (n - 1.0));
     if total <= 0.0 {
@@ -359,7 +361,7 @@ fn outlier(means: &[f64]) -> Option<String> {
     let largest = means.iter().map(|x| (x - mean).abs()).fold(0.0, f64::max) / total.sqrt();
     let t2 = n * (n - 2.0) * largest.powi(2) / ((n - 1.0).powi(2) - n * largest.powi(2));
     let p = if t2 > 0.0 { StudentsT::new(0.0, 1.0, n - 2.0).map_or(1.0, |t| 2.0 * n * t.sf(t2.sqrt())) } else { 0.0 };
-    (p < CONTAMINATION_LEVEL).then(|| {
+    (p < level).then(|| {
         format!("one measurement lies {largest:.1} standard deviations from the others ({})", stats::p_value_text(p))
     })
 }

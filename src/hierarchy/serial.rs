@@ -27,11 +27,11 @@ const FACTOR: f64 = 1.5157;
 
 /// Evidence of correlation, as a Bayes factor for each of the quantities that are tested together: below 0.5 % of independent batches reach
 /// it in one of three quantities (`tests/posterior/dependence.rs`).
-const EVIDENCE: f64 = 12.0;
+const EVIDENCE: f64 = 20.0;
 
 /// Where the evidence is just enough, the estimate is moved towards independence as if that were this much more probable beforehand, as
 /// a share of [`EVIDENCE`].
-const SHRINKAGE: f64 = 0.13;
+const SHRINKAGE: f64 = 0.08;
 
 /// Fewest measurements, beyond one for each batch, that can show a correlation.
 const FEWEST: usize = 7;
@@ -95,7 +95,7 @@ impl Serial {
         let independent = log_likelihood(&series, 0.0, 0.0, free);
         let mut times = Vec::new();
         let mut time = SHORTEST;
-        while time <= (longest as f64).max(4.0) {
+        while time <= 2.0 * longest as f64 {
             times.push(time);
             time *= FACTOR;
         }

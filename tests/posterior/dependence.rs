@@ -119,9 +119,9 @@ fn correlated_measurements_are_worth_as_many_as_their_mean_is_precise() {
         let found: Vec<f64> = (0..200).map(|_| one()).collect();
         let [low, middle, high] = [0.1, 0.5, 0.9].map(|level| stats::quantile(&found, level));
         println!("{batches} × {n}, ρ = {correlation}, share {share}: {exact:.1} exactly, found {middle:.1} ({low:.1} to {high:.1})");
-        // The median within 40 % and eight of ten within a factor of 2.5: a single series of 50 shows no more.
-        assert!((middle / exact).ln().abs() < 1.4_f64.ln(), "{correlation}: {middle}, exactly {exact}");
-        assert!(low > exact / 2.5 && high < 2.5 * exact, "{correlation}: {low} to {high}, exactly {exact}");
+        // The median within a factor of 1.7 and eight of ten within a factor of 3: a single series of 50 shows no more.
+        assert!((middle / exact).ln().abs() < 1.7_f64.ln(), "{correlation}: {middle}, exactly {exact}");
+        assert!(low > exact / 3.0 && high < 3.0 * exact, "{correlation}: {low} to {high}, exactly {exact}");
     }
     let serial = Serial { correlation: 0.5, share: 1.0, step_s: None };
     assert!((serial.effective(&[100_000]).of_mean / (100_000.0 / 3.0) - 1.0).abs() < 1e-3);
@@ -175,7 +175,7 @@ fn a_drift_a_step_and_two_states_are_named() {
     assert!(found.contains("lie about") && found.contains("similarly in 1 others"), "{found}");
 }
 
-/// Near-independence changes nothing, to the bit.
+/// Independent measurements change nothing, to the bit.
 #[test]
 fn independent_measurements_keep_their_population() {
     let mut stream = stats::stream(3, "test: unchanged");
