@@ -46,7 +46,7 @@ fn reference(
     mut series: impl FnMut(usize, &mut Stream) -> Vec<f64>,
     stream: &mut Stream,
 ) -> (f64, Result<Vec<String>, String>) {
-    let one = |k: usize, stream: &mut Stream| {
+    let mut one = |k: usize, stream: &mut Stream| {
         let values: Vec<f64> = sizes.iter().flat_map(|n| series(*n, stream)).map(|x| 5.0 + 0.1 * x).collect();
         quantity(&format!("k{k}"), &values, stream)
     };
@@ -78,7 +78,7 @@ fn independent_measurements_are_worth_as_many_and_raise_no_doubt() {
             let (effective, doubts) = reference(sizes, |n, stream| series(n, 0.0, 0.0, stream), &mut stream);
             shares.push(effective / n);
             flagged += usize::from(effective < n);
-            doubted += usize::from(doubts.is_ok_and(|d| d.is_empty())) ^ 1;
+            doubted += usize::from(!doubts.is_ok_and(|d| d.is_empty()));
         }
         let share = |count: usize| count as f64 / f64::from(runs);
         let mean = stats::mean(&shares);
