@@ -54,9 +54,9 @@ pub struct ChartStatus {
 ///  z = ±(μ_ud − x̄)/se,    se² = (s² + v − v_ud)/n + τ² + s²/n_ud + τ²/B
 /// ```
 ///
-/// x̄ is the mean of the n posterior means of the batch, s² the variance of a measurement in the undamaged reference (n_ud
-/// measurements in B batches), v and v_ud the mean posterior variance of a measurement in the batch and in the reference, τ the
-/// standard deviation between batches. The spread of the batch itself does not enter, because few measurements hardly determine it.
+/// x̄ is the mean of the posterior means of the batch, which are worth n independent ones (`measurements`), s² the variance of a
+/// measurement in the undamaged reference (worth n_ud independent ones, in B batches), v and v_ud the mean posterior variance of a
+/// measurement in the batch and in the reference, τ the standard deviation between batches. The spread of the batch itself does not enter, because few measurements hardly determine it.
 ///
 /// `None` when no change of the quantity indicates damage or the undamaged reference has no scatter.
 pub fn shift(
@@ -64,7 +64,7 @@ pub fn shift(
     direction: DamageDirection,
     mean: f64,
     within: f64,
-    measurements: usize,
+    measurements: f64,
 ) -> Option<f64> {
     let towards = match direction {
         DamageDirection::Decrease => 1.0,
@@ -72,30 +72,30 @@ pub fn shift(
         DamageDirection::None => return None,
     };
     let error = standard_error(reference, within, measurements);
-    (error > 0.0 && measurements > 0).then(|| towards * (reference.mean - mean) / error)
+    (error > 0.0 && measurements > 0.0).then(|| towards * (reference.mean - mean) / error)
 }
 
 /// Standard error of the difference between a batch and the undamaged reference, in the quantity's unit, see [`shift`].
-pub fn standard_error(reference: &ChartReference, within: f64, measurements: usize) -> f64 {
+pub fn standard_error(reference: &ChartReference, within: f64, measurements: f64) -> f64 {
     let variance = reference.std.powi(2);
     let here = (variance + within - reference.within).max(LEAST_VARIANCE * variance);
     let between = reference.between_batches_std.powi(2);
-    (here / measurements as f64 + between + undamaged_variance(reference)).sqrt()
+    (here / measurements + between + undamaged_variance(reference)).sqrt()
 }
 
 /// Share ρ in [0, 1] of [`standard_error`]² that comes from the undamaged reference and is the same in all batches.
-pub fn shared(reference: &ChartReference, within: f64, measurements: usize) -> f64 {
+pub fn shared(reference: &ChartReference, within: f64, measurements: f64) -> f64 {
     (undamaged_variance(reference) / standard_error(reference, within, measurements).powi(2)).clamp(0.0, 1.0)
 }
 
 fn undamaged_variance(reference: &ChartReference) -> f64 {
     let between = reference.between_batches_std.powi(2);
-    reference.std.powi(2) / reference.measurements as f64 + between / reference.batches.max(1) as f64
+    reference.std.powi(2) / reference.independent() + between / reference.batches.max(1) as f64
 }
 
 /// The limit of the chart expressed as a probability of damage: that of a batch whose mean lies on the limit and whose spread is
 /// the undamaged one. `None` when the quantity has no damage threshold.
-pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, within: f64, measurements: usize) -> Option<f64> {
+pub fn probability_limit(quantity: &UndamagedQuantity, limit: f64, within: f64, measurements: f64) -> Option<f64> {
     let threshold = quantity.threshold?;
     let distance = (quantity.mean - threshold).abs() / quantity.std;
     let moved = limit * standard_error(&quantity.reference, within, measurements) / quantity.std;

@@ -110,7 +110,8 @@ pub fn chart_points(
     let charted = charted(baseline, undamaged);
     for (reference, direction) in &charted {
         let Some(quantity) = assessment.quantities.iter().find(|q| q.name == reference.name) else { continue };
-        let (mean, within, n) = (quantity.pooled.mean, quantity.pooled.within, assessment.measurements_used);
+        let (mean, within) = (quantity.pooled.mean, quantity.pooled.within);
+        let n = quantity.effective_measurements.unwrap_or(assessment.measurements_used as f64);
         let Some(shift) = chart::shift(&reference.reference, *direction, mean, within, n) else { continue };
         let curve = known.get(reference.reference.degrees_of_freedom, charted.len(), settings);
         let limits = curve.at(chart::shared(&reference.reference, within, n));

@@ -1,6 +1,7 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
 use super::conditions::compare_conditions;
+use super::dependence;
 use super::estimate::ProcessQuantities;
 use super::quantities::{joint_samples, monitored_quantities};
 use super::result::Assessment;
@@ -54,7 +55,7 @@ pub fn assess(
             findings.iter_mut().for_each(accept_usual_misfit);
         }
     }
-    let sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
+    let mut sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
     for sample in sampled.iter().filter(|s| s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS) {
         let message = format!(
             "{:.0} % of the posterior samples of {} lie at the bounds of its prior: widen the prior",
@@ -67,10 +68,13 @@ pub fn assess(
     let not_informed = process.not_informed(&sampled);
     findings.extend(not_informed.iter().map(|name| not_informed_finding(name)));
     findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
-    let trust = Trust::new(&samples.fit, findings);
     let covariates = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(|p| &p.process.covariates);
     let estimate =
         covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates, samples.fit.misfit()));
+    // After the estimate: a process has its own account of how measurements follow one another.
+    findings.extend(dependence::within_batch(&mut sampled, measurements, context.undamaged));
+    let mut trust = Trust::new(&samples.fit, findings);
+    trust.effective_measurements = dependence::fewest(&sampled, &[samples.observations.len()]);
     // Where the simulation does not fit the data, its parameters say nothing about damage.
     let compared = context.undamaged.filter(|_| trust.accepted());
     let mut quantities = damage::assess(&sampled, compared);

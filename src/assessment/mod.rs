@@ -12,6 +12,7 @@ mod admission;
 mod chart_points;
 mod comparison;
 mod conditions;
+mod dependence;
 mod detail;
 mod estimate;
 mod population;

@@ -28,6 +28,7 @@ pub fn monitored_quantities(
         population: population(column).clone(),
         prior_bound_mass: prior_bound_mass[column],
         group: group_of(column),
+        serial: None,
     });
     let springs = baseline.simulator().derived_stiffnesses().into_iter().map(|spring| {
         let parameter = &baseline.space().as_slice()[spring.parameter];
@@ -41,6 +42,7 @@ pub fn monitored_quantities(
             draws: pooled.draws(),
             prior_bound_mass: prior_bound_mass[spring.parameter],
             group: group_of(spring.parameter),
+            serial: None,
             name: spring.name,
         }
     });
@@ -59,6 +61,7 @@ pub fn monitored_quantities(
             population: samples.populations.average(&group.columns),
             prior_bound_mass: group.columns.iter().map(|&column| prior_bound_mass[column]).fold(0.0, f64::max),
             group: None,
+            serial: None,
         }
     });
     parameters.chain(springs).chain(of_groups).collect()

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use super::conditions::conditions;
+use super::dependence;
 use super::estimate::{process_covariates, ProcessQuantities};
 use super::quantities::{joint_samples, monitored_quantities};
 use super::samples::{draw, joined, BatchSamples, Draws, Error};
@@ -172,6 +173,10 @@ impl<'a> ReferenceBatches<'a> {
             return Err(too_few.into());
         };
         let (mut measurements, mut parts, mut sizes) = (Vec::new(), Vec::new(), Vec::new());
+        // Once for the reference, however many of its batches have it.
+        let is_overstated = |f: &&Finding| f.code == FindingCode::NoiseOverstated;
+        let overstated = trusted.iter().find_map(|batch| batch.samples.findings.iter().find(is_overstated));
+        let overstated = overstated.map(|finding| finding.message.clone());
         for batch in trusted {
             measurements.push(batch.measurements);
             sizes.push(batch.samples.posterior.measurements());
@@ -179,7 +184,8 @@ impl<'a> ReferenceBatches<'a> {
         }
         let samples =
             joined(baseline, parts, draws).map_err(|e| ReferenceError::Assess { batch: 0, source: e.into() })?;
-        let quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
+        let mut quantities = monitored_quantities(baseline, &samples, draws.per_measurement);
+        dependence::within_batches(&mut quantities, &sizes, &measurements);
         let mut reference = UndamagedReference::from_samples(&quantities, &sizes, threshold_probability)?;
         if usual_misfit.iter().any(|usual| *usual > 1.0) {
             reference.doubts.push(format!(
@@ -188,6 +194,8 @@ impl<'a> ReferenceBatches<'a> {
                 usual_misfit[0].sqrt()
             ));
         }
+        reference.doubts.extend(overstated);
+        reference.doubts.extend(dependence::short_period(&measurements));
         reference.conditions = conditions(measurements.into_iter().flatten());
         match process {
             Ok(process) => reference.process = Some(Arc::new(process)),

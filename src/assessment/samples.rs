@@ -10,7 +10,7 @@ use crate::hierarchy::Populations;
 use crate::measurement::ModalMeasurement;
 use crate::posterior::PosteriorSamples;
 use crate::quantity::Hertz;
-use crate::trust::{cause, fit, quality, Finding, FindingCode, FindingEffect};
+use crate::trust::{cause, copies, fit, quality, Finding, FindingCode, FindingEffect};
 
 /// The pilot sample, which locates the population, is one third of the posterior samples for the population. Its samples include
 /// repeats from the resampling: a third of 64 with repeats locates the population as well as a quarter of them without, and saves
@@ -99,8 +99,12 @@ pub fn draw(
     previous: Option<&[Option<Hertz>]>,
     draws: Draws,
 ) -> Result<BatchSamples, Error> {
-    let quality::Inspection { kept, mut findings } = quality::inspect(measurements, previous);
+    let quality::Inspection { mut kept, mut findings } = quality::inspect(measurements, previous);
+    // How measurements follow one another is judged in the order of time.
+    kept.sort_by_key(|(_, measurement)| measurement.measured_at);
+    findings.extend(copies::noise_overstated(&kept));
     let (indices, observations) = admit(baseline, &kept, &mut findings);
+    let (indices, observations) = copies::counted_once(baseline.simulator(), indices, observations, &mut findings);
     if observations.is_empty() {
         return Err(Error::NoUsableMeasurement { measurements: measurements.len() });
     }

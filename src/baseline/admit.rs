@@ -54,7 +54,7 @@ impl Baseline {
                     // The tolerance keeps the limits inside the range in spite of rounding.
                     below_range |= frequency.is_some() && multiple < range.lowest * (1.0 - 1e-6);
                     above_range |= frequency.is_some() && multiple > range.highest * (1.0 + 1e-6);
-                    if multiple > MOST_BEYOND * range.highest {
+                    if multiple > MOST_BEYOND * range.highest * (1.0 + 1e-6) {
                         *frequency = None;
                     } else if frequency.is_some() {
                         noise_multiple[mode] = multiple.max(range.lowest);

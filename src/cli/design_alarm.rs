@@ -134,14 +134,14 @@ pub fn design_alarm(args: &DesignAlarmArgs) -> anyhow::Result<()> {
     anyhow::ensure!(!watched.is_empty(), "no parameter of {} has a direction of damage", simulator.id());
     // This share is the same for all charts, since batch and undamaged reference have the same noise.
     let first = of(watched[0].1);
-    let shared = shared(&reference(first, args.reference), first.noise_std.powi(2), args.measurements);
+    let shared = shared(&reference(first, args.reference), first.noise_std.powi(2), args.measurements as f64);
     let situation = Situation { shared, degrees_of_freedom: args.reference - 1, charts: watched.len() };
     let limits = limits(situation, &settings);
     let found = detection(situation, &limits, &settings, args.within, args.seed);
     let shift_90 = found.shift_found(0.9);
     let parameter = |&(p, k): &(&Parameter, usize)| {
         let own = of(k);
-        let error = standard_error(&reference(own, args.reference), own.noise_std.powi(2), args.measurements);
+        let error = standard_error(&reference(own, args.reference), own.noise_std.powi(2), args.measurements as f64);
         let change = shift_90.map(|shift| shift * error);
         ParameterReport {
             name: p.name.clone(),
@@ -230,6 +230,8 @@ fn reference(of: Moments, measurements: usize) -> ChartReference {
         batches: 1,
         degrees_of_freedom: measurements - 1,
         between_batches_std: 0.0,
+        effective_measurements: None,
+        serial: None,
     }
 }
 

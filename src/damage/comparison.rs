@@ -57,6 +57,10 @@ pub struct QuantityAssessment {
     pub prior_bound_mass: f64,
     /// Group of parameters that this one cannot be distinguished from: damage is assessed for the group.
     pub group: Option<String>,
+    /// Number of independent measurements that those of the batch are worth for the mean; `None` in an assessment that was read from
+    /// the database.
+    #[serde(skip)]
+    pub effective_measurements: Option<f64>,
     /// Comparison with the undamaged reference; `None` without one, when no change of this quantity indicates damage, when the
     /// batch is rejected, or for a parameter of a group.
     pub damage: Option<Damage>,
@@ -78,6 +82,7 @@ pub fn assess(samples: &[QuantitySamples], undamaged: Option<&UndamagedReference
             pooled: Hyperparameters::from_pool(&sample.pool, sample.draws),
             prior_bound_mass: sample.prior_bound_mass,
             group: sample.group.clone(),
+            effective_measurements: Some(sample.effective(&[sample.pool.len() / sample.draws]).of_mean),
             damage,
         }
     };

@@ -175,6 +175,7 @@ mod tests {
             population,
             prior_bound_mass: 0.0,
             group: None,
+            serial: None,
         }
     }
 

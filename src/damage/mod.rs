@@ -17,6 +17,7 @@
 //! ```
 
 mod comparison;
+mod doubts;
 mod joint;
 mod joint_comparison;
 mod orthant;

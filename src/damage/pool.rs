@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::hierarchy::PopulationEstimate;
+use crate::hierarchy::{Effective, PopulationEstimate, Serial};
 use crate::parameter::DamageDirection;
 use crate::stats;
 
@@ -79,6 +79,32 @@ pub struct QuantitySamples {
     pub prior_bound_mass: f64,
     /// Name of the group of parameters that this one cannot be distinguished from.
     pub group: Option<String>,
+    /// How its successive measurements are correlated; `None` where they count as independent.
+    pub serial: Option<Serial>,
+}
+
+impl QuantitySamples {
+    /// Means of the samples of each measurement, `[n]`.
+    pub fn means(&self) -> Vec<f64> {
+        self.pool.chunks(self.draws).map(stats::mean).collect()
+    }
+
+    /// Whether it has a figure of its own: no parameter of a group, which is judged instead, and no spring, which repeats its parameter.
+    pub fn is_judged(&self) -> bool {
+        self.group.is_none() && self.kind != QuantityKind::SpringStiffness
+    }
+
+    /// Effective number of its measurements, in batches of these sizes.
+    pub fn effective(&self, sizes: &[usize]) -> Effective {
+        self.serial.map_or_else(|| Effective::all(sizes.iter().sum()), |serial| serial.effective(sizes))
+    }
+
+    /// Sets how its successive measurements are correlated, and widens the population accordingly.
+    pub fn correlate(&mut self, serial: Option<Serial>, sizes: &[usize]) {
+        self.serial = serial;
+        let within = Hyperparameters::from_pool(&self.pool, self.draws).within;
+        self.population = self.population.widened(self.effective(sizes), within);
+    }
 }
 
 #[cfg(test)]

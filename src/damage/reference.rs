@@ -6,10 +6,11 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, FisherSnedecor, StudentsT};
 
+use super::doubts::doubts;
 use super::joint::JointReference;
 use super::pool::{Hyperparameters, QuantitySamples};
 use super::threshold::threshold;
-use crate::hierarchy::interval;
+use crate::hierarchy::{interval, Serial};
 use crate::process::reference::ReferenceProcess;
 use crate::quantity::{OutOfRange, Probability};
 use crate::stats;
@@ -56,6 +57,12 @@ pub struct ChartReference {
     pub degrees_of_freedom: usize,
     /// Standard deviation τ of the batch means beyond what the scatter within batches explains; 0 unless it is significant.
     pub between_batches_std: f64,
+    /// Number of independent measurements that these are worth for the mean; `null` in references of versions that did not estimate it.
+    #[serde(default)]
+    pub effective_measurements: Option<f64>,
+    /// How successive measurements of a batch are correlated; `null` where they count as independent.
+    #[serde(default)]
+    pub serial: Option<Serial>,
 }
 
 /// The undamaged reference of a structure, which batches are compared with; a version never changes.
@@ -123,6 +130,26 @@ pub enum Error {
         /// Fewest allowed.
         least: usize,
     },
+    /// Measurements that are worth too few independent ones.
+    #[error(
+        "{measurements} measurements that are worth only {effective:.1} independent ones, because successive measurements of {quantity} \
+         are correlated ({correlation:.2}): an undamaged reference needs at least {least} independent ones. Declare batches of further \
+         days, or measurements that are further apart in time{seen}"
+    )]
+    TooDependent {
+        /// Measurements given.
+        measurements: usize,
+        /// Independent measurements that they are worth.
+        effective: f64,
+        /// The quantity with the fewest.
+        quantity: String,
+        /// Correlation of its successive measurements.
+        correlation: f64,
+        /// Fewest allowed.
+        least: usize,
+        /// What else is suspicious about the measurements: empty, or sentences that begin with a full stop.
+        seen: String,
+    },
     /// A threshold probability outside (0, 0.5].
     #[error("threshold probability {0} must be above 0 and at most 0.5")]
     ThresholdProbability(f64),
@@ -134,18 +161,18 @@ pub enum Error {
 /// Fewest measurements of an undamaged reference: with 10, the standard error of the standard deviation is 24 %.
 pub const MINIMUM_MEASUREMENTS: usize = 10;
 
-/// Significance level at which the data of an undamaged reference raise a doubt.
-const CONTAMINATION_LEVEL: f64 = 0.001;
+/// Significance level at which the data of an undamaged reference raise a doubt, for each of two tests over all quantities together.
+const CONTAMINATION_LEVEL: f64 = 0.002;
 
 /// Significance level at which the scatter between batches enters the charts.
 const BETWEEN_LEVEL: f64 = 0.01;
 
 impl UndamagedReference {
-    /// Computes the undamaged reference from the samples of several batches, pooled batch after batch; `sizes` are the numbers of
-    /// measurements of the batches, `probability` is the threshold probability p. The version is 0 until the reference is stored.
+    /// Computes the undamaged reference from the samples of several batches, pooled batch after batch, each in the order of time; `sizes`
+    /// are the numbers of measurements of the batches, `probability` is the threshold probability p. The version is 0 until the reference is stored.
     ///
     /// # Errors
-    /// [`Error`] for too few measurements or a threshold probability outside (0, 0.5].
+    /// [`Error`] for too few measurements, for measurements worth too few independent ones, or a threshold probability outside (0, 0.5].
     pub fn from_samples(samples: &[QuantitySamples], sizes: &[usize], probability: f64) -> Result<Self, Error> {
         if !(probability > 0.0 && probability <= 0.5) {
             return Err(Error::ThresholdProbability(probability));
@@ -156,7 +183,22 @@ impl UndamagedReference {
         if measurements < MINIMUM_MEASUREMENTS {
             return Err(too_few);
         }
-        let mut doubts = Vec::new();
+        let judged = samples.iter().filter(|sample| sample.is_judged()).count();
+        let contamination = CONTAMINATION_LEVEL / judged.max(1) as f64;
+        let mut doubts = doubts(samples, sizes);
+        for sample in samples.iter().filter(|sample| sample.is_judged()) {
+            let effective = sample.effective(sizes).of_mean;
+            if let Some(serial) = sample.serial.filter(|_| effective < MINIMUM_MEASUREMENTS as f64) {
+                return Err(Error::TooDependent {
+                    measurements,
+                    effective,
+                    quantity: sample.name.clone(),
+                    correlation: serial.correlation * serial.share,
+                    least: MINIMUM_MEASUREMENTS,
+                    seen: doubts.iter().map(|doubt| format!(". {doubt}")).collect(),
+                });
+            }
+        }
         let mut quantity = |sample: &QuantitySamples| {
             let pooled = Hyperparameters::from_pool(&sample.pool, sample.draws);
             let population = &sample.population;
@@ -167,7 +209,7 @@ impl UndamagedReference {
                 .zip(&population.std_draws)
                 .filter_map(|(m, s)| threshold(*m, *s, sample.damage, level))
                 .collect();
-            let (reference, doubt) = ChartReference::new(sample, sizes);
+            let (reference, doubt) = ChartReference::new(sample, sizes, contamination);
             doubts.extend(doubt.map(|doubt| format!("{}: {doubt}", sample.name)));
             Some(UndamagedQuantity {
                 name: sample.name.clone(),
@@ -197,20 +239,34 @@ impl UndamagedReference {
     }
 }
 
+impl UndamagedReference {
+    /// Number of independent measurements that its measurements are worth, the smallest of its quantities; `None` in references of
+    /// versions that did not estimate it.
+    pub fn effective_measurements(&self) -> Option<f64> {
+        let all: Option<Vec<f64>> = self.quantities.iter().map(|q| q.reference.effective_measurements).collect();
+        all?.into_iter().reduce(f64::min)
+    }
+}
+
 impl ChartReference {
+    /// Number of independent measurements that its measurements are worth for the mean.
+    pub fn independent(&self) -> f64 {
+        self.effective_measurements.unwrap_or(self.measurements as f64)
+    }
+
     /// The reference of the alarm charts, and a doubt about its data if there is one.
     ///
-    /// If the batches differ (p < 0.01), the scatter between them enters the charts. If they differ strongly (p < 0.001), or if one
+    /// If the batches differ (p < 0.01), the scatter between them enters the charts. If they differ strongly (p < `level`), or if one
     /// measurement lies far from the others, a doubt warns that the reference may contain more than random scatter.
-    fn new(sample: &QuantitySamples, sizes: &[usize]) -> (Self, Option<String>) {
-        let means: Vec<f64> = sample.pool.chunks(sample.draws).map(stats::mean).collect();
-        let analysis = Scatter::of(&means, sizes);
-        let doubt = analysis.contamination.clone().or_else(|| outlier(&means));
+    fn new(sample: &QuantitySamples, sizes: &[usize], level: f64) -> (Self, Option<String>) {
+        let means = sample.means();
+        let analysis = Scatter::of(&means, sizes, sample.serial, level);
+        let doubt = analysis.contamination.clone().or_else(|| outlier(&means, level));
         let within = Hyperparameters::from_pool(&sample.pool, sample.draws).within;
         let (count, batches) = (means.len(), analysis.batches);
         let degrees_of_freedom = match (analysis.between_batches_std > 0.0, count > batches) {
             (true, _) => batches - 1,
-            (false, true) => count - batches,
+            (false, true) => analysis.degrees_within,
             (false, false) => count - 1,
         };
         let reference = Self {
@@ -221,6 +277,8 @@ impl ChartReference {
             batches,
             degrees_of_freedom,
             between_batches_std: analysis.between_batches_std,
+            effective_measurements: Some(sample.effective(sizes).of_mean),
+            serial: sample.serial,
         };
         (reference, doubt)
     }
@@ -231,6 +289,8 @@ struct Scatter {
     batches: usize,
     /// Variance within batches, unit².
     within_batches: f64,
+    /// Degrees of freedom of that variance.
+    degrees_within: usize,
     /// Standard deviation between batches, 0 unless significant.
     between_batches_std: f64,
     contamination: Option<String>,
@@ -238,9 +298,13 @@ struct Scatter {
 
 impl Scatter {
     /// ```text
-    ///  F = variance of the batch means · n̄ / variance within batches ~ F(B − 1, N − B)   for batches of one population
+    ///  F = variance of the batch means · n̄ / (variance within batches · τ) ~ F(B − 1, ν)   for batches of one population
+    ///  variance within batches = Σ_b SS_b/Σ_b (n_b − τ_b),    τ = Σ_b n_b τ_b/N,    ν = N_e − B
     /// ```
-    fn of(means: &[f64], sizes: &[usize]) -> Self {
+    ///
+    /// For independent measurements τ_b = 1 and N_e = N. Correlated ones scatter less about the mean of their batch than about that of
+    /// the population, and the mean of a batch is less precise: only what this does not explain is scatter between batches.
+    fn of(means: &[f64], sizes: &[usize], serial: Option<Serial>, level: f64) -> Self {
         let mut start = 0;
         let mut batches = Vec::new();
         for &size in sizes.iter().filter(|size| **size > 0) {
@@ -249,20 +313,34 @@ impl Scatter {
         }
         let mean = stats::mean(means);
         let (b, n) = (batches.len() as f64, means.len() as f64);
+        let tau = |size: usize| serial.map_or(1.0, |serial| serial.inefficiency(size));
+        let free: f64 = batches.iter().map(|x| x.len() as f64 - tau(x.len())).sum();
         // Batches with one measurement each have no spread within.
         let within_batches =
-            if n > b { batches.iter().map(|x| squares(x)).sum::<f64>() / (n - b) } else { squares(means) / (n - 1.0) };
+            if n > b { batches.iter().map(|x| squares(x)).sum::<f64>() / free } else { squares(means) / (n - 1.0) };
+        let degrees_within = match serial {
+            Some(serial) if n > b => ((serial.effective(sizes).of_spread - b) as usize).max(1),
+            _ => (means.len() - batches.len()).max(1),
+        };
+        let mean_tau = batches.iter().map(|x| x.len() as f64 * tau(x.len())).sum::<f64>() / n;
         // Equivalent size of unequal batches in the variance between them.
         let size = (n - batches.iter().map(|x| (x.len() as f64).powi(2)).sum::<f64>() / n) / (b - 1.0);
-        let mut found = Self { batches: batches.len(), within_batches, between_batches_std: 0.0, contamination: None };
+        let mut found = Self {
+            batches: batches.len(),
+            within_batches,
+            degrees_within,
+            between_batches_std: 0.0,
+            contamination: None,
+        };
         if batches.len() >= 2 && n > b && within_batches > 0.0 {
             let between: f64 = batches.iter().map(|x| x.len() as f64 * (stats::mean(x) - mean).powi(2)).sum();
-            let f = between / (b - 1.0) / within_batches;
-            let p = FisherSnedecor::new(b - 1.0, n - b).map_or(1.0, |distribution| distribution.sf(f));
+            let of_means = within_batches * mean_tau;
+            let f = between / (b - 1.0) / of_means;
+            let p = FisherSnedecor::new(b - 1.0, degrees_within as f64).map_or(1.0, |distribution| distribution.sf(f));
             if p < BETWEEN_LEVEL {
-                found.between_batches_std = ((between / (b - 1.0) - within_batches) / size).max(0.0).sqrt();
+                found.between_batches_std = ((between / (b - 1.0) - of_means) / size).max(0.0).sqrt();
             }
-            if p < CONTAMINATION_LEVEL {
+            if p < level {
                 found.contamination = Some(format!(
                     "its batches differ by more than their scatter ({}): damage, weather or a changed set-up may be the cause",
                     stats::p_value_text(p)
@@ -274,7 +352,7 @@ impl Scatter {
 }
 
 /// A doubt when one value lies far from the others, by Grubbs' test in its t approximation, two-sided.
-fn outlier(means: &[f64]) -> Option<String> {
+fn outlier(means: &[f64], level: f64) -> Option<String> {
     let n = means.len() as f64;
     let (mean, total) = (stats::mean(means), squares(means) / (n - 1.0));
     if total <= 0.0 {
@@ -283,7 +361,7 @@ fn outlier(means: &[f64]) -> Option<String> {
     let largest = means.iter().map(|x| (x - mean).abs()).fold(0.0, f64::max) / total.sqrt();
     let t2 = n * (n - 2.0) * largest.powi(2) / ((n - 1.0).powi(2) - n * largest.powi(2));
     let p = if t2 > 0.0 { StudentsT::new(0.0, 1.0, n - 2.0).map_or(1.0, |t| 2.0 * n * t.sf(t2.sqrt())) } else { 0.0 };
-    (p < CONTAMINATION_LEVEL).then(|| {
+    (p < level).then(|| {
         format!("one measurement lies {largest:.1} standard deviations from the others ({})", stats::p_value_text(p))
     })
 }

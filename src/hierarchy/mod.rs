@@ -61,6 +61,7 @@ mod population;
 mod populations;
 mod problem;
 mod proposal;
+mod serial;
 mod small;
 #[cfg(test)]
 mod tests;
@@ -71,3 +72,4 @@ pub use estimate::{estimate, populations, populations_of_each};
 pub use population::{interval, PopulationEstimate, DRAWS, INTERVAL};
 pub use populations::Populations;
 pub use proposal::proposals;
+pub use serial::{Effective, Serial};

@@ -104,6 +104,10 @@ pub struct AssessmentBody {
     measurements_used: usize,
     measurements_left_out: usize,
     measurements_outside: usize,
+    /// Number of independent measurements that those used are worth for the mean, the smallest of all parameters: fewer where successive
+    /// measurements are correlated. `null` in assessments of earlier versions of the program.
+    #[schema(required)]
+    effective_measurements: Option<f64>,
     effective_sample_size: f64,
     misfit_percent: Vec<Option<f64>>,
     assessed_at: Timestamp,
@@ -213,6 +217,7 @@ impl From<Assessment> for AssessmentBody {
             measurements_used: a.measurements_used,
             measurements_left_out: a.measurements_left_out,
             measurements_outside: a.measurements_outside,
+            effective_measurements: a.trust.effective_measurements,
             effective_sample_size: a.effective_sample_size,
             misfit_percent: a.misfit_percent,
             assessed_at: a.assessed_at,
@@ -382,6 +387,10 @@ pub struct Undamaged {
     model_digest: String,
     threshold_probability: f64,
     measurement_count: usize,
+    /// Number of independent measurements that these are worth, the smallest of all parameters; `null` in references of earlier versions
+    /// of the program.
+    #[schema(required)]
+    effective_measurements: Option<f64>,
     batches: Vec<String>,
     /// Ranges of the covariates in its batches.
     conditions: std::collections::BTreeMap<String, crate::damage::SeenCovariate>,
@@ -453,6 +462,7 @@ impl Undamaged {
             model_digest: record.model_digest.to_string(),
             threshold_probability: record.state.threshold_probability,
             measurement_count: record.state.measurements,
+            effective_measurements: record.state.effective_measurements(),
             batches: record.batches.clone(),
             conditions: record.state.conditions.clone(),
             doubts: record.state.doubts.clone(),

@@ -33,7 +33,7 @@ const DEPRECATION: (HeaderName, &str) = (HeaderName::from_static("deprecation"),
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 struct ReferenceInput {
-    /// Ids of the batches; together they must hold at least ten measurements.
+    /// Ids of the batches; together they must hold at least ten independent measurements.
     #[schema(min_items = 1)]
     batches: Option<Vec<String>>,
     /// Begin of a period: all batches that were measured completely from `from` on and before `to`.
@@ -169,7 +169,8 @@ struct Declared {
                    Batches that were never compared with a reference, and all batches measured after those of the reference, are \
                    then compared with it. Batches that cannot be used as a reference are refused with the code \
                    `unusable_baseline`, which has kept the earlier name, and `errors` names each of them; with \
-                   `leave_out_doubtful` they are left out and listed in the answer. From a period they are left out, and also \
+                   `leave_out_doubtful` they are left out and listed in the answer. The same code refuses measurements that are worth \
+                   fewer than ten independent ones. From a period they are left out, and also \
                    batches that were measured only in part in the period or during maintenance, and those without an assessment.",
     params(StructurePath),
     request_body(content = ReferenceInput, examples(

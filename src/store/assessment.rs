@@ -462,6 +462,7 @@ fn quantity_assessment(row: QuantityAssessmentRow) -> Result<QuantityAssessment,
         },
         prior_bound_mass: row.edge_mass,
         group: row.group_name,
+        effective_measurements: None,
         damage,
     })
 }

@@ -64,6 +64,7 @@ pub(super) fn assessment(model: &str, undamaged_version: Option<u32>, assessed_a
         pooled: Hyperparameters { mean: 3.61, std: None, within: 0.01, between: None },
         group: None,
         prior_bound_mass: 0.0,
+        effective_measurements: None,
         damage: undamaged_version.map(|_| damage.clone()),
     };
     Assessment {

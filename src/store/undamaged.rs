@@ -410,6 +410,8 @@ pub(super) fn quantity(row: ReferenceQuantityRow, measurements: usize) -> Result
             batches: 1,
             degrees_of_freedom: measurements.saturating_sub(1),
             between_batches_std: 0.0,
+            effective_measurements: None,
+            serial: None,
         };
         return Ok(UndamagedQuantity {
             name: row.quantity,

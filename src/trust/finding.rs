@@ -34,6 +34,12 @@ pub enum FindingCode {
     NoScatter,
     /// A measurement repeats an earlier one to the last digit.
     StaleRepeat,
+    /// Measurements that differ by far less than noise and scatter let independent ones differ: they are counted once.
+    NearCopies,
+    /// Successive measurements are correlated, so that they are worth fewer independent ones.
+    CorrelatedMeasurements,
+    /// The stated noise is far larger than the scatter of the frequencies.
+    NoiseOverstated,
     /// Frequencies are rounded to steps larger than their scatter.
     Quantised,
     /// Single measurements lie far from the others, or far from anything that the simulation gives; they are left out.

@@ -106,6 +106,20 @@ fn sort_modes(kept: &mut Vec<(usize, ModalMeasurement)>, findings: &mut Vec<Find
     }
 }
 
+/// Whether sorted values lie on a grid: the differences of neighbours are multiples of the smallest one or of a half, a third or a quarter
+/// of it, to a thousandth. Copies of a few measurements take few values too, but at arbitrary distances.
+fn on_grid(sorted: &[f64], smallest: f64) -> bool {
+    let fits = |parts: u8| {
+        let step = smallest / f64::from(parts);
+        let off = |pair: &[f64]| {
+            let steps = (pair[1] - pair[0]) / step;
+            (steps - steps.round()).abs() < 1e-3 + 1e-12 * pair[1].abs() / step
+        };
+        sorted.windows(2).all(off)
+    };
+    (1..=4).any(fits)
+}
+
 /// True when every mode that varies is rounded to coarse steps; each such mode is reported.
 fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) -> bool {
     let modes = kept.first().map_or(0, |(_, m)| m.frequencies_hz.len());
@@ -120,11 +134,11 @@ fn quantised(kept: &[(usize, ModalMeasurement)], findings: &mut Vec<Finding>) ->
             continue;
         }
         scattered += 1;
-        if values.len() as f64 > FEW_DISTINCT * count as f64 {
+        let step = values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
+        if values.len() as f64 > FEW_DISTINCT * count as f64 || !on_grid(&values, step) {
             continue;
         }
         coarse += 1;
-        let step = values.windows(2).map(|pair| pair[1] - pair[0]).fold(f64::INFINITY, f64::min);
         parts.push(format!(
             "mode {} takes {} values in {count} measurements, {step:.3e} Hz apart",
             mode + 1,

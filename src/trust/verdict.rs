@@ -28,6 +28,10 @@ pub struct Trust {
     pub distance: Option<f64>,
     /// Number of modes minus free parameters, summed over all measurements.
     pub degrees_of_freedom: usize,
+    /// Number of independent measurements that those of the batch are worth for the mean, the smallest of all parameters; `None` in
+    /// assessments of versions that did not estimate it.
+    #[serde(default)]
+    pub effective_measurements: Option<f64>,
     /// The findings, those with the strongest effect first.
     pub findings: Vec<Finding>,
 }
@@ -42,6 +46,7 @@ impl Trust {
             p_value: fit.p_value,
             distance: fit.distance,
             degrees_of_freedom: fit.degrees_of_freedom,
+            effective_measurements: None,
             findings,
         }
     }
@@ -49,7 +54,8 @@ impl Trust {
     /// The trust of an assessment that was stored by a version of the program without this check: accepted, without findings.
     pub fn unknown() -> Self {
         let verdict = TrustVerdict::Accepted;
-        Self { verdict, p_value: None, distance: None, degrees_of_freedom: 0, findings: Vec::new() }
+        let (p_value, distance, effective_measurements) = (None, None, None);
+        Self { verdict, p_value, distance, degrees_of_freedom: 0, effective_measurements, findings: Vec::new() }
     }
 
     /// True unless the batch is rejected.

@@ -233,10 +233,10 @@ pub fn three_dof_hz(k: [f64; 3]) -> [f64; 3] {
 }
 
 /// `count` measurements of `three-dof` ten minutes apart from `start_s` (seconds after 2026-01-01), with stiffnesses
-/// spread evenly by ±2 % about `k`.
+/// spread evenly by ±2 % about `k`, and without a correlation of successive measurements: 3.883 is the golden section of a turn.
 pub fn measurements(k: [f64; 3], count: usize, start_s: usize) -> Vec<Value> {
     let one = |i: usize| {
-        let wave = |phase: usize| 1.0 + 0.02 * ((i * 7 + phase * 3) as f64).sin();
+        let wave = |phase: usize| 1.0 + 0.02 * (3.883 * i as f64 + 3.0 * phase as f64).sin();
         let f = three_dof_hz([k[0] * wave(0), k[1] * wave(1), k[2] * wave(2)]);
         json!({ "measured_at": time(start_s + 600 * i), "frequencies_hz": f })
     };

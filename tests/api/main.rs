@@ -8,6 +8,7 @@ mod bad_input;
 mod batches;
 mod bulk;
 mod condition_report;
+mod dependence;
 mod diagnosis;
 mod docs;
 mod export;

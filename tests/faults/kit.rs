@@ -24,7 +24,7 @@ fn bank() -> &'static [Vec<f64>] {
     static BANK: OnceLock<Vec<Vec<f64>>> = OnceLock::new();
     BANK.get_or_init(|| {
         let simulator = modalwatch::baseline::library::find_structure(STRUCTURE).unwrap();
-        let wave = |i: usize, phase: usize| 1.0 + 0.02 * ((i * 7 + phase * 3) as f64).sin();
+        let wave = |i: usize, phase: usize| 1.0 + 0.02 * (3.883 * i as f64 + 3.0 * phase as f64).sin();
         let one = |i| simulator.frequencies_hz(&[4.0 * wave(i, 0), 5.0 * wave(i, 1), 6.0 * wave(i, 2)]).unwrap();
         (0..32).map(one).collect()
     })

@@ -84,10 +84,12 @@ impl Operation {
                 batches: 1,
                 degrees_of_freedom: baseline - 1,
                 between_batches_std: 0.0,
+                effective_measurements: None,
+                serial: None,
             }
         };
         let references: Vec<ChartReference> = (0..charts).map(reference).collect();
-        let error = standard_error(&references[0], references[0].within, size);
+        let error = standard_error(&references[0], references[0].within, size as f64);
         let shared = references[0].std.powi(2) / baseline as f64 / error.powi(2);
         let situation = Situation { shared, degrees_of_freedom: baseline - 1, charts };
         let limits = *known.get_or_insert_with(|| limits(situation, &settings));
@@ -100,7 +102,7 @@ impl Operation {
         let mut alarm = false;
         for (k, (reference, series)) in self.references.iter().zip(&mut self.series).enumerate() {
             let (mean, _, within) = bank.batch(size, k, &rows);
-            let z = shift(reference, DamageDirection::Decrease, mean, within, size).unwrap();
+            let z = shift(reference, DamageDirection::Decrease, mean, within, size as f64).unwrap();
             alarm |= series.take(&ChartPoint::damage(z, &self.limits, false)).state == State::Alarming;
         }
         alarm

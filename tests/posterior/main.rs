@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod alarms;
+mod dependence;
 mod exact;
 mod identifiability;
 mod population;

@@ -164,8 +164,15 @@ fn tiny_batches_and_equal_measurements_stay_finite() {
 fn an_undamaged_reference_with_damage_in_it_is_doubted_and_one_too_small_refused() {
     let baseline = shipped("three-dof");
     let healthy = batch(&baseline, &TABLE_2, 30, 1.0, 1);
-    let later = batch(&baseline, &TABLE_2, 30, 1.0, 2);
-    let damaged = batch(&baseline, &[(4.0, 0.3), (4.6, 0.1), (6.0, 0.2)], 30, 1.0, 3);
+    let two_days_later = |mut batch: Vec<ModalMeasurement>| {
+        for measurement in &mut batch {
+            measurement.measured_at =
+                Timestamp::from_micros(measurement.measured_at.micros() + 2 * 86_400_000_000).unwrap();
+        }
+        batch
+    };
+    let later = two_days_later(batch(&baseline, &TABLE_2, 30, 1.0, 2));
+    let damaged = two_days_later(batch(&baseline, &[(4.0, 0.3), (4.6, 0.1), (6.0, 0.2)], 30, 1.0, 3));
     let state = |parts: [&[ModalMeasurement]; 2]| {
         assessment::undamaged_reference(&baseline, &parts.map(|part| (part, DRAWS)), 0.05, 1_000.0).unwrap()
     };

@@ -102,6 +102,7 @@ fn assessment(model: &str, undamaged_version: Option<u32>, assessed_at: Timestam
         pooled: Hyperparameters { mean: 3.61, std: Some(0.31), within: 0.01, between: Some(0.08) },
         prior_bound_mass: 0.02,
         group: Some("group:k1+k2".to_owned()),
+        effective_measurements: None,
         damage: undamaged_version.map(|_| damage.clone()),
     };
     Assessment {
@@ -264,6 +265,8 @@ fn undamaged() -> modalwatch::damage::UndamagedReference {
                 batches: 2,
                 degrees_of_freedom: 18,
                 between_batches_std: 0.0,
+                effective_measurements: None,
+                serial: None,
             },
             mean_draws: vec![3.9, 4.1],
             std_draws: vec![0.28, 0.33],

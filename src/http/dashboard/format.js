@@ -121,6 +121,13 @@ export function percentWithin(probability, low, high) {
   return interval ? `${percent(probability)} (${percent(low)} to ${percent(high)})` : percent(probability);
 }
 
+/** What a number of measurements is worth, where it is fewer: `, worth 12 independent ones`. */
+export function worth(effective, all) {
+  return Number.isFinite(effective) && effective !== null && effective < 0.995 * all
+    ? `, worth ${Number(effective.toFixed(effective < 10 ? 1 : 0))} independent ones`
+    : "";
+}
+
 /** `snake_case` as words. */
 export function words(code) {
   const text = String(code).replaceAll("_", " ");

@@ -4,7 +4,7 @@ import { at, read } from "../api.js";
 import { densities } from "../charts/density.js";
 import { modes } from "../charts/modes.js";
 import { cell, fill, h, icon, problem } from "../dom.js";
-import { count, digest, local, number, percentWithin, quantity, timeElement, words } from "../format.js";
+import { count, digest, local, number, percentWithin, quantity, timeElement, words, worth } from "../format.js";
 import { help } from "../help.js";
 import { trustChip } from "../states.js";
 import { shapes } from "./shapes.js";
@@ -120,7 +120,7 @@ function describe(info) {
     [
       "Measurements",
       a
-        ? `${info.measurement_count}, of which ${a.measurements_used} used, ${a.measurements_left_out} left out, ${a.measurements_outside} outside the prior`
+        ? `${info.measurement_count}, of which ${a.measurements_used} used, ${a.measurements_left_out} left out, ${a.measurements_outside} outside the prior${worth(a.effective_measurements, a.measurements_used)}`
         : String(info.measurement_count),
     ],
     ["Source", info.source],

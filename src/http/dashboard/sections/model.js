@@ -2,7 +2,7 @@
 
 import { at, read, send } from "../api.js";
 import { ask, cell, fieldTime, fill, h, icon, notify, throttled } from "../dom.js";
-import { count, digest, local, number, percent, quantity, zone } from "../format.js";
+import { count, digest, local, number, percent, quantity, worth, zone } from "../format.js";
 import { training } from "./training.js";
 import { help } from "../help.js";
 
@@ -194,7 +194,7 @@ function undamaged(state) {
     facts([
       ["Version", `${state.version}, declared ${local(state.created_at)}${state.extends ? `, extends version ${state.extends}` : ""}`],
       state.reason && ["Reason", state.reason],
-      ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}`],
+      ["From", `${count(state.batches.length, "batch", "batches")}, ${count(state.measurement_count, "measurement")}${worth(state.effective_measurements, state.measurement_count)}`],
       ["Damage threshold δ", `below it are ${percent(state.threshold_probability)} of the healthy values`],
       conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
       state.process?.coverage && ["Months seen", state.process.coverage.months.map(monthName).join(", ")],
