@@ -7,6 +7,7 @@ mod dependence;
 mod exact;
 mod identifiability;
 mod population;
+mod priors;
 mod trust;
 
 use std::sync::Arc;
