@@ -20,7 +20,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use super::error::InferenceError;
-use super::local::Target;
+use super::local::{Target, STARTS};
 use super::model::Baseline;
 use super::observation::Observation;
 use super::proposal::Proposal;
@@ -119,16 +119,15 @@ impl Baseline {
         draws: usize,
         needed: f64,
     ) -> (Option<Found>, usize) {
-        let found = search.resampled(draws);
-        match found {
-            Some(Found { theta, complete: false }) => {
-                let target = Target::new(&self.simulator, self.space(), observation);
-                let local = target.sample(&theta, draws, needed, &mut search.stream);
-                let complete = local.theta.is_some();
-                (Some(Found { theta: local.theta.unwrap_or(theta), complete }), local.simulations)
-            }
-            found => (found, 0),
+        if matches!(search.state, State::Enough(_)) {
+            return (search.resampled(draws), 0);
         }
+        // They are in random order, so that the first ones are a sample as well.
+        let Some(Found { theta: starts, .. }) = search.resampled(draws.max(STARTS)) else { return (None, 0) };
+        let local = Target::new(&self.simulator, observation).sample(&starts, draws, needed, &mut search.stream);
+        let complete = local.theta.is_some();
+        let theta = local.theta.unwrap_or_else(|| starts.rows(0, draws).into_owned());
+        (Some(Found { theta, complete }), local.simulations)
     }
 
     /// A search that begins with the draws of the flow; for noise beyond the training, for which these are too narrow, with draws that

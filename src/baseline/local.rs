@@ -6,14 +6,14 @@
 //! in the others:
 //!
 //! ```text
-//!  u: position in the prior, in the unit box;    r_i(u) = (y_i − f_i(u))/s_i,    A = Jᵀ J,  J = −∂r/∂u
+//!  u: position between the bounds of the prior, in the unit box;    r_i(u) = (y_i − f_i(u))/s_i,    A = Jᵀ J,  J = −∂r/∂u
 //!  u ← u + (A + τ⁻² I)⁻¹ Jᵀ r                    Gauss–Newton steps onto the set; they do not move along it
 //!  A = Σ_j λ_j v_j v_jᵀ,    C = Σ_j c_j v_j v_jᵀ,    c_j = 1/λ_j where λ_j > τ⁻², otherwise 1/(λ_j + b⁻²)
-//!  q(u) = 1/N Σ_n t_ν(u; u_n, C_n),              w(u) = p(y | u)/q(u) inside the unit box, 0 outside
+//!  q(u) = 1/N Σ_n t_ν(u; u_n, C_n),              w(u) = p(y | u) p(u)/q(u) inside the unit box, 0 outside
 //! ```
 //!
-//! b is the distance to the fourth nearest point. The prior is uniform in the unit box. Stage by stage, the points are drawn from the
-//! weighted draws of the stage before, and become more.
+//! b is the distance to the fourth nearest point. Stage by stage, the points are drawn from the weighted draws of the stage before, and
+//! become more.
 //!
 //! Source: R. Douc, A. Guillin, J.-M. Marin, C. P. Robert (2007), Convergence of adaptive mixtures of importance sampling schemes, Annals of
 //! Statistics 35, 420–448; the local normal approximations are ours.
@@ -22,13 +22,14 @@ use nalgebra::{Cholesky, DMatrix, DVector, SymmetricEigen};
 
 use super::observation::Observation;
 use super::proposal::Proposal;
-use super::resample::log_likelihoods;
+use super::resample::log_posteriors;
 use crate::parameter::{Parameter, ParameterSpace};
 use crate::simulator::Simulator;
 use crate::stats::{self, Stream};
 
-/// Points of each stage.
-const POINTS: [usize; 3] = [96, 160, 256];
+/// Starting points of the first stage, and points of the others.
+pub(super) const STARTS: usize = 96;
+const POINTS: [usize; 2] = [160, 256];
 
 /// Draws of each stage for each draw that is needed, and the fewest.
 const DRAWS: [f64; 3] = [4.0, 6.0, 8.0];
@@ -49,9 +50,6 @@ const NEIGHBOUR: usize = 4;
 
 /// Factor of the standard deviations in determined directions: a proposal that is a little wide keeps the weights bounded.
 const WIDENED: f64 = 1.1;
-
-/// Half of the difference of positions over which the slope of the prior's scale is taken.
-const HALF_DIFFERENCE: f64 = 1e-6;
 
 /// Smallest distance of a point from the bounds of the unit box.
 const MARGIN: f64 = 1e-6;
@@ -85,8 +83,8 @@ struct Point {
 }
 
 impl<'a> Target<'a> {
-    pub(super) fn new(simulator: &'a Simulator, space: &'a ParameterSpace, observation: &'a Observation) -> Self {
-        Self { simulator, under_effects: observation.simulator(simulator), space, observation }
+    pub(super) fn new(simulator: &'a Simulator, observation: &'a Observation) -> Self {
+        Self { simulator, under_effects: observation.simulator(simulator), space: simulator.space(), observation }
     }
 
     /// `draws` samples from starting points `starts` (`[n, d]`, parameter units) near the posterior, if at least `needed` draws are
@@ -94,16 +92,16 @@ impl<'a> Target<'a> {
     pub(super) fn sample(&self, starts: &DMatrix<f64>, draws: usize, needed: f64, stream: &mut Stream) -> Found {
         let mut simulations = 0;
         let mut starts = starts.clone();
-        for (stage, count) in POINTS.into_iter().enumerate() {
+        for (stage, per_needed) in DRAWS.into_iter().enumerate() {
             let points = self.points(&starts, &mut simulations);
             let proposals = proposals(&points);
             if proposals.is_empty() {
                 break;
             }
-            let many = FEWEST_DRAWS.max((DRAWS[stage] * needed) as usize);
+            let many = FEWEST_DRAWS.max((per_needed * needed) as usize);
             let (units, log_q) = draw(&proposals, many, stream);
             let theta = self.to_parameters(&units);
-            let logs = self.log_likelihoods(&theta);
+            let logs = log_posteriors(self.simulator, std::slice::from_ref(self.observation), &theta);
             simulations += many;
             let inside = |row: usize| units.row(row).iter().all(|u| (0.0..1.0).contains(u));
             let log_weights: Vec<f64> = (0..many)
@@ -116,6 +114,7 @@ impl<'a> Target<'a> {
                 let theta = DMatrix::from_fn(draws, self.space.len(), |row, column| theta[(chosen[row], column)]);
                 return Found { theta: Some(theta), simulations };
             }
+            let Some(count) = POINTS.get(stage).copied() else { break };
             let Some(weights) = stats::tempered_weights(&log_weights, count as f64) else { break };
             let chosen = stats::systematic(&weights, count, stream);
             starts = DMatrix::from_fn(count, self.space.len(), |row, column| theta[(chosen[row], column)]);
@@ -162,11 +161,7 @@ impl<'a> Target<'a> {
     /// Residuals r, `[modes present]`, and J = −∂r/∂u, `[modes present, d]`; `None` where the simulation fails.
     fn linearised(&self, at: &DVector<f64>) -> Option<(DVector<f64>, DMatrix<f64>)> {
         let theta: Vec<f64> = self.space.iter().zip(at.iter()).map(|(parameter, u)| parameter.from_unit(*u)).collect();
-        let slope = |(parameter, u): (&Parameter, &f64)| {
-            let (low, high) = ((u - HALF_DIFFERENCE).max(0.0), (u + HALF_DIFFERENCE).min(1.0));
-            (parameter.from_unit(high) - parameter.from_unit(low)) / (high - low)
-        };
-        let scales: Vec<f64> = self.space.iter().zip(at.iter()).map(slope).collect();
+        let scales: Vec<f64> = self.space.iter().map(|parameter| parameter.upper - parameter.lower).collect();
         let (frequencies_hz, jacobian) = self.under_effects.frequencies_and_jacobian(&theta).ok()?;
         let present: Vec<(usize, f64)> =
             self.observation.frequencies_hz.iter().enumerate().filter_map(|(mode, f)| f.map(|f| (mode, f))).collect();
@@ -187,10 +182,6 @@ impl<'a> Target<'a> {
         let value =
             |row: usize, column: usize| self.space.as_slice()[column].from_unit(units[(row, column)].clamp(0.0, 1.0));
         DMatrix::from_fn(units.nrows(), units.ncols(), value)
-    }
-
-    fn log_likelihoods(&self, theta: &DMatrix<f64>) -> Vec<f64> {
-        log_likelihoods(self.simulator, std::slice::from_ref(self.observation), theta)
     }
 }
 
@@ -292,7 +283,7 @@ mod tests {
             ..Observation::complete(&exact_hz)
         };
         let (mean, std) = exact_moments(&simulator, exact_hz[0]);
-        let target = Target::new(&simulator, &space, &observation);
+        let target = Target::new(&simulator, &observation);
         let (repeats, draws) = (20, 100);
         let (mut values, mut worst) = (Vec::new(), 0.0_f64);
         for seed in 0..repeats {
