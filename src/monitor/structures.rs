@@ -167,7 +167,7 @@ impl ActiveStructures {
         if self.refused.contains_key(id) || self.read().get(id).is_some_and(in_use) {
             return Ok(());
         }
-        let simulator = Simulator::new(StructureDefinition::parse_json(&stored.definition_json)?)?;
+        let simulator = Simulator::parse_json(&stored.definition_json)?;
         let baseline = self.baseline_for(&simulator).await?;
         self.activate(simulator, baseline);
         self.events.structure_changed(id);

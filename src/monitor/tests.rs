@@ -256,7 +256,8 @@ async fn a_definition_that_was_stored_although_the_call_failed_is_used_after_the
     let faults = Faults::arm();
     let monitor = open(folder.path()).await;
     let active = monitor.structure(&structure()).unwrap();
-    let other = || StructureDefinition { id: "other".to_owned(), ..active.simulator.definition().clone() };
+    let definition = StructureDefinition { id: "other".to_owned(), ..active.simulator.definition().clone() };
+    let other = || Simulator::new(definition.clone()).unwrap();
     let id = StructureId::parse("other").unwrap();
     faults.set("store::committed", "1*return");
     assert!(monitor.structures().put(other()).await.is_err());
