@@ -17,7 +17,7 @@ const MOST_DETAILS: usize = 64;
 const MOST_CHECKS: usize = 16;
 
 /// How much further from the processor the threads are than those of new batches (`nice`).
-const NICE: i32 = 10;
+const NICE: i32 = 5;
 
 /// The threads. Without them, for want of memory, the common ones are used.
 static POOL: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {

@@ -108,7 +108,7 @@ async fn the_largest_definitions_need_the_memory_of_one_and_the_next_start_answe
 async fn a_definition_whose_client_leaves_is_not_stored() {
     let target = Target::start(&[]);
     for number in 0..2 {
-        let gone = put(&target, &format!("gone-{number}"), 1_200).timeout(Duration::from_millis(150)).send().await;
+        let gone = put(&target, &format!("gone-{number}"), 2_000).timeout(Duration::from_millis(150)).send().await;
         assert!(gone.is_err(), "the client should have left before the answer: {gone:?}");
     }
     let stays = put(&target, "stays", 10).send().await.unwrap();
