@@ -55,6 +55,10 @@ impl ProcessQuantities {
     /// Where the simulation fits the batch less well than its noise explains, the errors are larger than the draws show: their
     /// covariance is multiplied by the larger `misfit`, that of the single measurements or that of their mean, if it is above 1.
     ///
+    /// The draws are those of independent measurements, also where successive ones are correlated. The mean of a batch is an estimate of
+    /// the state of its time, with the error of its measurements; how slowly the state moves, within a batch as well as from one to the
+    /// next, is what the process describes. Widening the error by the effective number of measurements would count that movement twice.
+    ///
     /// Source: R. T. Birge (1932), The calculation of errors by the method of least squares, Physical Review 40, 207–227.
     pub fn estimate(
         &self,
