@@ -15,7 +15,7 @@ use tracing::{error, warn};
 use super::assessor::{Assessor, Computed, Finished, Settled};
 use super::error::{DeclareError, Error};
 use super::own_task::in_own_task;
-use super::patience::pause;
+use super::patience::{is_worth_another, pause};
 use super::references::{DeclaredReference, ExtensionRequest, ReferenceRequest, References};
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
@@ -52,7 +52,19 @@ impl Replay {
     /// Assesses what an earlier run left unassessed, in the background.
     pub fn resume_all(&self) {
         for structure in self.assessor.structures.ids() {
-            self.resume_later(structure);
+            let replay = self.clone();
+            tokio::spawn(async move {
+                // The models folder may have got back the trained baseline of the reference.
+                while let Err(error) = replay.references.requeue_uncompared(&structure).await {
+                    warn!(structure.id = %structure, %error, "Could not look for batches without a comparison of {structure}: {error}");
+                    let Error::Store(error) = error else { break };
+                    if !is_worth_another(&error, &replay.assessor.store) {
+                        break;
+                    }
+                    pause().await;
+                }
+                replay.resume_later(structure);
+            });
         }
     }
 
