@@ -129,7 +129,7 @@ impl Models {
         self.structures.set_library(library);
         let renewed = self.renewed(structure, &model_digest, renew).await;
         // Also if the reference could not be renewed: batches wait for this trained baseline.
-        self.replay.resume_later(structure.clone());
+        self.replay.resume_with_baseline(structure.clone());
         let (undamaged_version, reference_outdated) = renewed?;
         Ok(Reloaded {
             structure: structure.clone(),
@@ -146,7 +146,6 @@ impl Models {
     async fn renewed(&self, structure: &StructureId, used: &Digest, renew: bool) -> Result<(Option<u32>, bool), Error> {
         let newest = self.store.reference().undamaged(structure).await?;
         if newest.is_none_or(|newest| newest.model_digest == *used) {
-            self.references.requeue_uncompared(structure).await?;
             return Ok((None, false));
         }
         let version = if renew { self.references.renew(structure).await? } else { None };

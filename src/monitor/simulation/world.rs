@@ -131,17 +131,21 @@ impl Life {
         let (started, mut rest) = (Instant::now(), None);
         loop {
             tokio::time::sleep(Duration::from_micros(200)).await;
-            let (running, waiting) = (alive().saturating_sub(self.resting), self.waiting().await);
-            if running == 0 && waiting.is_empty() {
-                return Ok(());
-            }
-            rest = if running > 0 { None } else { rest.or_else(|| Some(Instant::now())) };
-            // A batch that waits although nothing runs is forgotten.
-            if rest.is_some_and(|since| since.elapsed() > FORGOTTEN) {
-                return Err(format!("the batches {waiting:?} wait, and nothing runs that would assess them"));
-            }
+            let running = alive().saturating_sub(self.resting);
             if started.elapsed() > PATIENCE {
                 return Err(format!("{running} tasks still run after {PATIENCE:?}"));
+            }
+            if running > 0 {
+                rest = None;
+                continue;
+            }
+            let waiting = self.waiting().await;
+            if waiting.is_empty() {
+                return Ok(());
+            }
+            // A batch that waits although nothing runs is forgotten.
+            if rest.get_or_insert_with(Instant::now).elapsed() > FORGOTTEN {
+                return Err(format!("the batches {waiting:?} wait, and nothing runs that would assess them"));
             }
         }
     }
