@@ -166,7 +166,9 @@ impl Replay {
             let examines = unexamined().remove(&structure);
             if examines {
                 let examined = replay.references.requeue_uncompared(&structure).await;
-                examined.inspect_err(|_| drop(unexamined().insert(structure.clone())))?;
+                examined.inspect_err(|_| {
+                    unexamined().insert(structure.clone());
+                })?;
             }
             replay.resume(&structure).await
         })
