@@ -129,9 +129,7 @@ impl Models {
         self.structures.set_library(library);
         let renewed = self.renewed(structure, &model_digest, renew).await;
         // Also if the reference could not be renewed: batches wait for this trained baseline.
-        if changed || !matches!(renewed, Ok((None, _))) {
-            self.replay.resume_later(structure.clone());
-        }
+        self.replay.resume_with_baseline(structure.clone());
         let (undamaged_version, reference_outdated) = renewed?;
         Ok(Reloaded {
             structure: structure.clone(),

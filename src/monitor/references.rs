@@ -103,6 +103,22 @@ impl References {
         }
     }
 
+    /// Marks batches to be assessed again that were assessed while another trained baseline than that of the newest reference was in use,
+    /// if its own one is in use now.
+    ///
+    /// # Errors
+    /// [`Error::Store`], after which it should be attempted again.
+    pub(super) async fn requeue_uncompared(&self, structure: &StructureId) -> Result<(), Error> {
+        let Assessor { store, structures, .. } = &*self.assessor;
+        let Ok(active) = structures.get(structure) else { return Ok(()) };
+        let Ok(baseline) = &active.baseline else { return Ok(()) };
+        let newest = store.reference().undamaged(structure).await?;
+        if let Some(newest) = newest.filter(|newest| newest.model_digest == *baseline.digest()) {
+            store.reference().requeue_uncompared(structure, newest.state.version).await?;
+        }
+        Ok(())
+    }
+
     /// Computes the newest reference of a structure again from its batches, with the trained baseline in use. Batches that cannot
     /// be trusted with this trained baseline are left out. Returns the version of the new reference; `None` if none can be made.
     ///

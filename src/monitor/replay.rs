@@ -4,7 +4,7 @@
 //! They are computed on all cores and stored in the order of their arrival. The results do not depend on the number of threads,
 //! because each batch has its own seed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -42,18 +42,27 @@ pub struct Replay {
     turns: Arc<Mutex<BTreeMap<StructureId, Arc<tokio::sync::Mutex<()>>>>>,
     /// Structures whose waiting batches are attempted repeatedly, each with whether this was requested again meanwhile.
     recovering: Arc<Mutex<BTreeMap<StructureId, bool>>>,
+    /// Structures for which batches without a comparison are looked for at the next attempt.
+    unexamined: Arc<Mutex<BTreeSet<StructureId>>>,
 }
 
 impl Replay {
     pub(super) fn new(assessor: Arc<Assessor>, references: Arc<References>) -> Self {
-        Self { assessor, references, turns: Arc::default(), recovering: Arc::default() }
+        Self { assessor, references, turns: Arc::default(), recovering: Arc::default(), unexamined: Arc::default() }
     }
 
     /// Assesses what an earlier run left unassessed, in the background.
     pub fn resume_all(&self) {
         for structure in self.assessor.structures.ids() {
-            self.resume_later(structure);
+            self.resume_with_baseline(structure);
         }
+    }
+
+    /// As [`Self::resume_later`], behind a trained baseline that was put into use: batches that were assessed while another one was in use
+    /// may now be comparable with the reference.
+    pub(super) fn resume_with_baseline(&self, structure: StructureId) {
+        self.unexamined.lock().expect("no holder of this lock panics").insert(structure.clone());
+        self.resume_later(structure);
     }
 
     /// Makes an undamaged reference from stored batches. Other batches without a comparison are compared with it afterwards, in the
@@ -153,6 +162,14 @@ impl Replay {
         in_own_task(async move {
             replay.assessor.structures.follow_stored(&structure).await?;
             replay.references.renew_if_outdated(&structure).await?;
+            let unexamined = || replay.unexamined.lock().expect("no holder of this lock panics");
+            let examines = unexamined().remove(&structure);
+            if examines {
+                let examined = replay.references.requeue_uncompared(&structure).await;
+                examined.inspect_err(|_| {
+                    unexamined().insert(structure.clone());
+                })?;
+            }
             replay.resume(&structure).await
         })
         .await

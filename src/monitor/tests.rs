@@ -64,7 +64,7 @@ async fn open(folder: &Path) -> Monitor {
 
 async fn open_with(folder: &Path, settings: MonitorSettings) -> Monitor {
     let mut opened = Store::open(folder).await;
-    for _ in 0..200 {
+    for _ in 0..1_200 {
         // Background tasks of the previous monitor may still hold the store open.
         if !matches!(opened, Err(store::Error::Locked(_))) {
             break;

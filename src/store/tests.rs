@@ -282,6 +282,27 @@ async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() 
 }
 
 #[tokio::test]
+async fn batches_assessed_under_another_baseline_are_found_when_that_of_the_reference_is_back() {
+    let (store, _folder) = open().await;
+    for id in ["b0", "b1", "b2"] {
+        store.batches().insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
+    }
+    let digest = Digest::of(&[b"m"]);
+    store.reference().insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap();
+    for (id, assessment) in [
+        ("b0", assessment("other", None, at(2))),
+        ("b1", assessment("m", Some(1), at(2))),
+        ("b2", assessment("m", Some(1), at(2))),
+        ("b2", assessment("other", None, at(3))),
+    ] {
+        store.assessments().insert_assessment(&bridge(), id, &assessment, NewCharts::default()).await.unwrap();
+    }
+    assert!(store.reference().requeue_uncompared(&bridge(), 1).await.unwrap());
+    assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b2"]);
+    assert!(!store.reference().requeue_uncompared(&bridge(), 1).await.unwrap());
+}
+
+#[tokio::test]
 async fn a_batch_that_is_deleted_while_it_is_read_is_gone_and_not_damaged() {
     let (store, folder) = open().await;
     store.batches().insert_batch(&batch("s", 0, None), "b", at(0)).await.unwrap();

@@ -119,6 +119,39 @@ impl References<'_> {
         Ok(version)
     }
 
+    /// Marks batches outside the newest reference, whose version is given, that are compared with none. Returns whether there are any.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn requeue_uncompared(self, structure: &StructureId, version: u32) -> Result<bool, Error> {
+        let uncompared = format!(
+            "structure_id = $1 and state = 'assessed'
+               and batch_id not in (select batch_id from undamaged_batch where structure_id = $1 and version = $2)
+               and 0 = (select undamaged_version from assessment a
+                   where a.structure_id = $1 and a.batch_id = measurement_batch.batch_id
+                   order by {CURRENT_FIRST} limit 1)"
+        );
+        let select = format!("select exists (select 1 from measurement_batch where {uncompared})");
+        let (any,): (bool,) = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(version)
+            .fetch_one(&self.database.reader)
+            .await?;
+        if !any {
+            return Ok(false);
+        }
+        let id = structure.to_string();
+        let written = self.database.write(move |transaction| {
+            Box::pin(async move {
+                let update = format!("update measurement_batch set state = 'received' where {uncompared}");
+                let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(id).bind(version);
+                update.execute(transaction.connection()).await?;
+                Ok(())
+            })
+        });
+        written.await.map(|()| true)
+    }
+
     /// The batches with measurements from `from` on and before `to`, by their first measurement.
     ///
     /// # Errors

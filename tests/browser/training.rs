@@ -63,7 +63,7 @@ async fn a_model_is_trained_from_the_page_with_its_progress_and_assesses_what_wa
     page.wait_for("document.getElementById('model').textContent.includes('The model is in use')");
     page.wait_for("document.getElementById('model').textContent.includes('Digest of the model')");
     let path = format!("/v1/structures/tiny/batches/{}", posted["batch"].as_str().unwrap());
-    within(Duration::from_secs(30), "the assessment", async || {
+    within(Duration::from_mins(1), "the assessment", async || {
         (service.read(&path).await["state"] == "assessed").then_some(())
     })
     .await;

@@ -13,7 +13,7 @@ async fn systemd_is_notified_of_readiness_watchdog_and_stop() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("notify");
     let socket = UnixDatagram::bind(&path).unwrap();
-    socket.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    socket.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
     let service = command(&folder.path().join("data"));
     let mut shell = Command::new("sh");
     // systemd sets the id of the process that it waits for; exec keeps this id.

@@ -25,6 +25,9 @@ use crate::store::{self, Acknowledgement, EpisodeQuery, EventFilter, Secret, Sto
 /// Longest wait until nothing runs in the background, far more than a busy machine needs.
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// Time after which a batch is forgotten that waits while nothing runs.
+const FORGOTTEN: Duration = Duration::from_secs(5);
+
 /// Time of the first round, µs: after the last measurement.
 const NOW_US: i64 = 1_770_000_000_000_000;
 
@@ -125,14 +128,32 @@ pub(super) struct Life {
 impl Life {
     /// Waits until nothing runs in the background.
     pub async fn idle(&self) -> Result<(), String> {
-        let started = Instant::now();
-        while alive() > self.resting {
-            if started.elapsed() > PATIENCE {
-                return Err(format!("{} tasks still run after {PATIENCE:?}", alive() - self.resting));
-            }
+        let (started, mut rest) = (Instant::now(), None);
+        loop {
             tokio::time::sleep(Duration::from_micros(200)).await;
+            let running = alive().saturating_sub(self.resting);
+            if started.elapsed() > PATIENCE {
+                return Err(format!("{running} tasks still run after {PATIENCE:?}"));
+            }
+            if running > 0 {
+                rest = None;
+                continue;
+            }
+            let waiting = self.waiting().await;
+            if waiting.is_empty() {
+                return Ok(());
+            }
+            // A batch that waits although nothing runs is forgotten.
+            if rest.get_or_insert_with(Instant::now).elapsed() > FORGOTTEN {
+                return Err(format!("the batches {waiting:?} wait, and nothing runs that would assess them"));
+            }
         }
-        Ok(())
+    }
+
+    /// The batches that wait for their assessment.
+    async fn waiting(&self) -> Vec<String> {
+        let waiting = self.monitor.store().batches().pending(&structure(), 1_000).await;
+        waiting.unwrap_or_default()
     }
 }
 
@@ -193,10 +214,11 @@ impl<'g> World<'g> {
                 let store = Store::open(self.folder.path()).await?;
                 store.file().set_limits(&limits(false));
                 let monitor = Monitor::open(store, self.ground.libraries[self.model].clone(), settings()).await?;
+                // Connections go back to their pool in tasks of their own.
                 let mut resting = usize::MAX;
-                while alive() < resting {
-                    resting = alive();
+                for _ in 0..4 {
                     tokio::time::sleep(Duration::from_millis(1)).await;
+                    resting = resting.min(alive());
                 }
                 monitor.replay().resume_all();
                 Ok::<_, Error>((monitor, resting))
