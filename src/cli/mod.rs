@@ -197,7 +197,7 @@ pub fn run() -> anyhow::Result<()> {
 
 /// Time that computations have to end after their command has ended. A job between two of its steps is left behind: the process ends
 /// without it, and what it computes is not stored.
-const LAST_STEPS: Duration = Duration::from_secs(1);
+const LAST_STEPS: Duration = Duration::from_millis(500);
 
 fn block_on(future: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

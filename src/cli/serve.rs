@@ -3,13 +3,15 @@
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{signal, SignalKind};
 use tokio::sync::{oneshot, watch, Notify};
-use tracing::{error, info};
+use tokio::task::JoinHandle;
+use tracing::{error, info, warn};
 
 use super::reload::Reloading;
 use super::supervisor;
@@ -26,12 +28,15 @@ use crate::store::Store;
 /// Upper bounds of the latency histogram buckets, s.
 const BUCKETS_SECONDS: [f64; 12] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 10.0];
 
+/// Time that the parts behind the requests have for their end even if the requests have used up the whole drain time.
+const SHORTEST_END: Duration = Duration::from_secs(1);
+
 /// A service that is listening.
 pub struct Running {
     /// The address it listens on.
     pub address: SocketAddr,
     /// Completes when the service has stopped; an error if a part of it failed.
-    pub task: tokio::task::JoinHandle<anyhow::Result<()>>,
+    pub task: JoinHandle<anyhow::Result<()>>,
     /// The monitor of the structures.
     pub monitor: Monitor,
 }
@@ -110,34 +115,56 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
     let (events, jobs) = (monitor.events().clone(), monitor.jobs().clone());
     publish.send_replace(Some(routes));
+    let drain = Duration::from_secs(config.http.drain_s);
     let task = tokio::spawn(async move {
         shutdown.await;
+        let begun = Instant::now();
         supervisor::stopping();
         // Jobs that compute end at their next epoch or step, while open requests finish.
-        jobs.stop().await;
+        background.push(jobs.stop());
         // Event streams do not end by themselves and would delay the shutdown up to its time limit.
         events.close();
         // Sending fails only if all background tasks, or the server, have ended already.
         let _ = stop.send(true);
         drop(end);
-        let mut failed = 0;
-        if let Err(failure) = server.await {
-            error!(error = %failure, "The server panicked: {failure}");
-            failed += 1;
+        let served = server.await;
+        if let Err(failure) = &served {
+            error!(%failure, "The server panicked: {failure}");
         }
         drop(publish);
+        let left = drain.saturating_sub(begun.elapsed()).max(SHORTEST_END);
+        end_parts(background, usize::from(served.is_err()), &store, left).await
+    });
+    Ok(Running { address, task, monitor })
+}
+
+/// Waits for the end of all parts behind the requests and closes the database, within a time limit. `failed`: parts that have failed before.
+async fn end_parts(
+    background: Vec<JoinHandle<()>>,
+    failed: usize,
+    store: &Store,
+    limit: Duration,
+) -> anyhow::Result<()> {
+    let ended = async {
+        let mut failed = failed;
         for task in background {
             if let Err(failure) = task.await {
                 error!(error = %failure, "A background task panicked: {failure}");
                 failed += 1;
             }
         }
+        // A request that was aborted may still hold a connection to the database.
         store.close().await;
-        info!("Stopped");
-        anyhow::ensure!(failed == 0, "{failed} parts of the service failed while it was running: its log names them");
-        Ok(())
-    });
-    Ok(Running { address, task, monitor })
+        failed
+    };
+    // Whatever is cut off is repeated by the next start: a write is complete or absent, a message is sent again.
+    let Ok(failed) = tokio::time::timeout(limit, ended).await else {
+        warn!("Stopped before all parts had ended: the next start completes what they were doing");
+        return Ok(());
+    };
+    info!("Stopped");
+    anyhow::ensure!(failed == 0, "{failed} parts of the service failed while it was running: its log names them");
+    Ok(())
 }
 
 /// Runs the service until SIGTERM or SIGINT; a second signal ends the process immediately. SIGHUP reads the configuration again.
@@ -147,27 +174,41 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
 pub async fn serve(config: Config, reloading: Reloading) -> anyhow::Result<()> {
     // Before the start is reported: SIGHUP may be sent as soon as the report is read.
     let hangups = Reloading::hangups()?;
-    let running = start(config.clone(), stop_signal()?).await?;
+    let (before_listening, shutdown) = (first_signal()?, stop_signal()?);
+    let running = tokio::select! {
+        biased;
+        running = start(config.clone(), shutdown) => running?,
+        // A start with many large structures takes minutes.
+        () = before_listening => {
+            info!("Stopped during the start");
+            return Ok(());
+        }
+    };
     reloading.follow(hangups, running.monitor.clone(), config);
     supervisor::ready(running.monitor);
     println!("modalwatch listens on http://{}", running.address);
     running.task.await.context("the service panicked")?
 }
 
-/// Completes at the first SIGTERM or SIGINT.
+/// Completes at the first SIGTERM or SIGINT; the next one ends the process immediately.
 ///
 /// # Errors
 /// If no signal handler can be installed.
 pub fn stop_signal() -> anyhow::Result<impl Future<Output = ()> + Send + 'static> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     Ok(async move {
-        let mut wait = async || {
-            tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} }
-        };
-        wait().await;
+        tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} }
         tokio::spawn(async move {
             tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} }
             std::process::exit(1);
         });
+    })
+}
+
+/// Completes at the first SIGTERM or SIGINT.
+fn first_signal() -> anyhow::Result<impl Future<Output = ()>> {
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    Ok(async move {
+        tokio::select! { _ = terminate.recv() => {}, _ = interrupt.recv() => {} }
     })
 }

@@ -5,6 +5,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
+mod definitions;
 mod details;
 #[path = "../api/helpers.rs"]
 #[allow(dead_code, reason = "shared with tests/api, which uses all of it")]

@@ -3,6 +3,7 @@
 use std::future::Future;
 use std::sync::Arc;
 
+use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
 use super::queue::{Halt, JobStatus, Queue};
@@ -149,12 +150,16 @@ impl Jobs {
         })
     }
 
-    /// Ends all jobs, because the service stops. Trainings and extensions begin again after the next start.
-    pub async fn stop(&self) {
+    /// Ends all jobs, because the service stops. Trainings and extensions begin again after the next start. The task notes in the
+    /// database that this stop is an orderly one.
+    pub fn stop(&self) -> JoinHandle<()> {
         self.queue.stop();
-        if let Err(failure) = self.store.diagnoses().note_orderly_stop().await {
-            warn!("Could not note that this stop is an orderly one: {failure}");
-        }
+        let store = self.store.clone();
+        tokio::spawn(async move {
+            if let Err(failure) = store.diagnoses().note_orderly_stop().await {
+                warn!("Could not note that this stop is an orderly one: {failure}");
+            }
+        })
     }
 
     /// What a job is doing now; `None` if it neither runs nor waits.
