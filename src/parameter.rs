@@ -4,6 +4,16 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
+/// The name of a monitored quantity as people read it: `spring:k12`, a stiffness that follows from a parameter by a law, is the "stiffness of
+/// spring k12", and `group:k1+k2`, parameters that the measurements cannot tell apart, is "k1 and k2 together". A parameter is itself.
+pub fn in_words(quantity: &str) -> String {
+    match quantity.split_once(':') {
+        Some(("spring", name)) => format!("stiffness of spring {name}"),
+        Some(("group", names)) => format!("{} together", names.replace('+', " and ")),
+        _ => quantity.to_owned(),
+    }
+}
+
 /// Direction of change of a parameter that is damage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -100,5 +110,17 @@ impl<'a> IntoIterator for &'a ParameterSpace {
 
     fn into_iter(self) -> Self::IntoIter {
         self.iter()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::in_words;
+
+    #[test]
+    fn a_quantity_has_no_prefix_where_people_read_its_name() {
+        assert_eq!(in_words("spring:k12"), "stiffness of spring k12");
+        assert_eq!(in_words("group:k1+k2"), "k1 and k2 together");
+        assert_eq!(in_words("west_ei"), "west_ei");
     }
 }

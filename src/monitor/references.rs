@@ -102,7 +102,7 @@ impl References {
     /// be trusted with this trained baseline are left out. Returns the version of the new reference.
     pub(super) async fn renew(&self, structure: &StructureId) -> Option<u32> {
         let failed = |error: &dyn std::fmt::Display| {
-            warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
+            warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained model: {error}");
         };
         let newest = self.assessor.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
         let request = ReferenceRequest {
