@@ -21,6 +21,16 @@ const BOUND_MARGIN: f64 = 0.01;
 /// Precision of a uniform prior of a position in the box: one over its variance 1/12.
 const UNIFORM_PRECISION: f64 = 12.0;
 
+/// The name of a monitored quantity as people read it: `spring:k12`, a stiffness that follows from a parameter by a law, is the "stiffness of
+/// spring k12", and `group:k1+k2`, parameters that the measurements cannot tell apart, is "k1 and k2 together". A parameter is itself.
+pub fn in_words(quantity: &str) -> String {
+    match quantity.split_once(':') {
+        Some(("spring", name)) => format!("stiffness of spring {name}"),
+        Some(("group", names)) => format!("{} together", names.replace('+', " and ")),
+        _ => quantity.to_owned(),
+    }
+}
+
 /// Direction of change of a parameter that is damage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -396,5 +406,12 @@ mod tests {
     fn a_uniform_prior_is_written_as_before_other_forms_existed() {
         let json = serde_json::to_string(&all()[0]).unwrap();
         assert_eq!(json, r#"{"name":"k1","unit":"N/m","lower":3.0,"upper":7.0,"damage":"decrease"}"#);
+    }
+
+    #[test]
+    fn a_quantity_has_no_prefix_where_people_read_its_name() {
+        assert_eq!(in_words("spring:k12"), "stiffness of spring k12");
+        assert_eq!(in_words("group:k1+k2"), "k1 and k2 together");
+        assert_eq!(in_words("west_ei"), "west_ei");
     }
 }

@@ -92,14 +92,14 @@ pub fn quantile(values: &[f64], level: f64) -> f64 {
     below + (position - place as f64) * (above - below)
 }
 
-/// A p-value as text for people: `p = 0.012`, or `p < 0.001` where more digits would say nothing.
-pub fn p_value_text(p: f64) -> String {
+/// A p-value for people: how often chance alone gives at least this deviation.
+pub fn by_chance(p: f64) -> String {
     if p < 0.001 {
-        "p < 0.001".to_owned()
+        "by chance in fewer than 1 of 1000 cases".to_owned()
     } else if p < 0.1 {
-        format!("p = {p:.3}")
+        format!("by chance in about {:.0} of 1000 cases", 1000.0 * p)
     } else {
-        format!("p = {p:.2}")
+        format!("by chance in about {:.0} of 100 cases", 100.0 * p)
     }
 }
 
@@ -240,9 +240,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn p_values_are_written_without_exponents() {
-        let texts = [0.0, 1e-300, 0.0004, 0.0123, 0.6].map(p_value_text);
-        assert_eq!(texts, ["p < 0.001", "p < 0.001", "p < 0.001", "p = 0.012", "p = 0.60"]);
+    fn p_values_are_written_as_cases_that_chance_alone_gives() {
+        let rare = "by chance in fewer than 1 of 1000 cases";
+        let texts = [0.0, 1e-300, 0.0004, 0.0123, 0.6].map(by_chance);
+        let common = ["by chance in about 12 of 1000 cases", "by chance in about 60 of 100 cases"];
+        assert_eq!(texts, [rare, rare, rare, common[0], common[1]]);
     }
 
     #[test]

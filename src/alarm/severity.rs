@@ -157,7 +157,9 @@ impl SeverityLimits {
                     |q: &crate::process::reference::QuantityChange| certain_size(q.interval.map(|end| q.percent(end)));
                 let largest = change.changes.iter().map(|q| (certain(q), q.name.as_str()));
                 match largest.max_by(|a, b| a.0.total_cmp(&b.0)) {
-                    Some((certain, name)) => (certain, format!("the lasting change of {name}")),
+                    Some((certain, name)) => {
+                        (certain, format!("the lasting change of {}", crate::parameter::in_words(name)))
+                    }
                     None => return unknown("the size of the change is not known."),
                 }
             }

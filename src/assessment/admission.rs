@@ -104,7 +104,7 @@ impl Reservations {
                 FindingCode::NoiseBelowRange,
                 self.below_noise_range,
                 format!(
-                    "measurements state less noise than {} times that of the structure, the least that the trained baseline \
+                    "measurements state less noise than {} times that of the structure, the least that the trained model \
                      covers: this least noise is used for them",
                     range[0]
                 ),
@@ -122,7 +122,7 @@ impl Reservations {
             (
                 FindingCode::NotUsable,
                 self.unusable,
-                "measurements are left out: they lack a mode that the trained baseline needs, or have no mode with a usable noise"
+                "measurements are left out: they lack a mode that the trained model needs, or have no mode with a usable noise"
                     .to_owned(),
             ),
         ];

@@ -10,6 +10,7 @@ use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{self, QuantityKind, UndamagedReference};
 use crate::measurement::ModalMeasurement;
+use crate::parameter::in_words;
 use crate::posterior::PosteriorSamples;
 use crate::quantity::{Hertz, Timestamp};
 use crate::stats;
@@ -120,8 +121,9 @@ fn accept_usual_misfit(finding: &mut Finding) {
 /// The finding about a quantity that the measurements of a batch hardly inform.
 fn not_informed_finding(name: &str) -> Finding {
     let message = format!(
-        "the measurements say hardly more about {name} than its prior, mostly because modes are missing: it has no probability of damage \
-         and no point on its chart"
+        "the measurements say hardly more about {} than its prior, mostly because modes are missing: it has no probability of damage \
+         and no point on its chart",
+        in_words(name)
     );
     Finding::new(FindingCode::NotInformed, FindingEffect::Note, message)
 }

@@ -24,7 +24,7 @@ const FEW_EFFECTIVE_SAMPLES: f64 = 3.0;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The trained baseline can use none of the measurements.
-    #[error("none of {measurements} measurements can be used: each lacks a mode that the trained baseline needs, or states more than ten times the largest noise that it was trained for")]
+    #[error("none of {measurements} measurements can be used: each lacks a mode that the trained model needs, or states more than ten times the largest noise that it was trained for")]
     NoUsableMeasurement {
         /// Measurements of the batch.
         measurements: usize,

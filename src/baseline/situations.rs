@@ -75,14 +75,14 @@ pub fn cell_words(cell: &Cell) -> String {
     format!("{what} and the noise is {}", noise_words(cell.noise_multiple))
 }
 
-/// Short title of a cell for tables and plots, such as "noise 0.2 × nominal, mode 4 missing".
+/// Short title of a cell for tables and plots, such as "0.2 times the stated noise, mode 4 missing".
 pub fn cell_title(cell: &Cell) -> String {
     let what = match (cell.missing_mode, cell.without_shapes) {
         (Some(mode), _) => format!("mode {mode} missing"),
         (None, Some(true)) => "no shapes".to_owned(),
         (None, _) => "all modes".to_owned(),
     };
-    format!("noise {} × nominal, {what}", plain(cell.noise_multiple))
+    format!("{} times the stated noise, {what}", plain(cell.noise_multiple))
 }
 
 /// A noise multiple in words: "a fifth of the nominal".

@@ -11,6 +11,7 @@ use crate::alarm::AlarmSettings;
 use crate::assessment::{self, Draws};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::measurement::MeasurementBatch;
+use crate::parameter::in_words;
 use crate::quantity::Timestamp;
 
 /// Assess measurements without a service.
@@ -76,7 +77,7 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     let misfit: Vec<String> = assessment.misfit_percent.iter().map(percent).collect();
     println!("deviation of the simulated from the mean measured frequencies: {} %", misfit.join(", "));
     println!(
-        "{:>16} {:>26} {:>26} {:>12} {:>24} {:>8}",
+        "{:>30} {:>26} {:>26} {:>12} {:>24} {:>8}",
         "parameter", "mean (90 %)", "std (90 %)", "threshold", "PoD, % (90 %)", "exceeds"
     );
     let with = |value: Option<f64>, interval: Option<[f64; 2]>, scale: f64, digits: usize| match (value, interval) {
@@ -89,8 +90,8 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
     for q in &assessment.quantities {
         let damage = q.damage.as_ref();
         println!(
-            "{:>16} {:>26} {:>26} {:>12} {:>24} {:>8}",
-            q.name,
+            "{:>30} {:>26} {:>26} {:>12} {:>24} {:>8}",
+            with_unit(q),
             with(Some(q.mean), q.mean_interval, 1.0, 4),
             with(q.std, q.std_interval, 1.0, 4),
             damage.map_or("-".to_owned(), |d| format!("{:.4}", d.threshold)),
@@ -98,7 +99,28 @@ pub fn assess(args: &AssessArgs) -> anyhow::Result<()> {
             damage.map_or("-", |d| if d.exceeds { "yes" } else { "no" })
         );
     }
+    println!(
+        "std: standard deviation between the measurements. (90 %): interval that contains the value with a probability of 90 %."
+    );
+    println!(
+        "threshold: {:.0} % of the undamaged values lie beyond it. PoD: probability of damage, that the value lies beyond the threshold.",
+        100.0 * args.threshold_probability
+    );
+    println!(
+        "exceeds: the PoD is above that of the undamaged measurements. Single healthy batches show that as well; alarms are raised by the \
+         charts of the service."
+    );
     trusted(args, &assessment)
+}
+
+/// The name of a quantity with its unit.
+fn with_unit(quantity: &crate::damage::QuantityAssessment) -> String {
+    let name = in_words(&quantity.name);
+    if matches!(quantity.unit.as_str(), "" | "1") {
+        name
+    } else {
+        format!("{name} ({})", quantity.unit)
+    }
 }
 
 /// An error for measurements that were not accepted: there is no probability of damage, and a script must not take this for "healthy".

@@ -95,11 +95,11 @@ fn rows(record: &CalibrationRecord) -> Vec<Vec<String>> {
 
 fn print(record: &CalibrationRecord) {
     println!(
-        "{:>36} {:>12} {:>16} {:>16} {:>14} {:>16}",
+        "{:>42} {:>12} {:>16} {:>16} {:>14} {:>16}",
         HEADER[0], HEADER[1], HEADER[2], HEADER[3], HEADER[4], HEADER[5]
     );
     for row in rows(record) {
-        println!("{:>36} {:>12} {:>16} {:>16} {:>14} {:>16}", row[0], row[1], row[2], row[3], row[4], row[5]);
+        println!("{:>42} {:>12} {:>16} {:>16} {:>14} {:>16}", row[0], row[1], row[2], row[3], row[4], row[5]);
     }
     println!("{LEGEND}");
     let (cells, simulations, draws) = (record.cells.len(), record.simulations, record.draws);

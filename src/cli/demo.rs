@@ -257,8 +257,8 @@ fn print_table(report: &Report) {
         "target: the population; realised: the {MEASUREMENTS} stiffnesses drawn from it; updated: estimated from their"
     );
     println!("frequencies. The standard deviations of the population are {}, {} and {} N/m.", STD[0], STD[1], STD[2]);
-    println!("PoD: probability of damage, of the pooled samples (as in the paper), and of the estimated population");
-    println!("with its 90 % interval.\n");
+    println!("PoD: probability of damage. pooled: of all samples of the batch together, noise included, as in the");
+    println!("paper; updated: of the population that was estimated, with its 90 % interval.\n");
     println!("   ------ mean, N/m ------ -- std, N/m ---- ----------------- PoD, % -----------------");
     println!(
         "{:<3}{:>6}{:>9}{:>8} {:>9}{:>8} {:>6}{:>9}{:>6}{:>7}{:>16} alarm",

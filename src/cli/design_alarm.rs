@@ -17,7 +17,7 @@ use crate::alarm::AlarmSettings;
 use crate::baseline::identifiability::fisher_covariance;
 use crate::baseline::library::find_structure;
 use crate::damage::ChartReference;
-use crate::parameter::{DamageDirection, Parameter};
+use crate::parameter::{in_words, DamageDirection, Parameter};
 use crate::plot::{page, table, Line, Plot};
 use crate::simulator::{DerivedStiffness, Simulator};
 
@@ -285,7 +285,7 @@ fn noise_std(simulator: &Simulator, moments: &[(f64, f64)], noise: f64) -> anyho
 
 fn print(report: &Report) {
     println!(
-        "{}: batches of {} measurements compared with an undamaged reference of {}, noise × {}",
+        "{}: batches of {} measurements compared with an undamaged reference of {}, with {} times the stated noise",
         report.structure, report.measurements, report.baseline_measurements, report.noise_multiple
     );
     let ewma = report.ewma_limit_standard_errors.map_or("off".to_owned(), |l| format!("{l:.2}"));
@@ -305,7 +305,7 @@ fn print(report: &Report) {
             p.name, p.mean, p.std, p.noise_std, p.standard_error
         );
         for (spring, loss) in &p.a90_of_stiffness {
-            println!("{:>16} as loss of stiffness of {spring}: {:.2} %", "", 100.0 * loss);
+            println!("{:>16} as a loss of the {}: {:.2} %", "", in_words(spring), 100.0 * loss);
         }
     }
     println!(

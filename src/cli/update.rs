@@ -275,8 +275,10 @@ fn by_flow(measurements: &[ModalMeasurement], args: &UpdateArgs) -> anyhow::Resu
     for (k, parameter) in model.space().iter().enumerate() {
         let pooled = Hyperparameters::from_pool(&pool.column(k), draws.per_measurement);
         let std = pooled.std.map_or("-".to_owned(), |std| format!("{std:.4}"));
-        notes
-            .push(format!("pooled samples of {}: mean {:.4}, std {std} (noise included)", parameter.name, pooled.mean));
+        notes.push(format!(
+            "all samples of {} together, measurement noise included: mean {:.4}, std {std}",
+            parameter.name, pooled.mean
+        ));
     }
     Ok(Answer {
         method: "cinn",

@@ -343,7 +343,7 @@ impl Scatter {
             if p < level {
                 found.contamination = Some(format!(
                     "its batches differ by more than their scatter ({}): damage, weather or a changed set-up may be the cause",
-                    stats::p_value_text(p)
+                    stats::by_chance(p)
                 ));
             }
         }
@@ -362,7 +362,7 @@ fn outlier(means: &[f64], level: f64) -> Option<String> {
     let t2 = n * (n - 2.0) * largest.powi(2) / ((n - 1.0).powi(2) - n * largest.powi(2));
     let p = if t2 > 0.0 { StudentsT::new(0.0, 1.0, n - 2.0).map_or(1.0, |t| 2.0 * n * t.sf(t2.sqrt())) } else { 0.0 };
     (p < level).then(|| {
-        format!("one measurement lies {largest:.1} standard deviations from the others ({})", stats::p_value_text(p))
+        format!("one measurement lies {largest:.1} standard deviations from the others ({})", stats::by_chance(p))
     })
 }
 

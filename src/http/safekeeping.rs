@@ -88,7 +88,7 @@ impl From<Reloaded> for ReloadedBody {
     fn from(reloaded: Reloaded) -> Self {
         let next_step = reloaded.reference_outdated.then(|| {
             format!(
-                "the undamaged reference was made with another trained baseline, so batches are not compared with it: declare \
+                "the undamaged reference was made with another trained model, so batches are not compared with it: declare \
                  undamaged batches again by {}",
                 declare_reference(&reloaded.structure)
             )

@@ -13,6 +13,7 @@ use crate::alarm::machine::State as AlarmState;
 use crate::baseline::Baseline;
 use crate::monitor::stored::{Episode, RelativeChange, StructureOverview};
 use crate::monitor::{Error, Monitor};
+use crate::parameter::in_words;
 use crate::process::reference::QuantityChange;
 use crate::quantity::{Digest, Timestamp};
 
@@ -184,7 +185,7 @@ fn names_in(found: &StructureOverview, state: AlarmState) -> String {
     let of_state = found.charts.iter().filter(|(_, own)| **own == state).map(|(series, _)| match series.as_str() {
         FIT_SERIES => "the fit of the simulation".to_owned(),
         crate::process::reference::JOINT_SERIES => "the chart of all parameters together".to_owned(),
-        name => format!("the chart of {name}"),
+        name => format!("the chart of {}", in_words(name)),
     });
     let names: Vec<String> = of_state.collect();
     let mut text = names.join(" and ");
@@ -245,7 +246,7 @@ fn of_process(change: &QuantityChange, onset: Timestamp) -> String {
     let [low, high] = change.interval.map(|end| signed(change.percent(end)));
     let mut text = format!(
         "{} {} % ({low} to {high} %) since {}",
-        change.name,
+        in_words(&change.name),
         signed(change.percent(change.change)),
         onset.day()
     );
@@ -258,7 +259,7 @@ fn of_process(change: &QuantityChange, onset: Timestamp) -> String {
 
 /// The change of a quantity in the latest batch, beside the opening of its alarm.
 fn of_batch(episode: &Episode, latest: Option<&RelativeChange>) -> String {
-    let name = episode.series.trim_start_matches("group:");
+    let name = in_words(&episode.series);
     let since = episode.opened_at.day();
     match latest {
         None => format!("{name} has shifted towards damage, alarm since {since}"),

@@ -25,7 +25,7 @@ pub enum Error {
         batch: String,
     },
     /// The structure has no trained baseline in use.
-    #[error("structure {structure} has no trained baseline in use: {reason}")]
+    #[error("structure {structure} has no trained model in use: {reason}")]
     NoModel {
         /// The structure.
         structure: StructureId,
@@ -264,7 +264,7 @@ pub enum JobError {
 #[derive(Debug, thiserror::Error)]
 pub enum ReloadError {
     /// The new trained baseline may not replace the one in use.
-    #[error("the new trained baseline for {structure} is refused ({}): {reason}", match kept {
+    #[error("the new trained model for {structure} is refused ({}): {reason}", match kept {
         Some(digest) => format!("the one with digest {digest} stays in use"),
         None => "no other one is in use".to_owned(),
     })]

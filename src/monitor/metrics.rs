@@ -9,7 +9,7 @@ const MEANINGS: [(&str, &str); 40] = [
     ("modalwatch_assessments_failed_total", "Batches that could not be assessed."),
     ("modalwatch_assessments_total", "Batches assessed."),
     ("modalwatch_backups_total", "Backups, by outcome."),
-    ("modalwatch_baselines_in_use", "Structures with a trained baseline in use."),
+    ("modalwatch_baselines_in_use", "Structures with a trained model in use."),
     ("modalwatch_batches_received_total", "New batches stored."),
     ("modalwatch_build_info", "Program and SQLite; always 1."),
     ("modalwatch_connections_refused_total", "Requests that found no free connection."),
@@ -23,7 +23,7 @@ const MEANINGS: [(&str, &str); 40] = [
     ("modalwatch_mail_deliveries_total", "Attempts to send a mail about an alarm, by outcome."),
     ("modalwatch_mail_pending", "Mails about alarms that wait for the server."),
     ("modalwatch_measurements_received_total", "Measurements in new batches."),
-    ("modalwatch_model_reloads_total", "Reloads of a trained baseline, by outcome."),
+    ("modalwatch_model_reloads_total", "Reloads of a trained model, by outcome."),
     ("modalwatch_mqtt_connected", "1 while the broker is connected."),
     ("modalwatch_mqtt_messages_total", "Messages from the broker, by outcome."),
     (

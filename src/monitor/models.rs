@@ -80,7 +80,7 @@ impl Models {
                 refused.remove(structure);
             }
             Err(ReloadError::Refused { reason, .. }) => {
-                warn!(structure.id = %structure, "Refused the new trained baseline of {structure}: {reason}");
+                warn!(structure.id = %structure, "Refused the new trained model of {structure}: {reason}");
                 refused.insert(structure.clone(), reason.clone());
             }
             Err(ReloadError::Monitor(_)) => {}
@@ -106,7 +106,7 @@ impl Models {
         if self.store.structures().trained_baseline(structure, active.simulator.digest()).await?.is_some() {
             let version = self.store.structures().structure_version(structure, active.simulator.digest()).await?;
             let reason = if version.is_some_and(|(_, parent)| parent.is_some()) {
-                "the present version is an extension, whose trained baseline was made by the service and cannot be \
+                "the present version is an extension, whose trained model was made by the service and cannot be \
                  replaced by a file: undo the extension first"
             } else {
                 "the service trained the model of this structure itself, and a file cannot replace it: train it again by \
@@ -124,7 +124,7 @@ impl Models {
         let changed = before.as_ref() != Some(&model_digest);
         if changed {
             self.structures.swap_baseline(&active, baseline)?;
-            info!(structure.id = %structure, model.digest = %model_digest, "Swapped the trained baseline of {structure}");
+            info!(structure.id = %structure, model.digest = %model_digest, "Swapped the trained model of {structure}");
         }
         self.structures.set_library(library);
         let renewed = self.renewed(structure, &model_digest, renew).await;
@@ -171,5 +171,5 @@ fn candidate(library: &Library, structure: &StructureId, active: &ActiveStructur
             "it was trained for another definition of the structure (digest {found}; the present definition has {present})"
         ));
     }
-    baseline.clone().ok_or_else(|| "the models folder has the structure, but no trained baseline for it".to_owned())
+    baseline.clone().ok_or_else(|| "the models folder has the structure, but no trained model for it".to_owned())
 }

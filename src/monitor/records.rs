@@ -52,7 +52,7 @@ impl fmt::Display for Missing {
             }
             Self::OutdatedReference(version) => write!(
                 f,
-                "the undamaged reference, version {version}, was made with another trained baseline: declare undamaged batches again"
+                "the undamaged reference, version {version}, was made with another trained model: declare undamaged batches again"
             ),
             Self::NotYet => f.write_str("the batch has not been compared with the undamaged reference yet"),
             Self::Reference => f.write_str("there is no undamaged reference: declare undamaged batches"),

@@ -228,7 +228,7 @@ impl ActiveStructures {
             return Ok(self.library_baseline(simulator));
         };
         let loaded = Baseline::load(&stored.manifest, &stored.weights, simulator);
-        let refused = |e: crate::baseline::LoadError| format!("the baseline trained by the service is refused: {e}");
+        let refused = |e: crate::baseline::LoadError| format!("the model trained by the service is refused: {e}");
         let usable = |baseline: &Baseline| if stored.accepted { Ok(()) } else { self.usable(baseline) };
         Ok(loaded.map_err(refused).and_then(|baseline| usable(&baseline).map(|()| Arc::new(baseline))))
     }
@@ -237,15 +237,15 @@ impl ActiveStructures {
         let id = simulator.id();
         let library = self.library();
         let Some(entry) = library.get(id) else {
-            return Err(format!("no trained baseline: {TRAIN}"));
+            return Err(format!("no trained model: {TRAIN}"));
         };
         if entry.simulator.digest() != simulator.digest() {
-            return Err(format!("the trained baseline is for another definition of {id}: {TRAIN}"));
+            return Err(format!("the trained model is for another definition of {id}: {TRAIN}"));
         }
         let refused = || library.refusals().iter().find(|r| r.structure.as_ref() == Some(id));
         let baseline = entry.baseline.clone().ok_or_else(|| match refused() {
             Some(refusal) => format!("{} is refused: {}", refusal.file, refusal.reason),
-            None => format!("no trained baseline: {TRAIN}"),
+            None => format!("no trained model: {TRAIN}"),
         })?;
         self.usable(&baseline).map(|()| baseline)
     }
@@ -260,7 +260,7 @@ impl ActiveStructures {
             return Ok(());
         }
         Err(format!(
-            "the trained baseline failed its calibration: it is overconfident ({}): train it again with `modalwatch train`, with a larger --epochs or --units; to \
+            "the trained model failed its calibration: it is overconfident ({}): train it again with `modalwatch train`, with a larger --epochs or --units; to \
              use it nevertheless, add its digest {digest} to monitor.accept_uncalibrated, and every assessment then has a finding \
              about it",
             calibration.failures.join("; ")

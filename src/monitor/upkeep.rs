@@ -90,7 +90,7 @@ impl Upkeep {
     pub async fn health(&self) -> Health {
         let mut reasons: Vec<Reason> = self.probe.finding().await.into_iter().collect();
         if self.baselines_in_use() == 0 {
-            reasons.push(Reason::new("no_model", "no trained baseline is in use"));
+            reasons.push(Reason::new("no_model", "no trained model is in use"));
         }
         let findings = self.findings(reasons.is_empty());
         Health { ready: reasons.is_empty(), reasons, findings }
@@ -120,7 +120,7 @@ impl Upkeep {
         }
         for (structure, reason) in self.models.refused() {
             let message =
-                format!("the last reload of the trained baseline of {structure} was refused, and the previous one stays in use: {reason}");
+                format!("the last reload of the trained model of {structure} was refused, and the previous one stays in use: {reason}");
             findings.push(Reason::new("model_reload_refused", message));
         }
         let failed = self.retention.last_run().and_then(|run| run.failure);

@@ -8,6 +8,7 @@ use sha2::{Digest as _, Sha256};
 use super::facts::{ActionFacts, Facts};
 use crate::alarm::chart::parameter_of;
 use crate::alarm::severity::{Severity, SeverityLimits};
+use crate::parameter::in_words;
 use crate::process::reference::LastingChange;
 use crate::quantity::Timestamp;
 use crate::store::{DueMail, OutboxEvent};
@@ -59,14 +60,16 @@ fn what(facts: &Facts) -> String {
         ("silence", ..) => "No measurements have arrived within the configured time.".to_owned(),
         ("simulation_does_not_fit", ..) => "The simulation does not fit the measurements.".to_owned(),
         (_, Some(change), _) => change.sentence(),
-        (_, None, Some(name)) => match facts.batch_change {
-            Some(batch) => {
-                let [low, high] = batch.interval.map(|end| 100.0 * end);
-                let change = 100.0 * batch.change;
-                format!("{name} has changed by {change:+.1} % ({low:+.1} to {high:+.1} %) in the newest batch of the alarm.")
+        (_, None, Some(name)) => {
+            match facts.batch_change {
+                Some(batch) => {
+                    let [low, high] = batch.interval.map(|end| 100.0 * end);
+                    let change = 100.0 * batch.change;
+                    format!("{} has changed by {change:+.1} % ({low:+.1} to {high:+.1} %) in the newest batch of the alarm.", in_words(&name))
+                }
+                None => format!("{} has shifted towards damage.", in_words(&name)),
             }
-            None => format!("{name} has shifted towards damage."),
-        },
+        }
         (_, None, None) => "The parameters together have shifted towards damage.".to_owned(),
     }
 }
@@ -75,7 +78,7 @@ fn what(facts: &Facts) -> String {
 fn in_short(facts: &Facts) -> String {
     let of_change = |change: &LastingChange| {
         let clear = change.changes.iter().filter(|q| q.is_clear());
-        let phrases = clear.map(|q| format!("{} {:+.1} %", q.name, q.percent(q.change)).replace('-', "−"));
+        let phrases = clear.map(|q| format!("{} {:+.1} %", in_words(&q.name), q.percent(q.change)).replace('-', "−"));
         phrases.collect::<Vec<_>>().join(", ")
     };
     let short = match facts.kind.as_str() {
@@ -84,8 +87,8 @@ fn in_short(facts: &Facts) -> String {
         _ => facts.change.as_ref().map(of_change).filter(|text| !text.is_empty()),
     };
     short.unwrap_or_else(|| match (parameter_of(facts.series.clone()), facts.batch_change) {
-        (Some(name), Some(batch)) => format!("{name} {:+.1} %", 100.0 * batch.change).replace('-', "−"),
-        (Some(name), None) => format!("{name} shifted"),
+        (Some(name), Some(batch)) => format!("{} {:+.1} %", in_words(&name), 100.0 * batch.change).replace('-', "−"),
+        (Some(name), None) => format!("{} shifted", in_words(&name)),
         (None, _) => "several parameters shifted".to_owned(),
     })
 }

@@ -29,8 +29,8 @@ const STYLE: &str =
      .dense{border-bottom:1px solid var(--rule)}caption span{display:inline-block;position:sticky;left:0;\
      max-width:min(52rem,calc(100vw - 2.5rem))}svg.strip{display:block;width:8.75rem;height:1.1rem;margin-top:.2rem}\
      nav ul{padding-left:1.1rem}nav a{white-space:nowrap}a{color:var(--bar)}.quiet{opacity:.75;font-size:.85em}\
-     details>summary{cursor:pointer}@media(max-width:40rem){.dense{font-size:.88rem}}@media print{body{margin:0;\
-     max-width:none;font-size:11pt}figure,tr,.card{break-inside:avoid}.scroll{overflow:visible}}";
+     details>summary{cursor:pointer}@media(max-width:40rem){.dense{font-size:.88rem}}@media print{h2,h3{break-after:avoid}body{margin:0;\
+     max-width:none;font-size:11pt}figure,tr,.card{break-inside:avoid}.scroll{overflow:visible}td.words,tbody th{min-width:0}td,td:not(.words){white-space:normal;padding:.2rem .4rem}}";
 
 /// A self-contained HTML page of sections with title and content. The content must already be HTML.
 pub fn page(title: &str, sections: &[(String, String)]) -> String {

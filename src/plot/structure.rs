@@ -155,7 +155,7 @@ impl Drawing {
         ));
         self.fixed.iter().for_each(|fixed| add(fixed_svg(*fixed, &frame)));
         add(self.shape_svg(&frame));
-        self.links.iter().for_each(|link| add(self.link_svg(link, &frame)));
+        (0..self.links.len()).for_each(|index| add(self.link_svg(index, &frame)));
         self.bodies.iter().for_each(|body| add(body_svg(body, &frame, self.axis.is_some())));
         add(self.axis_svg(&frame));
         add(self.key_svg(&frame));
@@ -182,7 +182,10 @@ impl Drawing {
         Frame { low: [low_x, low[1]], scale: [x_scale, step], height: 2.0 * MARGIN + step * extent[1] }
     }
 
-    fn link_svg(&self, link: &Link, frame: &Frame) -> String {
+    fn link_svg(&self, index: usize, frame: &Frame) -> String {
+        let link = &self.links[index];
+        // Springs side by side between the same bodies have their names one above the other.
+        let above = 30.0 * self.links[..index].iter().filter(|other| other.bodies == link.bodies).count() as f64;
         let [from, to] = link.ends.map(|end| frame.at(end));
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
         let length = dx.hypot(dy).max(1.0);
@@ -211,14 +214,13 @@ impl Drawing {
             )
             .expect("writing to memory cannot fail");
         }
-        let change = link.change_percent.map_or_else(String::new, |percent| format!(" {percent:+.1} %"));
+        let change = link.change_percent.map_or_else(String::new, |p| format!(" {p:+.1} %").replace('-', "−"));
         let label = escaped(&link.label);
         // Beside the middle of the link: to the right of what is upright, above what is level.
-        let upright = dy.abs() > dx.abs();
         let (x, y, anchor) = match link.kind {
             LinkKind::Beam => (middle[0], middle[1] - 22.0, "middle"),
             LinkKind::Rotation => (from[0] + 16.0, from[1] + 26.0, "start"),
-            LinkKind::Spring if upright => (middle[0] + 12.0, middle[1] - 2.0, "start"),
+            LinkKind::Spring if dy.abs() > dx.abs() => (middle[0] + 12.0, middle[1] - 2.0 - above, "start"),
             LinkKind::Spring => (middle[0], middle[1] - 24.0, "middle"),
         };
         write!(
@@ -320,16 +322,18 @@ impl Drawing {
         }
         let full = self.full_percent;
         let y = frame.height - 8.0;
+        let words = [format!("−{full:.0} %"), "no change".to_owned(), format!("+{full:.0} %")];
         let one = |(place, percent): (usize, f64)| {
             let x = 12.0 + 92.0 * place as f64;
             format!(
                 "<line x1=\"{x}\" x2=\"{}\" y1=\"{}\" y2=\"{}\" stroke=\"{}\" stroke-width=\"5\"/><text x=\"{}\" y=\"{y}\" \
-                 font-size=\"11\">{percent:+.0} %</text>",
+                 font-size=\"11\">{}</text>",
                 x + 24.0,
                 y - 4.0,
                 y - 4.0,
                 colour_of_change(percent, full),
-                x + 30.0
+                x + 30.0,
+                words[place]
             )
         };
         [-full, 0.0, full].into_iter().enumerate().map(one).collect()
@@ -462,11 +466,22 @@ mod tests {
         assert!(svg.contains("data-name=\"k1\"") && svg.contains("&lt;m1&gt;") && svg.contains("a &amp; b"), "{svg}");
         assert!(!svg.contains("NaN") && !svg.contains("inf") && !svg.contains("<m1>"), "{svg}");
         let changed = one_spring(Some(-7.9), true).svg();
-        assert!(changed.contains("k1 -7.9 %") && changed.contains(&colour_of_change(-7.9, 10.0)), "{changed}");
-        assert!(
-            changed.matches("<polyline").count() == svg.matches("<polyline").count() + 1,
-            "the outline of an alarm"
-        );
+        assert!(changed.contains("k1 −7.9 %") && changed.contains(&colour_of_change(-7.9, 10.0)), "{changed}");
+        let lines = |svg: &str| svg.matches("<polyline").count();
+        assert_eq!(lines(&changed), lines(&svg) + 1, "the outline of an alarm");
+    }
+
+    #[test]
+    fn springs_side_by_side_have_their_names_at_different_heights() {
+        let mut drawing = one_spring(None, false);
+        let first = drawing.links[0].clone();
+        drawing.links.push(Link { name: "k2".to_owned(), ends: [[0.5, 0.0], [0.0, 1.0]], ..first });
+        let svg = drawing.svg();
+        let height = |name: &str| -> f64 {
+            let before = svg.split(&format!(">{name}</text>")).next().unwrap();
+            before.rsplit(" y=\"").next().unwrap().split('"').next().unwrap().parse().unwrap()
+        };
+        assert!((height("k1") - height("k2")).abs() > 26.0, "{svg}");
     }
 
     #[test]

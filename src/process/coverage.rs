@@ -74,7 +74,8 @@ impl Coverage {
         for ((name, range), value) in names.iter().zip(&self.covariates).zip(&estimate.covariates) {
             let (Some([low, high]), Some(value)) = (range, value) else { continue };
             if distance(*value, [*low, *high]) > 0.0 {
-                found.push(format!("{name} of {value:.1} (seen: {low:.1} to {high:.1})"));
+                let seen = format!("{value:.1} (seen: {low:.1} to {high:.1})").replace('-', "−");
+                found.push(format!("{name} of {seen}"));
             }
         }
         found

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use super::estimate::percent;
 use super::reference::{LastingChange, QuantityChange};
+use crate::parameter::in_words;
 
 impl LastingChange {
     /// What has changed since when, by how much, and what the seasons explain, in one sentence.
@@ -50,13 +51,18 @@ impl QuantityChange {
         let mut ends = self.interval.map(|end| self.percent(end).abs());
         let direction = if percent < 0.0 { "fallen" } else { "risen" };
         ends.sort_by(f64::total_cmp);
+        let explained = self.percent(self.explained);
+        let beside = if explained.abs() < 0.05 {
+            "which weather and seasons do not explain,".to_owned()
+        } else {
+            format!("beside {explained:+.1} % that weather and seasons explain,").replace('-', "−")
+        };
         format!(
-            "{} has {direction} by {:.1} % ({:.1} to {:.1} %), beyond the {:+.1} % that weather and seasons explain,",
-            self.name,
+            "{} has {direction} by {:.1} % ({:.1} to {:.1} %), {beside}",
+            in_words(&self.name),
             percent.abs(),
             if self.is_clear() { ends[0] } else { 0.0 },
             ends[1],
-            self.percent(self.explained),
         )
     }
 }
@@ -102,8 +108,20 @@ mod tests {
         let sentence = lasting(vec![change("k1", "N/m", 0.01, 0.1), change("k2", "N/m", -0.12, 0.04)]).sentence();
         assert_eq!(
             sentence,
-            "k2 has fallen by 3.0 % (2.0 to 4.0 %), beyond the +1.0 % that weather and seasons explain, since 2026-08-04 (between \
+            "k2 has fallen by 3.0 % (2.0 to 4.0 %), beside +1.0 % that weather and seasons explain, since 2026-08-04 (between \
              2026-08-02 and 2026-08-06); the slow chart, which finds small lasting changes, is above its limit."
+        );
+    }
+
+    #[test]
+    fn what_weather_does_not_explain_is_not_stated_as_minus_zero() {
+        let mut none = change("k2", "N/m", -0.12, 0.04);
+        none.explained = -0.0001;
+        let sentence = lasting(vec![none]).sentence();
+        assert!(
+            sentence
+                .starts_with("k2 has fallen by 3.0 % (2.0 to 4.0 %), which weather and seasons do not explain, since"),
+            "{sentence}"
         );
     }
 

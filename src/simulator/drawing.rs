@@ -130,7 +130,9 @@ impl Simulator {
             p.sets.iter().any(|s| s.spring.as_ref() == Some(&link.name) || s.beam.as_ref() == Some(&link.name))
         };
         let parameters: Vec<&str> = self.definition().parameters.iter().filter(sets).map(|p| p.name.as_str()).collect();
-        let names = || std::iter::once(link.name.as_str()).chain(parameters.iter().copied());
+        // Where a law lies between, the change of the stiffness itself counts, and not that of its parameter.
+        let by_law = format!("spring:{}", link.name);
+        let names = || [by_law.as_str(), link.name.as_str()].into_iter().chain(parameters.iter().copied());
         let change = names().find_map(|name| marks.change_percent.get(name).copied());
         let alarm = names().any(|name| marks.alarms.iter().any(|alarm| alarm == name));
         if parameters.iter().any(|name| *name != link.name) {

@@ -135,7 +135,7 @@ impl Fit {
                 format!(
                     "the simulation does not fit these measurements: its residuals are {:.2} times the noise ({}){}",
                     self.distance.unwrap_or_default(),
-                    stats::p_value_text(self.p_value.unwrap_or_default()),
+                    stats::by_chance(self.p_value.unwrap_or_default()),
                     self.worst_mode()
                 )
             };
@@ -160,8 +160,8 @@ impl Fit {
         }
         if self.p_value.is_none() && !self.rejected() {
             let message = format!(
-                "with {} modes and {} parameters, the parameters can absorb nearly any measurement, so that only \
-                 measurements beyond the prior show a misfit",
+                "whether the simulation fits cannot be tested: with {} modes, {} parameters can be chosen so that nearly every measurement is \
+                 matched. Only measurements beyond the prior show a misfit; more modes or fewer parameters would allow the test",
                 simulator.modes(),
                 simulator.space().len()
             );

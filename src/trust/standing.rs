@@ -12,11 +12,11 @@ pub fn calibration_in_words(record: &CalibrationRecord) -> Option<String> {
     let (meaning, reasons) = match record.outcome() {
         Outcome::Passed => return None,
         Outcome::Cautious => (
-            "the trained baseline in use is cautious: some intervals are wider than they need to be, and none is too narrow",
+            "the trained model in use is cautious: some intervals are wider than they need to be, and none is too narrow",
             &record.cautions,
         ),
         Outcome::Overconfident => (
-            "the trained baseline in use is overconfident: some intervals are too narrow, and it is used only because it was accepted",
+            "the trained model in use is overconfident: some intervals are too narrow, and it is used only because it was accepted",
             &record.failures,
         ),
     };

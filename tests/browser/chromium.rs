@@ -155,6 +155,25 @@ impl Page {
         self.call("Input.dispatchKeyEvent", &up);
     }
 
+    /// Drags the mouse across the page, from one point in the window to another.
+    pub fn drag(&mut self, from: [f64; 2], to: [f64; 2]) {
+        let middle = [0, 1].map(|i| 0.5 * (from[i] + to[i]));
+        let steps = [
+            ("mouseMoved", from, 0),
+            ("mousePressed", from, 1),
+            ("mouseMoved", middle, 1),
+            ("mouseMoved", to, 1),
+            ("mouseReleased", to, 0),
+        ];
+        for (kind, [x, y], buttons) in steps {
+            let button = if kind == "mouseMoved" && buttons == 0 { "none" } else { "left" };
+            let clicks = i32::from(kind == "mousePressed" || kind == "mouseReleased");
+            let event =
+                json!({ "type": kind, "x": x, "y": y, "button": button, "buttons": buttons, "clickCount": clicks });
+            self.call("Input.dispatchMouseEvent", &event);
+        }
+    }
+
     /// Types into the focused element.
     pub fn type_text(&mut self, text: &str) {
         self.call("Input.insertText", &json!({ "text": text }));

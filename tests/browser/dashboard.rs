@@ -121,7 +121,7 @@ async fn every_view_is_complete_quiet_and_accessible_in_both_themes_and_on_a_pho
     page.visit(&at(&service, "#/jobs"));
     page.wait_for(&format!("document.querySelector('[data-job=\"{diagnosis}\"]')?.textContent.includes('Done')"));
 
-    for (theme, width) in [("light", 1280), ("dark", 1280), ("light", 390), ("dark", 390)] {
+    for (theme, width) in [("light", 1400), ("dark", 1400), ("light", 400), ("dark", 400)] {
         page.look(theme, width);
         let seen = |view: &str| format!("{view}, {theme}, {width} px");
         page.visit(&at(&service, ""));
@@ -147,6 +147,7 @@ async fn every_view_is_complete_quiet_and_accessible_in_both_themes_and_on_a_pho
             check_view(&mut page, &seen(&format!("structure, {section}")));
             let screens = page.evaluate("document.documentElement.scrollHeight / 900").as_f64().unwrap();
             println!("{}: {screens:.1} screens of 900 px", seen(section));
+            assert!(width < 1400 || screens <= 3.0, "{}: {screens:.1} screens of 900 px", seen(section));
         }
 
         // A structure without measurements shows the next step.

@@ -10,10 +10,12 @@ mod dashboard;
 mod extension;
 mod figures;
 mod firefox;
+mod guide;
 #[allow(dead_code, reason = "of the helpers of tests/api some are enough here")]
 #[path = "../api/helpers.rs"]
 mod helpers;
 mod hostile;
+mod labels;
 #[allow(dead_code, reason = "not every test binary needs every kind of thing")]
 #[path = "../zz_skipped/needs.rs"]
 mod needs;

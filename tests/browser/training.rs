@@ -46,6 +46,8 @@ async fn a_model_is_trained_from_the_page_with_its_progress_and_assesses_what_wa
         }
     }
     page.evaluate("document.querySelector('dialog button:not([type=submit])').click()");
+    // A dialog leaves the page a moment after it is closed.
+    page.wait_for("document.querySelector('dialog') === null");
 
     // A training that is cancelled, then one that is used.
     press_and_fill(&mut page, "model", "Train a model", &[("samples", "20000"), ("epochs", "2000")]);

@@ -7,4 +7,5 @@ mod demo;
 mod mistakes;
 mod new;
 mod simulate;
+mod words;
 mod world;

@@ -107,14 +107,14 @@ async fn each_kind_of_invalid_model_is_refused_with_its_reason_and_batches_wait(
             }),
             "not finite",
         ),
-        ("no weights", Box::new(|f| std::fs::remove_file(weights(f)).unwrap()), "no trained baseline"),
+        ("no weights", Box::new(|f| std::fs::remove_file(weights(f)).unwrap()), "no trained model"),
         (
             "weights that are a folder",
             Box::new(|f| {
                 std::fs::remove_file(weights(f)).unwrap();
                 std::fs::create_dir(weights(f)).unwrap();
             }),
-            "no trained baseline",
+            "no trained model",
         ),
     ];
     for (name, change, reason) in &cases {
@@ -123,7 +123,7 @@ async fn each_kind_of_invalid_model_is_refused_with_its_reason_and_batches_wait(
         let service = Service::spawn(command(folder.path()).arg("--models").arg(models.path()));
         let ready = service.read("/readyz").await;
         assert_eq!((&ready["ready"], &ready["baselines_in_use"]), (&json!(true), &json!(2)), "{name}: {ready}");
-        if *reason != "no trained baseline" {
+        if *reason != "no trained model" {
             assert!(ready["baselines_refused"].to_string().contains(reason), "{name}: {ready}");
         }
         let structure = service.read("/v1/structures/three-dof").await;

@@ -12,6 +12,7 @@ mod migration;
 mod models;
 mod monitoring;
 mod output;
+mod prometheus;
 mod storage;
 mod supervision;
 mod world;

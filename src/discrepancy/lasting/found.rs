@@ -110,7 +110,7 @@ impl LastingChange {
         consequence.clone_into(&mut self.consequence);
         self.sentence = format!(
             "{} these measurements behave differently from those before: the frequencies change by {}. Neither the causes that were \
-             found nor the recorded quantities nor a yearly or daily swing explains it; this may be damage.{looks_like} {consequence}",
+             found nor the recorded quantities nor a yearly or daily cycle explains it; this may be damage.{looks_like} {consequence}",
             capitalised(&self.since_in_words(data)),
             modes.join(", ")
         );

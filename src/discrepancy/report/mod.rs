@@ -322,5 +322,5 @@ const GLOSSARY: &str = "<dl>\
     <dt>Residual</dt><dd>Measured frequency minus the predicted one. Noise alone gives a horizontal band around 0; a pattern \
     means that the simulation lacks something.</dd>\
     <dt>Lasting change</dt><dd>From a time on, the frequencies differ from those before, and neither the causes found, nor a recorded \
-    quantity with any linear or quadratic influence on each mode, nor a yearly or daily swing explains it.</dd>\
+    quantity with any linear or quadratic influence on each mode, nor a yearly or daily cycle explains it.</dd>\
     <dt>Covariate</dt><dd>A quantity that was recorded with the frequencies: temperature, load, operator, time.</dd></dl>";

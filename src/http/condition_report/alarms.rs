@@ -6,6 +6,7 @@ use std::fmt::Write as _;
 use super::words::{list, time};
 use crate::alarm::severity::SeverityLimits;
 use crate::monitor::stored::{ActionKind, AlarmAction, Episode, Handling, MaintenanceWindow, Note};
+use crate::parameter::in_words;
 use crate::plot::{escaped, table_of_html};
 
 /// The alarms with their severity, and below them what people did.
@@ -46,8 +47,12 @@ pub fn notes(notes: &[Note]) -> String {
 
 fn table(alarms: &[Episode], handling: &BTreeMap<i64, Handling>, limits: SeverityLimits) -> String {
     let what = |e: &Episode| match (e.kind.as_str(), &e.change) {
-        ("damage", Some(change)) => change.sentence(),
-        ("damage", None) => format!("{} has shifted towards damage", e.series.trim_start_matches("group:")),
+        // One event may raise the chart of a part and that of all together.
+        ("damage", Some(change)) if e.series.starts_with("structure:") => {
+            format!("Chart of all parameters together: {}", change.sentence())
+        }
+        ("damage", Some(change)) => format!("Chart of {}: {}", in_words(&e.series), change.sentence()),
+        ("damage", None) => format!("{} has shifted towards damage", in_words(&e.series)),
         ("silence", _) => "no measurement within the configured time".to_owned(),
         _ => "the simulation does not fit the measurements".to_owned(),
     };
@@ -65,15 +70,15 @@ fn table(alarms: &[Episode], handling: &BTreeMap<i64, Handling>, limits: Severit
         [Some(noted), assigned, closed].into_iter().flatten().collect::<Vec<_>>().join("; ")
     };
     let row = |e: &Episode| {
-        let ended = e.ended_at.map_or_else(|| "still open".to_owned(), time);
+        let when = match e.ended_at {
+            None => format!("since {}, still open", time(e.opened_at)),
+            Some(ended) => format!("{} to {}", time(e.opened_at), time(ended)),
+        };
         let severity = e.severity(limits).sentence;
-        [e.number.to_string(), time(e.opened_at), ended, what(e), severity, noted(e)]
-            .map(|cell| escaped(&cell))
-            .to_vec()
+        [e.number.to_string(), when, what(e), severity, noted(e)].map(|cell| escaped(&cell)).to_vec()
     };
     let rows: Vec<Vec<String>> = alarms.iter().map(row).collect();
-    let header =
-        [("Alarm", false), ("Opened", true), ("Ended", true), ("What", true), ("Severity", true), ("Handled by", true)];
+    let header = [("Alarm", false), ("When (UTC)", true), ("What", true), ("Severity", true), ("Handled by", true)];
     table_of_html("", &header, &rows)
 }
 

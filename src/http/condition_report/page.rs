@@ -5,12 +5,13 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 
 use super::alarms;
-use super::words::{list, time};
+use super::words::{counted, list, time};
 use crate::alarm::severity::SeverityLimits;
 use crate::baseline::Baseline;
 use crate::damage::UndamagedQuantity;
 use crate::monitor::stored::{Episode, Handling, MaintenanceWindow, Note, QuantitySeries, ReferenceRecord};
 use crate::monitor::Series;
+use crate::parameter::in_words;
 use crate::plot::{escaped, figure, key, page, table_of_html, Curve, Panel, Swatch};
 use crate::quantity::{StructureId, Timestamp};
 use crate::trust::TrustVerdict;
@@ -89,10 +90,10 @@ fn verdict(c: &Contents) -> String {
     };
     let _ = write!(
         text,
-        "<p class=\"facts\">Period: {period} (UTC), {} batches with {} measurements. The verdict is that of {} (UTC) and follows from the alarm \
+        "<p class=\"facts\">Period: {period} (UTC), {} with {}. The verdict is that of {} (UTC) and follows from the alarm \
          charts. Made by modalwatch {}.</p>",
-        c.series.extent.batches,
-        c.series.extent.measurements,
+        counted(c.series.extent.batches, "batch", "batches"),
+        counted(c.series.extent.measurements, "measurement", "measurements"),
         time(c.made_at),
         env!("CARGO_PKG_VERSION")
     );
@@ -150,14 +151,14 @@ fn parameters(c: &Contents) -> String {
         ("Mean", false),
         ("90 % interval", false),
         ("Change", false),
-        ("Threshold δ", false),
+        ("Damage threshold δ", false),
         ("Probability of damage", false),
     ];
     let keys = [
         key(Swatch::Line, 0, "mean of each batch"),
         key(Swatch::Bar, 6, "90 % interval"),
         key(Swatch::Dashed, 2, "mean of the undamaged reference"),
-        key(Swatch::Dashed, 1, "threshold δ"),
+        key(Swatch::Dashed, 1, "damage threshold δ"),
     ]
     .concat();
     let caption = "Probability of damage: that the parameter lies below δ, the 5 % quantile of the undamaged reference. One of twenty healthy \
@@ -186,7 +187,7 @@ fn latest(c: &Contents, q: &QuantitySeries) -> Vec<String> {
         p if p > 0.999 => "> 99.9 %".to_owned(),
         p => format!("{:.1} %", 100.0 * p),
     };
-    [q.name.clone(), with_unit(mean), interval, change, threshold, probability].map(|cell| escaped(&cell)).to_vec()
+    [in_words(&q.name), with_unit(mean), interval, change, threshold, probability].map(|cell| escaped(&cell)).to_vec()
 }
 
 fn panel(c: &Contents, q: &QuantitySeries) -> String {
@@ -206,9 +207,9 @@ fn panel(c: &Contents, q: &QuantitySeries) -> String {
         Curve { colour, dashed: true, filled_to: None, points }
     };
     Panel {
-        title: q.name.clone(),
+        title: in_words(&q.name),
         x_label: format!("days after {}", Timestamp::from_micros(begin).map_or_else(|_| String::new(), Timestamp::day)),
-        y_label: if unit.is_empty() { q.name.clone() } else { unit },
+        y_label: if unit.is_empty() { in_words(&q.name) } else { unit },
         band: band.collect(),
         curves: vec![
             level(reference.map(|r| r.mean), 2),
@@ -247,8 +248,13 @@ fn missing_modes(c: &Contents) -> Vec<f64> {
 fn quality(c: &Contents) -> String {
     let (rejected, found) = findings(c);
     let shown = c.series.trust.rows.len();
-    let mut items = vec![format!("{rejected} of {shown} assessed batches were rejected.")];
-    items.extend(found.iter().map(|(code, count)| format!("{count} batches with the finding “{code}”.")));
+    let mut items =
+        vec![format!("Rejected: {rejected} of {}.", counted(shown as u64, "assessed batch", "assessed batches"))];
+    items.extend(
+        found
+            .iter()
+            .map(|(code, count)| format!("{} with the finding “{code}”.", counted(*count as u64, "batch", "batches"))),
+    );
     for (mode, share) in missing_modes(c).into_iter().enumerate().filter(|(_, share)| *share > 0.0) {
         items.push(format!("Mode {} is missing in {:.1} % of the measurements.", mode + 1, 100.0 * share));
     }
@@ -282,11 +288,11 @@ fn basis(c: &Contents) -> String {
         Some(record) => {
             let state = &record.state;
             items.push(format!(
-                "Undamaged reference, version {}, declared {}: {} batches with {} measurements.",
+                "Undamaged reference, version {}, declared {}: {} with {}.",
                 state.version,
                 time(record.created_at),
-                record.batches.len(),
-                state.measurements
+                counted(record.batches.len() as u64, "batch", "batches"),
+                counted(state.measurements as u64, "measurement", "measurements")
             ));
             items.extend(state.origin.reason.iter().map(|reason| format!("Its reason: {reason}.")));
             items.extend(state.doubts.iter().map(|doubt| format!("Doubt about it: {doubt}.")));
@@ -322,8 +328,10 @@ fn unknown(c: &Contents) -> Vec<String> {
             }
             for (name, found) in longest {
                 items.push(format!(
-                    "Lasting losses of {name} below {:.1} %: these charts find larger ones with a probability of 90 % within {} batches.",
-                    found.loss_percent, found.batches
+                    "Lasting losses of {} below {:.1} %: these charts find larger ones with a probability of 90 % within {} batches.",
+                    in_words(name),
+                    found.loss_percent,
+                    found.batches
                 ));
             }
             if let Some(coverage) = process.process.coverage.as_ref().filter(|coverage| coverage.months.len() < 12) {
@@ -354,7 +362,10 @@ fn unknown(c: &Contents) -> Vec<String> {
     }
     let (rejected, _) = findings(c);
     if rejected > 0 {
-        items.push(format!("The condition during the {rejected} rejected batches: nothing is concluded from them."));
+        items.push(format!(
+            "The condition during {}: nothing is concluded from what was rejected.",
+            counted(rejected as u64, "rejected batch", "rejected batches")
+        ));
     }
     for (mode, _) in missing_modes(c).into_iter().enumerate().filter(|(_, share)| *share > OFTEN_MISSING) {
         items.push(format!("Changes that only mode {} shows, while it is missing.", mode + 1));

@@ -18,3 +18,8 @@ pub fn list(items: &[String]) -> String {
     }
     text + "</ul>"
 }
+
+/// `1 batch`, `2 batches`.
+pub fn counted(n: u64, one: &str, many: &str) -> String {
+    format!("{n} {}", if n == 1 { one } else { many })
+}

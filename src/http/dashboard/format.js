@@ -73,9 +73,9 @@ export function number(value, digits = 4) {
   const size = Math.abs(value);
   if (size !== 0 && (size < 1e-3 || size >= 1e6)) {
     const [mantissa, exponent] = value.toExponential(digits - 1).split("e");
-    return `${Number(mantissa)}·10${[...String(Number(exponent))].map((c) => SUPERSCRIPT[c]).join("")}`;
+    return minus(`${Number(mantissa)}·10${[...String(Number(exponent))].map((c) => SUPERSCRIPT[c]).join("")}`);
   }
-  return String(Number(value.toPrecision(digits)));
+  return minus(String(Number(value.toPrecision(digits))));
 }
 
 const SUPERSCRIPT = Object.fromEntries([..."0123456789-"].map((c, i) => [c, "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"[i]]));
@@ -134,9 +134,29 @@ export function words(code) {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
+/** A text with a capital letter at its beginning. */
+export function sentence(text) {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** A number as text with the sign of minus instead of a hyphen. */
+function minus(text) {
+  return text.replace("-", "−");
+}
+
 /** The first digits of a digest; the tooltip shows all of them. */
 export function digest(value) {
   return value ? h("code", { title: value }, value.slice(0, 12)) : h("span", null, MISSING);
+}
+
+/**
+ * The name of a monitored quantity as people read it: `spring:k12`, a stiffness that follows from a parameter by a law, is the
+ * “stiffness of spring k12”; `group:k1+k2`, parameters that the measurements cannot tell apart, is “k1 and k2 together”.
+ */
+export function inWords(quantity) {
+  if (quantity?.startsWith("spring:")) return `stiffness of spring ${quantity.slice(7)}`;
+  if (quantity?.startsWith("group:")) return `${quantity.slice(6).replaceAll("+", " and ")} together`;
+  return quantity;
 }
 
 /** `1 batch`, `2 batches`. */

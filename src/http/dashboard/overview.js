@@ -3,8 +3,9 @@
 import { at, read } from "./api.js";
 import { acknowledgeDialog, alarmWords } from "./sections/alarms.js";
 import { describe } from "./sections/describe.js";
+import { guide } from "./sections/guide.js";
 import { cell, fill, h, icon, refill, throttled } from "./dom.js";
-import { age, count, percent } from "./format.js";
+import { age, count, inWords, percent } from "./format.js";
 import { help } from "./help.js";
 import { EVERY_STATE, stateChip, stateWord, trustChip, urgency } from "./states.js";
 
@@ -40,6 +41,13 @@ export function overview() {
     body,
   );
   const blank = h("div", null);
+  /** Whether the guide is shown. */
+  let guided = false;
+  const another = h(
+    "p",
+    { class: "buttons start" },
+    h("button", { type: "button", onclick: () => describe() }, "Describe a structure"),
+  );
   const element = h(
     "div",
     { class: "view", dataset: { page: "fleet" } },
@@ -48,11 +56,7 @@ export function overview() {
     alarmList,
     blank,
     table,
-    h(
-      "p",
-      { class: "buttons start" },
-      h("button", { type: "button", onclick: () => describe() }, "Describe a structure"),
-    ),
+    another,
   );
 
   const load = async () => {
@@ -73,8 +77,13 @@ export function overview() {
     fill(body, sorted.map(row));
     if (focused) body.querySelector(`tr[data-structure="${CSS.escape(focused)}"] a`)?.focus();
     table.hidden = items.length === 0;
-    tiles.hidden = items.length === 0;
-    fill(blank, items.length === 0 ? firstSteps() : "");
+    // Until there are measurements, the way to them is what a person needs.
+    const isNew = items.every((item) => item.batches === 0);
+    tiles.hidden = isNew;
+    // The first step of the guide has the same button.
+    another.hidden = isNew;
+    if (isNew !== guided) fill(blank, isNew ? firstSteps(items.length > 0) : "");
+    guided = isNew;
     const open = items.reduce((sum, item) => sum + item.open_alarms, 0);
     // The title shows the number of alarms even if the tab is in the background.
     document.title = `${open > 0 ? `(${open}) ` : ""}Fleet – modalwatch`;
@@ -156,7 +165,7 @@ function row(item) {
     cell(
       "Probability of damage",
       damage
-        ? h("span", null, meter(latest), ` ${latest.max_parameter}`)
+        ? h("span", null, meter(latest), ` ${inWords(latest.max_parameter)}`)
         : h(
             "span",
             { class: "soft" },
@@ -204,20 +213,19 @@ function modelMark(item) {
   return h("span", { class: "soft" }, "calibrated");
 }
 
-/** The way to the first verdict, for a service without any structure. */
-function firstSteps() {
-  return h(
-    "div",
-    { class: "blank" },
-    h("h2", null, "No structures yet"),
-    h(
-      "ol",
-      null,
-      h("li", null, h("strong", null, "Describe"), " the structure: button below, or a structure file."),
-      h("li", null, h("strong", null, "Train"), " its model: its page shows the command."),
-      h("li", null, h("strong", null, "Upload"), " measured frequencies: drag a table onto its page."),
-      h("li", null, h("strong", null, "Mark"), " the healthy period: its page compares all later batches with it."),
+/** The way to the first verdict, for a service without any measurements. Some structures are shipped with the program. */
+function firstSteps(others) {
+  return guide({
+    title: "No measurements yet: four steps to the first verdict",
+    done: [false, false, false, false],
+    act: [() => describe()],
+    more: h(
+      "p",
+      { class: "fine" },
+      others && "The structures below are examples that are shipped with the program, or yours: their pages go on with the step that comes next. ",
+      "Everything is done on these pages; programs do the same over the ",
+      h("a", { href: "docs/api" }, "API"),
+      ".",
     ),
-    h("p", { class: "fine" }, "Programs do the same over the ", h("a", { href: "docs/api" }, "API"), "."),
-  );
+  });
 }

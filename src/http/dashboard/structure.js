@@ -8,14 +8,16 @@ import { parameters } from "./charts/parameters.js";
 import { scatter } from "./charts/scatter.js";
 import { tracks } from "./charts/tracks.js";
 import { trust } from "./charts/trust.js";
-import { ask, fieldTime, fill, h, icon, throttled } from "./dom.js";
-import { age, count, local, percent, zone } from "./format.js";
+import { ask, fieldTime, fill, h, icon, notify, throttled } from "./dom.js";
+import { age, count, inWords, local, percent, zone } from "./format.js";
 import { help } from "./help.js";
 import { alarms } from "./sections/alarms.js";
 import { batch } from "./sections/batch.js";
 import { diagnosis } from "./sections/diagnosis.js";
 import { drawing } from "./sections/drawing.js";
+import { guide } from "./sections/guide.js";
 import { maintenance } from "./sections/maintenance.js";
+import { marking } from "./sections/marking.js";
 import { declare, model, postLine } from "./sections/model.js";
 import { notes } from "./sections/notes.js";
 import { upload } from "./sections/upload.js";
@@ -48,6 +50,9 @@ const SECTIONS = [
 /** Sections that show the time span that is chosen. */
 const OVER_TIME = ["condition", "tracks", "batch"];
 
+/** Sections with charts on which the healthy period can be marked by dragging. */
+const MARKED_ON = ["condition", "tracks"];
+
 /** `query` is the part of the address that says what is shown: `section`, `from`, `to`, `batch`. */
 export function structure(id, query) {
   const state = { info: null, item: null, series: null, batch: query.get("batch") };
@@ -70,9 +75,13 @@ export function structure(id, query) {
     state.batch = chosen;
     writeAddress();
   });
-  const drawn = drawing(id, (name) => {
-    figures.control.choose(name);
-    figures.control.element.scrollIntoView({ block: "start" });
+  const drawn = drawing(id, (part) => {
+    const sets = (p) => [p.sets ?? []].flat().some((set) => set.spring === part || set.beam === part);
+    const own = (state.info.definition.parameter ?? []).filter(sets).map((p) => p.name);
+    const ofGroup = ({ chart }) => own.some((name) => chart.startsWith("group:") && chart.slice(6).split("+").includes(name));
+    const groups = (state.series?.charts ?? []).filter(ofGroup).map((c) => c.chart);
+    if (figures.control.choose([part, `spring:${part}`, ...own, ...groups])) figures.control.element.scrollIntoView({ block: "start" });
+    else notify(own.length > 0 ? `There is no control chart of ${part} yet.` : `${part} is not monitored: no parameter of the structure sets it.`);
   });
   const alarmList = alarms(id);
   const windows = maintenance(id, () => refresh.series());
@@ -86,13 +95,13 @@ export function structure(id, query) {
     { type: "button", onclick: () => declare(id, () => refresh.all(), { period: shownSpan() }) },
     "Use this time span as undamaged reference",
   );
-  const first = h("div", null);
+  const marker = marking(group, (period) => declare(id, () => refresh.all(), { period }));
+  const first = h("div", { hidden: true });
   const sections = {
     condition: section(
       "condition",
       "Condition",
-      drawn.element,
-      figures.parameters.element,
+      h("div", { class: "beside" }, drawn.element, figures.parameters.element),
       figures.control.element,
       h("div", { class: "grid two" }, figures.heat.element, figures.trust.element),
     ),
@@ -106,7 +115,7 @@ export function structure(id, query) {
   let shown = SECTIONS.some(([name]) => name === query.get("section")) ? query.get("section") : "condition";
   const compared = h("a", { class: "button", href: "#/compare" }, "Compare");
   const printed = h("a", { class: "button" }, "Condition report");
-  const spansRow = h("div", { class: "row spans" }, spans, spanText, h("span", null, asReference, " ", help("undamaged reference")), printed, compared);
+  const spansRow = h("div", { class: "row spans" }, spans, spanText, marker.button, h("span", null, asReference, " ", help("undamaged reference")), printed, compared);
   const jumps = h(
     "nav",
     { class: "jumps", "aria-label": "Sections" },
@@ -127,6 +136,7 @@ export function structure(id, query) {
     jumps,
     first,
     spansRow,
+    marker.hint,
     Object.values(sections),
   );
 
@@ -169,6 +179,7 @@ export function structure(id, query) {
       else link.removeAttribute("aria-current");
     }
     spansRow.hidden = empty || !OVER_TIME.includes(shown);
+    if (!MARKED_ON.includes(shown)) marker.end();
     writeAddress();
   }
 
@@ -262,9 +273,11 @@ export function structure(id, query) {
     const empty = (item?.batches ?? series.batches) === 0;
     state.empty = empty;
     show(empty && OVER_TIME.includes(shown) ? "upload" : shown);
-    fill(first, empty ? nothingYet(info) : "");
+    showSteps();
+    alarmList.element.hidden = empty;
     if (empty) return;
     asReference.hidden = !info.model;
+    marker.button.hidden = !info.model;
     const ends = shownSpan();
     const period = new URLSearchParams({ from: iso(ends[0]), to: iso(ends[1] + 60) });
     printed.href = `${address()}/report?${period}`;
@@ -286,12 +299,38 @@ export function structure(id, query) {
     });
   }
 
+  /** What of the guide is shown, so that it is drawn again only after a step was done. */
+  let stepsShown = null;
+
+  /** The guide to the first verdict, until there is one. */
+  function showSteps() {
+    const { info, empty } = state;
+    const done = [true, Boolean(info.model), !empty, Boolean(info.undamaged)];
+    if (String(done) === stepsShown) return;
+    stepsShown = String(done);
+    const train = () => {
+      show("model");
+      used.train();
+    };
+    const mark = () => {
+      show("condition");
+      marker.begin();
+      spansRow.scrollIntoView({ block: "start" });
+    };
+    const more = empty && byProgram(info);
+    const act = [null, train, () => show("upload"), mark];
+    const steps = guide({ title: "The way to the first verdict", done, act, more });
+    first.hidden = steps === null;
+    fill(first, steps);
+  }
+
   async function loadInfo() {
     const [info, overview] = await Promise.all([read(at(id)), read("v1/overview")]);
     state.info = info;
     state.item = overview.items.find((item) => item.id === id) ?? null;
     fill(headline, head(id, state));
     used.update(info, state.item?.batches ?? 0);
+    if (state.empty !== undefined) showSteps();
     await drawn.load(info);
   }
 
@@ -359,7 +398,10 @@ export function structure(id, query) {
       } else if (name === "structure") refresh.all();
     },
     missed: () => refresh.all(),
-    end: () => (left = true),
+    end: () => {
+      left = true;
+      marker.leave();
+    },
   };
 }
 
@@ -374,9 +416,9 @@ function head(id, { info, item }) {
   else if (latest && latest.max_probability_of_damage !== null && latest.max_probability_of_damage !== undefined)
     facts.push(
       ["Highest probability of damage ", help("probability of damage")],
-      ` in the latest batch: ${percent(latest.max_probability_of_damage)} (${latest.max_parameter}).`,
+      ` in the latest batch: ${percent(latest.max_probability_of_damage)} (${inWords(latest.max_parameter)}).`,
     );
-  if (item?.state === "not_judged") facts.push("Declare the undamaged reference below, under “Model”.");
+  if (item?.state === "not_judged" && item.undamaged_version) facts.push("The undamaged reference can be declared again under “Model”.");
   if (item?.state === "silent") facts.push("Check the data logger and its connection.");
   return [
     h("div", { class: "row" }, h("h1", null, id), item && stateChip(item.state)),
@@ -387,12 +429,16 @@ function head(id, { info, item }) {
         "p",
         { class: "fine" },
         facts.flatMap((fact) => [fact, " "]),
-        "Last measured ",
-        age(item.last_measured_at),
-        ", last received ",
-        age(item.last_received_at),
-        ", ",
-        count(item.batches, "batch", "batches"),
+        item.batches === 0
+          ? "No measurements yet."
+          : [
+              "Last measured ",
+              age(item.last_measured_at),
+              ", last received ",
+              age(item.last_received_at),
+              ", ",
+              count(item.batches, "batch", "batches"),
+            ],
         item.open_alarms > 0 && [
           " · ",
           icon("alarm"),
@@ -403,18 +449,13 @@ function head(id, { info, item }) {
   ];
 }
 
-function nothingYet(info) {
+/** How a program sends the first batch. */
+function byProgram(info) {
   return h(
-    "div",
-    { class: "blank" },
-    h("h2", null, "No measurements yet"),
-    h(
-      "p",
-      null,
-      "The structure is registered",
-      info.model ? " and its trained model is ready" : "",
-      ". Send the first batch; it appears here automatically:",
-    ),
+    "details",
+    null,
+    h("summary", null, "Send measurements by a program"),
+    h("p", { class: "fine" }, "They appear here by themselves:"),
     h("pre", { tabindex: 0 }, h("code", null, postLine(info))),
   );
 }

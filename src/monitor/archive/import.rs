@@ -184,7 +184,7 @@ impl Import<'_> {
             (_, Some((definition, _))) => simulator_of(&structure, version.as_str(), &definition)?,
             _ => {
                 return Err(
-                    invalid(&format!("a trained baseline is for version {version}, which the archive lacks")).into()
+                    invalid(&format!("a trained model is for version {version}, which the archive lacks")).into()
                 )
             }
         };
@@ -193,7 +193,7 @@ impl Import<'_> {
         let loaded = tokio::task::spawn_blocking(move || Baseline::load(&manifest, &weights, &simulator)).await;
         let loaded = loaded.map_err(|_| Error::Panicked)?.map_err(|e| invalid(&e))?;
         if loaded.digest().as_str() != model.model_digest {
-            return Err(invalid(&"a trained baseline does not match its digest").into());
+            return Err(invalid(&"a trained model does not match its digest").into());
         }
         self.done.models +=
             u64::from(self.assessor.store.archive().import_model(&structure, model, Timestamp::now()).await?);
@@ -214,7 +214,7 @@ impl Import<'_> {
         if let Some(state) = self.assessor.store.reference().undamaged(&structure).await? {
             if in_use.as_ref().is_some_and(|digest| *digest != state.model_digest) {
                 self.done.warnings.push(format!(
-                    "the undamaged reference {} was made with the trained baseline {}, which is not in use here: batches are not \
+                    "the undamaged reference {} was made with the trained model {}, which is not in use here: batches are not \
                      compared with it",
                     state.state.version, state.model_digest
                 ));

@@ -217,23 +217,38 @@ export function endCharts() {
   [...liveCharts].forEach((end) => end());
 }
 
+/** The selection of a chart in which nothing is selected. */
+const NOTHING = { left: 0, top: 0, width: 0, height: 0 };
+
 /** Charts with a common time span, cursor and zoom. */
 export class TimeGroup {
   constructor(onZoom) {
     this.sync = uPlot.sync(`group-${Math.random()}`);
     this.onZoom = onZoom;
+    /** Takes the time span of a drag instead of `onZoom`, while a period is marked; `null` otherwise. */
+    this.onMark = null;
     /** Time span shown, in seconds; `null` shows the whole record `all`. */
     this.range = null;
     this.all = [0, 1];
+  }
+
+  /** Takes what is marked off all charts. */
+  clearSelection() {
+    for (const u of this.sync.plots) u.setSelect(NOTHING, false);
   }
 
   /** uPlot options common to all charts of the group. */
   options() {
     const zoom = (u) => {
       const { left, width } = u.select;
-      u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
-      if (width < 8) return;
       const range = [u.posToVal(left, "x"), u.posToVal(left + width, "x")];
+      // What is marked stays visible until it is decided upon.
+      if (this.onMark && width >= 8) {
+        this.onMark(range);
+        return;
+      }
+      u.setSelect(NOTHING, false);
+      if (width < 8) return;
       // All charts with the common cursor report the same selection; only the first report counts.
       if (this.range && Math.abs(range[0] - this.range[0]) + Math.abs(range[1] - this.range[1]) < 1) return;
       this.onZoom(range);

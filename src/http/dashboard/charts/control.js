@@ -1,7 +1,7 @@
 // The control chart: shift of each batch and its moving average, with limits and alarms.
 
 import { h } from "../dom.js";
-import { count, local, number, timeElement, words } from "../format.js";
+import { count, inWords, local, number, timeElement, words } from "../format.js";
 import { stateChip, urgency } from "../states.js";
 import { chart, curve, draw, mark, merged, rule, seconds, shade, timeAxis, valueAxis, withGaps } from "./base.js";
 import { figure } from "./figure.js";
@@ -23,18 +23,22 @@ const KEYS = [
 ];
 
 const label = (chart) =>
-  chart === FIT_CHART ? "simulation fit" : chart === JOINT_CHART ? "all parameters together" : chart;
+  chart === FIT_CHART ? "simulation fit" : chart === JOINT_CHART ? "all parameters together" : inWords(chart);
 
 /** Names of the two values of a chart. */
 const names = (c) =>
-  c.is_process
+  c.chart === FIT_CHART
+    ? { one: "rejected", several: "average", unit: "1: rejected, 0: accepted" }
+    : c.is_process
     ? { one: "fast chart", several: "slow chart", unit: "standard deviations" }
     : { one: "shift", several: "moving average", unit: "standard errors" };
 
 const hint = (c) =>
-  c.is_process
+  c.chart === FIT_CHART
+    ? "Whether the simulation can explain each batch: 1 is a rejected batch, 0 an accepted one. Several rejected batches raise an alarm about the simulation or the data, not about the structure."
+    : c.is_process
     ? "Evidence for a lasting loss that weather and seasons do not explain, in standard deviations. The fast chart finds steps in up to three batches, the slow one small losses over up to 60. The process was learned from the undamaged reference."
-    : "Shift towards damage relative to the undamaged reference, in standard errors. In the chart “simulation fit”, 1 means a rejected batch.";
+    : "Shift towards damage relative to the undamaged reference, in standard errors. Several batches together show small losses by their moving average.";
 
 /** States of a chart in words: they say nothing about the structure as a whole. */
 const CHART_STATES = {
@@ -206,11 +210,13 @@ export function control(group, selectBatch) {
 
   return {
     element: frame.element,
-    /** Shows the chart with a name, if there is one. */
-    choose(name) {
-      if (!newest?.charts.some((c) => c.chart === name)) return;
-      chosen = name;
+    /** Shows the first chart there is of some names; returns whether there is one. */
+    choose(names) {
+      const found = names.find((name) => newest?.charts.some((c) => c.chart === name && c.times.length > 0));
+      if (found === undefined) return false;
+      chosen = found;
       show();
+      return true;
     },
     update(series) {
       newest = series;

@@ -1,7 +1,7 @@
 // Prior, reference and posterior density of each parameter for one batch.
 
 import { h } from "../dom.js";
-import { number, quantity } from "../format.js";
+import { inWords, number, quantity } from "../format.js";
 import { acrossAxis, band, chart, curve, draw, edge, rule, valueAxis } from "./base.js";
 import { figure, keyList } from "./figure.js";
 import { help } from "../help.js";
@@ -24,7 +24,7 @@ export function densities() {
       charts = [];
       grid.replaceChildren();
       for (const p of detail?.parameters ?? []) {
-        const frame = figure({ name: `density-${p.name}`, title: p.name, level: "h4", fileKeys: KEYS });
+        const frame = figure({ name: `density-${p.name}`, title: inWords(p.name), level: "h4", fileKeys: KEYS });
         grid.append(frame.element);
         if (p.grid.length === 0) {
           frame.empty("No samples for this parameter.");
@@ -52,7 +52,7 @@ function densityChart(frame, p) {
       ],
       bands: [band(3, 4, "curve-1", 0.22)],
       axes: [
-        acrossAxis(unit ? `${p.name} (${unit})` : p.name),
+        acrossAxis(unit ? `${inWords(p.name)} (${unit})` : inWords(p.name)),
         valueAxis(unit ? `density (1/${unit.includes("/") ? `(${unit})` : unit})` : "density"),
       ],
       scales: {
@@ -78,20 +78,20 @@ function densityChart(frame, p) {
   }
   const peak = (values) => p.grid[values.indexOf(Math.max(...values))];
   frame.summarise(
-    `Density of ${p.name}. This batch peaks at ${quantity(peak(p.posterior), unit)}` +
+    `Density of ${inWords(p.name)}. This batch peaks at ${quantity(peak(p.posterior), unit)}` +
       `${p.undamaged ? `, the undamaged reference at ${quantity(peak(p.undamaged), unit)}` : ""}` +
-      `${p.threshold === null || p.threshold === undefined ? "" : `; threshold δ ${quantity(p.threshold, unit)}`}. Use the arrow keys to read the values.`,
+      `${p.threshold === null || p.threshold === undefined ? "" : `; damage threshold δ ${quantity(p.threshold, unit)}`}. Use the arrow keys to read the values.`,
   );
   const perUnit = unit ? `1/(${unit})` : "1";
   frame.record(() => ({
     columns: [
-      unit ? `${p.name} (${unit})` : p.name,
+      unit ? `${inWords(p.name)} (${unit})` : inWords(p.name),
       ...["this batch", "undamaged reference", "prior"].map((words) => `density of ${words} (${perUnit})`),
     ],
     rows: p.grid.map((x, i) => [x, p.posterior[i], undamaged[i], p.prior[i]]),
   }));
   frame.tabulate(() => ({
-    columns: [unit ? `${p.name} (${unit})` : p.name, "This batch", "Undamaged reference", "Prior"],
+    columns: [unit ? `${inWords(p.name)} (${unit})` : inWords(p.name), "This batch", "Undamaged reference", "Prior"],
     rows: p.grid.map((x, i) => [
       number(x, 5),
       number(p.posterior[i], 3),

@@ -1,7 +1,7 @@
 // Heat map of the probability of damage: one row per parameter, one column per batch. Its colours are neutral, because a healthy
 // structure shows high probabilities at times; a red frame marks the alarms of a parameter.
 
-import { count, local, percent, timeElement } from "../format.js";
+import { count, inWords, local, percent, timeElement } from "../format.js";
 import { LEFT, chart, draw, mark, merged, seconds, timeAxis, valueAxis } from "./base.js";
 import { figure } from "./figure.js";
 import { alarmSpans, rejectedBatches } from "./parameters.js";
@@ -35,7 +35,7 @@ export function heat(group, selectBatch) {
       one = null;
       const rows = parameters.filter((p) => p.probability_of_damage.some((v) => v !== null && v !== undefined));
       if (rows.length === 0)
-        return frame.empty("Requires an undamaged reference: see “Trained model and undamaged reference”.");
+        return frame.empty("Begins with an undamaged reference: “Mark the healthy period” above.");
       frame.empty(null);
       // A thinned series may keep different batches for each parameter; the map shows all of them.
       const cells = new Map();
@@ -115,21 +115,21 @@ export function heat(group, selectBatch) {
       function readout(u) {
         const column = columns[u.cursor.idx ?? -1];
         return column
-          ? [timeElement(column.time), ` · ${rows.map((p, r) => `${p.name} ${describe(column, r)}`).join(" · ")}`]
+          ? [timeElement(column.time), ` · ${rows.map((p, r) => `${inWords(p.name)} ${describe(column, r)}`).join(" · ")}`]
           : "";
       }
       const latest = columns.at(-1);
       const most = rows.map((_, r) => r).sort((a, b) => (latest.values[b] ?? -1) - (latest.values[a] ?? -1))[0];
       frame.summarise(
         `${count(rows.length, "parameter")} over ${count(columns.length, "batch", "batches")} to ${local(latest.time)}. ` +
-          `Highest in the latest batch: ${rows[most].name} ${describe(latest, most)}. Use the arrow keys to read the values and Enter to open the batch.`,
+          `Highest in the latest batch: ${inWords(rows[most].name)} ${describe(latest, most)}. Use the arrow keys to read the values and Enter to open the batch.`,
       );
       frame.record(() => ({
-        columns: ["time", ...rows.map((p) => `probability of damage of ${p.name} (1)`), "batch"],
+        columns: ["time", ...rows.map((p) => `probability of damage of ${inWords(p.name)} (1)`), "batch"],
         rows: columns.map((c) => [c.time, ...rows.map((_, r) => c.values[r]), c.batch]),
       }));
       frame.tabulate(() => ({
-        columns: ["Time", ...rows.map((p) => p.name)],
+        columns: ["Time", ...rows.map((p) => inWords(p.name))],
         rows: columns.map((c) => [timeElement(c.time), ...rows.map((_, r) => describe(c, r))]),
       }));
     },
@@ -150,4 +150,8 @@ function edgesOf(times) {
   });
 }
 
-const short = (name) => (name.length > 9 ? `${name.slice(0, 8)}…` : name);
+/** A name that fits beside its row. */
+const short = (name) => {
+  const bare = name.replace(/^(spring|group):/, "");
+  return bare.length > 9 ? `${bare.slice(0, 8)}…` : bare;
+};

@@ -1,7 +1,7 @@
 // For each parameter, the mean with its 90 % interval and the threshold, and below it the probability of damage.
 
 import { h } from "../dom.js";
-import { changePercent, count, local, number, percent, percentWithin, scale, timeElement } from "../format.js";
+import { changePercent, count, inWords, local, number, percent, percentWithin, scale, timeElement } from "../format.js";
 import {
   band,
   chart,
@@ -90,7 +90,7 @@ export function parameters(group, selectBatch) {
 }
 
 function parameterFigure(group, { name, unit }, selectBatch) {
-  const frame = figure({ name: `parameter-${name}`, title: name, level: "h4", fileKeys: KEYS });
+  const frame = figure({ name: `parameter-${name}`, title: inWords(name), level: "h4", fileKeys: KEYS });
   let charts = [];
   const end = () => {
     charts.forEach((c) => c.end());
@@ -100,7 +100,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
   const update = (given, series, usual) => {
     end();
     const p = inReadableUnit(given, unit);
-    const title = p.unit ? `${name} (${p.unit})` : name;
+    const title = p.unit ? `${inWords(name)} (${p.unit})` : inWords(name);
     if (p.times.length === 0) return frame.empty("No assessed batch in this time span.");
     frame.empty(null);
     const filled = withGaps(p.times.map(seconds), [
@@ -116,7 +116,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
     const windows = series.maintenance.map((w) => [seconds(w.from), seconds(w.to)]);
     const background = (u) => {
       shade(u, windows, "maintenance");
-            drawNotes(u, series.notes);
+      drawNotes(u, series.notes);
       shade(u, alarms, "bad", { opacity: 0.16 });
       shade(u, filled.gaps, "ink-soft", { striped: true });
     };
@@ -202,7 +202,7 @@ function parameterFigure(group, { name, unit }, selectBatch) {
     frame.record(() => ({
       columns: [
         "time",
-        inUnit(`mean of ${name}`),
+        inUnit(`mean of ${inWords(name)}`),
         inUnit("lower end of its 90 % interval"),
         inUnit("upper end of its 90 % interval"),
         "probability of damage (1)",

@@ -2,7 +2,7 @@
 
 import { at, read, send } from "../api.js";
 import { ask, fill, h, icon, notify, problem, refill } from "../dom.js";
-import { count, number, timeElement, words } from "../format.js";
+import { count, inWords, number, timeElement, words } from "../format.js";
 import { authorBody, authorField, plain } from "./notes.js";
 
 const STATE = {
@@ -44,7 +44,7 @@ export function alarmWords(alarm) {
   if (alarm.kind === "damage" && alarm.sentence) return alarm.sentence;
   if (alarm.kind === "damage" && !alarm.parameter) return "the parameters together have shifted towards damage";
   if (alarm.kind === "damage")
-    return `${alarm.parameter} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
+    return `${inWords(alarm.parameter)} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
   if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit the measurements";
   if (alarm.kind === "silence") return "no measurement within the configured time";
   return words(alarm.kind).toLowerCase();
@@ -213,6 +213,12 @@ function severityChip(severity) {
   return h("span", { class: `chip ${kind}` }, word);
 }
 
+/** The chart that raised an alarm: one event may raise that of a part and that of all together. */
+function chartOf(alarm) {
+  if (alarm.kind !== "damage") return null;
+  return alarm.parameter ? `chart of ${inWords(alarm.parameter)}, ` : "chart of all parameters together, ";
+}
+
 export function alarms(structure) {
   let filter = "all";
   let loaded = null;
@@ -305,6 +311,7 @@ export function alarms(structure) {
         h(
           "span",
           { class: "fine" },
+          chartOf(alarm),
           "from ",
           timeElement(alarm.opened_at),
           !superseded && alarm.ended_at && [" to ", timeElement(alarm.ended_at)],

@@ -1,10 +1,11 @@
 // One batch in detail: probability densities, measured and predicted frequencies, trust and findings.
 
 import { at, read } from "../api.js";
+import { signed } from "../charts/parameters.js";
 import { densities } from "../charts/density.js";
 import { modes } from "../charts/modes.js";
 import { cell, fill, h, icon, problem } from "../dom.js";
-import { count, digest, local, number, percentWithin, quantity, timeElement, words, worth } from "../format.js";
+import { count, digest, inWords, local, number, percentWithin, quantity, timeElement, words, worth } from "../format.js";
 import { help } from "../help.js";
 import { trustChip } from "../states.js";
 import { shapes } from "./shapes.js";
@@ -131,7 +132,7 @@ function describe(info) {
         "span",
         null,
         trustChip(a.trust, a.findings.length),
-        a.fit_p_value !== null ? [` fit: p = ${number(a.fit_p_value, 2)} `, help("p-value of the fit")] : "",
+        a.fit_p_value !== null ? [` p-value of the fit: ${number(a.fit_p_value, 2)} `, help("p-value of the fit")] : "",
       ),
     ],
     a && ["Trained model", digest(a.model_digest)],
@@ -191,11 +192,11 @@ function parameterTable(a) {
     h(
       "tr",
       null,
-      h("th", { scope: "row" }, p.name),
+      h("th", { scope: "row" }, inWords(p.name)),
       cell("Mean", quantity(p.mean, p.unit)),
       cell("90 % interval", interval(p.mean_interval)),
       cell("Damage threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
-      cell("Change from reference", p.relative_change === null ? "–" : `${number(100 * p.relative_change, 3)} %`),
+      cell("Change from reference", p.relative_change === null ? "–" : `${signed(100 * p.relative_change)} %`),
       cell(
         "Probability of damage",
         p.probability_of_damage === null

@@ -2,7 +2,7 @@
 
 import { at, read, send } from "../api.js";
 import { ask, cell, fieldTime, fill, h, icon, notify, throttled } from "../dom.js";
-import { count, digest, local, number, percent, quantity, worth, zone } from "../format.js";
+import { count, digest, inWords, local, number, percent, quantity, sentence, worth, zone } from "../format.js";
 import { training } from "./training.js";
 import { help } from "../help.js";
 
@@ -21,6 +21,7 @@ export function model(structure, changed) {
     element,
     /** Shows the progress of a training. */
     job: throttledJob(trainings),
+    train: () => trainings.train(),
     update(info, batches) {
       // Redraw only after a change, so that details opened by the user stay open when a batch arrives.
       const key = JSON.stringify([info, batches > 0]);
@@ -37,7 +38,7 @@ export function model(structure, changed) {
             "div",
             null,
             h("div", { class: "figure-title" }, h("h3", null, "Undamaged reference"), help("undamaged reference")),
-            info.undamaged ? undamaged(info.undamaged) : firstStep(info, batches),
+            info.undamaged ? undamaged(info.undamaged, unitsOf(info)) : firstStep(info, batches),
             info.model &&
               batches > 0 &&
               h(
@@ -81,7 +82,7 @@ const FACT_HELP = {
   Emulator: () => help("emulator"),
   "Damage threshold δ": () => help("damage threshold"),
   "Movement in time": () => help("common factor"),
-  "Found with 90 %": () => help("detectable loss"),
+  "Losses found with 90 % probability": () => help("detectable loss"),
 };
 
 const facts = (list) =>
@@ -93,13 +94,15 @@ const facts = (list) =>
 
 function missing(info) {
   return [
-    h("p", { class: "callout" }, icon("note"), info.model_missing ?? "There is no trained model for this structure."),
+    h("p", { class: "callout" }, icon("note"), sentence(info.model_missing ?? "there is no trained model for this structure"), "."),
+    h("p", null, "Batches are stored and wait for their assessment. “Train a model” below makes one."),
     h(
-      "p",
+      "details",
       null,
-      "Batches are stored and wait for their assessment. Train a model below. Where another computer shall do it, train for exactly this definition there, copy the folder to the models folder and restart the service:",
+      h("summary", null, "Or train on another computer"),
+      h("p", { class: "fine" }, "Train for exactly this definition there, copy the folder to the models folder, and restart the service:"),
+      h("pre", { tabindex: 0 }, h("code", null, `modalwatch train --structure structure.toml --out models/${info.id}`)),
     ),
-    h("pre", { tabindex: 0 }, h("code", null, `modalwatch train --structure structure.toml --out models/${info.id}`)),
   ];
 }
 
@@ -117,11 +120,11 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
       ["Trained with", `modalwatch ${m.program_version}, ${m.training_samples.toLocaleString()} simulations`],
       noise && [
         "Trained noise range",
-        `${number(noise.lowest)} to ${number(noise.highest)} × the noise of the structure`,
+        `${number(noise.lowest)} to ${number(noise.highest)} times the noise of the structure`,
       ],
       [
         "Validation",
-        `−ln of the density at the true parameters, lower is better: ${number(validation.negative_log_likelihood, 3)} ± ${number(validation.negative_log_likelihood_error, 2)}`,
+        `score ${number(validation.negative_log_likelihood, 3)} ± ${number(validation.negative_log_likelihood_error, 2)} on simulations it was not trained on; lower is better`,
       ],
       emulator && [
         "Emulator",
@@ -142,12 +145,18 @@ function inUse({ digest: structureDigest, definition, model: m, emulator }) {
   ];
 }
 
+/** Help at the columns of the calibration. */
+const CALIBRATION_HELP = {
+  "Coverage of 50 % intervals": () => [" ", help("coverage")],
+  "Joint test (p-value)": () => [" ", help("joint test")],
+};
+
 /** One row per noise level and missing mode: how often the posterior intervals contain the true value. */
 function calibrationTable(cells) {
   if (cells.length === 0) return null;
   const range = (values) => {
-    const [low, high] = [Math.min(...values), Math.max(...values)];
-    return low === high ? percent(low) : `${percent(low)} to ${percent(high)}`;
+    const [low, high] = [Math.min(...values), Math.max(...values)].map(percent);
+    return low === high ? low : `${low} to ${high}`;
   };
   const line = (condition) =>
     h(
@@ -156,7 +165,7 @@ function calibrationTable(cells) {
       h(
         "th",
         { scope: "row" },
-        `${number(condition.noise_multiple, 2)} times the usual noise, ${condition.missing_mode ? `mode ${condition.missing_mode} missing` : "all modes"}`,
+        `${number(condition.noise_multiple, 2)} times the noise of the structure, ${condition.missing_mode ? `mode ${condition.missing_mode} missing` : "all modes"}`,
       ),
       cell("Coverage of 50 % intervals", range(condition.parameters.map((p) => p.coverage_50))),
       cell("Coverage of 90 % intervals", range(condition.parameters.map((p) => p.coverage_90))),
@@ -177,7 +186,7 @@ function calibrationTable(cells) {
           "tr",
           null,
           ["Noise and modes", "Coverage of 50 % intervals", "Coverage of 90 % intervals", "Joint test (p-value)"].map((c) =>
-            h("th", { scope: "col" }, c),
+            h("th", { scope: "col" }, c, CALIBRATION_HELP[c]?.()),
           ),
         ),
       ),
@@ -186,7 +195,23 @@ function calibrationTable(cells) {
   );
 }
 
-function undamaged(state) {
+/** Gives the unit of a quantity of the reference by its name. */
+function unitsOf({ definition }) {
+  const springs = new Map((definition.spring ?? []).map((spring) => [spring.name, spring]));
+  const ofSpring = (name) => (springs.get(name)?.n_m_per_rad === undefined ? "N/m" : "N·m/rad");
+  return (quantity) => {
+    if (quantity.startsWith("spring:")) return ofSpring(quantity.slice(7));
+    const parameter = (definition.parameter ?? []).find((p) => p.name === quantity);
+    if (!parameter) return "";
+    if (parameter.scale) return "% of nominal";
+    if (parameter.unit) return parameter.unit;
+    const [set] = [parameter.sets ?? []].flat();
+    if (!set || set.law) return "";
+    return set.beam ? "N·m²" : ofSpring(set.spring);
+  };
+}
+
+function undamaged(state, units) {
   const seenWords = (seen) =>
     seen.range ? `${number(seen.range[0])} to ${number(seen.range[1])}` : (seen.categories ?? []).join(", ");
   const conditions = Object.entries(state.conditions).map(([name, seen]) => `${name} ${seenWords(seen)}`);
@@ -199,7 +224,7 @@ function undamaged(state) {
       conditions.length > 0 && ["Covariate ranges", conditions.join("; ")],
       state.process?.coverage && ["Months seen", state.process.coverage.months.map(monthName).join(", ")],
       ["Movement in time", seasonWords(state)],
-      state.process?.detectable?.length > 0 && ["Found with 90 %", detectableWords(state.process.detectable)],
+      state.process?.detectable?.length > 0 && ["Losses found with 90 % probability", detectableWords(state.process.detectable)],
     ]),
     state.doubts.length > 0 &&
       h(
@@ -229,10 +254,10 @@ function undamaged(state) {
           h(
             "tr",
             null,
-            h("th", { scope: "row" }, p.name),
-            cell("Mean", quantity(p.mean, p.unit)),
-            cell("Standard deviation", quantity(p.std, p.unit, 3)),
-            cell("Damage threshold δ", p.threshold === null ? "–" : quantity(p.threshold, p.unit)),
+            h("th", { scope: "row" }, inWords(p.name)),
+            cell("Mean", quantity(p.mean, units(p.name))),
+            cell("Standard deviation", quantity(p.std, units(p.name), 3)),
+            cell("Damage threshold δ", p.threshold === null ? "–" : quantity(p.threshold, units(p.name))),
           ),
         ),
       ),
@@ -250,7 +275,7 @@ function detectableWords(list) {
     .map((name) => {
       const own = list.filter((d) => d.name === name);
       const [first, last] = [own[0], own.at(-1)];
-      return `${name} −${number(first.loss_percent, 2)} % with the first batch, −${number(last.loss_percent, 2)} % within ${count(last.batches, "batch", "batches")}`;
+      return `${inWords(name)} −${number(first.loss_percent, 2)} % with the first batch, −${number(last.loss_percent, 2)} % within ${count(last.batches, "batch", "batches")}`;
     })
     .join("; ");
 }
@@ -270,12 +295,7 @@ function seasonWords(state) {
 
 function firstStep(info, batches) {
   if (!info.model) return h("p", { class: "soft" }, "Available as soon as there is a trained model.");
-  if (batches === 0) {
-    return [
-      h("p", null, "No measurements yet. Send the first batch:"),
-      h("pre", { tabindex: 0 }, h("code", null, postLine(info))),
-    ];
-  }
+  if (batches === 0) return h("p", { class: "soft" }, "Available as soon as there are measurements.");
   return h(
     "p",
     { class: "callout" },
@@ -293,12 +313,15 @@ export function postLine(info) {
   return `curl ${location.origin}/v1/structures/${info.id}/batches \\\n  -H 'content-type: application/json' \\\n  -d '${JSON.stringify({ measurements: [measurement] })}'`;
 }
 
+/** Maximum number of batches that the dialog lists; a period has no such limit. */
+const MOST_LISTED = 200;
+
 /** Dialog to choose the batches of a new undamaged reference, or, with `extend`, of an extension. `period`: begin and end of a proposed
  * period in seconds. */
 export async function declare(structure, changed, { extend = false, period: proposed = null } = {}) {
   let items;
   try {
-    ({ items } = await read(at(structure, "/history?limit=200")));
+    ({ items } = await read(at(structure, `/history?limit=${MOST_LISTED}`)));
   } catch (error) {
     return notify(error.message, "error");
   }
@@ -324,6 +347,14 @@ export async function declare(structure, changed, { extend = false, period: prop
     );
   });
   const list = h("ul", { class: "choices", tabindex: 0, "aria-label": "Batches" }, boxes);
+  const listed = h(
+    "details",
+    { open: !proposed },
+    h("summary", null, proposed ? "Choose single batches instead of the period" : "Single batches"),
+    items.length === MOST_LISTED &&
+      h("p", { class: "fine" }, `The first ${MOST_LISTED} batches of the record are listed; a period below takes any of them.`),
+    list,
+  );
   const done = await ask({
     title: extend ? "Extend the undamaged reference" : "Declare the undamaged reference",
     body: [
@@ -334,12 +365,12 @@ export async function declare(structure, changed, { extend = false, period: prop
           ? "The reference keeps its batches and gains others that you accept as healthy, so that it has seen more of the year. Batches of a damage alarm are not accepted, and nothing is changed if the first version of the reference shows a lasting loss in what was added since."
           : "Later batches are compared with these. Choose batches measured while the structure was known to be undamaged, over as wide a range of temperature and other covariates as available, or the period in which it was. All batches are compared again with the new reference, and its alarms replace those of the old one where it covers their time.",
       ),
-      list,
+      listed,
     ],
     fields: [
       {
         name: "from",
-        label: `Instead of batches, a period: from (${zone()})`,
+        label: `${proposed ? "Period" : "Instead of batches, a period"}: from (${zone()})`,
         type: "datetime-local",
         value: proposed ? fieldTime(proposed[0]) : "",
         hint: "All batches of the period are used. Doubtful ones are left out and named.",

@@ -16,7 +16,7 @@ const OUTCOMES = {
 };
 
 const recipeWords = ({ recipe: r }) =>
-  `${r.samples.toLocaleString("en")} simulations, ${r.epochs} epochs, ${r.units} units, at most ${r.rounds} ${r.rounds === 1 ? "round" : "rounds"}, noise × ${number(r.noise_range.lowest)} to ${number(r.noise_range.highest)}, seed ${r.seed}`;
+  `${r.samples.toLocaleString("en")} simulations, ${r.epochs} epochs, ${r.units} units, at most ${r.rounds} ${r.rounds === 1 ? "round" : "rounds"}, noise from ${number(r.noise_range.lowest)} to ${number(r.noise_range.highest)} times that of the structure, seed ${r.seed}`;
 
 /** A whole number of the dialog. */
 function whole(text, name, lowest, highest) {
@@ -79,7 +79,8 @@ export function training(structure, changed) {
   };
 
   const train = async () => {
-    if (!defaults) return;
+    if (!defaults) await load();
+    if (!defaults || begin.disabled) return;
     const done = await ask({
       title: `Train a model of ${structure}`,
       body: h(
@@ -157,6 +158,8 @@ export function training(structure, changed) {
   return {
     element,
     load,
+    /** Opens the dialog that begins a training. */
+    train,
     /** Shows a change of a job of this structure. */
     job(data) {
       load();
