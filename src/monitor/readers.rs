@@ -16,18 +16,24 @@ const MOST_DETAILS: usize = 64;
 /// Definitions of structures that may be checked or wait for their check. One of 2,000 masses takes about 200 MB.
 const MOST_CHECKS: usize = 16;
 
-/// How much further from the processor the threads are than those of new batches (`nice`).
-const NICE: i32 = 5;
+/// Threads; `None` if they cannot be started for want of memory, and then the common ones are used.
+type Pool = LazyLock<Option<ThreadPool>>;
 
-/// The threads. Without them, for want of memory, the common ones are used.
-static POOL: LazyLock<Option<ThreadPool>> = LazyLock::new(|| {
-    let give_way = |_| {
+/// Threads of details and drawings, which anybody with a token may ask for: they give way to everything else.
+static OF_DETAILS: Pool = LazyLock::new(|| pool("detail", at_a_time(), 10));
+
+/// The thread of checks, which only an administrator asks for.
+static OF_CHECKS: Pool = LazyLock::new(|| pool("check", 1, 5));
+
+/// Threads that are further from the processor by `nice` than those of new batches.
+fn pool(name: &'static str, threads: usize, nice: i32) -> Option<ThreadPool> {
+    let give_way = move |_| {
         // On Linux this concerns the calling thread alone. Where it is not allowed, the threads are ordinary ones.
-        let _ = rustix::process::nice(NICE);
+        let _ = rustix::process::nice(nice);
     };
-    let builder = ThreadPoolBuilder::new().num_threads(at_a_time().max(2)).start_handler(give_way);
-    builder.thread_name(|number| format!("reader-{number}")).build().ok()
-});
+    let builder = ThreadPoolBuilder::new().num_threads(threads).start_handler(give_way);
+    builder.thread_name(move |number| format!("{name}-{number}")).build().ok()
+}
 
 /// Half of the cores, at least one.
 fn at_a_time() -> usize {
@@ -44,6 +50,7 @@ pub struct TooManyReaders {
 /// Computations of one kind; cloning gives a handle on the same ones.
 #[derive(Clone)]
 pub struct Readers {
+    pool: &'static Pool,
     most: usize,
     places: Arc<Semaphore>,
     turns: Arc<Semaphore>,
@@ -51,6 +58,7 @@ pub struct Readers {
 
 /// The turn of a reader.
 pub struct Turn {
+    pool: &'static Pool,
     permits: (OwnedSemaphorePermit, OwnedSemaphorePermit),
 }
 
@@ -77,16 +85,16 @@ impl Drop for Wish {
 impl Readers {
     /// Details and drawings: half as many at a time as there are cores.
     pub(super) fn of_details() -> Self {
-        Self::new(MOST_DETAILS, at_a_time())
+        Self::new(&OF_DETAILS, MOST_DETAILS, at_a_time())
     }
 
     /// Checks of definitions, one at a time.
     pub(super) fn of_checks() -> Self {
-        Self::new(MOST_CHECKS, 1)
+        Self::new(&OF_CHECKS, MOST_CHECKS, 1)
     }
 
-    fn new(most: usize, at_a_time: usize) -> Self {
-        Self { most, places: Arc::new(Semaphore::new(most)), turns: Arc::new(Semaphore::new(at_a_time)) }
+    fn new(pool: &'static Pool, most: usize, at_a_time: usize) -> Self {
+        Self { pool, most, places: Arc::new(Semaphore::new(most)), turns: Arc::new(Semaphore::new(at_a_time)) }
     }
 
     /// Waits for a turn, in the order of the calls. A caller that is dropped waits no longer.
@@ -97,7 +105,7 @@ impl Readers {
         let place = Arc::clone(&self.places).try_acquire_owned();
         let place = place.map_err(|_| TooManyReaders { most: self.most })?;
         let turn = Arc::clone(&self.turns).acquire_owned().await.expect("the semaphore is never closed");
-        Ok(Turn { permits: (place, turn) })
+        Ok(Turn { pool: self.pool, permits: (place, turn) })
     }
 }
 
@@ -108,16 +116,17 @@ impl Turn {
     /// # Errors
     /// [`Panicked`] when `work` panicked.
     pub async fn run<T: Send + 'static>(self, work: impl FnOnce(&Wanted) -> T + Send + 'static) -> Result<T, Panicked> {
+        let Self { pool, permits } = self;
         let (found, answer) = oneshot::channel();
         let wanted = Wanted(Arc::new(AtomicBool::new(true)));
         let _wish = Wish(wanted.clone());
         let work = move || {
             let done = catch_unwind(AssertUnwindSafe(|| work(&wanted)));
-            drop(self.permits);
+            drop(permits);
             // Sending fails if the caller was dropped.
             let _ = found.send(done);
         };
-        match &*POOL {
+        match &**pool {
             Some(pool) => pool.spawn(work),
             None => rayon::spawn(work),
         }
@@ -135,7 +144,7 @@ mod tests {
 
     #[tokio::test]
     async fn work_is_given_up_with_its_caller_and_its_turn_ends_with_the_work() {
-        let readers = Readers::new(10, 1);
+        let readers = Readers::new(&OF_DETAILS, 10, 1);
         let turn = readers.turn().await.unwrap();
         let (began, begun) = std::sync::mpsc::channel();
         let (go_on, goes_on) = std::sync::mpsc::channel::<()>();
@@ -162,7 +171,7 @@ mod tests {
 
     #[tokio::test]
     async fn few_wait_and_those_who_leave_make_room() {
-        let readers = Readers::new(2, 1);
+        let readers = Readers::new(&OF_DETAILS, 2, 1);
         let first = readers.turn().await.unwrap();
         let mut second = Box::pin(readers.turn());
         assert!((&mut second).now_or_never().is_none());

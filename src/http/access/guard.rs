@@ -45,7 +45,7 @@ async fn admitted(access: &AccessControl, request: &mut Request) -> Result<Optio
         (route::Subject::Filtered, _) => About::Filtered,
         _ => About::Service,
     };
-    allow(&grant, class.need, about).map_err(|denied| forbidden(denied, class.about))?;
+    allow(&grant, class.need, about).map_err(|denied| forbidden(&denied, class.about))?;
 
     let pattern = pattern.filter(|_| route::is_change(request.method(), class));
     let entry = pattern.map(|pattern| journal::entry(&grant, &client, request, &pattern, structure));
@@ -84,8 +84,8 @@ fn refuse_token_in_address(uri: &Uri) -> Result<(), ApiError> {
     Ok(())
 }
 
-fn forbidden(denied: Denied, about: route::Subject) -> ApiError {
-    let detail = match (&denied, about) {
+fn forbidden(denied: &Denied, about: route::Subject) -> ApiError {
+    let detail = match (denied, about) {
         // The client has named a diagnosis or training: it must not learn from it which other structures exist.
         (Denied::Structure { .. }, route::Subject::Job) => {
             "this token is limited to structures other than that of this diagnosis or training".to_owned()
