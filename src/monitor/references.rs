@@ -284,10 +284,8 @@ impl References {
         events.structure_changed(structure);
         // It is returned as it was stored, without reading it from the database, which might fail.
         let state = UndamagedReference { version, ..state };
-        Ok(DeclaredReference {
-            record: Arc::new(ReferenceRecord { state, model_digest, created_at, batches: batch_ids }),
-            left_out,
-        })
+        let record = Arc::new(ReferenceRecord { state, model_digest, created_at, batches: batch_ids });
+        Ok(DeclaredReference { record, left_out })
     }
 
     /// The ids of the chosen batches, and those that cannot be used whatever they contain.

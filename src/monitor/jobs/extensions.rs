@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use tracing::info;
 
 use super::queue::{computed, Halt};
-use super::runner::{JobOutput, Jobs};
+use super::runner::{switch, JobOutput, Jobs};
 use super::study::{DiagnosisRequest, ExtensionTraining};
 use crate::baseline::train::Trained;
 use crate::monitor::error::JobError;
@@ -112,7 +112,7 @@ async fn extend(
             accepted,
         }),
     };
-    let switched = jobs.switch(&parent, version, extended.simulator, Arc::new(baseline)).await;
+    let switched = switch(jobs, &parent, version, extended.simulator, Arc::new(baseline)).await;
     let result = ExtensionResult {
         added: extended.added,
         left_out: extended.left_out,

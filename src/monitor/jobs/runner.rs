@@ -86,27 +86,6 @@ impl Jobs {
         });
     }
 
-    /// Puts a version of a structure into use that a job has made, in place of `expected`; attempted again while the database fails for a
-    /// moment. Returns the version of the renewed reference.
-    pub(super) async fn switch(
-        &self,
-        expected: &Digest,
-        version: NewVersion,
-        simulator: Simulator,
-        baseline: Arc<Baseline>,
-    ) -> Result<Option<u32>, String> {
-        loop {
-            let parts = (version.clone(), simulator.clone(), Arc::clone(&baseline));
-            match self.versions.switch(expected, parts.0, parts.1, parts.2).await {
-                Err(Error::Store(error)) if is_worth_another(&error, &self.store) => {
-                    warn!(%error, "Could not put the result of a job into use, trying again: {error}");
-                    pause().await;
-                }
-                outcome => return outcome.map_err(|e| e.to_string()),
-            }
-        }
-    }
-
     /// Jobs of all structures, newest first, at most `limit`, each with what it is doing now if it runs or waits.
     ///
     /// # Errors
@@ -175,6 +154,27 @@ impl Jobs {
     /// Number of jobs that run or wait.
     pub fn running(&self) -> usize {
         self.queue.count()
+    }
+}
+
+/// Puts a version of a structure into use that a job has made, in place of `expected`; attempted again while the database fails for a
+/// moment. Returns the version of the renewed reference.
+pub(super) async fn switch(
+    jobs: &Jobs,
+    expected: &Digest,
+    version: NewVersion,
+    simulator: Simulator,
+    baseline: Arc<Baseline>,
+) -> Result<Option<u32>, String> {
+    loop {
+        let parts = (version.clone(), simulator.clone(), Arc::clone(&baseline));
+        match jobs.versions.switch(expected, parts.0, parts.1, parts.2).await {
+            Err(Error::Store(error)) if is_worth_another(&error, &jobs.store) => {
+                warn!(%error, "Could not put the result of a job into use, trying again: {error}");
+                pause().await;
+            }
+            outcome => return outcome.map_err(|e| e.to_string()),
+        }
     }
 }
 

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use tracing::info;
 
 use super::queue::{computed, Halt, JobStatus};
-use super::runner::{JobOutput, Jobs, MOST_JOBS};
+use super::runner::{switch, JobOutput, Jobs, MOST_JOBS};
 use super::watch::Watch;
 use crate::baseline::manifest::{Manifest, Outcome};
 use crate::baseline::recipe::{Recipe, RecipeRequest};
@@ -201,7 +201,7 @@ async fn put_into_use(
         diagnosis: None,
         baseline: Some(StoredBaseline { model_digest, manifest: manifest_json, weights, accepted }),
     };
-    jobs.switch(&digest, version, simulator, Arc::new(baseline)).await
+    switch(jobs, &digest, version, simulator, Arc::new(baseline)).await
 }
 
 /// The result of a training, without its duration and the renewed reference.
