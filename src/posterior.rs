@@ -4,9 +4,6 @@ use nalgebra::DMatrix;
 
 use crate::parameter::{Parameter, ParameterSpace};
 
-/// A sample within this distance of a bound of the prior is considered to lie at the bound; a share of the prior's width.
-pub const BOUND_MARGIN: f64 = 0.01;
-
 /// Posterior samples of n measurements, `draws` for each.
 #[derive(Debug, Clone)]
 pub struct PosteriorSamples {
@@ -102,12 +99,12 @@ impl PosteriorSamples {
         })
     }
 
-    /// Posterior mass at the prior bounds, `[d]`: the share of the samples of each parameter within [`BOUND_MARGIN`] of a
-    /// bound.
+    /// Posterior mass at the ends of the prior, `[d]`: the share of the samples of each parameter for which
+    /// [`Parameter::is_at_end`] holds.
     pub fn prior_bound_mass(&self, space: &ParameterSpace) -> Vec<f64> {
         let share = |(index, parameter): (usize, &Parameter)| {
-            let at_bound = |value: &&f64| !(BOUND_MARGIN..=1.0 - BOUND_MARGIN).contains(&parameter.to_unit(**value));
-            self.theta.column(index).iter().filter(at_bound).count() as f64 / self.theta.nrows() as f64
+            let at_end = |value: &&f64| parameter.is_at_end(**value);
+            self.theta.column(index).iter().filter(at_end).count() as f64 / self.theta.nrows() as f64
         };
         space.iter().enumerate().map(share).collect()
     }

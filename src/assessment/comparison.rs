@@ -56,11 +56,14 @@ pub fn assess(
     }
     let sampled = monitored_quantities(baseline, &samples, draws.per_measurement);
     for sample in sampled.iter().filter(|s| s.kind == QuantityKind::Parameter && s.prior_bound_mass > MUCH_MASS) {
-        let message = format!(
-            "{:.0} % of the posterior samples of {} lie at the bounds of its prior: widen the prior",
-            100.0 * sample.prior_bound_mass,
-            sample.name
-        );
+        let tails = baseline.space().iter().any(|p| p.name == sample.name && !p.is_uniform());
+        let place = if tails {
+            "lie beyond three standard deviations of its prior, which pulls them towards its middle"
+        } else {
+            "lie at the bounds of its prior"
+        };
+        let share = 100.0 * sample.prior_bound_mass;
+        let message = format!("{share:.0} % of the posterior samples of {} {place}: widen the prior", sample.name);
         findings.push(Finding::new(FindingCode::PriorEdge, FindingEffect::Note, message));
     }
     let process = ProcessQuantities::of(baseline);

@@ -53,7 +53,7 @@ pub struct ParameterDetail {
     pub unit: String,
     /// Grid points in the unit of the parameter, ascending; closer together where the densities are concentrated.
     pub grid: Vec<f64>,
-    /// Density of the uniform prior.
+    /// Density of the prior.
     pub prior: Vec<f64>,
     /// Density of the pooled posterior samples of the batch.
     pub posterior: Vec<f64>,
@@ -92,12 +92,10 @@ pub fn detail(
         let population = reference.map(|q| (q.mean, q.std)).filter(|(_, std)| *std > 0.0);
         let pool = pooled.column(column);
         let grid = grid(parameter, &pool, population);
-        let height = 1.0 / (parameter.upper - parameter.lower);
-        let inside = |x: &f64| if (parameter.lower..=parameter.upper).contains(x) { height } else { 0.0 };
         ParameterDetail {
             name: parameter.name.clone(),
             unit: parameter.unit.clone(),
-            prior: grid.iter().map(inside).collect(),
+            prior: grid.iter().map(|x| parameter.prior_density(*x)).collect(),
             // Samples that are all equal have no density.
             posterior: density::kernel_at(&pool, &grid).unwrap_or_else(|| vec![0.0; grid.len()]),
             undamaged: population.map(|(mean, std)| grid.iter().map(|x| density::normal(*x, mean, std)).collect()),

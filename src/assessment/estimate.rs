@@ -6,7 +6,6 @@ use super::chart_points::charted_columns;
 use crate::baseline::Baseline;
 use crate::damage::{Hyperparameters, QuantitySamples};
 use crate::measurement::{CovariateValue, ModalMeasurement};
-use crate::parameter::Parameter;
 use crate::process::estimate::BatchEstimate;
 use crate::process::fit::Quantities;
 use crate::stats;
@@ -25,7 +24,6 @@ pub(super) struct ProcessQuantities {
 impl ProcessQuantities {
     pub fn of(baseline: &Baseline) -> Self {
         let space = baseline.space().as_slice();
-        let variance = |p: &Parameter| (p.upper - p.lower).powi(2) / 12.0;
         let mut quantities = Quantities { names: Vec::new(), units: Vec::new(), directions: Vec::new() };
         let mut prior_variances = Vec::new();
         for (name, columns) in charted_columns(baseline) {
@@ -33,7 +31,7 @@ impl ProcessQuantities {
             quantities.units.push(space[columns[0]].unit.clone());
             quantities.directions.push(space[columns[0]].damage);
             // The mean of independent parameters.
-            let sum: f64 = columns.iter().map(|column| variance(&space[*column])).sum();
+            let sum: f64 = columns.iter().map(|column| space[*column].prior_variance()).sum();
             prior_variances.push(sum / (columns.len() as f64).powi(2));
         }
         Self { quantities, prior_variances }

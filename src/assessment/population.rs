@@ -25,7 +25,7 @@ const NOISE_DOMINATED: f64 = 0.56;
 const POSTERIOR_BETTER: f64 = 2.0;
 
 /// Estimates the population behind posterior samples, either from an importance proposal whose samples are weighted by their
-/// posterior density, or from `draws` samples of each posterior if these have the larger effective share. Returns the posterior
+/// likelihood, or from `draws` samples of each posterior if these have the larger effective share. Returns the posterior
 /// samples, with those drawn in addition, and the population.
 ///
 /// # Errors
@@ -66,8 +66,8 @@ pub(super) fn population_behind(
         proposal_draws = PROPOSAL_DRAWS_NOISE_DOMINATED;
     }
     let (samples, log_density) = proposals(&posterior, &found, space, proposal_draws, seed);
-    let log_posterior = baseline.log_posterior_of_draws(samples.theta(), observations)?;
-    let log_weights: Vec<f64> = log_posterior.iter().zip(&log_density).map(|(q, r)| q - r).collect();
+    let log_likelihood = baseline.log_likelihood_of_draws(samples.theta(), observations)?;
+    let log_weights: Vec<f64> = log_likelihood.iter().zip(&log_density).map(|(l, r)| l - r).collect();
     let proposed = populations(&samples, Some(&log_weights), space, seed);
     if effective_share(&found, posterior.draws()) <= POSTERIOR_BETTER * effective_share(&proposed, proposal_draws) {
         return Ok((posterior, proposed));

@@ -7,7 +7,7 @@
 //!
 //! ```text
 //!  q_0 = N(0, I),    q_t = t_ν(m_t, S_t),    q(z) = Σ_t n_t q_t(z) / Σ_t n_t
-//!  w(z) = p(y | x(z)) |∂x/∂z| / q(z) inside the prior, 0 outside
+//!  w(z) = p(y | x(z)) p(x(z)) |∂x/∂z| / q(z) inside the prior, 0 outside
 //!  m_t, S_t: mean and covariance of z under the weights w^β, β ≤ 1 the largest exponent that leaves enough effective draws
 //! ```
 //!
@@ -24,7 +24,7 @@ use super::model::Baseline;
 use super::observation::Observation;
 use super::proposal::Proposal;
 use super::real_line::from_real_line;
-use super::resample::log_likelihoods;
+use super::resample::log_posteriors;
 use crate::stats::{self, Stream};
 
 /// Stages of a measurement, the first one included.
@@ -144,10 +144,10 @@ impl Baseline {
             }
         }
         let of_open: Vec<Observation> = open.iter().map(|&row| observations[row as usize].clone()).collect();
-        let log_likelihoods = log_likelihoods(&self.simulator, &of_open, &theta);
+        let log_posteriors = log_posteriors(&self.simulator, &of_open, &theta);
         active.par_iter_mut().enumerate().for_each(|(index, search)| {
             for row in index * many..(index + 1) * many {
-                let log_target = log_likelihoods[row] - log_jacobian[row];
+                let log_target = log_posteriors[row] - log_jacobian[row];
                 let usable = inside[row] && log_target.is_finite();
                 search.log_target.push(if usable { log_target } else { f64::NEG_INFINITY });
                 search.theta.extend(theta.row(row).iter());
@@ -166,7 +166,7 @@ struct Search {
     latent: Vec<f64>,
     /// Parameters of each draw, `[n·d]`.
     theta: Vec<f64>,
-    /// ln p(y | x) |∂x/∂z| of each draw up to a constant, −∞ outside the prior, `[n]`.
+    /// ln p(y | x) p(x) |∂x/∂z| of each draw up to a constant, −∞ outside the prior, `[n]`.
     log_target: Vec<f64>,
     /// ln Σ_t q_t of each draw, `[n]`. Each stage has the same number of draws.
     log_mixture: Vec<f64>,
@@ -441,7 +441,7 @@ mod tests {
             let step = if column == 0 { row / steps } else { row % steps };
             [50.0, 30.0][column] * (1.0 + 2.0 * step as f64 / (steps - 1) as f64)
         });
-        let logs = log_likelihoods(&simulator, std::slice::from_ref(&observation), &grid);
+        let logs = log_posteriors(&simulator, std::slice::from_ref(&observation), &grid);
         let weights = stats::weights(&logs, 0.0).unwrap();
         let total: f64 = weights.iter().sum();
         for column in 0..2 {

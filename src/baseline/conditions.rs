@@ -31,7 +31,7 @@ pub struct Whitening {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Conditions {
-    /// Lower and upper end of the training box, one pair per parameter, in parameter units: the prior with a margin. Draws
+    /// Lower and upper end of the training box, one pair per parameter, in parameter units: a uniform prior with a margin. Draws
     /// outside the prior are rejected and drawn again.
     pub training_box: Vec<[f64; 2]>,
     /// Noise of the frequencies; `None` for a structure without noise, whose measurements must be complete and exact.

@@ -1,12 +1,12 @@
 //! Which parameters the modes of a structure can distinguish at its noise.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
 use super::error::InferenceError;
 use super::manifest::{IdentifiabilityRecord, ParameterIdentifiability, GROUP_CORRELATION, UNRESOLVED};
 use super::model::Baseline;
 use super::observation::{measure, measure_shapes, Observation};
-use crate::parameter::ParameterSpace;
+use crate::parameter::{Parameter, ParameterSpace};
 use crate::physics;
 use crate::physics::eigen::transposed_product;
 use crate::simulator::{Simulator, TrainingSet};
@@ -17,9 +17,6 @@ const POINTS: usize = 200;
 
 /// Posterior draws at each point.
 const DRAWS: usize = 60;
-
-/// Precision of a uniform prior in the unit box: one over its variance 1/12.
-const PRIOR_PRECISION: f64 = 12.0;
 
 /// Measures which parameters one measurement can distinguish, from the Fisher information ([`local_covariance`]) and from
 /// the posterior of the flow, averaged over the prior.
@@ -57,7 +54,7 @@ pub fn identifiability(baseline: &Baseline, seed: u64) -> Result<Identifiability
             name: p.name.clone(),
             fisher_std: stats::quantile(&local, 0.5),
             posterior_std: covariance[(k, k)].sqrt() * width,
-            variance_left: (PRIOR_PRECISION * covariance[(k, k)]).min(1.0),
+            variance_left: (p.box_precision() * covariance[(k, k)]).min(1.0),
             confused_with: partner.map(|j| (space.as_slice()[j].name.clone(), correlation(k, j))),
         }
     });
@@ -147,16 +144,18 @@ pub fn local_covariance(
     let std_hz = exact_hz.iter().enumerate().map(|(mode, f)| simulator.std_hz(mode, *f).max(1e-5 * f));
     let covariance =
         fisher_covariance(simulator, &there.frequency_slopes, &std_hz.collect::<Vec<_>>(), &there.shape_slopes);
-    let d = simulator.space().len();
-    Ok(covariance.unwrap_or_else(|| DMatrix::identity(d, d) / PRIOR_PRECISION))
+    let of_prior = || DMatrix::from_diagonal(&prior_precision(simulator).map(f64::recip));
+    Ok(covariance.unwrap_or_else(of_prior))
 }
 
 /// Covariance of the parameters in the unit box of the prior, `[d, d]`, by the Fisher information of one measurement and
-/// the variance 1/12 of the uniform prior.
+/// the variance of the prior.
 ///
 /// ```text
-///  C = (Jᵀ R⁻¹ J + 12·1)⁻¹,    J: derivatives of frequencies and shapes by u,   R: variances of their noise
+///  C = (Jᵀ R⁻¹ J + P)⁻¹,    J: derivatives of frequencies and shapes by u,   R: variances of their noise
 /// ```
+///
+/// P: diagonal matrix of one over the variance of the prior, 12 for a uniform one.
 ///
 /// `frequency_slopes`: ∂f/∂θ, `[modes, d]`, Hz per parameter unit; `std_hz`: standard deviation of each frequency, Hz, `[modes]`;
 /// `shape_slopes`: ∂φ/∂θ of each mode, `[points, d]`, per parameter unit; empty without shapes. Returns `None` only if a value is
@@ -171,11 +170,16 @@ pub fn fisher_covariance(
     let d = parameters.len();
     let width = |k: usize| parameters[k].upper - parameters[k].lower;
     let scaled = DMatrix::from_fn(std_hz.len(), d, |mode, k| frequency_slopes[(mode, k)] * width(k) / std_hz[mode]);
-    let mut precision = scaled.transpose() * scaled + DMatrix::identity(d, d) * PRIOR_PRECISION;
+    let mut precision = scaled.transpose() * scaled + DMatrix::from_diagonal(&prior_precision(simulator));
     for slopes in shape_slopes {
         let scaled =
             DMatrix::from_fn(slopes.nrows(), d, |point, k| slopes[(point, k)] * width(k) / simulator.shape_std());
         precision += transposed_product(&scaled, &scaled);
     }
     Some(precision.cholesky()?.inverse())
+}
+
+/// One over the variance of the prior of each parameter in the unit box, `[d]`.
+fn prior_precision(simulator: &Simulator) -> DVector<f64> {
+    DVector::from_iterator(simulator.space().len(), simulator.space().iter().map(Parameter::box_precision))
 }

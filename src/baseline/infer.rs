@@ -77,15 +77,15 @@ impl Baseline {
         self.infer_from(observations, draws, 1, seed)
     }
 
-    /// Logarithm of the posterior density at `draws` rows of `theta` for each observation, in the unit box of the prior,
-    /// nats, up to a constant for each observation. It is the simulation's likelihood where the draws are resampled by it,
-    /// otherwise the density of the flow, stretched as its draws are.
+    /// Logarithm of the likelihood at `draws` rows of `theta` for each observation, nats, up to a constant for each observation. It is
+    /// that of the simulation where the draws are resampled by it, otherwise the density of the flow, stretched as its draws are, over
+    /// that of the prior.
     ///
     /// `theta`: `[n·draws, d]`; `observations`: n. Returns n·draws values.
     ///
     /// # Errors
     /// [`InferenceError`] for another number of modes.
-    pub fn log_posterior_of_draws(
+    pub fn log_likelihood_of_draws(
         &self,
         theta: &DMatrix<f64>,
         observations: &[Observation],
@@ -93,12 +93,18 @@ impl Baseline {
         if self.is_resampled() && !observations.iter().any(Observation::is_marginalised) {
             return Ok(resample::log_likelihoods(&self.simulator, observations, theta));
         }
-        if !self.stretches(observations) {
-            return self.log_density_of_draws(theta, observations);
+        let mut logs = if self.stretches(observations) {
+            let (before, log_stretch) = self.before_stretching(theta, observations)?;
+            let density = self.log_density_of_draws(&before, observations)?;
+            density.into_iter().zip(log_stretch).map(|(log_q, stretch)| log_q - stretch).collect()
+        } else {
+            self.log_density_of_draws(theta, observations)?
+        };
+        let space = self.space();
+        if !space.is_uniform() {
+            logs.iter_mut().zip(theta.row_iter()).for_each(|(log, row)| *log -= space.log_prior(row.iter()));
         }
-        let (before, log_stretch) = self.before_stretching(theta, observations)?;
-        let density = self.log_density_of_draws(&before, observations)?;
-        Ok(density.into_iter().zip(log_stretch).map(|(log_q, stretch)| log_q - stretch).collect())
+        Ok(logs)
     }
 
     /// As [`Self::infer`], with `proposals` draws of the flow for each sample.

@@ -4,7 +4,7 @@
 //! the structural parameters:
 //!
 //! ```text
-//!  p(θ | y) ∝ p(y | θ) p(θ),    y: natural frequencies (and mode shapes) with their noise,  p(θ) uniform on the prior box
+//!  p(θ | y) ∝ p(y | θ) p(θ),    y: natural frequencies (and mode shapes) with their noise,  p(θ) the prior
 //! ```
 //!
 //! Source: Wang et al. (2025), §3.

@@ -36,10 +36,10 @@ pub(super) struct Resampled {
 /// Resamples `draws` of the proposals of each observation by their importance weights, `[n·draws, d]`.
 ///
 /// ```text
-///  w_s = p(y | x_s)/q(x_s | y),    ln p(y | x) = −Σ_i ½((y_i − f_i(x))/s_i)² + ln s_i,   s_i the noise at f_i(x)
+///  w_s = p(y | x_s) p(x_s)/q(x_s | y),    ln p(y | x) = −Σ_i ½((y_i − f_i(x))/s_i)² + ln s_i,   s_i the noise at f_i(x)
 /// ```
 ///
-/// under the uniform prior; the sum is over the modes present. Resampling is systematic, followed by a shuffle, so that any
+/// with the prior p(x); the sum is over the modes present. Resampling is systematic, followed by a shuffle, so that any
 /// first few draws are a sample too. Spurious modes of the flow, such as bridges between two modes of the posterior, are
 /// removed. Where the effective sample size is less than [`EFFECTIVE`], the flow's draws are kept unchanged.
 ///
@@ -53,7 +53,7 @@ pub(super) fn resample(
 ) -> Resampled {
     let d = proposals.theta.ncols();
     let many = proposals.theta.nrows() / observations.len().max(1);
-    let log_likelihoods = log_likelihoods(simulator, observations, &proposals.theta);
+    let log_posteriors = log_posteriors(simulator, observations, &proposals.theta);
     let choose = |row: usize| -> (Vec<usize>, bool) {
         let rows = row * many..(row + 1) * many;
         if proposals.moved[row] {
@@ -61,7 +61,7 @@ pub(super) fn resample(
         }
         // Non-finite weights are set to zero.
         let log_weight = |row: usize| {
-            let weight = log_likelihoods[row] - proposals.log_density[row];
+            let weight = log_posteriors[row] - proposals.log_density[row];
             if weight.is_finite() {
                 weight
             } else {
@@ -84,6 +84,17 @@ pub(super) fn resample(
     let weighted = found.iter().map(|(_, weighted)| *weighted).collect();
     let theta = DMatrix::from_fn(chosen.len(), d, |row, column| proposals.theta[(chosen[row], column)]);
     Resampled { theta, weighted }
+}
+
+/// ln p(y | x) p(x) up to a constant for each row of `theta` `[n·k, d]`, k rows for each of the n observations, with the prior p(x) in
+/// the unit box; nats.
+pub(super) fn log_posteriors(simulator: &Simulator, observations: &[Observation], theta: &DMatrix<f64>) -> Vec<f64> {
+    let mut all = log_likelihoods(simulator, observations, theta);
+    let space = simulator.space();
+    if !space.is_uniform() {
+        all.iter_mut().zip(theta.row_iter()).for_each(|(log, row)| *log += space.log_prior(row.iter()));
+    }
+    all
 }
 
 /// ln p(y | x) up to a constant for each row of `theta` `[n·k, d]`, k rows for each of the n observations; nats.

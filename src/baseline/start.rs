@@ -6,12 +6,12 @@
 //! flow only learns how the posterior differs from the normal distribution at the fit:
 //!
 //! ```text
-//!  û    = argmin ½ |r(u)|² + 6 |u − ½|²          r: residuals in standard deviations, u: position in the prior box
-//!  R Rᵀ = JᵀJ/a² + 12·1                          12: one over the variance of a uniform prior,  J = −∂r/∂u at û
+//!  û    = argmin ½ |r(u)|² + ½ (u − m)ᵀ P (u − m)    r: residuals in standard deviations, u: position in the prior box
+//!  R Rᵀ = JᵀJ/a² + P                                J = −∂r/∂u at û
 //!  x    = Rᵀ (u − û),    flow:  x ⟷ z | û, ln std of each parameter, ln a
 //! ```
 //!
-//! a² is the misfit at û beyond what the noise explains, and 1 where the fit is good: where the search stops in a local
+//! m and P⁻¹ are mean and (diagonal) variance of the prior: ½ and 1/12 where it is uniform. a² is the misfit at û beyond what the noise explains, and 1 where the fit is good: where the search stops in a local
 //! minimum, the starting distribution is wide. Modes are paired anew at each step, by MAC and frequency, so that a
 //! measurement may have its modes in another order than the simulation, or lack modes or shapes.
 
@@ -29,9 +29,6 @@ use crate::stats::{normal_cdf, normal_quantile, Stream};
 
 /// Number of parameters from which on a flow starts at the best fit.
 pub const MANY_PARAMETERS: usize = 17;
-
-/// Precision of the uniform prior of a position in the box: one over its variance 1/12.
-const PRIOR_PRECISION: f64 = 12.0;
 
 /// Most steps of the search. It takes five or six steps where the noise is small.
 const STEPS: usize = 20;
@@ -75,6 +72,23 @@ pub struct Located {
     pub excess: f64,
     /// Simulated frequency of each mode of the measurement, Hz.
     pub frequencies_hz: Vec<f64>,
+    /// Mean m and precision P of the prior of each position.
+    pub prior: BoxPrior,
+}
+
+/// Mean and precision (one over the variance) of the prior of each position in the box, `[d]`.
+#[derive(Debug, Clone)]
+pub struct BoxPrior {
+    mean: DVector<f64>,
+    precision: DVector<f64>,
+}
+
+impl BoxPrior {
+    fn of(parameters: &[Parameter]) -> Self {
+        let of_each =
+            |value: fn(&Parameter) -> f64| DVector::from_iterator(parameters.len(), parameters.iter().map(value));
+        Self { mean: of_each(Parameter::box_mean), precision: of_each(Parameter::box_precision) }
+    }
 }
 
 /// Residuals of a measurement at one point and their derivatives.
@@ -99,11 +113,11 @@ pub fn locate_all(simulator: &Simulator, observations: &[Observation]) -> Result
 /// Finds the best fit û of one measurement and the normal distribution about it, by Gauss–Newton steps on the tempered posterior.
 ///
 /// ```text
-///  û    = argmin ½ |r(u)|² + 6 |u − ½|²
-///  R Rᵀ = JᵀJ/a² + 12·1,    J = −∂r/∂u at û
+///  û    = argmin ½ |r(u)|² + ½ (u − m)ᵀ P (u − m)
+///  R Rᵀ = JᵀJ/a² + P,    J = −∂r/∂u at û
 /// ```
 ///
-/// r: residuals in standard deviations of the noise; u: position in the prior box, `[d]`; a: see the module.
+/// r: residuals in standard deviations of the noise; u: position in the prior box, `[d]`; m, P, a: see the module.
 ///
 /// # Errors
 /// [`physics::Error`], which cannot occur inside a checked prior.
@@ -114,7 +128,8 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
     let wide = simulator.training_space();
     let limits: Vec<(f64, f64)> =
         prior.iter().zip(wide.iter()).map(|(p, w)| (p.to_unit(w.lower), p.to_unit(w.upper))).collect();
-    let mut u = DVector::from_element(prior.len(), 0.5);
+    let of_prior = BoxPrior::of(prior);
+    let mut u = of_prior.mean.clone();
     let (mut residuals, mut step);
     let mut taken = 0;
     loop {
@@ -122,9 +137,10 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
         taken += 1;
         let rms = (residuals.values.norm_squared() / residuals.values.len() as f64).sqrt();
         let tempering = (CAUTION * rms).max(1.0).powi(-2);
-        let descent = residuals.slopes.tr_mul(&residuals.values) * tempering - u.add_scalar(-0.5) * PRIOR_PRECISION;
+        let descent = residuals.slopes.tr_mul(&residuals.values) * tempering
+            - (&u - &of_prior.mean).component_mul(&of_prior.precision);
         let normal = transposed_product(&residuals.slopes, &residuals.slopes);
-        let (_, factor) = precision(&normal, tempering);
+        let (_, factor) = precision(&normal, tempering, &of_prior);
         step = solve(&factor, &descent);
         let gain = descent.dot(&step);
         for (position, (change, (lowest, highest))) in u.iter_mut().zip(step.iter().zip(&limits)) {
@@ -133,33 +149,43 @@ pub fn locate(simulator: &Simulator, observation: &Observation) -> Result<Locate
         // With this form of the condition, NaN ends the search too.
         let goes_on = gain >= LEAST_GAIN || tempering < 1.0;
         if taken == STEPS || !goes_on {
-            return Ok(located(u, residuals, &normal, &step));
+            return Ok(located(u, residuals, &normal, &step, of_prior));
         }
     }
 }
 
 /// The normal distribution at the end of the search. The derivatives before the last step are used, because that step is small.
-fn located(unit: DVector<f64>, residuals: Residuals, normal: &DMatrix<f64>, step: &DVector<f64>) -> Located {
+fn located(
+    unit: DVector<f64>,
+    residuals: Residuals,
+    normal: &DMatrix<f64>,
+    step: &DVector<f64>,
+    prior: BoxPrior,
+) -> Located {
     let left = residuals.values - &residuals.slopes * step;
     let chi_squared = left.norm_squared();
-    let (_, full) = precision(normal, 1.0);
-    // The number of directions that are determined by the data rather than by the prior.
-    let absorbed = unit.len() as f64 - PRIOR_PRECISION * inverse(&full).norm_squared();
+    let (_, full) = precision(normal, 1.0, &prior);
+    // The number of directions that are determined by the data rather than by the prior: d − tr(P C).
+    let mut left = inverse(&full);
+    for (mut column, precision) in left.column_iter_mut().zip(&prior.precision) {
+        column *= (precision / prior.precision[0]).sqrt();
+    }
+    let absorbed = unit.len() as f64 - prior.precision[0] * left.norm_squared();
     let degrees_of_freedom = (residuals.free - absorbed).max(0.0);
     let expected = degrees_of_freedom + MISFIT_ALLOWED * (2.0 * degrees_of_freedom.max(1.0)).sqrt();
     let excess = (chi_squared / expected - 1.0).max(0.0);
-    let (precision, factor) = precision(normal, 1.0 / (1.0 + excess));
+    let (precision, factor) = precision(normal, 1.0 / (1.0 + excess), &prior);
     let inverse = inverse(&factor);
     let std = DVector::from_iterator(unit.len(), inverse.column_iter().map(|column| column.norm()));
     let frequencies_hz = residuals.frequencies_hz;
-    Located { unit, precision, factor, std, chi_squared, degrees_of_freedom, excess, frequencies_hz }
+    Located { unit, precision, factor, std, chi_squared, degrees_of_freedom, excess, frequencies_hz, prior }
 }
 
-/// JᵀJ·weight + 12·1, `[d, d]`, and its lower triangular factor.
-fn precision(normal: &DMatrix<f64>, weight: f64) -> (DMatrix<f64>, DMatrix<f64>) {
+/// JᵀJ·weight + P, `[d, d]`, and its lower triangular factor.
+fn precision(normal: &DMatrix<f64>, weight: f64, prior: &BoxPrior) -> (DMatrix<f64>, DMatrix<f64>) {
     let mut precision = normal * weight;
     for i in 0..precision.nrows() {
-        precision[(i, i)] += PRIOR_PRECISION;
+        precision[(i, i)] += prior.precision[i];
     }
     let factor = precision.clone().cholesky().expect("squares plus a positive diagonal are positive definite").unpack();
     (precision, factor)
@@ -234,9 +260,9 @@ impl Located {
     /// Condition of the flow: û and the logarithms of the standard deviations, both in units of the prior's standard
     /// deviation, and ln a.
     pub(super) fn features(&self) -> impl Iterator<Item = f64> + '_ {
-        let wide = PRIOR_PRECISION.sqrt();
-        let position = self.unit.iter().map(move |u| wide * (u - 0.5));
-        let std = self.std.iter().map(move |std| (wide * std).ln());
+        let prior = || self.prior.mean.iter().zip(&self.prior.precision);
+        let position = self.unit.iter().zip(prior()).map(|(u, (mean, precision))| precision.sqrt() * (u - mean));
+        let std = self.std.iter().zip(prior()).map(|(std, (_, precision))| (precision.sqrt() * std).ln());
         position.chain(std).chain(std::iter::once(0.5 * self.excess.ln_1p()))
     }
 

@@ -196,7 +196,8 @@ impl<'a> WarmStart<'a> {
         // Without noise the range is not used.
         let noise_range = of_parent.conditions.noise_range.unwrap_or(super::observation::DEFAULT_NOISE_RANGE);
         check(samples, noise_range, &FlowSettings::default(), settings)?;
-        let space = self.parent.training_space.clone();
+        // The limits of the parent's training, with the form of the priors of the structure to be trained.
+        let space = of_parent.conditions.training_space(simulator.space());
         let training = simulator.pairs(&space, samples, purpose_seed(settings.seed, TRAINING_SET))?;
         let (conditions, inherited) = self.conditions(simulator, effect_ranges(simulator, &training));
         let (own, of_effects) = if conditions.starts_at_fit {

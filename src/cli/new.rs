@@ -10,6 +10,7 @@ use clap::Args;
 use super::output::write_whole;
 use crate::quantity::{shown, significant, StructureId};
 use crate::simulator::definition::StructureDefinition;
+use crate::simulator::prior::{NormalPrior, Prior};
 use crate::simulator::Simulator;
 
 const EXAMPLE: &str = "Example: a tower of two storeys whose lower spring is unknown, without questions:
@@ -31,7 +32,8 @@ pub struct NewArgs {
     #[arg(long = "spring", value_name = "NAME=FROM,TO,N_PER_M", value_parser = spring)]
     springs: Vec<NewSpring>,
     /// Unknown stiffness of a spring, with the range of possible values as factors of its nominal stiffness, k1=0.5..1.5, or as
-    /// stiffnesses, k1=1.5e7..4.5e7N/m; once per unknown spring
+    /// stiffnesses, k1=1.5e7..4.5e7N/m; or with mean and standard deviation of a normal distribution, k1=1.0±0.1 or
+    /// k1=3e7±3e6N/m (+- for ±); once per unknown spring
     #[arg(long = "parameter", value_name = "SPRING=LOW..HIGH", value_parser = unknown)]
     parameters: Vec<NewParameter>,
     /// Number of measured modes, from the lowest
@@ -68,9 +70,9 @@ struct NewSpring {
 #[derive(Debug, Clone, PartialEq)]
 struct NewParameter {
     spring: String,
-    /// Range as factors of the nominal stiffness, or as stiffnesses, N/m.
-    range: [f64; 2],
-    /// Whether the range is one of stiffnesses.
+    /// Prior as factors of the nominal stiffness, or as stiffnesses, N/m.
+    prior: Prior,
+    /// Whether the prior is one of stiffnesses.
     in_n_per_m: bool,
 }
 
@@ -231,7 +233,7 @@ fn quoted(text: &str) -> String {
 fn write_parameter(out: &mut String, p: &NewParameter, springs: &[NewSpring]) -> anyhow::Result<()> {
     let spring = springs.iter().find(|s| s.name == p.spring);
     let k = spring.with_context(|| format!("--parameter {}: there is no spring of this name", p.spring))?.n_per_m;
-    let ([low, high], name) = (p.range, quoted(&p.spring));
+    let ([low, high], name) = (p.prior.bounds(), quoted(&p.spring));
     if p.in_n_per_m {
         writeln!(out, "\n# The unknown stiffness of {}, N/m.", p.spring)?;
     } else {
@@ -242,12 +244,23 @@ fn write_parameter(out: &mut String, p: &NewParameter, springs: &[NewSpring]) ->
             p.spring
         )?;
     }
-    writeln!(out, "# The range holds every value that is possible, damaged states included.")?;
+    let (meaning, prior) = if let Prior::Normal(NormalPrior { mean, std }) = p.prior {
+        let meaning = format!(
+            "Mean and standard deviation, damaged states included; values beyond {} to {} are taken for impossible.",
+            significant(low),
+            significant(high)
+        );
+        (meaning, format!("normal = {{ mean = {mean:?}, std = {std:?} }}"))
+    } else {
+        let meaning = "The range holds every value that is possible, damaged states included.".to_owned();
+        (meaning, format!("uniform = [{low:?}, {high:?}]"))
+    };
+    writeln!(out, "# {meaning}")?;
     writeln!(out, "[[parameter]]\nname = {name}")?;
     if !p.in_n_per_m {
         writeln!(out, "scale = true    # a factor of n_per_m; results are in per cent of it")?;
     }
-    writeln!(out, "prior = {{ uniform = [{low:?}, {high:?}] }}\nsets = {{ spring = {name} }}\ndamage = \"decrease\"")?;
+    writeln!(out, "prior = {{ {prior} }}\nsets = {{ spring = {name} }}\ndamage = \"decrease\"")?;
     Ok(())
 }
 
@@ -310,7 +323,7 @@ fn unknown(text: &str) -> Result<NewParameter, String> {
     let wrong = || {
         format!(
             "{} must have the form spring=LOW..HIGH with factors of the nominal stiffness, such as k1=0.5..1.5, or with stiffnesses, such \
-             as k1=1.5e7..4.5e7N/m",
+             as k1=1.5e7..4.5e7N/m, or spring=MEAN±STD, such as k1=1.0±0.1",
             shown(text)
         )
     };
@@ -319,19 +332,22 @@ fn unknown(text: &str) -> Result<NewParameter, String> {
         Some(stiffnesses) => (stiffnesses, true),
         None => (range, false),
     };
-    let (low, high) = range.split_once("..").ok_or_else(wrong)?;
-    let range = [positive(low).ok_or_else(wrong)?, positive(high).ok_or_else(wrong)?];
-    if range[0] >= range[1] {
+    let sign = ["±", "+-"].into_iter().find(|sign| range.contains(sign)).unwrap_or("..");
+    let normal = sign != "..";
+    let (first, second) = range.split_once(sign).ok_or_else(wrong)?;
+    let [low, high] = [positive(first).ok_or_else(wrong)?, positive(second).ok_or_else(wrong)?];
+    if !normal && low >= high {
         return Err(wrong());
     }
-    if !in_n_per_m && range[0] > 100.0 {
+    if !in_n_per_m && low > 100.0 {
         return Err(format!(
-            "{}: {} is not a factor of the nominal stiffness; write 0.5..1.5, or add the unit to stiffnesses, {low}..{high}N/m",
+            "{}: {low} is not a factor of the nominal stiffness; write {}, or add the unit to stiffnesses, {first}{sign}{second}N/m",
             shown(text),
-            range[0]
+            if normal { "1.0±0.1" } else { "0.5..1.5" }
         ));
     }
-    Ok(NewParameter { spring: name.trim().to_owned(), range, in_n_per_m })
+    let prior = if normal { Prior::Normal(NormalPrior { mean: low, std: high }) } else { Prior::Uniform([low, high]) };
+    Ok(NewParameter { spring: name.trim().to_owned(), prior, in_n_per_m })
 }
 
 fn covariate(text: &str) -> Result<NewCovariate, String> {

@@ -51,7 +51,8 @@ pub struct QuantityAssessment {
     pub std_interval: Option<[f64; 2]>,
     /// Mean and spread of the pool (paper).
     pub pooled: Hyperparameters,
-    /// Posterior mass at the prior bounds: share of the samples within 1 % of the prior's width from a bound. Above a few per
+    /// Posterior mass at the ends of the prior: share of the samples within 1 % of the prior's width from a bound, or beyond three
+    /// standard deviations of a normal or log-normal prior. Above a few per
     /// cent the prior is too narrow or the simulation does not fit.
     #[serde(rename = "edge_mass")]
     pub prior_bound_mass: f64,

@@ -75,7 +75,8 @@ pub struct QuantitySamples {
     pub draws: usize,
     /// The population behind the pool.
     pub population: PopulationEstimate,
-    /// Posterior mass at the prior bounds: share of the samples within 1 % of the prior's width from a bound.
+    /// Posterior mass at the ends of the prior: share of the samples within 1 % of the prior's width from a bound, or beyond three
+    /// standard deviations of a normal or log-normal prior.
     pub prior_bound_mass: f64,
     /// Name of the group of parameters that this one cannot be distinguished from.
     pub group: Option<String>,

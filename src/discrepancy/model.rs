@@ -202,10 +202,7 @@ impl Study<'_> {
 
     /// Inverse prior variance of each free mean and all ψ, `[free + ψ]`.
     pub fn prior_information(&self, fit: &Fit) -> Vec<f64> {
-        let mean = |k: &usize| {
-            let p = &self.simulator.space().as_slice()[*k];
-            (0.5 * (p.upper - p.lower)).powi(-2)
-        };
+        let mean = |k: &usize| self.simulator.space().as_slice()[*k].as_normal().1.powi(-2);
         let numbers = fit.effects.iter().flat_map(|e| &e.numbers).map(|n| n.prior_std.powi(-2));
         self.free.iter().map(mean).chain(numbers).collect()
     }

@@ -13,7 +13,8 @@ use super::study::{Present, Study};
 use crate::physics::effect::Target;
 use crate::simulator::law::Input;
 
-/// Prior median of a parameter's standard deviation between rows, as a share of the width of the parameter's prior, and the
+/// Prior median of a parameter's standard deviation between rows, as a share of the width of the parameter's prior (of two standard
+/// deviations of a prior that is not uniform), and the
 /// standard deviation of its logarithm.
 const SPREAD_SHARE: f64 = 0.02;
 const SPREAD_LN_STD: f64 = 1.5;
@@ -98,8 +99,7 @@ impl<'a> Problem<'a> {
 
     /// Prior mean and standard deviation of the mean of parameter `k`.
     fn scale(&self, k: usize) -> (f64, f64) {
-        let p = &self.study.simulator.space().as_slice()[k];
-        (f64::midpoint(p.lower, p.upper), 0.5 * (p.upper - p.lower))
+        self.study.simulator.space().as_slice()[k].as_normal()
     }
 
     /// Sets the unknowns `eta` to the values of a start.

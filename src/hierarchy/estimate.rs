@@ -19,11 +19,11 @@ use crate::stats;
 /// posterior is far from normal.
 ///
 /// ```text
-///  E:  w_js ∝ N(x_js; μ, Σ)
+///  E:  w_js ∝ N(x_js; μ, Σ)/p(x_js)
 ///  M:  μ = 1/n Σ_js w_js x_js,   Σ = 1/n [ Σ_js w_js (x_js − μ)(x_js − μ)ᵀ + Σ − W ],   W = 1/n Σ_j cov_w(x_j)
 /// ```
 ///
-/// Priors: μ is uniform in the prior box; each σ_k uniform up to half the width of the prior, with a factor (σ_k² + W_kk)^(−(d−1)/8)
+/// Priors: μ has the prior of the parameters; each σ_k uniform up to half the width of the prior, with a factor (σ_k² + W_kk)^(−(d−1)/8)
 /// for d correlated parameters, where W_kk is the noise of a measurement; each correlation uniform between −1 and 1 (with the
 /// distribution of Barnard, McCulloch and Meng for all together). The second term of Σ is ours and corresponds to
 /// the restricted likelihood of a normal population: it restores the variance that the fitted mean absorbs, which is Σ/n for data
@@ -32,9 +32,9 @@ use crate::stats;
 /// For one parameter, for more than eight, and for fewer than max(8, 2d + 4, 2(d − 1)²) measurements, Σ is diagonal: such a batch hardly
 /// determines correlations, and none are reported.
 ///
-/// `samples`: x, `[n·draws, d]` in parameter units. `log_weights`: ln q(x_js | y_j) − ln r_j(x_js), nats, `[n·draws]`, up to a
-/// constant for each measurement, if the samples were drawn from densities r_j instead of q(· | y_j). Their exponentials
-/// multiply each w_js and each term of L.
+/// `samples`: x, `[n·draws, d]` in parameter units, drawn from the posteriors under the priors of `space`. `log_weights`:
+/// ln p(y_j | x_js) − ln r_j(x_js), nats, `[n·draws]`, up to a constant for each measurement, if the samples were drawn from densities
+/// r_j instead. Their exponentials multiply each w_js and each term of L.
 ///
 /// Source: D. W. Hogg, A. D. Myers, J. Bovy (2010), Inferring the eccentricity distribution, The Astrophysical Journal 725,
 /// 2166–2175; prior of σ: A. Gelman (2006), Prior distributions for variance parameters in hierarchical models, Bayesian
@@ -62,6 +62,7 @@ pub fn populations(
     let point = problem.maximise();
     let effective_sample_size = problem.effective_sample_size(&point);
     let states = importance::draws(&problem, &point, seed).unwrap_or_else(|| gibbs::draws(&problem, &point, seed));
+    let states = under_prior(states, |state| state.mean.as_slice(), space, seed);
     Populations { parameters: in_units(&point, &states, space), correlations: None, effective_sample_size }
 }
 
@@ -69,7 +70,7 @@ pub fn populations(
 fn correlated(problem: &Problem, space: &ParameterSpace, seed: u64) -> Option<Populations> {
     let point = normal(problem)?;
     let effective_sample_size = problem.effective_sample_size_of_normal(&point);
-    let draws = joint::draws(problem, &point, seed)?;
+    let draws = under_prior(joint::draws(problem, &point, seed)?, |normal| &normal.mean[..], space, seed);
     let state = |normal: &Normal| State {
         mean: normal.mean[..space.len()].to_vec(),
         std: (0..space.len()).map(|k| normal.std(k)).collect(),
@@ -77,6 +78,19 @@ fn correlated(problem: &Problem, space: &ParameterSpace, seed: u64) -> Option<Po
     let states: Vec<State> = draws.iter().map(state).collect();
     let parameters = in_units(&state(&point), &states, space);
     Some(Populations { parameters, correlations: Some(Correlations::of_draws(&draws)), effective_sample_size })
+}
+
+/// Draws of a population under a uniform prior of its mean μ, resampled by the priors of the parameters at μ. Unchanged where these are
+/// uniform. `mean`: μ in the unit box, `[d]` or longer.
+fn under_prior<T: Clone>(draws: Vec<T>, mean: impl Fn(&T) -> &[f64], space: &ParameterSpace, seed: u64) -> Vec<T> {
+    if space.is_uniform() {
+        return draws;
+    }
+    let one = |draw: &T| space.iter().zip(mean(draw)).map(|(p, u)| p.log_prior(p.from_unit(*u))).sum::<f64>();
+    let log_weights: Vec<f64> = draws.iter().map(one).collect();
+    let Some(weights) = stats::weights(&log_weights, 0.0) else { return draws };
+    let chosen = stats::systematic(&weights, draws.len(), &mut stats::stream(seed, "prior of the mean"));
+    chosen.into_iter().map(|draw| draws[draw].clone()).collect()
 }
 
 /// Where the posterior of one measurement is wider than so many spreads of the population, the correlations are hardly determined, and
@@ -116,11 +130,11 @@ fn in_units(point: &State, states: &[State], space: &ParameterSpace) -> Vec<Popu
     space.iter().enumerate().map(one).collect()
 }
 
-/// Estimates the population of each parameter separately, with those of all others uniform over the prior. With many
+/// Estimates the population of each parameter separately, with those of all others distributed as their priors. With many
 /// parameters there are too few samples to weight them by all populations jointly.
 ///
 /// ```text
-///  L_k(μ_k, σ_k) ∝ Π_j 1/S Σ_s N(x_jsk; μ_k, σ_k²)
+///  L_k(μ_k, σ_k) ∝ Π_j 1/S Σ_s N(x_jsk; μ_k, σ_k²)/p(x_jsk)
 /// ```
 ///
 /// `samples`: `[n·draws, d]`, parameter units. The effective sample size is the smallest of all parameters.

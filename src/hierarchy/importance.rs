@@ -133,7 +133,7 @@ fn derivatives(problem: &Problem, point: &State, weights: &Weights) -> (DVector<
 mod tests {
     use super::super::gibbs;
     use super::*;
-    use crate::parameter::{DamageDirection, Parameter, ParameterSpace};
+    use crate::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
     use crate::posterior::PosteriorSamples;
 
     /// Normal posteriors of three parameters with standard deviations `within`, from a population with standard deviation
@@ -145,6 +145,7 @@ mod tests {
             lower: 0.0,
             upper: 1.0,
             damage: DamageDirection::Decrease,
+            form: PriorForm::Uniform,
         };
         let space = ParameterSpace::new(["a", "b", "c"].map(parameter).to_vec());
         let (draws, mut stream) = (64, stats::stream(3, "test: populations"));

@@ -1,12 +1,15 @@
 //! The population behind a batch: mean and spread of the parameters over its measurements, without the noise of the single
 //! measurements.
 //!
-//! The posterior samples of each measurement j follow q(x | y_j) ∝ p(y_j | x) under a uniform prior. They suffice to
+//! The posterior samples of each measurement j follow q(x | y_j) ∝ p(y_j | x) p(x) under the prior p(x). They suffice to
 //! compute the likelihood of a normal population (μ, Σ):
 //!
 //! ```text
-//!  L(μ, Σ) = Π_j ∫ p(y_j | x) N(x; μ, Σ) dx ∝ Π_j 1/S Σ_s N(x_js; μ, Σ)
+//!  L(μ, Σ) = Π_j ∫ p(y_j | x) N(x; μ, Σ) dx ∝ Π_j 1/S Σ_s N(x_js; μ, Σ)/p(x_js)
 //! ```
+//!
+//! A uniform prior is a constant factor. Any other one is divided by once for each measurement, so that it does not count as often as
+//! there are measurements, and then counts once, as the prior of the mean μ.
 //!
 //! The parameters of a healthy structure move together, with temperature for example, so that Σ is a full matrix where the batch
 //! determines one.
@@ -23,7 +26,7 @@
 //!
 //! ```
 //! use modalwatch::hierarchy::populations;
-//! use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
+//! use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
 //! use modalwatch::posterior::PosteriorSamples;
 //! use modalwatch::stats;
 //! use nalgebra::DMatrix;
@@ -31,7 +34,8 @@
 //! use rand_distr::StandardNormal;
 //!
 //! let (name, unit) = ("k1".to_owned(), "N/m".to_owned());
-//! let stiffness = Parameter { name, unit, lower: 3.0, upper: 7.0, damage: DamageDirection::Decrease };
+//! let (damage, form) = (DamageDirection::Decrease, PriorForm::Uniform);
+//! let stiffness = Parameter { name, unit, lower: 3.0, upper: 7.0, damage, form };
 //! let space = ParameterSpace::new(vec![stiffness]);
 //!
 //! let (measurements, draws) = (30, 64);

@@ -89,7 +89,7 @@ pub(super) fn within(columns: &[Vec<f64>], draws: usize) -> Vec<f64> {
 
 impl Problem {
     /// Arranges the posterior samples, `[n·draws, d]`, in lanes. `log_weights`: logarithms of their own weights, `[n·draws]`,
-    /// nats.
+    /// nats; without them the samples are weighted by one over the density of the prior.
     pub(super) fn new(samples: &PosteriorSamples, log_weights: Option<&[f64]>, space: &ParameterSpace) -> Self {
         let (draws, measurements) = (samples.draws(), samples.measurements());
         let columns = unit_columns(samples, space);
@@ -127,7 +127,15 @@ impl Problem {
                 weights.chunks(draws).map(|own| own.iter().copied().fold(f64::NEG_INFINITY, f64::max)).collect();
             deviations_in_lanes(weights, &largest, LOG2_E)
         };
-        let offsets = log_weights.map_or_else(|| vec![Lanes::ZERO; places], relative);
+        let over_prior = || {
+            let log_weights = |row: usize| -space.log_prior(samples.theta().row(row).iter());
+            (0..samples.theta().nrows()).map(log_weights).collect::<Vec<f64>>()
+        };
+        let offsets = match log_weights {
+            Some(weights) => relative(weights),
+            None if space.is_uniform() => vec![Lanes::ZERO; places],
+            None => relative(&over_prior()),
+        };
         let centres = (0..measurements).flat_map(|j| means.iter().map(move |own| own[j])).collect();
         let in_lanes = |block: &Block, own: &Vec<f64>| {
             let mut all = [0.0; LANES];
@@ -328,6 +336,7 @@ mod tests {
             lower: 0.0,
             upper: 1.0,
             damage: crate::parameter::DamageDirection::Decrease,
+            form: crate::parameter::PriorForm::Uniform,
         };
         let space = ParameterSpace::new(["a", "b", "c"].map(parameter).to_vec());
         let (measurements, draws) = (21, 16);

@@ -9,7 +9,7 @@ use super::normal::Normal;
 use super::problem::Problem;
 use super::small::SmallMatrix;
 use super::{estimate, joint, joint_chain, populations, proposals, Populations};
-use crate::parameter::{DamageDirection, Parameter, ParameterSpace};
+use crate::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
 use crate::posterior::PosteriorSamples;
 use crate::stats;
 
@@ -23,6 +23,7 @@ fn space(d: usize) -> ParameterSpace {
         lower: 0.0,
         upper: 1.0,
         damage: DamageDirection::Decrease,
+        form: PriorForm::Uniform,
     };
     ParameterSpace::new((0..d).map(parameter).collect())
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::definition::{
-    CovariateDefinition, DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Prior, Sets,
+    CovariateDefinition, DefinitionProblem, Law, MassDefinition, MeasurementNoise, ParameterDefinition, Sets,
     SimulationKind, StructureDefinition, PERCENT_OF_NOMINAL,
 };
 use super::discrepancy;
@@ -252,11 +252,8 @@ fn check_parameters(definition: &StructureDefinition, problems: &mut Problems) -
     check_names("parameter", definition.parameters.iter().map(|p| &p.name), problems);
     let mut bindings: Vec<Binding> = Vec::new();
     for (index, parameter) in definition.parameters.iter().enumerate() {
-        let Prior::Uniform([lower, upper]) = parameter.prior;
-        if !(lower.is_finite() && upper.is_finite() && lower < upper) {
-            let message =
-                format!("uniform = [{lower}, {upper}]: both bounds must be finite, the first below the second");
-            problems.push(DefinitionProblem::new(format!("/parameter/{index}/prior/uniform"), message));
+        if let Some((below, message)) = parameter.prior.mistake() {
+            problems.push(DefinitionProblem::new(parameter.prior.pointer(index) + below, message));
         }
         let table = definition.simulation == SimulationKind::Table;
         check_factor(definition, index, problems);
@@ -387,10 +384,10 @@ fn parameter(structure: &StructureDefinition, definition: &ParameterDefinition) 
         Some(sets) => structure.stiffness_unit(sets),
     };
     let unit = definition.unit.clone().unwrap_or_else(|| unit.to_owned());
-    Parameter { name: definition.name.clone(), unit, lower, upper, damage: definition.damage }
+    Parameter { name: definition.name.clone(), unit, lower, upper, damage: definition.damage, form: definition.form() }
 }
 
-/// The stiffnesses at their nominal values: those of the file, or else at the middle of the prior of the parameter that sets
+/// The stiffnesses at their nominal values: those of the file, or else at the median of the prior of the parameter that sets
 /// them.
 fn springs(
     definition: &StructureDefinition,
@@ -402,10 +399,7 @@ fn springs(
     let spans = definition.beams.iter().map(|b| (&b.name, b.bending_stiffness_n_m2));
     let nominal = |(index, ((name, value), form)): (usize, ((&String, Option<f64>), Form))| {
         let binding = bindings.iter().find(|b| b.spring == index);
-        let middle = binding.map(|b| {
-            let [lower, upper] = definition.parameters[b.parameter].bounds();
-            b.stiffness(f64::midpoint(lower, upper))
-        });
+        let middle = binding.map(|b| b.stiffness(definition.parameters[b.parameter].median()));
         let n_per_m = value.or(middle).unwrap_or_else(|| {
             let of_springs = definition.springs.len();
             let (pointer, message) = if index < of_springs {
@@ -432,22 +426,26 @@ fn check_priors(
 ) -> Vec<Spring> {
     let mut weakest: Vec<Spring> = springs.to_vec();
     for binding in bindings {
+        let prior = definition.parameters[binding.parameter].prior;
+        if prior.mistake().is_some() {
+            continue;
+        }
         let [lower, upper] = definition.parameters[binding.parameter].bounds();
         // Every law is monotone, so that its smallest value is at a bound of the prior.
         let (at_lower, at_upper) = (binding.stiffness(lower), binding.stiffness(upper));
         let least = at_lower.min(at_upper);
-        let pointer = format!("/parameter/{}/prior/uniform", binding.parameter);
         let name = shown(&springs[binding.spring].name);
         let kind = if binding.spring < definition.springs.len() { "spring" } else { "beam" };
         // Both bounds are checked, because `min` ignores NaN, which 0·exp(large) gives.
         if !(least >= 0.0 && at_lower.is_finite() && at_upper.is_finite()) {
             let unit = if kind == "beam" { "N·m²" } else { "N/m" };
-            let Prior::Uniform([first, last]) = definition.parameters[binding.parameter].prior;
             let message = format!(
-                "the prior [{first}, {last}] lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must \
-                 be finite and not negative"
+                "the {} lets {kind} {name} have a stiffness of {at_lower} to {at_upper} {unit}: it must be finite and not \
+                 negative{}",
+                prior.words(),
+                prior.instead()
             );
-            problems.push(DefinitionProblem::new(pointer, message));
+            problems.push(DefinitionProblem::new(prior.pointer(binding.parameter), message));
         }
         weakest[binding.spring].n_per_m = least;
     }
@@ -472,7 +470,8 @@ fn check_connected_to_ground(
     } else if let Some(mass) = floating_mass(masses, weakest.iter().filter(|s| s.n_per_m > 0.0)) {
         let name = shown(&definition.masses[mass].name);
         let to_zero = bindings.iter().find(|b| weakest[b.spring].n_per_m <= 0.0);
-        let pointer = to_zero.map_or("/parameter".to_owned(), |b| format!("/parameter/{}/prior/uniform", b.parameter));
+        let of_prior = |b: &Binding| definition.parameters[b.parameter].prior.pointer(b.parameter);
+        let pointer = to_zero.map_or_else(|| "/parameter".to_owned(), of_prior);
         let message = format!(
             "the prior allows a mechanism: with a stiffness of 0, mass {name} is not connected to the ground; let the prior \
              begin above 0"

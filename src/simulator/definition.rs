@@ -10,8 +10,9 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::discrepancy::definition::DiscrepancyDefinition;
 use super::law::LawKind;
+pub use super::prior::Prior;
 use crate::measurement::CovariateKind;
-use crate::parameter::DamageDirection;
+use crate::parameter::{DamageDirection, PriorForm};
 use crate::quantity::Digest;
 
 /// A structure as its file describes it; [`crate::simulator::Simulator`] is the checked form.
@@ -181,7 +182,7 @@ pub struct BeamDefinition {
     pub from: String,
     /// Name of the node at the other end.
     pub to: String,
-    /// Nominal bending stiffness EI, N·m². If a parameter sets it, the default is its value in the middle of the prior.
+    /// Nominal bending stiffness EI, N·m². If a parameter sets it, the default is its value at the median of the prior.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bending_stiffness_n_m2: Option<f64>,
     /// Mass per length, kg/m.
@@ -260,7 +261,7 @@ pub struct SpringDefinition {
     pub from: String,
     /// `ground` or the name of a mass (of a node in a simulation `beam`).
     pub to: String,
-    /// Nominal stiffness, N/m. If a parameter sets it, the default is its value in the middle of the prior.
+    /// Nominal stiffness, N/m. If a parameter sets it, the default is its value at the median of the prior.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub n_per_m: Option<f64>,
     /// Nominal stiffness of a rotational spring at nodes of a beam, N·m/rad, instead of `n_per_m`.
@@ -291,27 +292,37 @@ pub struct ParameterDefinition {
     pub damage: DamageDirection,
 }
 
-/// Prior distribution of a parameter.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Prior {
-    /// Uniform between the two values.
-    Uniform([f64; 2]),
-}
-
 /// Unit of the values of a parameter that is a factor of the nominal stiffness.
 pub const PERCENT_OF_NOMINAL: &str = "% of nominal";
 
 impl ParameterDefinition {
-    /// Bounds of the prior in the unit of the parameter's values: those of the file, or 100 times the factors of the file for
-    /// `scale`, because the values of such a parameter are per cent of the nominal stiffness.
-    pub fn bounds(&self) -> [f64; 2] {
-        let Prior::Uniform(bounds) = self.prior;
+    /// Factor from the numbers of the prior in the file to the parameter's values: 100 for `scale`, because the values of such a
+    /// parameter are per cent of the nominal stiffness.
+    fn unit_factor(&self) -> f64 {
         if self.scale {
-            bounds.map(|factor| 100.0 * factor)
+            100.0
         } else {
-            bounds
+            1.0
         }
+    }
+
+    /// Bounds of the prior in the unit of the parameter's values.
+    pub fn bounds(&self) -> [f64; 2] {
+        self.prior.bounds().map(|value| self.unit_factor() * value)
+    }
+
+    /// Median of the prior in the unit of the parameter's values.
+    pub fn median(&self) -> f64 {
+        let [low, high] = self.bounds();
+        match self.form() {
+            PriorForm::Uniform => f64::midpoint(low, high),
+            PriorForm::Normal { mean: median, .. } | PriorForm::LogNormal { median, .. } => median,
+        }
+    }
+
+    /// Form of the prior between these bounds.
+    pub fn form(&self) -> PriorForm {
+        self.prior.form(self.unit_factor())
     }
 }
 

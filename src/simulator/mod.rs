@@ -49,6 +49,7 @@ mod nominal;
 mod parse;
 pub mod plausibility;
 pub mod population;
+pub mod prior;
 pub mod rehearsal;
 mod respond;
 pub mod settings;

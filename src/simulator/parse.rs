@@ -148,8 +148,8 @@ fn hint(pointer: &str, message: &str) -> Option<&'static str> {
             Some("scale = true belongs to the [[parameter]], which then is a factor of the nominal stiffness of all that it sets")
         }
         "parameter" if message.contains("unknown variant") && pointer.contains("/prior") => Some(
-            "a prior is uniform between the smallest and the largest possible value, damaged states included: for a mean and a standard \
-             deviation write uniform = [mean − 3 std, mean + 3 std]",
+            "a prior is one of { uniform = [low, high] }, { normal = { mean = 1.0, std = 0.1 } } and { log_normal = { median = 1.0, \
+             relative_std = 0.2 } }",
         ),
         "spring" | "beam" if unknown("prior") || unknown("uniform") => {
             Some("a prior belongs to a [[parameter]] that sets the stiffness: sets = { spring = \"k1\" } or { beam = \"span\" }")

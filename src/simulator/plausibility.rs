@@ -1,6 +1,6 @@
 //! Priors that contradict the stated nominal stiffness, such as a factor where a stiffness is expected.
 
-use super::definition::{ParameterDefinition, Prior};
+use super::definition::ParameterDefinition;
 use super::simulate::Simulator;
 use crate::quantity::{significant, with_prefix};
 
@@ -26,7 +26,7 @@ impl Simulator {
     fn prior_doubt(&self, column: usize, parameter: &ParameterDefinition) -> Option<PriorDoubt> {
         let sets = parameter.sets.first().filter(|sets| sets.law.is_none())?;
         let stiffness = self.definition().stated_stiffness(sets).filter(|k| *k > 0.0)?;
-        let Prior::Uniform([low, high]) = parameter.prior;
+        let [low, high] = parameter.prior.bounds();
         let nominal = if parameter.scale { 1.0 } else { stiffness };
         if (low..=high).contains(&nominal) {
             return None;
@@ -70,7 +70,7 @@ impl Simulator {
     /// The parameters that are stiffnesses themselves although their prior looks like that of a factor, each as a question.
     pub fn probable_factors(&self) -> Vec<String> {
         let one = |(parameter, unit): (&ParameterDefinition, &String)| {
-            let Prior::Uniform([low, high]) = parameter.prior;
+            let [low, high] = parameter.prior.bounds();
             let itself =
                 !parameter.scale && !parameter.sets.is_empty() && parameter.sets.iter().all(|s| s.law.is_none());
             let stated = parameter.sets.iter().all(|s| self.definition().stated_stiffness(s).is_some());

@@ -338,7 +338,7 @@ impl Simulator {
         }
     }
 
-    /// Natural frequencies at the nominal stiffnesses, or in the middle of the prior of a table, Hz, `[m]`.
+    /// Natural frequencies at the nominal stiffnesses, or at the medians of the priors of a table, Hz, `[m]`.
     pub fn nominal_frequencies_hz(&self) -> Vec<f64> {
         self.parts.checked.nominal_frequencies_hz.clone()
     }

@@ -7,7 +7,7 @@ use nalgebra::DMatrix;
 
 use super::definition::{DefinitionProblem, StructureDefinition};
 use crate::emulator::{Emulator, FitError, Runs};
-use crate::parameter::ParameterSpace;
+use crate::parameter::{Parameter, ParameterSpace};
 use crate::quantity::{shown, Digest};
 
 /// Share of the range of the runs by which a prior may extend beyond them: a Latin hypercube does not sample its edges.
@@ -88,9 +88,9 @@ impl Table {
         theta.iter().zip(self.emulator.ranges()).all(|(x, [low, high])| (low..=high).contains(x))
     }
 
-    /// Frequencies in the middle of the prior, Hz, `[modes]`.
+    /// Frequencies at the medians of the priors, Hz, `[modes]`.
     pub(super) fn nominal_frequencies_hz(&self, space: &ParameterSpace, modes: usize) -> Vec<f64> {
-        let middle: Vec<f64> = space.iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
+        let middle: Vec<f64> = space.iter().map(Parameter::prior_median).collect();
         let mut frequencies = self.frequencies_hz(&middle);
         frequencies.truncate(modes);
         frequencies
@@ -149,7 +149,7 @@ pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) 
                 "the prior of {} extends from {} to {}, the runs only from {lower} to {upper}: an emulator does not extrapolate",
                 parameter.name, parameter.lower, parameter.upper
             );
-            return Err(wrong(&format!("/parameter/{column}/prior/uniform"), message));
+            return Err(wrong(&definition.parameters[column].prior.pointer(column), message));
         }
     }
     Ok(Table { emulator, runs: count })

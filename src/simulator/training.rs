@@ -17,7 +17,7 @@ const MARGIN: f64 = 0.1;
 /// Simulated parameters with their exact frequencies, from which a flow is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingSet {
-    /// Parameters, uniform in a box, `[n, d]`, parameter units.
+    /// Parameters, drawn from their priors in a box, `[n, d]`, parameter units.
     pub theta: DMatrix<f64>,
     /// Frequencies without noise, Hz, `[n, m]`.
     pub frequencies_hz: DMatrix<f64>,
@@ -31,16 +31,19 @@ pub struct TrainingSet {
 }
 
 impl Simulator {
-    /// The box in which a flow is trained: the prior with a margin on each side. A density is hardest to learn at the edge of its
+    /// The box in which a flow is trained: a uniform prior with a margin on each side. A density is hardest to learn at the edge of its
     /// support, and the margin keeps the bounds of the prior away from that edge.
     ///
     /// The margin is a tenth of the width of the prior. It is smaller where a stiffness would fall below half its smallest value
-    /// in the prior, and zero for a table, which must not be extrapolated.
+    /// in the prior, and zero for a table, which must not be extrapolated, and for a prior with tails, whose density has no edge.
     pub fn training_space(&self) -> ParameterSpace {
         if self.table().is_some() {
             return self.space().clone();
         }
         let padded = |(column, parameter): (usize, &Parameter)| {
+            if !parameter.is_uniform() {
+                return parameter.clone();
+            }
             let width = parameter.upper - parameter.lower;
             let bindings = || self.bindings().iter().filter(move |b| b.parameter == column);
             let margin = |bound: f64, outwards: f64| {
@@ -66,7 +69,7 @@ impl Simulator {
         self.pairs(self.space(), samples, seed)
     }
 
-    /// Simulates `samples` rows of parameters drawn uniformly from the box `space`. The same seed gives the same bits on any number
+    /// Simulates `samples` rows of parameters drawn from the priors of the box `space`. The same seed gives the same bits on any number
     /// of threads, and a longer set begins with the rows of a shorter one.
     ///
     /// # Errors
@@ -76,7 +79,7 @@ impl Simulator {
         let mut stream = stats::stream(seed, "prior");
         // Drawn row by row, so that a longer set begins with the rows of a shorter one.
         let rows: Vec<Vec<f64>> =
-            (0..samples).map(|_| space.iter().map(|p| p.from_unit(stream.random::<f64>())).collect()).collect();
+            (0..samples).map(|_| space.iter().map(|p| p.at_level(stream.random::<f64>())).collect()).collect();
         let theta = DMatrix::from_fn(samples, space.len(), |row, column| rows[row][column]);
         let mut stream = stats::stream(seed, "covariates");
         let mut effect_sizes = vec![Vec::new(); samples];

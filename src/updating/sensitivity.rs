@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
+use crate::parameter::Parameter;
 use crate::physics;
 use crate::simulator::Simulator;
 
@@ -105,7 +106,7 @@ pub fn update(simulator: &Simulator, frequencies_hz: &[Option<f64>], start: &[f6
     Ok(Update { theta: theta(&u), residual: root_mean_square(&residual), iterations, starts: 1, converged })
 }
 
-/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the middle of the prior; while its frequencies are
+/// [`update`] for many measurements (`[n][m]`) in parallel. Each starts from the median of the prior; while its frequencies are
 /// not matched, it starts again from the next of `further_starts` (`[starts][d]`), and the best result is kept.
 ///
 /// # Errors
@@ -115,7 +116,7 @@ pub fn update_all(
     measurements: &[Vec<Option<f64>>],
     further_starts: &[Vec<f64>],
 ) -> Result<Vec<Update>, physics::Error> {
-    let middle: Vec<f64> = simulator.space().iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
+    let middle: Vec<f64> = simulator.space().iter().map(Parameter::prior_median).collect();
     let one = |frequencies: &Vec<Option<f64>>| {
         let mut best = update(simulator, frequencies, &middle)?;
         for start in further_starts {
@@ -134,8 +135,8 @@ pub fn update_all(
     measurements.par_iter().map(one).collect()
 }
 
-/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box over the first six parameters,
-/// with the others at the middle of their priors, `[starts][d]`.
+/// Further starts for [`update_all`]: a lattice of at most 64 interior points of the prior box, at equal steps of probability, over the
+/// first six parameters, with the others at the medians of their priors, `[starts][d]`.
 pub fn prior_lattice(simulator: &Simulator) -> Vec<Vec<f64>> {
     const MOST: usize = 64;
     let space = simulator.space().as_slice();
@@ -145,7 +146,7 @@ pub fn prior_lattice(simulator: &Simulator) -> Vec<Vec<f64>> {
         k if k < spanned => ((point / steps.pow(k as u32) % steps) as f64 + 0.5) / steps as f64,
         _ => 0.5,
     };
-    let start = |point: usize| space.iter().enumerate().map(|(k, p)| p.from_unit(at(point, k))).collect();
+    let start = |point: usize| space.iter().enumerate().map(|(k, p)| p.at_level(at(point, k))).collect();
     (0..steps.pow(spanned as u32)).map(start).collect()
 }
 

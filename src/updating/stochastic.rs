@@ -36,7 +36,7 @@ const MOST_POINTS: usize = 1 << 16;
 /// ```text
 ///  θ = (μ, σ),    x ~ N(μ, diag σ²),    y = M(x) + noise
 ///  ln L(θ) = −D_B(measured, simulated at θ)/ε²,    ε² = 1/(4n)          (paper Eq. 5)
-///  μ ~ U(prior),    σ ~ U(0, width of the prior/√12)
+///  μ ~ prior,    σ ~ U(0, standard deviation of the prior)
 /// ```
 ///
 /// The simulated measurements are computed from the same normal scores at every θ, which makes the likelihood smooth. The scores
@@ -225,20 +225,21 @@ impl Target for Population<'_> {
 
     fn draw_prior(&self, stream: &mut Stream) -> Vec<f64> {
         let space = self.simulator.space();
-        let means = space.iter().map(|p| (p.lower, p.upper - p.lower));
-        let widths = space.iter().map(|p| (0.0, (p.upper - p.lower) / 12.0_f64.sqrt()));
-        means.chain(widths).map(|(from, width)| from + width * stream.random::<f64>()).collect()
+        let mut theta: Vec<f64> = space.iter().map(|p| p.at_level(stream.random())).collect();
+        theta.extend(space.iter().map(|p| p.prior_std() * stream.random::<f64>()));
+        theta
     }
 
     fn log_prior(&self, theta: &[f64]) -> f64 {
         let parameters = self.simulator.space().as_slice();
         let (means, stds) = theta.split_at(parameters.len());
-        let inside = parameters.iter().zip(means).zip(stds).all(|((p, mean), std)| {
-            let widest = (p.upper - p.lower) / 12.0_f64.sqrt();
-            (p.lower..=p.upper).contains(mean) && (0.0..=widest).contains(std)
-        });
+        let inside = parameters
+            .iter()
+            .zip(means)
+            .zip(stds)
+            .all(|((p, mean), std)| (p.lower..=p.upper).contains(mean) && (0.0..=p.prior_std()).contains(std));
         if inside {
-            0.0
+            self.simulator.space().log_prior(means)
         } else {
             f64::NEG_INFINITY
         }

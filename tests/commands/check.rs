@@ -138,3 +138,28 @@ fn towers_beams_and_frames_are_drawn_with_all_their_parts() {
         }
     }
 }
+
+#[test]
+fn a_narrower_prior_leaves_a_smaller_standard_deviation_and_a_larger_share_of_its_variance() {
+    let world = World::new();
+    let of = |name: &str, prior: &str| {
+        let text = TOWER.replacen("{ uniform = [1.5e7, 4.5e7] }", prior, 1);
+        std::fs::write(world.path(name), text).unwrap();
+        figures(&world, &[name])["parameters"][0].clone()
+    };
+    let uniform = of("uniform.toml", "{ uniform = [1.5e7, 4.5e7] }");
+    let normal = of("normal.toml", "{ normal = { mean = 3e7, std = 1e5 } }");
+    let log_normal = of("log_normal.toml", "{ log_normal = { median = 3e7, relative_std = 0.00333333 } }");
+    let number = |figures: &Value, key: &str| figures[key].as_f64().unwrap();
+    // The information of the prior adds to that of the measurement, of which the uniform prior has hardly a share.
+    let of_data = number(&uniform, "std").powi(-2) - 12.0 / 3e7_f64.powi(2);
+    let expected = (of_data + 1e5_f64.powi(-2)).sqrt().recip();
+    for (figures, key) in [(&normal, "normal"), (&log_normal, "log_normal")] {
+        assert!((number(figures, "std") / expected - 1.0).abs() < 0.02, "{figures} {expected}");
+        let left = (number(figures, "std") / 1e5).powi(2);
+        assert!((number(figures, "variance_left") / left - 1.0).abs() < 0.02, "{figures} {left}");
+        assert!(figures["prior_form"][key].is_object(), "{figures}");
+    }
+    assert_eq!(uniform["prior_form"], "uniform");
+    assert!(number(&uniform, "variance_left") < number(&normal, "variance_left"));
+}

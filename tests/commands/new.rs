@@ -76,3 +76,31 @@ fn a_file_is_not_replaced_and_a_mechanism_is_not_written() {
     let (_, said) = world.fails(&[BY_FLAGS, &["--replace", "--parameter", "k7=0.5..1.5"]].concat());
     assert!(said.contains("there is no spring of this name"), "{said}");
 }
+
+#[test]
+fn a_mean_and_a_standard_deviation_become_a_normal_prior() {
+    let world = World::new();
+    let parameters = ["--parameter", "k2=2.5e7+-2.5e6N/m", "--out", "normal.toml"];
+    let by_flags: Vec<&str> =
+        BY_FLAGS.iter().map(|flag| if *flag == "k1=0.5..1.5" { "k1=1.0±0.1" } else { flag }).collect();
+    world.run(&[&by_flags, &parameters[..]].concat());
+    let text = std::fs::read_to_string(world.path("normal.toml")).unwrap();
+    assert!(text.contains("prior = { normal = { mean = 1.0, std = 0.1 } }"), "{text}");
+    assert!(text.contains("prior = { normal = { mean = 25000000.0, std = 2500000.0 } }"), "{text}");
+    assert!(text.contains("values beyond 0.6 to 1.4 are taken for impossible"), "{text}");
+    let said = world.run(&["check", "normal.toml"]);
+    assert!(
+        said.contains(
+            "normal prior of mean 100 % of nominal and standard deviation 10 % of nominal, 60 to 140 % of nominal"
+        ),
+        "{said}"
+    );
+    assert!(
+        said.contains("normal prior of mean 25 MN/m and standard deviation 2.5 MN/m, 15 MN/m to 35 MN/m"),
+        "{said}"
+    );
+    // A standard deviation with which a stiffness could be negative.
+    let wide: Vec<&str> = by_flags.iter().map(|flag| if *flag == "k1=1.0±0.1" { "k1=1.0±0.3" } else { flag }).collect();
+    let (_, said) = world.fails(&[&wide[..], &["--out", "wide.toml"]].concat());
+    assert!(said.contains("a std below 0.25 keeps the prior above 0") && !world.path("wide.toml").exists(), "{said}");
+}

@@ -12,7 +12,7 @@ use modalwatch::measurement::csv::{read, CsvOptions};
 use modalwatch::measurement::csv_output::write;
 use modalwatch::measurement::shape::InstrumentedPoints;
 use modalwatch::measurement::{Covariate, CovariateKind, CovariateValue, ModalMeasurement};
-use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
+use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
 use modalwatch::quantity::{Hertz, Timestamp};
 use proptest::prelude::*;
 
@@ -27,6 +27,7 @@ fn space() -> ParameterSpace {
         lower: 0.5,
         upper: 9.0,
         damage: DamageDirection::Decrease,
+        form: PriorForm::Uniform,
     };
     ParameterSpace::new(vec![parameter])
 }

@@ -74,13 +74,6 @@ fn each_mistake_is_named_with_its_line_and_place() {
             "is an [[effect]]",
         ),
         ("name = \"p\"", "name = \"p\"\ncovariate = \"temperature_c\"", 20, "/parameter/0", "is an [[effect]]"),
-        (
-            "uniform = [5.0, 15.0]",
-            "normal = { mean = 10.0, std = 1.0 }",
-            20,
-            "/parameter/0/prior",
-            "uniform = [mean − 3 std",
-        ),
         ("modes = 2", "modes = 2\nlaw = \"linear\"", 3, "", "belongs into sets of its [[parameter]]"),
         (
             "sets = { spring = \"k2\" }",
@@ -160,7 +153,7 @@ fn each_mistake_is_named_with_its_line_and_place() {
         ("uniform = [5.0, 15.0]", "uniform = [15.0, 5.0]", 20, "/parameter/0/prior/uniform", "first below the second"),
         ("uniform = [5.0, 15.0]", "uniform = [-5.0, 15.0]", 20, "/parameter/0/prior/uniform", "stiffness of -5"),
         ("uniform = [5.0, 15.0]", "uniform = [0.0, 15.0]", 20, "/parameter/0/prior/uniform", "allows a mechanism"),
-        ("uniform = [5.0, 15.0]", "normal = [5.0, 15.0]", 20, "/parameter/0/prior", "unknown variant"),
+        ("uniform = [5.0, 15.0]", "triangular = [5.0, 15.0]", 20, "/parameter/0/prior", "unknown variant"),
         ("sets = { spring = \"k2\" }", "sets = { spring = \"k9\" }", 21, "/parameter/0/sets", "no spring \"k9\""),
         ("sets = { spring = \"k2\" }", "sets = []", 21, "/parameter/0/sets", "sets nothing"),
         (

@@ -7,6 +7,7 @@ mod beam;
 mod definition;
 mod effect;
 mod factor;
+mod prior;
 mod table;
 
 use std::f64::consts::PI;

@@ -5,7 +5,7 @@ use rand::Rng as _;
 use serde::Serialize;
 
 use crate::baseline::identifiability::local_covariance;
-use crate::parameter::{DamageDirection, Parameter};
+use crate::parameter::{DamageDirection, Parameter, PriorForm};
 use crate::quantity::significant;
 use crate::simulator::plausibility::MISTAKEN;
 use crate::simulator::{SimulationModel, Simulator};
@@ -21,9 +21,6 @@ const TOGETHER: f64 = 0.95;
 
 /// Share of the prior variance above which one measurement says little about a parameter.
 const LITTLE: f64 = 0.5;
-
-/// Variance of a uniform distribution of width 1, inverse.
-const PRIOR_PRECISION: f64 = 12.0;
 
 /// What is known about a structure without any measurement.
 #[derive(Debug, Serialize)]
@@ -49,6 +46,7 @@ pub struct ParameterFigures {
     pub name: String,
     pub unit: String,
     pub prior: [f64; 2],
+    pub prior_form: PriorForm,
     pub nominal: f64,
     pub damage: DamageDirection,
     pub sets: Vec<String>,
@@ -110,10 +108,11 @@ impl Figures {
             name: p.name.clone(),
             unit: p.unit.clone(),
             prior: [p.lower, p.upper],
+            prior_form: p.form,
             nominal: nominal[k],
             damage: p.damage,
             sets: sets(simulator, k),
-            variance_left: (PRIOR_PRECISION * covariance[(k, k)]).min(1.0),
+            variance_left: (p.box_precision() * covariance[(k, k)]).min(1.0),
             std: covariance[(k, k)].sqrt() * (p.upper - p.lower),
         };
         let mut figures = Self {
@@ -160,7 +159,7 @@ impl Figures {
         self.judge_measured(simulator);
     }
 
-    /// Compares the measured frequencies with the ranges of the prior, and the lowest one with that in the middle of the prior.
+    /// Compares the measured frequencies with the ranges of the prior, and the lowest one with that at the medians of the priors.
     fn judge_measured(&mut self, simulator: &Simulator) {
         for mode in self.modes.iter().filter(|m| m.measured_is_possible == Some(false)) {
             let [low, high] = mode.prior_hz;
@@ -173,7 +172,7 @@ impl Figures {
             ));
         }
         let Some(measured) = self.modes.first().and_then(|m| m.measured_hz) else { return };
-        let middle: Vec<f64> = simulator.space().iter().map(|p| p.from_unit(0.5)).collect();
+        let middle: Vec<f64> = simulator.space().iter().map(|p| p.at_level(0.5)).collect();
         let Ok(frequencies) = simulator.frequencies_hz(&middle) else { return };
         let factor = measured / frequencies[0];
         if (1.0 / MISTAKEN..=MISTAKEN).contains(&factor) {

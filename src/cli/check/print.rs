@@ -1,7 +1,7 @@
 //! The figures of `modalwatch check` as text.
 
 use super::figures::{Figures, ModeFigures, ParameterFigures};
-use crate::parameter::DamageDirection;
+use crate::parameter::{DamageDirection, PriorForm};
 use crate::quantity::{significant, with_prefix};
 use crate::simulator::definition::{CovariateDefinition, MeasurementNoise, SpringDefinition, StructureDefinition};
 
@@ -52,7 +52,19 @@ impl Figures {
             // Per cent take no prefix, so that the unit is needed only once.
             let low = if p.unit.starts_with('%') { significant(low) } else { with_prefix(low, &p.unit) };
             let high = with_prefix(high, &p.unit);
-            println!("  {:width$}  uniform prior {low} to {high}, nominal {nominal}; {damage}{sets}", p.name);
+            let prior = match p.prior_form {
+                PriorForm::Uniform => format!("uniform prior {low} to {high}"),
+                PriorForm::Normal { mean, std } => {
+                    let [mean, std] = [mean, std].map(|value| with_prefix(value, &p.unit));
+                    format!("normal prior of mean {mean} and standard deviation {std}, {low} to {high}")
+                }
+                PriorForm::LogNormal { median, ln_std } => format!(
+                    "log-normal prior of median {} and relative standard deviation {} %, {low} to {high}",
+                    with_prefix(median, &p.unit),
+                    significant(100.0 * ln_std.powi(2).exp_m1().sqrt())
+                ),
+            };
+            println!("  {:width$}  {prior}, nominal {nominal}; {damage}{sets}", p.name);
         }
     }
 

@@ -156,10 +156,7 @@ struct Competitors {
 impl Competitors {
     fn new(study: &Study<'_>, rows: &Rows, basis: &Basis) -> Option<Self> {
         let precision = rows.precision(&basis.extra)?;
-        let width = |k: &usize| {
-            let p = &study.simulator.space().as_slice()[*k];
-            0.5 * (p.upper - p.lower)
-        };
+        let width = |k: &usize| study.simulator.space().as_slice()[*k].as_normal().1;
         let means: Vec<ByMode> = rows
             .slopes
             .iter()

@@ -21,6 +21,7 @@ use rayon::prelude::*;
 
 use super::rank::Ranked;
 use super::study::Study;
+use crate::parameter::Parameter;
 use experiment::{Experiment, Kind, NextMeasurement};
 use predict::{Prediction, Predictor};
 use simulated::Normals;
@@ -271,6 +272,6 @@ fn reference(study: &Study<'_>, experiment: &Experiment) -> Option<DMatrix<f64>>
     if experiment.points.is_empty() {
         return None;
     }
-    let middle: Vec<f64> = study.simulator.space().iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
+    let middle: Vec<f64> = study.simulator.space().iter().map(Parameter::prior_median).collect();
     study.simulator.shapes_under(&middle, experiment.modes, (&[], &[]), &experiment.points).ok()?
 }

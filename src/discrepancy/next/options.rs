@@ -204,7 +204,11 @@ fn further_settings(simulator: &Simulator, ranked: &[&Ranked], plain: &Experimen
     let of_column = |column: &usize| {
         let parameter = &simulator.space().as_slice()[*column];
         let width = parameter.upper - parameter.lower;
-        let ends = [parameter.lower + FROM_END * width, parameter.upper - FROM_END * width];
+        let ends = if parameter.is_uniform() {
+            [parameter.lower + FROM_END * width, parameter.upper - FROM_END * width]
+        } else {
+            [FROM_END, 1.0 - FROM_END].map(|level| parameter.at_level(level))
+        };
         let conditions = ends.into_iter().map(|end| {
             let mut condition = plain.conditions[0].clone();
             condition.set.insert(*column, end);

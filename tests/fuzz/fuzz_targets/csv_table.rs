@@ -9,14 +9,14 @@ use modalwatch::measurement::check::{check_measurements, Expectation, Purpose};
 use modalwatch::measurement::csv::{offered, read, CsvOptions, Times};
 use modalwatch::measurement::csv_output::write;
 use modalwatch::measurement::{Covariate, CovariateKind, ModalMeasurement};
-use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace};
+use modalwatch::parameter::{DamageDirection, Parameter, ParameterSpace, PriorForm};
 use modalwatch::quantity::Timestamp;
 
 fn space() -> &'static ParameterSpace {
     static SPACE: OnceLock<ParameterSpace> = OnceLock::new();
     SPACE.get_or_init(|| {
         let (name, unit) = ("k1".to_owned(), "N/m".to_owned());
-        ParameterSpace::new(vec![Parameter { name, unit, lower: 0.5, upper: 9.0, damage: DamageDirection::Decrease }])
+        ParameterSpace::new(vec![Parameter { name, unit, lower: 0.5, upper: 9.0, damage: DamageDirection::Decrease, form: PriorForm::Uniform }])
     })
 }
 

@@ -21,7 +21,8 @@ spring = [
 ]
 
 # What is unknown: a factor of the nominal stiffness (scale = true). The prior is the range in which it can lie, damaged or not:
-# here 0.5 to 1.4 times n_per_m. Results are in per cent of the nominal stiffness.
+# here 0.5 to 1.4 times n_per_m. Results are in per cent of the nominal stiffness. Where you know a mean and a standard deviation
+# instead: prior = { normal = { mean = 1.0, std = 0.1 } }, or { log_normal = { median = 1.0, relative_std = 0.2 } }, which is above 0.
 [[parameter]]
 name = "storey1"
 scale = true
