@@ -290,6 +290,34 @@ async fn a_structure_with_mistakes_is_refused_with_its_place() {
     problem(service.get("/v1/structures/x").send().await.unwrap(), 404, "unknown_structure").await;
 }
 
+#[tokio::test]
+async fn a_normal_prior_is_taken_and_an_impossible_one_is_refused_with_its_reason() {
+    let (service, _folder) = spawn();
+    let put = |prior: &str| {
+        let request =
+            service.request(reqwest::Method::PUT, "/v1/structures/x").header("content-type", "application/toml");
+        let text = include_str!("../../models/three-dof/structure.toml").replace("id = \"three-dof\"", "id = \"x\"");
+        let body = text.replacen("{ uniform = [3.0, 7.0] }", prior, 1);
+        async { request.body(body).send().await.unwrap() }
+    };
+    for (prior, key, part) in [
+        ("{ normal = { mean = 4.0, std = -0.5 } }", "/normal/std", "std = -0.5"),
+        ("{ normal = { mean = 4.0, std = 2.0 } }", "/normal", "a std below 1 keeps the prior above 0"),
+        ("{ log_normal = { median = 4.0, relative_std = 20.0 } }", "/log_normal/relative_std", "did you mean 20 %"),
+        ("{ uniform = [3.0, 7.0], normal = { mean = 4.0, std = 0.5 } }", "", "a parameter has one prior"),
+    ] {
+        let answer = problem(put(prior).await, 422, "invalid_structure").await;
+        let error = &answer["errors"][0];
+        let pointer = format!("/parameter/0/prior{key}");
+        assert!(error["pointer"].as_str().unwrap().ends_with(&pointer), "{answer}");
+        assert!(error["message"].as_str().unwrap().contains(part), "{answer}");
+    }
+    let answer = put("{ normal = { mean = 4.0, std = 0.5 } }").await;
+    assert_eq!(answer.status(), 201, "{}", answer.text().await.unwrap());
+    let prior = service.read("/v1/structures/x").await["definition"]["parameter"][0]["prior"].clone();
+    assert_eq!(prior, json!({ "normal": { "mean": 4.0, "std": 0.5 } }));
+}
+
 /// Change of the files of a trained model.
 type Change<'a> = Box<dyn Fn(&std::path::Path) + 'a>;
 

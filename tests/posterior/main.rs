@@ -6,6 +6,7 @@ mod alarms;
 mod exact;
 mod identifiability;
 mod population;
+mod priors;
 mod trust;
 
 use std::sync::Arc;

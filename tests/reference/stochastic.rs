@@ -5,6 +5,7 @@ use modalwatch::simulator::population::Population as Drawn;
 use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use modalwatch::updating::stochastic::{settings, Error, Population};
+use modalwatch::updating::tmcmc::Target as _;
 use nalgebra::DMatrix;
 
 const MODES: [usize; 3] = [0, 1, 2];
@@ -91,4 +92,44 @@ fn the_points_of_the_simulation_have_the_moments_of_thousands() {
         // A difference of one nat matters between two points of the posterior.
         assert!((few - exact).abs() < 0.5, "{few} {exact}");
     }
+}
+
+#[test]
+fn a_normal_prior_counts_once_for_the_mean_of_the_population() {
+    // The same bounds, 3 to 7, under both priors.
+    let normal = |text: &str| text.replace("uniform = [3.0, 7.0]", "normal = { mean = 5.0, std = 0.5 }");
+    let text = normal(include_str!("../../models/three-dof/structure.toml"));
+    let (flat, tailed) = (three_dof(), Simulator::new(StructureDefinition::parse_toml(&text).unwrap()).unwrap());
+    // Eight measurements determine the mean of k1 so badly that its prior, two standard deviations away, matters.
+    let drawn = Drawn::new(flat.space(), &moments()).unwrap().draw(&flat, 8, 0.0, 3).unwrap();
+    let of = |simulator| Population::new(simulator, &drawn.frequencies_hz, &MODES, 0.0, 128, 1).unwrap();
+    let log_prior = |theta: &[f64]| of(&tailed).log_prior(theta);
+    let z = |theta: &[f64]| theta[..3].iter().map(|mean| -0.5 * ((mean - 5.0) / 0.5).powi(2)).sum::<f64>();
+    let [near, far] = [[5.0, 5.1, 4.8, 0.3, 0.1, 0.2], [4.0, 5.0, 6.2, 0.2, 0.1, 0.4]];
+    assert!((log_prior(&near) - log_prior(&far) - (z(&near) - z(&far))).abs() < 1e-9);
+    assert!(log_prior(&[5.0, 5.0, 5.0, 0.3, 0.51, 0.2]).is_infinite(), "no population is wider than the prior");
+    let mut stream = stats::stream(1, "test");
+    let first: Vec<f64> = (0..4_000).map(|_| of(&tailed).draw_prior(&mut stream)[0]).collect();
+    // Four standard errors.
+    assert!((stats::mean(&first) - 5.0).abs() < 4.0 * 0.5 / 4_000.0_f64.sqrt());
+    assert!((stats::sample_std(&first).unwrap() / 0.5 - 1.0).abs() < 4.0 / 8_000.0_f64.sqrt());
+
+    let (samples, uniform) = of(&flat).sample(&settings(1_000), 1, &|_| {}).unwrap();
+    let (_, found) = of(&tailed).sample(&settings(1_000), 2, &|_| {}).unwrap();
+    // Samples under the uniform prior, weighted by the normal one.
+    let rows: Vec<Vec<f64>> = samples.theta.row_iter().map(|row| row.iter().copied().collect()).collect();
+    let weights: Vec<f64> = rows.iter().map(|row| log_prior(row).exp()).collect();
+    let mean = |k: usize| {
+        rows.iter().zip(&weights).map(|(row, weight)| weight * row[k]).sum::<f64>() / weights.iter().sum::<f64>()
+    };
+    let error = stats::sample_std(&samples.theta.column(0).iter().copied().collect::<Vec<f64>>()).unwrap();
+    println!(
+        "k1: {:.4} under the uniform prior, {:.4} under the normal one, {:.4} by weights; ± {error:.4}",
+        uniform.mean[0],
+        found.mean[0],
+        mean(0)
+    );
+    // Both have an error of about 0.1 posterior standard deviations; the prior moves the mean by 0.4 of them.
+    assert!((found.mean[0] - mean(0)).abs() < 0.25 * error, "{} {}", found.mean[0], mean(0));
+    assert!(found.mean[0] - uniform.mean[0] > 0.15 * error, "{} {}", found.mean[0], uniform.mean[0]);
 }
