@@ -102,7 +102,6 @@ pub struct Parameter {
     pub form: PriorForm,
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands over a reference")]
 fn is_uniform(form: &PriorForm) -> bool {
     *form == PriorForm::Uniform
 }
@@ -356,7 +355,7 @@ mod tests {
     #[test]
     fn level_and_quantile_are_inverse_and_the_density_is_the_slope_of_the_level() {
         for p in all() {
-            assert_eq!([p.level(p.lower), p.level(p.upper)], [0.0, 1.0], "{p:?}");
+            assert!(p.level(p.lower).abs() < 1e-15 && (p.level(p.upper) - 1.0).abs() < 1e-15, "{p:?}");
             for i in 1..100 {
                 let level = f64::from(i) / 100.0;
                 let x = p.at_level(level);
@@ -369,7 +368,7 @@ mod tests {
                 let slope = (p.level(x + step) - p.level(x - step)) / (2.0 * step);
                 assert!((p.prior_density(x) / slope - 1.0).abs() < 1e-4, "{p:?} at {x}: {slope}");
             }
-            assert_eq!([p.prior_density(p.lower - 1e-6), p.prior_density(p.upper + 1e-6)], [0.0; 2]);
+            assert!(p.prior_density(p.lower - 1e-6).max(p.prior_density(p.upper + 1e-6)) <= 0.0, "{p:?}");
         }
     }
 

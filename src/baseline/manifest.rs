@@ -115,7 +115,7 @@ pub struct SpreadCell {
 pub struct ValidationRecord {
     /// Pairs used.
     pub samples: usize,
-    /// Mean of −ln q(u | y) with u the position in the prior box, nats.
+    /// Mean of ln p(u) − ln q(u | y) with u the position in the prior box and p the density of the prior, 1 where it is uniform; nats.
     pub negative_log_likelihood: f64,
     /// Standard error of that mean, nats.
     pub negative_log_likelihood_error: f64,

@@ -15,7 +15,7 @@ use crate::stats;
 /// Draws per held-out pair.
 const HELD_OUT_DRAWS: usize = 10;
 
-/// Measures a model on held-out pairs: mean log-density of the truth, R² of posterior means and samples, inverse error of
+/// Measures a model on held-out pairs: mean log-density of the truth above that of the prior, R² of posterior means and samples, inverse error of
 /// the flow. `theta`: `[n, d]`, the truths of the n observations.
 ///
 /// Source: Wang et al. (2025), Fig. 8.
@@ -29,7 +29,9 @@ pub fn validate(
     seed: u64,
 ) -> Result<ValidationRecord, InferenceError> {
     let count = observations.len();
-    let losses: Vec<f64> = baseline.log_density_unit_box(theta, observations)?.iter().map(|log_q| -log_q).collect();
+    let density = baseline.log_density_unit_box(theta, observations)?;
+    let prior = theta.row_iter().map(|row| baseline.space().log_prior(row.iter()));
+    let losses: Vec<f64> = prior.zip(&density).map(|(prior, log_q)| prior - log_q).collect();
     let samples = baseline.infer(observations, HELD_OUT_DRAWS, seed)?;
     let means = samples.means();
     let validation = |(column, parameter): (usize, &Parameter)| {

@@ -120,7 +120,7 @@ fn each_prior_that_cannot_be_one_is_refused_with_its_reason() {
         ("log_normal = { median = 100.0, relative_std = 20.0 }", "/parameter/0/prior/log_normal/relative_std", "did you mean 20 %, relative_std = 0.2?"),
         ("log_normal = { median = 0.0, relative_std = 0.2 }", "/parameter/0/prior/log_normal/median", "median = 0: the median of a log-normal prior must be finite and above 0"),
         ("log_normal = { mean = 100.0, std = 0.2 }", LOG_NORMAL, "unknown field `mean`, expected `median` or `relative_std`"),
-        ("uniform = [50.0, 150.0], normal = { mean = 100.0, std = 10.0 }", PRIOR, "has both uniform and \"normal\": a parameter has one prior"),
+        ("uniform = [50.0, 150.0], normal = { mean = 100.0, std = 10.0 }", PRIOR, "a parameter has one prior, remove one of the two"),
         ("gaussian = { mean = 100.0, std = 10.0 }", PRIOR, "a prior is one of { uniform = [low, high] }, { normal = { mean = 1.0, std = 0.1 } }"),
         ("", PRIOR, "the prior is empty"),
     ];

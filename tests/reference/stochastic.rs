@@ -114,8 +114,8 @@ fn a_normal_prior_counts_once_for_the_mean_of_the_population() {
     assert!((stats::mean(&first) - 5.0).abs() < 4.0 * 0.5 / 4_000.0_f64.sqrt());
     assert!((stats::sample_std(&first).unwrap() / 0.5 - 1.0).abs() < 4.0 / 8_000.0_f64.sqrt());
 
-    let (samples, uniform) = of(&flat).sample(&settings(2_000), 1, &|_| {}).unwrap();
-    let (_, found) = of(&tailed).sample(&settings(2_000), 2, &|_| {}).unwrap();
+    let (samples, uniform) = of(&flat).sample(&settings(1_000), 1, &|_| {}).unwrap();
+    let (_, found) = of(&tailed).sample(&settings(1_000), 2, &|_| {}).unwrap();
     // Samples under the uniform prior, weighted by the normal one.
     let rows: Vec<Vec<f64>> = samples.theta.row_iter().map(|row| row.iter().copied().collect()).collect();
     let weights: Vec<f64> = rows.iter().map(|row| log_prior(row).exp()).collect();
@@ -129,7 +129,7 @@ fn a_normal_prior_counts_once_for_the_mean_of_the_population() {
         found.mean[0],
         mean(0)
     );
-    // Both have an error of about 0.07 posterior standard deviations; the prior moves the mean by 0.4 of them.
+    // Both have an error of about 0.1 posterior standard deviations; the prior moves the mean by 0.4 of them.
     assert!((found.mean[0] - mean(0)).abs() < 0.25 * error, "{} {}", found.mean[0], mean(0));
     assert!(found.mean[0] - uniform.mean[0] > 0.15 * error, "{} {}", found.mean[0], uniform.mean[0]);
 }
