@@ -20,7 +20,6 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use super::error::InferenceError;
-use super::local::{Target, STARTS};
 use super::model::Baseline;
 use super::observation::Observation;
 use super::proposal::Proposal;
@@ -99,35 +98,9 @@ impl Baseline {
                 let judge = |search: &mut Search| search.judge(stage + 1, needed);
                 searches.par_iter_mut().filter(|search| search.is_open()).for_each(judge);
             }
-            let ended: Vec<(Option<Found>, usize)> = (searches.par_iter_mut().zip(part))
-                .map(|(search, observation)| self.ended(search, observation, draws, needed))
-                .collect();
-            for (found, simulations) in ended {
-                adapted.found.push(found);
-                adapted.simulations += simulations;
-            }
+            adapted.found.extend(searches.iter_mut().map(|search| search.resampled(draws)));
         }
         Ok(adapted)
-    }
-
-    /// The samples of a search and the number of further simulations: where the stages did not suffice, those about the set of parameters
-    /// that reproduce the measurement, see `src/baseline/local.rs`.
-    fn ended(
-        &self,
-        search: &mut Search,
-        observation: &Observation,
-        draws: usize,
-        needed: f64,
-    ) -> (Option<Found>, usize) {
-        if matches!(search.state, State::Enough(_)) {
-            return (search.resampled(draws), 0);
-        }
-        // They are in random order, so that the first ones are a sample as well.
-        let Some(Found { theta: starts, .. }) = search.resampled(draws.max(STARTS)) else { return (None, 0) };
-        let local = Target::new(&self.simulator, observation).sample(&starts, draws, needed, &mut search.stream);
-        let complete = local.theta.is_some();
-        let theta = local.theta.unwrap_or_else(|| starts.rows(0, draws).into_owned());
-        (Some(Found { theta, complete }), local.simulations)
     }
 
     /// A search that begins with the draws of the flow; for noise beyond the training, for which these are too narrow, with draws that
@@ -257,21 +230,21 @@ impl Search {
             self.state = State::GivenUp;
             return;
         };
-        let effective = stats::effective_number(&weights);
+        let effective = effective(&weights);
         if effective >= needed {
             self.state = State::Enough(weights);
             return;
         }
         let hopeless = stages >= STAGES_BEFORE_DOUBT && effective < HOPEFUL * weights.len() as f64;
-        match self.fitted(&log_weights).filter(|_| !hopeless) {
+        match self.fitted(&log_weights, weights).filter(|_| !hopeless) {
             Some(proposal) => self.proposals.push(proposal),
             None => self.state = State::GivenUp,
         }
     }
 
     /// The Student distribution with the moments of the draws under w^β.
-    fn fitted(&self, log_weights: &[f64]) -> Option<Proposal> {
-        let weights = stats::tempered_weights(log_weights, EFFECTIVE_PER_DIMENSION * (self.d + 1) as f64)?;
+    fn fitted(&self, log_weights: &[f64], weights: Vec<f64>) -> Option<Proposal> {
+        let weights = tempered(log_weights, weights, EFFECTIVE_PER_DIMENSION * (self.d + 1) as f64)?;
         let total: f64 = weights.iter().sum();
         let draws = || self.latent.chunks_exact(self.d).zip(&weights).filter(|(_, weight)| **weight > 0.0);
         let mut mean = DVector::zeros(self.d);
@@ -296,14 +269,44 @@ impl Search {
             State::Enough(weights) => (weights.clone(), true),
             State::Open | State::GivenUp => {
                 let log_weights = self.log_weights();
-                let usable = stats::weights(&log_weights, 0.0)?.iter().filter(|weight| **weight > 0.0).count() as f64;
-                (stats::tempered_weights(&log_weights, EFFECTIVE.max(draws as f64).min(0.5 * usable))?, false)
+                let weights = stats::weights(&log_weights, 0.0)?;
+                let usable = weights.iter().filter(|weight| **weight > 0.0).count() as f64;
+                (tempered(&log_weights, weights, EFFECTIVE.max(draws as f64).min(0.5 * usable))?, false)
             }
         };
         let chosen = stats::systematic(&weights, draws, &mut self.stream);
         let theta = DMatrix::from_fn(draws, self.d, |row, column| self.theta[chosen[row] * self.d + column]);
         Some(Found { theta, complete })
     }
+}
+
+/// The weights w^β for the largest β ≤ 1 that leaves `wanted` effective draws, or as many as there are; `None` where the draws with a
+/// weight are fewer.
+fn tempered(log_weights: &[f64], weights: Vec<f64>, wanted: f64) -> Option<Vec<f64>> {
+    if effective(&weights) >= wanted {
+        return Some(weights);
+    }
+    if (log_weights.iter().filter(|weight| weight.is_finite()).count() as f64) < wanted {
+        return None;
+    }
+    let raised = |beta: f64| {
+        let raised: Vec<f64> = log_weights.iter().map(|weight| weight * beta).collect();
+        stats::weights(&raised, 0.0)
+    };
+    // The effective number falls with β, so that bisection in its logarithm finds the largest one.
+    let (mut low, mut high) = (-40.0_f64, 0.0_f64);
+    for _ in 0..24 {
+        let middle = 0.5 * (low + high);
+        let enough = raised(middle.exp()).is_some_and(|weights| effective(&weights) >= wanted);
+        *(if enough { &mut low } else { &mut high }) = middle;
+    }
+    raised(low.exp())
+}
+
+/// Effective number (Σ w)²/Σ w² of draws with the weights w.
+fn effective(weights: &[f64]) -> f64 {
+    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
+    sum * sum / squares
 }
 
 /// ln(eᵃ + eᵇ).

@@ -47,7 +47,6 @@ mod infer;
 mod judge;
 pub mod library;
 mod load;
-mod local;
 pub mod manifest;
 mod model;
 pub mod nearest;
