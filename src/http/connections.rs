@@ -99,19 +99,18 @@ impl Connections {
 
     /// A place in the reserve; if it is full, that of the oldest connection there.
     pub async fn reserve_place(&self) -> ReservePlace {
-        let permit = match Arc::clone(&self.reserve).try_acquire_owned() {
-            Ok(permit) => permit,
-            Err(_) => {
-                let oldest = self.in_reserve.lock().expect("no holder of this lock panics").front().map(|w| w.since);
-                if let Some(since) = oldest {
-                    tokio::time::sleep(SAFE_FOR.saturating_sub(since.elapsed())).await;
-                }
-                if let Some(waiting) = self.in_reserve.lock().expect("no holder of this lock panics").pop_front() {
-                    // Sending fails if it has just ended.
-                    let _ = waiting.evicted.send(true);
-                }
-                Arc::clone(&self.reserve).acquire_owned().await.expect("the semaphore is never closed")
+        let permit = if let Ok(permit) = Arc::clone(&self.reserve).try_acquire_owned() {
+            permit
+        } else {
+            let oldest = self.in_reserve.lock().expect("no holder of this lock panics").front().map(|w| w.since);
+            if let Some(since) = oldest {
+                tokio::time::sleep(SAFE_FOR.saturating_sub(since.elapsed())).await;
             }
+            if let Some(waiting) = self.in_reserve.lock().expect("no holder of this lock panics").pop_front() {
+                // Sending fails if it has just ended.
+                let _ = waiting.evicted.send(true);
+            }
+            Arc::clone(&self.reserve).acquire_owned().await.expect("the semaphore is never closed")
         };
         let (sender, evicted) = watch::channel(false);
         let number = self.next.fetch_add(1, Ordering::Relaxed);

@@ -13,13 +13,16 @@ use crate::store::{BatchRecord, ReferenceRecord};
 /// Details that are kept.
 const KEPT: usize = 32;
 
+/// A detail and the digest of what it depends on.
+type Kept = (Digest, Arc<BatchDetail>);
+
 /// Computes the details of batches, and keeps the last ones.
 #[derive(Clone)]
 pub(super) struct Details {
     assessor: Arc<Assessor>,
     readers: Readers,
     /// The last ones by the digest of what they depend on, the newest last.
-    kept: Arc<Mutex<VecDeque<(Digest, Arc<BatchDetail>)>>>,
+    kept: Arc<Mutex<VecDeque<Kept>>>,
 }
 
 impl Details {
