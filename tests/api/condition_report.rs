@@ -42,7 +42,7 @@ async fn a_report_has_the_verdict_the_alarms_with_their_notes_and_what_is_not_kn
         "Ines Vogel",
         "inspection on Monday",
         "8 batches with 160 measurements",
-        "0 of 8 assessed batches were rejected",
+        "Rejected: 0 of 8 assessed batches",
         "No batch from 2026-01-05",
         "before the &lt;opening&gt;",
         "What is not known",
