@@ -195,7 +195,7 @@ impl UndamagedReference {
                     quantity: sample.name.clone(),
                     correlation: serial.correlation * serial.share,
                     least: MINIMUM_MEASUREMENTS,
-                    seen: doubts.iter().map(|doubt| format!(". {doubt}")).collect(),
+                    seen: doubts.iter().flat_map(|doubt| [". ", doubt.as_str()]).collect(),
                 });
             }
         }

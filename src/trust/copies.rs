@@ -172,9 +172,10 @@ impl Spread {
         let pairs = self.pairs(&thresholds);
         let (close, rest) = pairs.split_at(by_chance.len());
         let (within, around) = rest.split_at(groups.len());
-        let copies = (0..SHARES_BY_CHANCE.len())
-            .filter(|place| poisson_tail(close[*place], 0.5 * n as f64 * SHARES_BY_CHANCE[*place]) < CHANCE);
-        let mut kept = copies.last().map_or_else(|| (0..n).collect(), |place| self.leaders(by_chance[place]));
+        let is_beyond_chance =
+            |place: &usize| poisson_tail(close[*place], 0.5 * n as f64 * SHARES_BY_CHANCE[*place]) < CHANCE;
+        let copies = (0..SHARES_BY_CHANCE.len()).rev().find(is_beyond_chance);
+        let mut kept = copies.map_or_else(|| (0..n).collect(), |place| self.leaders(by_chance[place]));
         for (place, threshold) in groups.into_iter().enumerate() {
             let all = n * (n - 1) / 2;
             if within[place] < 10 || within[place] as f64 > 0.6 * all as f64 {
