@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rumqttc::{AsyncClient, Event, EventLoop, Packet, Publish, QoS, SubscribeReasonCode};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{mpsc, watch, OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinHandle;
 use tracing::{error, info, warn};
 
@@ -14,14 +14,22 @@ use super::settings::{MqttSettings, SettingError};
 use super::status::MqttStatus;
 use crate::monitor::Monitor;
 
-/// Maximum number of waiting messages. When it is reached, the connection is not read, and the broker keeps further
-/// messages.
-const WAITING: usize = 64;
+/// Messages that may wait: one for each packet id of the protocol, and as many again of the connection before. A broker without a limit of
+/// its own sends so many before it waits for an acknowledgement.
+const WAITING: usize = 2 * u16::MAX as usize;
 
-/// Requests that may wait to be sent to the broker, most of them acknowledgements: one for each packet id of the protocol, and some for
-/// subscriptions. The loop that sends them also hands messages over and waits while `WAITING` of them are there; an acknowledgement
-/// that then had to wait for a place in this queue would stop both for good.
-const REQUESTS: usize = u16::MAX as usize + WAITING;
+/// Size of the messages that may wait, bytes. When it is reached, the connection is not read, and the broker keeps further messages.
+/// Until then everything is read at once: the answers to subscriptions and pings come behind the messages, and a connection whose ping is
+/// not answered within an interval of the keep-alive is given up, with all acknowledgements that were not sent.
+const WAITING_BYTES: usize = 64 << 20;
+
+/// What a message takes beside its payload, bytes.
+const OVERHEAD_BYTES: usize = 512;
+
+/// Requests that may wait to be sent to the broker, most of them acknowledgements: one for each packet id, and some for subscriptions. The
+/// loop that sends them also hands messages over, and waits while `WAITING_BYTES` of them are there; an acknowledgement that then had to
+/// wait for a place in this queue would stop both for good.
+const REQUESTS: usize = u16::MAX as usize + 64;
 
 /// Maximum number of messages that are processed at a time.
 const AT_A_TIME: usize = 8;
@@ -37,6 +45,8 @@ const SUBSCRIBE_AGAIN: Duration = Duration::from_secs(30);
 struct Arrived {
     connection: u64,
     publish: Publish,
+    /// Its part of `WAITING_BYTES`.
+    _bytes: OwnedSemaphorePermit,
 }
 
 /// A message that is being processed.
@@ -58,10 +68,10 @@ pub fn run(
     if settings.is_off() {
         return Ok(None);
     }
-    let (options, topic) = (settings.options()?, settings.topic()?);
+    let options = settings.options()?;
+    let intake = Arc::new(Intake::new(monitor, settings)?);
     let (client, events) = AsyncClient::new(options, REQUESTS);
     status.set(false, None);
-    let intake = Arc::new(Intake { monitor, topic: topic.clone(), max_payload_bytes: settings.max_payload_bytes });
     // Incremented with every connection: an acknowledgement is only valid on the connection on which its message
     // arrived.
     let connection = Arc::new(AtomicU64::new(0));
@@ -69,10 +79,12 @@ pub fn run(
     let (in_work, to_acknowledge) = mpsc::channel(AT_A_TIME);
     let (status, url) = (status.clone(), settings.url.clone());
     Ok(Some(tokio::spawn(async move {
+        let filter = intake.filter();
         let working = tokio::spawn(work(to_work, in_work, intake));
         let acknowledging =
             tokio::spawn(acknowledge(to_acknowledge, client.clone(), Arc::clone(&connection), status.clone()));
-        let link = Link { client, filter: topic.filter(), status, url, connection, arrived, trouble: None };
+        let room = Arc::new(Semaphore::new(WAITING_BYTES));
+        let link = Link { client, filter, status, url, connection, arrived, room, trouble: None };
         link.hold(events, stop).await;
         // Unacknowledged messages are delivered again after the next start.
         working.abort();
@@ -124,6 +136,8 @@ struct Link {
     url: String,
     connection: Arc<AtomicU64>,
     arrived: mpsc::Sender<Arrived>,
+    /// Bytes that further messages may take.
+    room: Arc<Semaphore>,
     /// The last failure, so that repeated failures are logged once.
     trouble: Option<String>,
 }
@@ -184,14 +198,22 @@ impl Link {
             Event::Incoming(Packet::Publish(publish)) => {
                 let connection = self.connection.load(Ordering::SeqCst);
                 self.status.arrived();
-                // Blocks while the queue is full; the receiver lives as long as this task.
-                let _ = self.arrived.send(Arrived { connection, publish }).await;
+                // Waits while too many bytes are there.
+                let bytes = (publish.payload.len() + publish.topic.len() + OVERHEAD_BYTES).min(WAITING_BYTES) as u32;
+                let room = Arc::clone(&self.room).acquire_many_owned(bytes).await;
+                let room = room.expect("the semaphore is never closed");
+                // The receiver lives as long as this task.
+                let _ = self.arrived.send(Arrived { connection, publish, _bytes: room }).await;
             }
             _ => {}
         }
     }
 
     /// Subscribes in a separate task, because the request queue is emptied by the loop that calls this.
+    ///
+    /// With a quality of service of 1, whatever the senders use: a message may then come twice, and the database recognises it. With 2,
+    /// rumqttc 0.25 would forget at a reconnection which messages it had received (`MqttState::clean`), and end each further connection
+    /// at the first PUBREL that the broker repeats (`StateError::Unsolicited`).
     fn subscribe(&self, after: Duration) {
         let (client, filter) = (self.client.clone(), self.filter.clone());
         tokio::spawn(async move {

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use tracing::{error, warn};
 
+use super::settings::{MqttSettings, SettingError};
 use super::topic::Topic;
 use crate::measurement::body::RawBatch;
 use crate::measurement::check::Problem;
@@ -22,10 +23,10 @@ const FIRST_DELAY: Duration = Duration::from_millis(500);
 const DELAY_WITHOUT_STORE: Duration = Duration::from_secs(5);
 
 /// Stores messages.
-pub(super) struct Intake {
-    pub(super) monitor: Monitor,
-    pub(super) topic: Topic,
-    pub(super) max_payload_bytes: usize,
+pub struct Intake {
+    monitor: Monitor,
+    topic: Topic,
+    max_payload_bytes: usize,
 }
 
 /// Why a message was not stored.
@@ -37,9 +38,22 @@ enum Refused {
 }
 
 impl Intake {
+    /// Stores messages in the database of a monitor.
+    ///
+    /// # Errors
+    /// [`SettingError`] for a topic that cannot be used.
+    pub fn new(monitor: Monitor, settings: &MqttSettings) -> Result<Self, SettingError> {
+        Ok(Self { monitor, topic: settings.topic()?, max_payload_bytes: settings.max_payload_bytes })
+    }
+
+    /// Filter of the subscription to the messages.
+    pub(super) fn filter(&self) -> String {
+        self.topic.filter()
+    }
+
     /// Processes a message. It returns when the message is stored as a batch or in quarantine and may be acknowledged;
     /// while nothing can be written, it waits.
-    pub(super) async fn take(&self, topic: &str, payload: impl AsRef<[u8]>) {
+    pub async fn take(&self, topic: &str, payload: impl AsRef<[u8]>) {
         let payload = payload.as_ref();
         loop {
             let Some((reason, tries)) = self.store(topic, payload).await else { return };

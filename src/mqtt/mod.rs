@@ -12,5 +12,6 @@ mod status;
 mod topic;
 
 pub use connection::run;
+pub use message::Intake;
 pub use settings::{MqttSettings, SettingError};
 pub use status::MqttStatus;

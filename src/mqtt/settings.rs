@@ -1,11 +1,13 @@
 //! Section `mqtt` of the configuration.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use reqwest::Url;
-use rumqttc::tokio_rustls::rustls::{ClientConfig, RootCertStore};
 use rumqttc::{MqttOptions, TlsConfiguration, Transport};
+use rustls::pki_types::pem::PemObject as _;
+use rustls::pki_types::CertificateDer;
+use rustls::{ClientConfig, RootCertStore};
 use serde::{Deserialize, Serialize};
 
 use super::topic::{Topic, PLACEHOLDER};
@@ -14,8 +16,8 @@ use super::topic::{Topic, PLACEHOLDER};
 /// connection would be closed each time the broker sends such a message again.
 const LARGEST_PACKET: usize = 268_435_460;
 
-/// Keep-alive interval of the connection.
-const KEEP_ALIVE: Duration = Duration::from_secs(30);
+/// Keep-alive interval of the connection. Messages that are larger than what may wait in memory keep the answer to a ping waiting.
+const KEEP_ALIVE: Duration = Duration::from_mins(1);
 
 /// Settings of the MQTT broker.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -148,17 +150,39 @@ impl MqttSettings {
             options.set_credentials(&self.username, password.trim_end_matches(['\r', '\n']));
         }
         if encrypted {
-            let tls = if let Some(path) = &self.ca_file {
-                TlsConfiguration::Simple { ca: read("mqtt.ca_file", path)?, alpn: None, client_auth: None }
+            let mut roots = RootCertStore::empty();
+            if let Some(path) = &self.ca_file {
+                for certificate in certificates(&read("mqtt.ca_file", path)?, path)? {
+                    roots.add(certificate).map_err(|e| {
+                        let must = format!("certificates of an authority ({e})");
+                        wrong("mqtt.ca_file", path.display().to_string(), must)
+                    })?;
+                }
             } else {
-                let mut roots = RootCertStore::empty();
                 roots.add_parsable_certificates(webpki_root_certs::TLS_SERVER_ROOT_CERTS.iter().cloned());
-                TlsConfiguration::from(ClientConfig::builder().with_root_certificates(roots).with_no_client_auth())
-            };
-            options.set_transport(Transport::tls_with_config(tls));
+            }
+            // Not `TlsConfiguration::Simple`, which reads certificates by a package that is no longer maintained.
+            let tls = ClientConfig::builder().with_root_certificates(roots).with_no_client_auth();
+            options.set_transport(Transport::tls_with_config(TlsConfiguration::from(tls)));
         }
         Ok(options)
     }
+}
+
+/// The certificates of a PEM file, at least one.
+fn certificates(pem: &[u8], path: &Path) -> Result<Vec<CertificateDer<'static>>, SettingError> {
+    let must = |why: &str| {
+        let must = format!(
+            "a file with certificates between lines -----BEGIN CERTIFICATE----- and -----END CERTIFICATE----- ({why})"
+        );
+        wrong("mqtt.ca_file", path.display().to_string(), must)
+    };
+    let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
+    let found = found.map_err(|e| must(&e.to_string()))?;
+    if found.is_empty() {
+        return Err(must("there is none"));
+    }
+    Ok(found)
 }
 
 #[cfg(test)]
@@ -173,6 +197,25 @@ mod tests {
         for wrong in ["broker", "http://broker", "mqtt://", "mqtt://u:secret@broker", "mqtt://broker/path"] {
             let error = of(wrong).unwrap_err().to_string();
             assert!(error.contains("mqtt.url") && !error.contains("secret"), "{wrong}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_file_without_a_certificate_is_refused_at_the_start() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("ca.pem");
+        let begin = "-----BEGIN CERTIFICATE-----\n";
+        for (text, why) in [
+            (String::new(), "there is none"),
+            ("-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n".to_owned(), "there is none"),
+            (format!("{begin}AAAA"), "-----BEGIN CERTIFICATE-----"),
+            (format!("{begin}AAAA\n-----END CERTIFICATE-----\n"), "certificates of an authority"),
+        ] {
+            std::fs::write(&path, &text).unwrap();
+            let url = "mqtts://broker".to_owned();
+            let settings = MqttSettings { url, ca_file: Some(path.clone()), ..MqttSettings::default() };
+            let refused = settings.options().unwrap_err().to_string();
+            assert!(refused.contains("mqtt.ca_file") && refused.contains(why), "{text}: {refused}");
         }
     }
 }
