@@ -20,6 +20,9 @@ const MOST_COLUMNS: usize = 50;
 /// Optional column that numbers the runs.
 const RUN_COLUMN: &str = "run";
 
+/// Factor by which a frequency in the middle of the priors may lie outside the frequencies of the runs.
+const PLAUSIBLE: f64 = 2.0;
+
 /// Largest number of emulators in the cache. A definition is read several times, and fitting thousands of runs takes long.
 const MOST_CACHED: usize = 16;
 
@@ -152,7 +155,19 @@ pub(super) fn emulate(definition: &StructureDefinition, space: &ParameterSpace) 
             return Err(wrong(&format!("/parameter/{column}/prior/uniform"), message));
         }
     }
-    Ok(Table { emulator, runs: count })
+    let emulated = Table { emulator, runs: count };
+    for (mode, f) in emulated.nominal_frequencies_hz(space, definition.modes).into_iter().enumerate() {
+        let (low, high) = (runs.frequencies_hz.column(mode).min(), runs.frequencies_hz.column(mode).max());
+        if !(low / PLAUSIBLE..=high * PLAUSIBLE).contains(&f) {
+            let message = format!(
+                "in the middle of the priors the emulator gives {f} Hz for mode {}, but the runs have {low} to {high} Hz: spread the \
+                 runs over the whole ranges of the parameters",
+                mode + 1
+            );
+            return Err(wrong("/table/csv", message));
+        }
+    }
+    Ok(emulated)
 }
 
 /// The emulator with this key from the cache; if it is not there, it is fitted and added.

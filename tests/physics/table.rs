@@ -184,4 +184,12 @@ fn mistakes_in_a_table_are_named_with_their_place() {
     }
     let few = StructureDefinition::parse_toml(&table_file(&runs(&rig(), 4, 1))).unwrap_err().to_string();
     assert!(few.contains("/table/csv"), "{few}");
+    // All runs but one at one end: between them the polynomials are free to go anywhere.
+    let gap = "id = \"t\"\nmodes = 2\nsimulation = \"table\"\nparameter = [{ name = \"k\", prior = { uniform = [1.0, 270] } }]\n\
+               [table]\ncsv = \"\"\"\nk,f1_hz,f2_hz\n1.0,1.0,2.0\n1.1,1.014,2.3\n1.4,1.18,2.4\n1.5,1.22,23\n1.4,1.18,2.4\n1.5,1.22,2.5\n\
+               1.6,1.26,2.7\n1.7,1.30,2.7\n1.8,1.34,2.8\n1.9,1.38,2.9\n280,1.41,3.0\n\"\"\"\n";
+    let gap = StructureDefinition::parse_toml(gap).unwrap_err().to_string();
+    assert!(gap.contains("in the middle of the priors"), "{gap}");
+    let many = StructureDefinition::parse_toml(&table_file(&runs(&rig(), 5_001, 1))).unwrap_err().to_string();
+    assert!(many.contains("more than 5000 runs"), "{many}");
 }
