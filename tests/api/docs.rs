@@ -127,3 +127,53 @@ async fn earlier_addresses_are_redirected_and_unknown_ones_are_not_found() {
         problem(service.get(unknown).send().await.unwrap(), 404, "unknown_route").await;
     }
 }
+
+/// Text of all files below a folder with this ending.
+fn sources(folder: &Path, ending: &str, text: &mut String) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            sources(&path, ending, text);
+        } else if path.extension().is_some_and(|found| found == ending) {
+            *text += &std::fs::read_to_string(path).unwrap();
+        }
+    }
+}
+
+/// A limit whose setting was renamed, or whose test is gone, is a promise that nobody keeps.
+#[test]
+fn the_limits_of_the_security_page_name_settings_and_tests_that_exist() {
+    let page = std::fs::read_to_string(root().join("docs/security.md")).unwrap();
+    let settings: toml::Table =
+        toml::from_str(&std::fs::read_to_string(root().join("src/config.default.toml")).unwrap()).unwrap();
+    let is_setting = |key: &str| {
+        let mut place = Some(&settings);
+        let (sections, name) = key.rsplit_once('.').unwrap_or(("", key));
+        for section in sections.split('.') {
+            place = place.and_then(|table| table.get(section)).and_then(toml::Value::as_table);
+        }
+        place.is_some_and(|table| table.contains_key(name))
+    };
+    let mut code = String::new();
+    sources(&root().join("src"), "rs", &mut code);
+    sources(&root().join("tests"), "rs", &mut code);
+    let of = |cell: &str| cell.split('`').skip(1).step_by(2).map(str::to_owned).collect::<Vec<_>>();
+    let limits = page.split("\n## Limits").nth(1).unwrap().split("\n## ").next().unwrap();
+    let mut rows = 0;
+    for row in limits.lines().filter(|line| line.starts_with("| ") && !line.starts_with("| limit")) {
+        let cells: Vec<&str> = row.trim_matches('|').split('|').collect();
+        let [_, number, setting, test] = cells[..] else { panic!("{row}") };
+        assert!(!number.trim().is_empty() && !of(setting).is_empty() && !of(test).is_empty(), "{row}");
+        for setting in of(setting) {
+            let is_there = if setting.contains('/') { root().join(&setting).is_file() } else { is_setting(&setting) };
+            assert!(is_there, "no setting or file {setting}: {row}");
+        }
+        for test in of(test) {
+            let is_there =
+                if test.contains('/') { root().join(&test).is_file() } else { code.contains(&format!("fn {test}(")) };
+            assert!(is_there, "no test {test}: {row}");
+        }
+        rows += 1;
+    }
+    assert!(rows >= 25, "{rows} limits: the test reads the page wrongly");
+}
