@@ -17,7 +17,7 @@ use super::topic::{Topic, PLACEHOLDER};
 const LARGEST_PACKET: usize = 268_435_460;
 
 /// Keep-alive interval of the connection. Messages that are larger than what may wait in memory keep the answer to a ping waiting.
-const KEEP_ALIVE: Duration = Duration::from_secs(60);
+const KEEP_ALIVE: Duration = Duration::from_mins(1);
 
 /// Settings of the MQTT broker.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
