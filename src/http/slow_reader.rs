@@ -158,7 +158,7 @@ mod tests {
                 client.read_exact(&mut bytes).await.unwrap();
             }
         });
-        writes.write_all(&[0; 100_000]).await.unwrap();
+        writes.write_all(&vec![0; 100_000]).await.unwrap();
         reader.await.unwrap();
     }
 

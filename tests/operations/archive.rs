@@ -123,6 +123,20 @@ async fn an_incomplete_or_altered_archive_is_refused_with_its_line() {
         assert!(said.contains("line ") && said.contains("undamaged reference"), "{said}");
     }
 
+    // The same for each time that an archive carries beside the batches: a month 13 is found before the structure is stored.
+    for kind in ["maintenance", "acknowledgement", "alarm_action", "note"] {
+        let position = lines.iter().position(|line| line.contains(&format!("\"record\":\"{kind}\""))).unwrap();
+        let record: serde_json::Map<String, Value> = serde_json::from_str(lines[position]).unwrap();
+        let is_time = |value: &&Value| value.as_str().is_some_and(|text| text.parse::<jiff::Timestamp>().is_ok());
+        let times: Vec<&str> = record.values().filter(is_time).filter_map(Value::as_str).collect();
+        assert!(!times.is_empty(), "{kind}");
+        for time in times {
+            let wrong = lines[position].replacen(time, &time.replacen("2026-", "2026-13", 1), 1);
+            let said = refused(changed(lines[position], &wrong)).await;
+            assert!(said.contains("line "), "{kind} at {time}: {said}");
+        }
+    }
+
     let unknown = service.get("/v1/structures/bridge/export").send().await.unwrap();
     problem(unknown, 404, "unknown_structure").await;
     let out = folder.path().join("never.ndjson");

@@ -26,10 +26,13 @@ fn kolmogorov(mut values: Vec<f64>, distribution: impl Fn(f64) -> f64) -> f64 {
     values.iter().enumerate().map(apart).fold(0.0, f64::max)
 }
 
+/// The standard score of a value under a prior.
+type Score = Box<dyn Fn(f64) -> f64>;
+
 #[test]
 fn training_sets_have_the_distribution_of_the_prior() {
     let log_std = (1.0_f64 + 0.2 * 0.2).ln().sqrt();
-    let cases: [(&str, f64, f64, Box<dyn Fn(f64) -> f64>); 3] = [
+    let cases: [(&str, f64, f64, Score); 3] = [
         ("prior = { normal = { mean = 1000.0, std = 100.0 } }", 600.0, 1400.0, Box::new(|x| (x - 1000.0) / 100.0)),
         (
             "prior = { log_normal = { median = 1000.0, relative_std = 0.2 } }",
@@ -149,8 +152,8 @@ fn each_prior_that_cannot_be_one_is_refused_with_its_reason() {
 
 #[test]
 fn a_table_must_cover_the_prior_up_to_its_ends() {
-    let runs: String =
-        (0..80).map(|i| format!("{0},{1}\\n", 60.0 + f64::from(i), (60.0 + f64::from(i)).sqrt())).collect();
+    let run = |i: u32| format!("{0},{1}\\n", 60.0 + f64::from(i), (60.0 + f64::from(i)).sqrt());
+    let runs = (0..80).map(run).collect::<Vec<String>>().concat();
     let text = |std: f64| {
         format!(
             "id = \"t\"\nmodes = 1\nsimulation = \"table\"\ntable = {{ csv = \"p,f1_hz\\n{runs}\" }}\n[[parameter]]\nname = \"p\"\nprior = {{ \

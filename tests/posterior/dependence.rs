@@ -165,7 +165,7 @@ fn a_drift_a_step_and_two_states_are_named() {
     };
     let drift = |t: usize, n: usize| 5.0 * t as f64 / n as f64;
     let step = |t: usize, n: usize| if 2 * t < n { 0.0 } else { 5.0 };
-    let turns = |t: usize, _: usize| if t % 2 == 0 { 0.0 } else { 10.0 };
+    let turns = |t: usize, _: usize| if t.is_multiple_of(2) { 0.0 } else { 10.0 };
     let said = |found: Result<Vec<String>, String>| found.unwrap_or_else(|refused| vec![refused]).join("; ");
     let found = said(reference(&[50], pattern(drift), &mut stream).1);
     assert!(found.contains("drifts from"), "{found}");

@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use crate::helpers::{measurements, within};
 use crate::target::Target;
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 fn detail_of(batch: &str) -> String {
     format!("/v1/structures/three-dof/batches/{batch}/detail")

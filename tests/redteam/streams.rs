@@ -11,7 +11,7 @@ use crate::target::{id_of, Target};
 /// Longest time that a stream may outlive its token.
 const SOON: Duration = Duration::from_secs(3);
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 async fn stream(target: &Target, token: &str) -> Response {
     target.ask(Method::GET, "/v1/events", Some(token), PATIENCE).send().await.unwrap()

@@ -10,7 +10,7 @@ use serde_json::{json, Value};
 use crate::helpers::within;
 use crate::target::{command, Target};
 
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A tower of `count` masses, one above the other.
 fn tower(id: &str, count: usize) -> Value {
@@ -62,7 +62,7 @@ async fn times_of_a_start(mut target: Target) -> (Duration, Duration) {
     let client = modalwatch::notify::client_builder().timeout(Duration::from_secs(2)).build().unwrap();
     let mut times = Vec::new();
     for path in ["/healthz", "/readyz"] {
-        within(Duration::from_secs(120), path, async || {
+        within(Duration::from_mins(2), path, async || {
             // Before the program listens, a connection is refused.
             TcpStream::connect(port).ok()?;
             let response = client.get(format!("http://{port}{path}")).send().await.ok()?;

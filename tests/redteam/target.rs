@@ -84,7 +84,7 @@ impl Target {
     }
 
     pub async fn post(&self, path: &str, token: &str, body: &Value) -> reqwest::Response {
-        self.ask(Method::POST, path, Some(token), Duration::from_secs(60)).json(body).send().await.unwrap()
+        self.ask(Method::POST, path, Some(token), Duration::from_mins(1)).json(body).send().await.unwrap()
     }
 
     /// Posts a batch of three-dof that must be accepted; returns its id.

@@ -251,7 +251,14 @@ fn check_record(
 ) -> Result<(), ImportError> {
     let time = |text: &str| Timestamp::parse(text).map(drop).map_err(|e| invalid(&format!("{}: {e}", shown(text))));
     match record {
-        Record::Archive(_) | Record::End(_) | Record::Acknowledgement(_) | Record::AlarmAction(_) => {}
+        Record::Archive(_) | Record::End(_) => {}
+        Record::Acknowledgement(note) => time(&note.at)?,
+        Record::AlarmAction(action) => {
+            [Some(&action.at), Some(&action.opened_at), action.ended_at.as_ref()]
+                .into_iter()
+                .flatten()
+                .try_for_each(|text| time(text))?;
+        }
         Record::Structure(present) => *simulator = Some(simulator_of(structure, &present.digest, &present.definition)?),
         Record::Version(version) => {
             simulator_of(structure, &version.digest, &version.definition)?;
@@ -263,8 +270,15 @@ fn check_record(
             checked_batch(batch, simulator)?;
         }
         Record::UndamagedReference(state) => state.check()?,
-        Record::Maintenance(window) => [&window.from, &window.to].into_iter().try_for_each(|text| time(text))?,
-        Record::Note(note) => time(&note.from)?,
+        Record::Maintenance(window) => {
+            [&window.from, &window.to, &window.created_at].into_iter().try_for_each(|text| time(text))?;
+        }
+        Record::Note(note) => {
+            [Some(&note.from), note.to.as_ref(), Some(&note.created_at)]
+                .into_iter()
+                .flatten()
+                .try_for_each(|text| time(text))?;
+        }
     }
     Ok(())
 }

@@ -23,7 +23,7 @@ use crate::quantity::{Digest, Timestamp};
 use crate::store::{self, Acknowledgement, EpisodeQuery, EventFilter, Secret, Store, WebhookRecord, DATABASE_FILE};
 
 /// Longest wait until nothing runs in the background, far more than a busy machine needs.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// Time after which a batch is forgotten that waits while nothing runs.
 const FORGOTTEN: Duration = Duration::from_secs(5);
