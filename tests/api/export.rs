@@ -109,6 +109,19 @@ async fn the_files_hold_the_same_and_csv_goes_back_in() {
 }
 
 #[tokio::test]
+async fn a_text_that_a_spreadsheet_would_compute_is_a_text_in_the_table_and_as_sent_in_json() {
+    let (service, _folder) = spawn();
+    let source = "=HYPERLINK(1)";
+    let body = json!({ "source": source, "measurements": measurements([4.0, 5.0, 6.0], 3, 0) });
+    created(service.post(BATCHES, &body).await).await;
+    for path in [MEASUREMENTS, "/v1/structures/three-dof/history"] {
+        let table = service.get(&format!("{path}?format=csv")).send().await.unwrap().text().await.unwrap();
+        assert!(table.contains(&format!(",'{source},")) && !table.contains(&format!(",{source},")), "{path}: {table}");
+        assert_eq!(service.read(path).await["items"][0]["source"], source, "{path}");
+    }
+}
+
+#[tokio::test]
 async fn a_file_of_many_pages_is_complete() {
     let (service, _folder) = spawn();
     let mut sent = BTreeSet::new();

@@ -92,9 +92,9 @@ async fn a_structure_beyond_its_limits_is_refused_before_anything_is_computed() 
         text
     };
     for (text, what) in [
-        (tower(2_001, 2_001, 1), "a structure has 1 to 2000 [[mass]]"),
-        (tower(100, 20_001, 1), "20000"),
-        (tower(200, 200, 101), "100"),
+        (tower(2_001, 2_001, 1), "2001 [[mass]]: a structure has at most 2000"),
+        (tower(100, 20_001, 1), "20001 [[spring]]: a structure has at most 20000"),
+        (tower(200, 200, 101), "101 [[parameter]]: a structure has at most 100"),
     ] {
         let (answer, took_s) = refused(&service, "application/toml", text).await;
         assert!(answer["errors"].to_string().contains(what), "{what}: {answer}");
