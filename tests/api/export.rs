@@ -109,16 +109,37 @@ async fn the_files_hold_the_same_and_csv_goes_back_in() {
 }
 
 #[tokio::test]
-async fn a_text_that_a_spreadsheet_would_compute_is_a_text_in_the_table_and_as_sent_in_json() {
+async fn a_text_that_a_spreadsheet_would_compute_is_a_text_in_the_table_and_comes_back_as_it_was() {
     let (service, _folder) = spawn();
-    let source = "=HYPERLINK(1)";
-    let body = json!({ "source": source, "measurements": measurements([4.0, 5.0, 6.0], 3, 0) });
-    created(service.post(BATCHES, &body).await).await;
-    for path in [MEASUREMENTS, "/v1/structures/three-dof/history"] {
-        let table = service.get(&format!("{path}?format=csv")).send().await.unwrap().text().await.unwrap();
-        assert!(table.contains(&format!(",'{source},")) && !table.contains(&format!(",{source},")), "{path}: {table}");
-        assert_eq!(service.read(path).await["items"][0]["source"], source, "{path}");
+    let definition = json!({
+        "id": "tower-1", "modes": 1,
+        "mass": [{ "name": "m", "kg": 100.0 }],
+        "spring": [{ "name": "k", "from": "ground", "to": "m" }],
+        "parameter": [{ "name": "k", "prior": { "uniform": [1000.0, 9000.0] }, "sets": { "spring": "k" } }],
+        "covariate": [{ "name": "operator", "kind": "category" }],
+    });
+    let put = service.request(reqwest::Method::PUT, "/v1/structures/tower-1").json(&definition);
+    assert_eq!(put.send().await.unwrap().status(), 201);
+    let texts = ["=HYPERLINK(1)", "+1", "-1", "@A1", "'=1", "ann"];
+    let one = |(index, text): (usize, &&str)| json!({ "measured_at": time(600 * index), "frequencies_hz": [1.1 + 0.001 * index as f64], "covariates": { "operator": text } });
+    let sent: Vec<Value> = texts.iter().enumerate().map(one).collect();
+    service.post_batch("tower-1", &sent).await;
+    let path = "/v1/structures/tower-1/measurements?format=csv";
+    let table = service.get(path).send().await.unwrap().text().await.unwrap();
+    for text in &texts[..5] {
+        assert!(table.contains(&format!(",'{text},")) && !table.contains(&format!(",{text},")), "{text}: {table}");
     }
+    assert!(table.contains(",ann,"), "{table}");
+
+    let (other, _folder) = spawn();
+    let put = other.request(reqwest::Method::PUT, "/v1/structures/tower-1").json(&definition);
+    assert_eq!(put.send().await.unwrap().status(), 201);
+    let posted = other.post_text("/v1/structures/tower-1/batches?ignore=source,batch", "text/csv", table).await;
+    let batch = created(posted).await["batch"].clone();
+    let stored = other.read(&format!("/v1/structures/tower-1/batches/{}", batch.as_str().unwrap())).await;
+    let operators: Vec<&Value> =
+        (stored["measurements"].as_array().unwrap().iter()).map(|m| &m["covariates"]["operator"]).collect();
+    assert_eq!(json!(operators), json!(texts));
 }
 
 #[tokio::test]
