@@ -1,5 +1,6 @@
 //! The cells of a table, independent of the format of the file.
 
+use crate::measurement::csv_text::guarded;
 use crate::quantity::Timestamp;
 
 /// Type of the cells of a column.
@@ -40,11 +41,11 @@ impl Cell {
         value.map_or(Self::Empty, Self::Number)
     }
 
-    /// The text of the cell in a CSV table; an empty cell is an empty text.
+    /// The text of the cell in a CSV table; an empty cell is an empty text. Numbers stay as they are.
     pub fn into_text(self) -> String {
         match self {
             Self::Empty => String::new(),
-            Self::Text(text) => text,
+            Self::Text(text) => guarded(text),
             Self::Number(number) => number.to_string(),
             Self::Count(count) => count.to_string(),
             Self::Flag(flag) => flag.to_string(),

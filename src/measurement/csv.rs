@@ -10,6 +10,7 @@
 use std::collections::BTreeMap;
 
 use super::check::{FieldPath, Problem, RawMeasurement};
+use super::csv_text::unguarded;
 use super::{Covariate, CovariateKind, CovariateValue};
 use crate::quantity::{shown, Timestamp};
 
@@ -406,7 +407,7 @@ pub(super) fn row(
                 raw.covariates.insert(name.clone(), CovariateValue::Number(number(name.clone())?));
             }
             Column::Covariate(name, CovariateKind::Category) => {
-                raw.covariates.insert(name.clone(), CovariateValue::Category(cell.to_owned()));
+                raw.covariates.insert(name.clone(), CovariateValue::Category(unguarded(cell).to_owned()));
             }
             Column::Setting(name) => {
                 raw.settings.insert(name.clone(), number(format!("set_{name}"))?);

@@ -1,5 +1,6 @@
 //! Measurements written as a CSV table.
 
+use super::csv_text::guarded;
 use super::{CovariateValue, ModalMeasurement};
 use crate::quantity::Hertz;
 
@@ -34,7 +35,7 @@ pub fn write(measurements: &[ModalMeasurement]) -> String {
         }
         row.extend(covariates.iter().map(|name| match m.covariates.get(name) {
             Some(CovariateValue::Number(number)) => number.to_string(),
-            Some(CovariateValue::Category(text)) => text.clone(),
+            Some(CovariateValue::Category(text)) => guarded(text.clone()),
             None => String::new(),
         }));
         row.extend(settings.iter().map(|name| cell(m.settings.get(name).copied())));

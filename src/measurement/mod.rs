@@ -7,6 +7,7 @@ pub mod body;
 pub mod check;
 pub mod csv;
 pub mod csv_output;
+pub mod csv_text;
 pub mod json;
 pub mod order;
 pub mod shape;

@@ -20,6 +20,7 @@ mod assessor;
 pub mod automatic_diagnoses;
 mod backups;
 pub mod compute;
+mod deletion;
 mod error;
 pub mod events;
 mod ingest;
@@ -52,7 +53,10 @@ use self::assessor::Assessor;
 use self::automatic_diagnoses::AutomaticDiagnoses;
 pub use self::backups::Backups;
 use self::compute::Compute;
-pub use self::error::{BackupError, DeclareError, Error, IngestError, JobError, LeftOutBatch, ReloadError};
+pub use self::deletion::{DeletedStructure, Deletions};
+pub use self::error::{
+    BackupError, DeclareError, DeleteError, Error, IngestError, JobError, LeftOutBatch, ReloadError,
+};
 use self::events::Events;
 pub use self::ingest::{Ingest, Ingested, DEFAULT_SOURCE};
 pub use self::jobs::{
@@ -91,6 +95,7 @@ pub struct Monitor {
     models: Models,
     upkeep: Upkeep,
     archive: Archive,
+    deletions: Deletions,
 }
 
 impl Monitor {
@@ -124,6 +129,7 @@ impl Monitor {
         let records = Records::new(Arc::clone(&assessor));
         let versions = Versions::new(store.clone(), Arc::clone(&structures), Arc::clone(&references), replay.clone());
         let jobs = Jobs::new(store.clone(), Arc::clone(&structures), versions.clone(), events.clone());
+        let deletions = Deletions::new(store.clone(), Arc::clone(&structures), jobs.clone(), events.clone());
         let models = Models::new(store.clone(), Arc::clone(&structures), references, replay.clone());
         let upkeep = Upkeep {
             store: store.clone(),
@@ -136,11 +142,26 @@ impl Monitor {
             diagnoses: AutomaticDiagnoses::new(store.clone(), Arc::clone(&structures), jobs.clone()),
             silence: Silence::new(store.clone(), Arc::clone(&structures), Arc::clone(&alarms), silence_after_s),
             sources: Arc::default(),
+            unreadable: Arc::default(),
             started: Instant::now(),
         };
         let ingest = Ingest::new(Arc::clone(&assessor), replay.clone(), records.clone());
         let archive = Archive::new(assessor, replay.clone());
-        Ok(Self { store, events, structures, alarms, records, ingest, replay, versions, jobs, models, upkeep, archive })
+        Ok(Self {
+            store,
+            events,
+            structures,
+            alarms,
+            records,
+            ingest,
+            replay,
+            versions,
+            jobs,
+            models,
+            upkeep,
+            archive,
+            deletions,
+        })
     }
 
     /// A structure in use.
@@ -194,6 +215,11 @@ impl Monitor {
     /// The health of the service, its gauges, backups, retention, alarms of silence, and diagnoses that nobody requested.
     pub fn upkeep(&self) -> &Upkeep {
         &self.upkeep
+    }
+
+    /// Deletes structures.
+    pub fn deletions(&self) -> &Deletions {
+        &self.deletions
     }
 
     /// Exports a structure as an archive, and imports archives.

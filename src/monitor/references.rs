@@ -10,8 +10,8 @@ use super::compute::Place;
 use super::error::{DeclareError, Error, LeftOutBatch};
 use crate::assessment::{BatchState, DoubtfulBatch, Draws, ReferenceBatches, ReferenceError};
 use crate::damage::{ReferenceOrigin, UndamagedReference};
-use crate::quantity::{StructureId, Timestamp};
-use crate::store::{MeasuredBatch, ReferenceRecord};
+use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::store::{MeasuredBatch, NewReference, ReferenceRecord};
 
 /// The batches of an undamaged reference.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -62,6 +62,16 @@ struct Making {
     watched_by: Option<BTreeSet<String>>,
 }
 
+/// A reference that is not stored yet.
+struct Made {
+    state: UndamagedReference,
+    model_digest: Digest,
+    batches: Vec<String>,
+    left_out: Vec<LeftOutBatch>,
+    /// The version of which it is the same reference, computed again.
+    replaces: Option<u32>,
+}
+
 /// An undamaged reference that was declared.
 #[derive(Debug, Clone)]
 pub struct DeclaredReference {
@@ -98,26 +108,63 @@ impl References {
         self.renew(structure).await
     }
 
-    /// Computes the newest reference of a structure again from its batches, with the trained baseline in use. Batches that cannot
-    /// be trusted with this trained baseline are left out. Returns the version of the new reference.
+    /// Computes the newest reference of a structure again from its batches, with the trained baseline in use, and those that waiting
+    /// batches keep. Batches that cannot be trusted with this trained baseline are left out. Returns the version of the newest.
     pub(super) async fn renew(&self, structure: &StructureId) -> Option<u32> {
         let failed = |error: &dyn std::fmt::Display| {
             warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
         };
-        let newest = self.assessor.store.reference().undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
-        let request = ReferenceRequest {
-            choice: ReferenceChoice::Batches(newest.batches.clone()),
-            leave_out_doubtful: true,
-            threshold_probability: newest.state.threshold_probability,
-            reason: newest.state.origin.reason.clone(),
-        };
-        let place = self.assessor.compute.wait().await;
-        let origin = newest.state.origin.clone();
-        let declared = self.declare_as(structure, request, origin, place).await.map_err(|e| failed(&e)).ok()?;
-        for LeftOutBatch { batch, reason } in &declared.left_out {
+        let references = self.assessor.store.reference();
+        let newest = references.undamaged(structure).await.map_err(|e| failed(&e)).ok()??;
+        let mut made = Vec::new();
+        for version in self.kept_of_other_models(structure).await.map_err(|e| failed(&e)).ok()? {
+            if let Some(kept) = references.version(structure, version).await.map_err(|e| failed(&e)).ok()? {
+                made.extend(self.renewed(structure, &kept).await.map_err(|e| failed(&e)).ok());
+            }
+        }
+        made.push(self.renewed(structure, &newest).await.map_err(|e| failed(&e)).ok()?);
+        for LeftOutBatch { batch, reason } in made.iter().flat_map(|made| &made.left_out) {
             warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged reference of {structure}: {reason}");
         }
-        Some(declared.record.state.version)
+        let stored = self.store(structure, made).await.map_err(|e| failed(&e)).ok()?;
+        Some(stored.state.version)
+    }
+
+    /// Versions of other trained baselines than the one in use that waiting batches keep.
+    async fn kept_of_other_models(&self, structure: &StructureId) -> Result<Vec<u32>, Error> {
+        let baseline = self.assessor.structures.get(structure)?.trained_baseline()?;
+        Ok(self.assessor.store.reference().kept_of_other_models(structure, baseline.digest()).await?)
+    }
+
+    /// Waiting batches that keep a reference of another trained baseline than the one in use are compared with none.
+    pub(super) async fn keep_comparable(&self, structure: &StructureId) {
+        let Some(active) = self.assessor.structures.get(structure).ok() else { return };
+        let Ok(baseline) = &active.baseline else { return };
+        match self.assessor.store.reference().keep_none_of_other_models(structure, baseline.digest()).await {
+            Ok(0) => {}
+            Ok(batches) => warn!(
+                structure.id = %structure,
+                "{batches} batches of {structure} are not compared with their undamaged reference: it was made with another trained baseline"
+            ),
+            Err(error) => {
+                warn!(structure.id = %structure, %error, "Could not read the references of {structure}: {error}")
+            }
+        }
+    }
+
+    /// A reference, computed again from its batches with the trained baseline in use.
+    async fn renewed(&self, structure: &StructureId, record: &ReferenceRecord) -> Result<Made, DeclareError> {
+        let origin = record.state.origin.clone();
+        let declared_at_us = origin.declared_at_us.or(Some(record.created_at.micros()));
+        let making = Making {
+            leave_out_doubtful: true,
+            threshold_probability: record.state.threshold_probability,
+            origin: ReferenceOrigin { declared_at_us, ..origin },
+            watched_by: None,
+        };
+        let place = self.assessor.compute.wait().await;
+        let made = self.make(structure, (record.batches.clone(), Vec::new()), making, place).await?;
+        Ok(Made { replaces: Some(record.state.version), ..made })
     }
 
     /// Makes a reference from stored batches, and stores it. Other batches are compared with it when they are assessed again.
@@ -127,21 +174,12 @@ impl References {
         request: ReferenceRequest,
         place: Place,
     ) -> Result<DeclaredReference, DeclareError> {
-        let origin = ReferenceOrigin { reason: request.reason.clone(), ..ReferenceOrigin::default() };
-        self.declare_as(structure, request, origin, place).await
-    }
-
-    async fn declare_as(
-        &self,
-        structure: &StructureId,
-        request: ReferenceRequest,
-        origin: ReferenceOrigin,
-        place: Place,
-    ) -> Result<DeclaredReference, DeclareError> {
         let chosen = self.chosen(structure, &request.choice).await?;
-        let ReferenceRequest { leave_out_doubtful, threshold_probability, .. } = request;
+        let ReferenceRequest { leave_out_doubtful, threshold_probability, reason, .. } = request;
+        let origin = ReferenceOrigin { reason, ..ReferenceOrigin::default() };
         let making = Making { leave_out_doubtful, threshold_probability, origin, watched_by: None };
-        self.make(structure, chosen, making, place).await
+        let made = self.make(structure, chosen, making, place).await?;
+        self.declared(structure, made).await
     }
 
     /// Extends the newest reference by further batches, and stores the result as the next version.
@@ -172,23 +210,50 @@ impl References {
         let making = Making {
             leave_out_doubtful: request.leave_out_doubtful,
             threshold_probability: newest.state.threshold_probability,
-            origin: ReferenceOrigin { extends: Some(version), first: Some(first), reason: request.reason },
+            origin: ReferenceOrigin {
+                extends: Some(version),
+                first: Some(first),
+                reason: request.reason,
+                declared_at_us: None,
+            },
             watched_by: (!request.despite_alarms).then(|| of_first.into_iter().collect()),
         };
         let all = newest.batches.iter().cloned().chain(added).collect();
-        self.make(structure, (all, left_out), making, place).await
+        let made = self.make(structure, (all, left_out), making, place).await?;
+        self.declared(structure, made).await
     }
 
-    /// Makes a reference from chosen batches, beside those that were left out already, and stores it.
+    /// Stores a reference that was declared.
+    async fn declared(&self, structure: &StructureId, made: Made) -> Result<DeclaredReference, DeclareError> {
+        let left_out = made.left_out.clone();
+        Ok(DeclaredReference { record: self.store(structure, vec![made]).await?, left_out })
+    }
+
+    /// Stores references of one trained baseline in one transaction, and returns the last of them.
+    async fn store(&self, structure: &StructureId, made: Vec<Made>) -> Result<Arc<ReferenceRecord>, Error> {
+        let Assessor { store, events, alarms, .. } = &*self.assessor;
+        let Some(last) = made.last() else { return Err(Error::Panicked) };
+        let (batches, without, digest) = (last.batches.len(), last.left_out.len(), last.model_digest.clone());
+        let new =
+            made.into_iter().map(|Made { state, batches, replaces, .. }| NewReference { state, batches, replaces });
+        let version =
+            store.reference().insert_all_undamaged(structure, new.collect(), &digest, Timestamp::now()).await?;
+        info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");
+        alarms.publish_changes(structure).await;
+        events.structure_changed(structure);
+        let stored = store.reference().undamaged(structure).await?;
+        stored.ok_or_else(|| Error::UnknownStructure(structure.clone()))
+    }
+
+    /// Makes a reference from chosen batches, beside those that were left out already.
     async fn make(
         &self,
         structure: &StructureId,
         (mut batch_ids, mut left_out): (Vec<String>, Vec<LeftOutBatch>),
         making: Making,
         place: Place,
-    ) -> Result<DeclaredReference, DeclareError> {
-        let Assessor { store, structures, events, alarms, .. } = &*self.assessor;
-        let baseline = structures.get(structure)?.trained_baseline()?;
+    ) -> Result<Made, DeclareError> {
+        let baseline = self.assessor.structures.get(structure)?.trained_baseline()?;
         let doubtful_already = !left_out.is_empty();
         let mut records = Vec::new();
         for id in &batch_ids {
@@ -247,14 +312,7 @@ impl References {
         })?;
         batch_ids.retain(|id| doubtful.iter().all(|left_out| left_out.batch != *id));
         left_out.extend(doubtful);
-        let version =
-            store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, Timestamp::now()).await?;
-        let (batches, without) = (batch_ids.len(), left_out.len());
-        info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");
-        alarms.publish_changes(structure).await;
-        events.structure_changed(structure);
-        let stored = store.reference().undamaged(structure).await?;
-        Ok(DeclaredReference { record: stored.expect("it was stored a moment ago and is never deleted"), left_out })
+        Ok(Made { state, model_digest, batches: batch_ids, left_out, replaces: None })
     }
 
     /// The ids of the chosen batches, and those that cannot be used whatever they contain.

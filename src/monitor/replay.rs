@@ -20,6 +20,7 @@ use super::references::{DeclaredReference, ExtensionRequest, ReferenceRequest, R
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
 use crate::store;
+use crate::store::archive::ImportedActions;
 
 /// Pause between two attempts to store results that could not be stored, for example on a full disk.
 const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
@@ -32,8 +33,8 @@ enum Waiting {
     Computed(Box<Computed>),
     /// It does not wait any more, or it cannot be read.
     Done,
-    /// There is no trained baseline to assess it with.
-    NoBaseline,
+    /// It waits further: there is no trained baseline to assess it with, or the reference that it keeps is computed again first.
+    Later,
 }
 
 /// Assesses waiting batches.
@@ -103,6 +104,7 @@ impl Replay {
         let replay = self.clone();
         tokio::spawn(async move {
             replay.references.renew_if_outdated(&structure).await;
+            replay.references.keep_comparable(&structure).await;
             if let Err(error) = replay.resume(&structure).await {
                 error!(structure.id = %structure, %error, "Could not assess the waiting batches of {structure}: {error}");
                 replay.resume_until_done(structure);
@@ -121,7 +123,7 @@ impl Replay {
             loop {
                 tokio::time::sleep(BETWEEN_ATTEMPTS).await;
                 match replay.resume(&structure).await {
-                    Ok(()) => break,
+                    Ok(_) => break,
                     Err(_) if replay.assessor.store.file().is_closed() => break,
                     Err(error) => {
                         warn!(structure.id = %structure, %error, "Could not assess the waiting batches of {structure}, trying again: {error}");
@@ -132,24 +134,27 @@ impl Replay {
         });
     }
 
-    /// Assesses the waiting batches of a structure.
-    pub(super) async fn resume(&self, structure: &StructureId) -> Result<(), Error> {
+    /// Assesses the waiting batches of a structure, and then stores what an archive says about their alarms.
+    pub(super) async fn resume(&self, structure: &StructureId) -> Result<ImportedActions, Error> {
         // One at a time for each structure: two would assess the same batches.
         let turn =
             Arc::clone(self.turns.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default());
         let _turn = turn.lock().await;
         loop {
             let pending = self.assessor.store.batches().pending(structure, PAGE).await?;
-            if pending.is_empty() || !self.assess_all(structure, pending).await? {
-                return Ok(());
+            if pending.is_empty() {
+                return Ok(self.assessor.store.archive().settle_actions(structure).await?);
+            }
+            if !self.assess_all(structure, pending).await? {
+                return Ok(ImportedActions::default());
             }
         }
     }
 
-    /// Assesses some batches. Returns false when there is no trained baseline to assess them with.
+    /// Assesses some batches. Returns false when they have to wait further.
     async fn assess_all(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
         let at_a_time = self.assessor.compute.places_behind();
-        let has_baseline = AtomicBool::new(true);
+        let can_proceed = AtomicBool::new(true);
         // Each in a task of its own: a future of this stream that was given a thread is not polled while a batch below is assessed
         // again, and that would wait for the thread for ever.
         let compute = |id: String| {
@@ -162,8 +167,8 @@ impl Replay {
             let queued = match waiting {
                 Waiting::Computed(computed) => Some(self.assessor.store_computed(*computed)),
                 Waiting::Done => None,
-                Waiting::NoBaseline => {
-                    has_baseline.store(false, Ordering::Relaxed);
+                Waiting::Later => {
+                    can_proceed.store(false, Ordering::Relaxed);
                     None
                 }
             };
@@ -183,7 +188,7 @@ impl Replay {
             };
             self.resume_if_superseded(structure, &finished);
         }
-        Ok(has_baseline.load(Ordering::Relaxed))
+        Ok(can_proceed.load(Ordering::Relaxed))
     }
 
     /// Resumes a structure whose version changed while one of its batches was assessed.
@@ -198,9 +203,9 @@ impl Replay {
         let place = self.assessor.compute.wait_behind().await;
         // The version may change at any time: each batch is assessed under the present one.
         let active = self.assessor.structures.get(structure)?;
-        if active.baseline.is_err() {
-            return Ok(Waiting::NoBaseline);
-        }
+        let Ok(baseline) = &active.baseline else {
+            return Ok(Waiting::Later);
+        };
         let record = match self.assessor.stored(structure, &batch_id).await {
             // One damaged row must not block the batches after it.
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
@@ -213,6 +218,12 @@ impl Replay {
         };
         if record.state != BatchState::Received {
             return Ok(Waiting::Done);
+        }
+        if let Some(kept) = record.kept_reference {
+            let reference = self.assessor.store.reference().version(structure, kept).await?;
+            if reference.is_some_and(|reference| reference.model_digest != *baseline.digest()) {
+                return Ok(Waiting::Later);
+            }
         }
         let task = self.assessor.task(active, record, place).await?;
         Ok(Waiting::Computed(Box::new(self.assessor.compute(task).await?)))

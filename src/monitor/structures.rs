@@ -54,7 +54,7 @@ pub struct ActiveStructures {
     accept_uncalibrated: Vec<String>,
     library: RwLock<Arc<Library>>,
     active: RwLock<BTreeMap<StructureId, Arc<ActiveStructure>>>,
-    refused: BTreeMap<StructureId, String>,
+    refused: RwLock<BTreeMap<StructureId, String>>,
 }
 
 impl ActiveStructures {
@@ -70,15 +70,26 @@ impl ActiveStructures {
         }
         for (id, entry) in library.iter() {
             let json = entry.simulator.definition().canonical_json();
-            let outcome =
-                store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            // Without a write where it is stored already: the service must start for reading on a full disk.
+            let stored = store.structures().structure(id).await?;
+            if stored.is_some_and(|stored| stored.digest == *entry.simulator.digest()) {
+                continue;
+            }
+            let put = store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await;
+            let outcome = match put {
+                Err(full) if full.disk_cause().is_some() => {
+                    error!(structure.id = %id, "Could not store {id} of the models folder, until the next start: {full}");
+                    continue;
+                }
+                outcome => outcome?,
+            };
             if outcome == PutStructure::Refused {
                 warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches, and the library's definition differs");
             }
         }
         let library = RwLock::new(Arc::new(library));
-        let (active, refused) = (RwLock::default(), BTreeMap::new());
-        let mut structures = Self { store, events, accept_uncalibrated, library, active, refused };
+        let (active, refused) = (RwLock::default(), RwLock::default());
+        let structures = Self { store, events, accept_uncalibrated, library, active, refused };
         for summary in structures.store.structures().list().await? {
             let id = summary.id;
             let Some(record) = structures.store.structures().structure(&id).await? else { continue };
@@ -90,7 +101,7 @@ impl ActiveStructures {
                 // One invalid definition must not keep the other structures from being monitored.
                 Err(reason) => {
                     error!(structure.id = %id, "Refused the stored definition of {id}: {reason}");
-                    structures.refused.insert(id, reason.to_string());
+                    structures.refused.write().expect("no holder of this lock panics").insert(id, reason.to_string());
                 }
             }
         }
@@ -102,7 +113,7 @@ impl ActiveStructures {
     /// # Errors
     /// [`Error::UnknownStructure`]; [`Error::DefinitionRefused`] for one whose stored definition is not valid any more.
     pub fn get(&self, id: &StructureId) -> Result<Arc<ActiveStructure>, Error> {
-        self.read().get(id).cloned().ok_or_else(|| match self.refused.get(id) {
+        self.read().get(id).cloned().ok_or_else(|| match self.refused().get(id) {
             Some(reason) => Error::DefinitionRefused { structure: id.clone(), reason: reason.clone() },
             None => Error::UnknownStructure(id.clone()),
         })
@@ -119,8 +130,18 @@ impl ActiveStructures {
     }
 
     /// Stored structures that this version of the program refuses, with the reason.
-    pub fn refused(&self) -> &BTreeMap<StructureId, String> {
-        &self.refused
+    pub fn refused(&self) -> BTreeMap<StructureId, String> {
+        self.refused.read().expect("no holder of this lock panics").clone()
+    }
+
+    /// Takes a structure out of use.
+    pub(super) fn deactivate(&self, id: &StructureId) {
+        self.active.write().expect("no holder of this lock panics").remove(id);
+    }
+
+    /// A structure whose stored definition was refused is stored no more.
+    pub(super) fn forget_refused(&self, id: &StructureId) {
+        self.refused.write().expect("no holder of this lock panics").remove(id);
     }
 
     /// Structures and trained baselines on disk, as last read.

@@ -11,6 +11,7 @@ use super::chart_point::StoredChartPoint;
 use super::column::{bad_row, elements, from_blob, list, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
+use super::kept::settle_kept;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
@@ -115,6 +116,22 @@ impl Assessments<'_> {
         assessment: &Assessment,
         charted: NewCharts,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
+        self.insert_kept(structure, batch_id, assessment, charted, None)
+    }
+
+    /// As [`Self::insert_assessment`], for a batch that was compared with the first of the undamaged references that it keeps, of
+    /// version `kept`. It waits further if it keeps others.
+    ///
+    /// # Errors
+    /// As [`Self::insert_assessment`].
+    pub fn insert_kept(
+        self,
+        structure: &StructureId,
+        batch_id: &str,
+        assessment: &Assessment,
+        charted: NewCharts,
+        kept: Option<u32>,
+    ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.database.write(move |transaction| {
             Box::pin(async move {
@@ -125,13 +142,17 @@ impl Assessments<'_> {
                 if slot.taken {
                     remove(transaction, &structure, &id, &a).await?;
                 }
+                if let Some(version) = kept {
+                    settle_kept(transaction, (&structure, &id), version).await?;
+                }
                 insert(transaction, &structure, &id, &a, slot.assessed_at_us).await?;
                 let batch = Charted {
                     structure: &structure,
                     position: (slot.measured_to_us, id.clone()),
                     now: assessed_at,
                     maintained: slot.maintained,
-                    newest_undamaged: slot.newest_undamaged,
+                    undamaged_version: kept.and(a.undamaged_version).unwrap_or(slot.newest_undamaged),
+                    succeeded_at_us: slot.succeeded_at_us,
                 };
                 let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
                 let newest_undamaged = slot.newest_undamaged;
@@ -218,6 +239,8 @@ struct Slot {
     maintained: bool,
     /// Version of the newest undamaged reference; 0 if there is none.
     newest_undamaged: u32,
+    /// When the reference after the one of the assessment was declared, µs.
+    succeeded_at_us: Option<i64>,
 }
 
 #[derive(FromRow)]
@@ -229,6 +252,7 @@ struct SlotRow {
     measured_to_us: i64,
     maintained: bool,
     newest_undamaged: u32,
+    succeeded_at_us: Option<i64>,
 }
 
 /// Reads what must be known to store an assessment. `None` if it was made for a version of the structure that is not the present
@@ -244,7 +268,9 @@ async fn slot_of(
         "select own_us, others_us, measured_to_us,
                 exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
                     and to_us > measured_from_us) as maintained,
-                (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged
+                (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged,
+                (select coalesce(json_extract(origin, '$.declared_at_us'), created_at_us) from undamaged_state
+                    where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us
          from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
                       max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
                from assessment where structure_id = $1 and batch_id = $2) a
@@ -258,12 +284,12 @@ async fn slot_of(
     .bind(a.structure_digest.as_str())
     .fetch_optional(transaction.connection())
     .await?;
-    let Some(SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged }) = found else {
-        return Ok(None);
-    };
+    let Some(found) = found else { return Ok(None) };
+    let SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged, succeeded_at_us } = found;
     let after = others_us.map_or(given, |latest| given.max(latest + 1));
     let assessed_at_us = if own_us == Some(given) { given } else { after };
-    Ok(Some(Slot { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
+    let taken = own_us.is_some();
+    Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us }))
 }
 
 /// Removes the stored assessment for the same trained baseline and undamaged reference.
@@ -303,7 +329,10 @@ async fn insert(
     // Two statements in one call, which saves a round trip to the thread of SQLite for every batch. PostgreSQL takes them singly.
     let insert =
         "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16);
-         update measurement_batch set state = 'assessed', failure = null where structure_id = $1 and batch_id = $2";
+         update measurement_batch set failure = null,
+             state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
+                     else 'assessed' end
+         where structure_id = $1 and batch_id = $2";
     sqlx::query(insert)
         .bind(structure)
         .bind(batch_id)

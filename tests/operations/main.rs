@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod archive;
+mod archive_references;
 mod backup;
 mod doctor;
 #[path = "../api/helpers.rs"]
@@ -13,5 +14,6 @@ mod models;
 mod monitoring;
 mod output;
 mod storage;
+mod stored;
 mod supervision;
 mod world;

@@ -97,10 +97,10 @@ export async function png(svg) {
   );
 }
 
-/** A cell of RFC 4180: numbers with all their digits, missing values empty. */
+/** A cell of RFC 4180: numbers with all their digits, missing values empty, texts that look like formulas with an apostrophe before them. */
 function csvCell(value) {
   if (value === null || value === undefined || (typeof value === "number" && !Number.isFinite(value))) return "";
-  const text = String(value);
+  const text = typeof value === "string" && /^'*[=+\-@\t\r\n]/.test(value) ? `'${value}` : String(value);
   return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
