@@ -1,7 +1,7 @@
 //! The assessment of one batch: its samples, its findings, and its comparison with the undamaged reference.
 
 use super::conditions::compare_conditions;
-use super::estimate::ProcessQuantities;
+use super::estimate::{mean_effect_sizes, mean_frequencies, ProcessQuantities};
 use super::quantities::{joint_samples, monitored_quantities};
 use super::result::Assessment;
 use super::samples::{draw, BatchSamples, Draws, Error};
@@ -68,9 +68,12 @@ pub fn assess(
     findings.extend(not_informed.iter().map(|name| not_informed_finding(name)));
     findings.extend(beyond_runs(baseline, &samples.posterior, &samples.asked));
     let trust = Trust::new(&samples.fit, findings);
-    let covariates = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(|p| &p.process.covariates);
-    let estimate =
-        covariates.and_then(|covariates| process.estimate(&sampled, measurements, covariates, samples.fit.misfit()));
+    let learned = context.undamaged.and_then(|undamaged| undamaged.process.as_ref()).map(|p| &p.process);
+    let mut estimate =
+        learned.and_then(|p| process.estimate(&sampled, measurements, &p.covariates, samples.fit.misfit()));
+    if let Some(estimate) = estimate.as_mut().filter(|_| learned.is_some_and(|p| p.modes.is_some())) {
+        estimate.frequencies = mean_frequencies(baseline, &samples.observations)?;
+    }
     // Where the simulation does not fit the data, its parameters say nothing about damage.
     let compared = context.undamaged.filter(|_| trust.accepted());
     let mut quantities = damage::assess(&sampled, compared);
@@ -150,11 +153,7 @@ fn beyond_runs(baseline: &Baseline, posterior: &PosteriorSamples, asked: &[Obser
 fn misfit_percent(baseline: &Baseline, samples: &BatchSamples) -> Result<Vec<Option<f64>>, Error> {
     let theta: Vec<f64> = samples.posterior.theta().row_mean().iter().copied().collect();
     // The simulation is evaluated at the mean sizes of the effects.
-    let count = samples.observations.len() as f64;
-    let known: Vec<&Vec<f64>> =
-        samples.observations.iter().map(|o| &o.effect_sizes).filter(|s| !s.is_empty()).collect();
-    let sizes: Vec<f64> =
-        (0..known.first().map_or(0, |s| s.len())).map(|i| known.iter().map(|s| s[i]).sum::<f64>() / count).collect();
+    let sizes = mean_effect_sizes(&samples.observations);
     let simulated = baseline.simulator().under(&sizes).frequencies_hz(&theta)?;
     let misfit = |(mode, simulated): (usize, f64)| {
         let measured: Vec<f64> = samples.observations.iter().filter_map(|o| o.frequencies_hz[mode]).collect();

@@ -3,11 +3,13 @@
 use nalgebra::DMatrix;
 
 use super::chart_points::charted_columns;
+use crate::baseline::observation::Observation;
 use crate::baseline::Baseline;
 use crate::damage::{Hyperparameters, QuantitySamples};
 use crate::measurement::{CovariateValue, ModalMeasurement};
 use crate::parameter::Parameter;
-use crate::process::estimate::BatchEstimate;
+use crate::physics;
+use crate::process::estimate::{BatchEstimate, MeanFrequencies};
 use crate::process::fit::Quantities;
 use crate::stats;
 use crate::trust::fit::Misfit;
@@ -26,7 +28,7 @@ impl ProcessQuantities {
     pub fn of(baseline: &Baseline) -> Self {
         let space = baseline.space().as_slice();
         let variance = |p: &Parameter| (p.upper - p.lower).powi(2) / 12.0;
-        let mut quantities = Quantities { names: Vec::new(), units: Vec::new(), directions: Vec::new() };
+        let mut quantities = Quantities { names: Vec::new(), units: Vec::new(), directions: Vec::new(), effects: None };
         let mut prior_variances = Vec::new();
         for (name, columns) in charted_columns(baseline) {
             quantities.names.push(name);
@@ -37,6 +39,27 @@ impl ProcessQuantities {
             prior_variances.push(sum / (columns.len() as f64).powi(2));
         }
         Self { quantities, prior_variances }
+    }
+
+    /// The quantities with their effects on the modes at some parameters, `[d]`, or without effects where the modes do not outnumber the
+    /// quantities.
+    ///
+    /// # Errors
+    /// [`physics::Error`], which does not occur inside a checked prior.
+    pub fn with_effects(self, baseline: &Baseline, theta: &[f64]) -> Result<Quantities, physics::Error> {
+        let mut quantities = self.quantities;
+        let simulator = baseline.simulator();
+        if has_misfits(baseline) {
+            let response = simulator.respond(theta, simulator.modes(), &[], &[])?;
+            let columns = charted_columns(baseline);
+            // The mean of a group changes by as much as its members if these change together.
+            let effect = |mode: usize, k: usize| {
+                let sum: f64 = columns[k].1.iter().map(|column| response.by_parameter[(mode, *column)]).sum();
+                sum / response.frequencies_hz[mode]
+            };
+            quantities.effects = Some(DMatrix::from_fn(simulator.modes(), columns.len(), effect));
+        }
+        Ok(quantities)
     }
 
     /// Whether the measurements behind some samples say more about quantity k than its prior.
@@ -79,8 +102,48 @@ impl ProcessQuantities {
             mean: (0..d).map(|k| self.informs(k, own[k]).then_some(centres[k])).collect(),
             covariance: covariance.as_slice().to_vec(),
             covariates: covariates.iter().map(|name| mean_covariate(measurements, name)).collect(),
+            frequencies: None,
         })
     }
+}
+
+/// Whether there are more modes than quantities, so that the modes have misfits.
+fn has_misfits(baseline: &Baseline) -> bool {
+    baseline.simulator().modes() > charted_columns(baseline).len()
+}
+
+/// The mean frequencies of some measurements, compared with the simulation in the middle of the prior under their mean conditions; `None`
+/// where the modes have no misfits, or where the parameters are not estimated from the frequencies alone.
+///
+/// # Errors
+/// [`physics::Error`], which does not occur inside a checked prior.
+pub(super) fn mean_frequencies(
+    baseline: &Baseline,
+    observations: &[Observation],
+) -> Result<Option<MeanFrequencies>, physics::Error> {
+    if !has_misfits(baseline) || observations.iter().any(|o| o.has_shapes() || o.is_marginalised()) {
+        return Ok(None);
+    }
+    let simulator = baseline.simulator();
+    let middle: Vec<f64> = baseline.space().iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
+    let simulated = simulator.under(&mean_effect_sizes(observations)).frequencies_hz(&middle)?;
+    let of_mode = |mode: usize| {
+        let ratios: Vec<f64> =
+            observations.iter().filter_map(|o| Some((o.frequencies_hz[mode]? / simulated[mode]).ln())).collect();
+        let error = |o: &Observation| Some((o.std_hz(simulator, mode)? / o.frequencies_hz[mode]?).powi(2));
+        let errors: f64 = observations.iter().filter_map(error).sum();
+        let count = ratios.len() as f64;
+        ((!ratios.is_empty()).then(|| stats::mean(&ratios)), if count > 0.0 { errors / count.powi(2) } else { 0.0 })
+    };
+    let (ln_ratio, variance) = (0..simulator.modes()).map(of_mode).unzip();
+    Ok(Some(MeanFrequencies { ln_ratio, variance }))
+}
+
+/// Mean sizes of the effects of some measurements, of those for which they are known.
+pub(super) fn mean_effect_sizes(observations: &[Observation]) -> Vec<f64> {
+    let known: Vec<&Vec<f64>> = observations.iter().map(|o| &o.effect_sizes).filter(|s| !s.is_empty()).collect();
+    let mean = |i: usize| known.iter().map(|s| s[i]).sum::<f64>() / known.len() as f64;
+    (0..known.first().map_or(0, |s| s.len())).map(mean).collect()
 }
 
 /// Mean of a numeric covariate over the measurements that have it.

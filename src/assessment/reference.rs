@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::conditions::conditions;
-use super::estimate::{process_covariates, ProcessQuantities};
+use super::estimate::{mean_frequencies, process_covariates, ProcessQuantities};
 use super::quantities::{joint_samples, monitored_quantities};
 use super::samples::{draw, joined, BatchSamples, Draws, Error};
 use crate::baseline::Baseline;
@@ -207,19 +207,38 @@ fn process(
     mean_run_batches: f64,
     usual_misfit: Misfit,
 ) -> Result<ReferenceProcess, fit::Error> {
-    let quantities = ProcessQuantities::of(baseline).quantities;
+    let failed = |e: crate::physics::Error| fit::Error::Search(e.to_string());
+    let quantities = ProcessQuantities::of(baseline).with_effects(baseline, &mean_parameters(baseline, trusted));
+    let quantities = quantities.map_err(failed)?;
     let measurements: Vec<&[ModalMeasurement]> = trusted.iter().map(|batch| batch.measurements).collect();
     let covariates = process_covariates(&measurements);
     let estimates = estimates(baseline, trusted, &covariates);
     ReferenceProcess::new(&quantities, &covariates, estimates, mean_run_batches, usual_misfit)
 }
 
-/// The estimates of some batches.
+/// Mean of the posterior samples of some batches, `[d]`; the middle of the prior without any.
+fn mean_parameters(baseline: &Baseline, batches: &[&TrustedBatch<'_>]) -> Vec<f64> {
+    let middle = baseline.space().iter().map(|p| f64::midpoint(p.lower, p.upper)).collect::<Vec<_>>();
+    let means: Vec<Vec<f64>> =
+        batches.iter().map(|b| b.samples.posterior.theta().row_mean().iter().copied().collect()).collect();
+    let mean = |(k, middle): (usize, &f64)| {
+        if means.is_empty() {
+            *middle
+        } else {
+            stats::mean(&means.iter().map(|own| own[k]).collect::<Vec<_>>())
+        }
+    };
+    middle.iter().enumerate().map(mean).collect()
+}
+
+/// The estimates of some batches, with their frequencies.
 fn estimates(baseline: &Baseline, batches: &[&TrustedBatch<'_>], covariates: &[String]) -> Vec<BatchEstimate> {
     let quantities = ProcessQuantities::of(baseline);
     let estimate = |batch: &&TrustedBatch<'_>| {
         let sampled = monitored_quantities(baseline, &batch.samples, batch.draws.per_measurement);
-        quantities.estimate(&sampled, batch.measurements, covariates, batch.samples.fit.misfit())
+        let estimate = quantities.estimate(&sampled, batch.measurements, covariates, batch.samples.fit.misfit())?;
+        let frequencies = mean_frequencies(baseline, &batch.samples.observations).ok()?;
+        Some(BatchEstimate { frequencies, ..estimate })
     };
     batches.iter().filter_map(estimate).collect()
 }

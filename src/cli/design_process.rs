@@ -94,6 +94,7 @@ impl Weather {
             names: parameters.iter().map(|p| p.parameter.name.clone()).collect(),
             units: parameters.iter().map(|p| p.parameter.unit.clone()).collect(),
             directions: parameters.iter().map(|p| p.parameter.damage).collect(),
+            effects: None,
         };
         let estimates = self.estimates(parameters)?;
         let found = ReferenceProcess::watched(&quantities, &[], estimates, (self.mean_run_batches, [1.0; 2]), &watch)?;
@@ -138,6 +139,7 @@ impl Weather {
                 mean: (0..d).map(|k| value(k, normal())).collect(),
                 covariance,
                 covariates: Vec::new(),
+                frequencies: None,
             });
         }
         Ok(estimates)

@@ -411,6 +411,9 @@ pub struct ProcessBody {
     step_s: f64,
     /// Covariates whose influence was learned.
     covariates: Vec<String>,
+    /// Whether it describes the frequencies of all modes, because their misfits help to tell weather from damage; otherwise it
+    /// describes the parameters.
+    uses_misfits: bool,
     /// Correlation of each common factor without a measured cause over one step.
     factor_correlations: Vec<f64>,
     /// The conditions that its batches have seen; absent in references of earlier versions of the program.
@@ -432,6 +435,7 @@ impl From<&ReferenceProcess> for ProcessBody {
             period: process.period,
             step_s: process.step_s,
             covariates: process.covariates.clone(),
+            uses_misfits: process.modes.is_some(),
             factor_correlations: process.numbers().persistence.iter().take(process.factors).copied().collect(),
             coverage: process.coverage.clone(),
             limits: reference.limits,

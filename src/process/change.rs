@@ -4,17 +4,19 @@
 //! the filter, which takes part of the change for weather. For each onset, the innovations since then give a score and its variance:
 //!
 //! ```text
-//!  ν_s ~ N(G_s δ, S_s),    G_s = 1 − H M_s,    M_τ = 0,    M_s+1 = F (M_s + K_s G_s)
+//!  ν_s ~ N(G_s δ, S_s),    G_s = E − H M_s,    M_τ = 0,    M_s+1 = F (M_s + K_s G_s)
 //!  b = Σ_s G_sᵀ S_s⁻¹ ν_s,    I = Σ_s G_sᵀ S_s⁻¹ G_s
 //!  one parameter: z_k = ∓b_k/√I_kk,        several: z² = max over losses δ of 2 bᵀδ − δᵀIδ
 //! ```
+//!
+//! E: effect of each quantity on each coordinate of the process, 1 where the quantities are the coordinates.
 //!
 //! Source: A. S. Willsky, H. L. Jones (1976), IEEE Trans. Automatic Control 21, 108–112.
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use super::filter::Innovation;
+use super::filter::{Filter, Innovation};
 use crate::parameter::DamageDirection;
 
 /// Ages of a change, in batches since its onset, that are tested.
@@ -68,29 +70,29 @@ pub struct Score {
     pub information: DMatrix<f64>,
     /// M: what the states have taken of the change, `[q + d, d]`.
     pub taken: DMatrix<f64>,
-    /// H M at the newest innovation: the part of the change that its prediction contains, `[d, d]`.
+    /// H M at the newest innovation: the part of the change that its prediction contains, `[coordinates, d]`.
     pub predicted: DMatrix<f64>,
 }
 
 impl Score {
-    /// Before the first changed innovation, with `states` = q + d states and `quantities` = d.
-    pub fn new(states: usize, quantities: usize) -> Self {
+    /// Before the first changed innovation of a filter.
+    pub fn new(filter: &Filter) -> Self {
+        let (states, (coordinates, quantities)) = (filter.contributions().ncols(), filter.effects().shape());
         Self {
             score: DVector::zeros(quantities),
             information: DMatrix::zeros(quantities, quantities),
             taken: DMatrix::zeros(states, quantities),
-            predicted: DMatrix::zeros(quantities, quantities),
+            predicted: DMatrix::zeros(coordinates, quantities),
         }
     }
 
-    /// Adds the next innovation. `contributions`: H, `[d, q + d]`.
-    pub fn add(&mut self, innovation: &Innovation, contributions: &DMatrix<f64>) {
+    /// Adds the next innovation of the filter.
+    pub fn add(&mut self, innovation: &Innovation, filter: &Filter) {
         for (mut row, decay) in self.taken.row_iter_mut().zip(innovation.decay.iter()) {
             row *= *decay;
         }
-        let d = contributions.nrows();
-        self.predicted = contributions * &self.taken;
-        let left = DMatrix::identity(d, d) - &self.predicted;
+        self.predicted = filter.contributions() * &self.taken;
+        let left = filter.effects() - &self.predicted;
         let signature = left.select_rows(&innovation.informed);
         let weighted = signature.transpose() * &innovation.precision;
         self.score += &weighted * &innovation.difference;
@@ -121,12 +123,11 @@ pub fn signs(directions: &[DamageDirection]) -> Vec<f64> {
     directions.iter().map(sign).collect()
 }
 
-/// The score of a change with the first of some successive innovations. `contributions`: H, `[d, q + d]`.
-pub fn score(innovations: &[Innovation], contributions: &DMatrix<f64>) -> Score {
-    let (d, n) = contributions.shape();
-    let mut found = Score::new(n, d);
+/// The score of a change with the first of some successive innovations of a filter.
+pub fn score(innovations: &[Innovation], filter: &Filter) -> Score {
+    let mut found = Score::new(filter);
     for innovation in innovations {
-        found.add(innovation, contributions);
+        found.add(innovation, filter);
     }
     found
 }
@@ -135,16 +136,16 @@ pub fn score(innovations: &[Innovation], contributions: &DMatrix<f64>) -> Score 
 ///
 /// The quantity with the largest evidence is tested alone, the others beside it, because a loss of one looks like a loss of others
 /// with a similar effect. The largest evidence of all, for which the limits are computed, does not depend on that.
-pub fn evidence(innovations: &[Innovation], contributions: &DMatrix<f64>, signs: &[f64]) -> LossEvidence {
+pub fn evidence(innovations: &[Innovation], filter: &Filter, signs: &[f64]) -> LossEvidence {
     let newest = innovations.last();
-    let informed = |k: usize| newest.is_some_and(|newest| newest.informed.contains(&k));
+    let informed = |k: usize| newest.is_some_and(|newest| newest.quantities.contains(&k));
     let charted = |k: usize| signs[k] != 0.0;
     let mut quantities: Vec<Option<Evidence>> =
         (0..signs.len()).map(|k| (charted(k) && informed(k)).then_some(Evidence::NONE)).collect();
     let several = (0..signs.len()).filter(|k| charted(*k)).count() > 1;
     let mut joint = (several && quantities.iter().any(Option::is_some)).then_some(Evidence::NONE);
     for age in AGES.into_iter().filter(|age| *age <= innovations.len()) {
-        let found = score(&innovations[innovations.len() - age..], contributions);
+        let found = score(&innovations[innovations.len() - age..], filter);
         let (alone, together) = found.evidence(signs);
         for (evidence, z) in quantities.iter_mut().zip(alone) {
             if let Some(evidence) = evidence {
@@ -234,15 +235,10 @@ pub struct Change {
 /// ```
 ///
 /// The prior is uniform over the onsets. `None` without innovations that inform it.
-pub fn change(
-    innovations: &[Innovation],
-    contributions: &DMatrix<f64>,
-    signs: &[f64],
-    only: Option<usize>,
-) -> Option<Change> {
+pub fn change(innovations: &[Innovation], filter: &Filter, signs: &[f64], only: Option<usize>) -> Option<Change> {
     let d = signs.len();
     let onset = |first: usize| {
-        let found = score(&innovations[first..], contributions);
+        let found = score(&innovations[first..], filter);
         let sought =
             |k: &usize| only.is_none_or(|only| only == *k) && signs[*k] != 0.0 && found.information[(*k, *k)] > 0.0;
         let places: Vec<usize> = (0..d).filter(sought).collect();

@@ -34,14 +34,14 @@ pub struct Detectable {
 /// The chart of all quantities together, and ages between, find a little more.
 pub(super) fn detectable(process: &Process, limits: &Limits) -> Vec<Detectable> {
     let Some(steady) = Steady::new(process) else { return Vec::new() };
-    let numbers = process.numbers();
+    let usual = process.quantities_behind(&process.numbers().mean);
     let errors = steady.standard_errors();
     let one = |k: usize, (age, errors): (&usize, &Vec<f64>)| {
         let limit = if *age <= FAST_AGE { limits.quantity.fast } else { limits.quantity.slow };
         let scale = process.scales[k];
         let loss = (limit + NORMAL_90) * errors[k] * scale.unit;
         let unit = process.units[k].clone();
-        let mean = scale.origin + scale.unit * numbers.mean[k];
+        let mean = scale.origin + scale.unit * usual[k];
         Detectable {
             name: process.quantities[k].clone(),
             batches: *age,

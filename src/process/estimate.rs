@@ -19,15 +19,30 @@ pub struct BatchEstimate {
     pub covariance: Vec<f64>,
     /// Mean of each covariate over the batch, `[m]`; `None` where none was measured.
     pub covariates: Vec<Option<f64>>,
+    /// The frequencies behind the estimate; `None` where they are not all that it is based on, as with mode shapes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frequencies: Option<MeanFrequencies>,
 }
 
-/// The estimate in standardised units, without the quantities that the batch does not inform.
+/// Mean frequencies of a batch.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MeanFrequencies {
+    /// Mean of ln(measured/simulated frequency) of each mode, `[modes]`, simulated with fixed parameters; `None` for a mode that was not
+    /// measured.
+    pub ln_ratio: Vec<Option<f64>>,
+    /// Variance of its error by the stated noise, `[modes]`; 0 for a mode that was not measured.
+    pub variance: Vec<f64>,
+}
+
+/// What a batch shows of the coordinates of a process in standardised units, without those that it does not inform.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Observation {
     /// Time since the observation before, in steps of the process; 0 for the first.
     pub steps: f64,
-    /// Indices of the quantities that are informed, ascending, `[o]`.
+    /// Indices of the coordinates that are informed, ascending, `[o]`.
     pub informed: Vec<usize>,
+    /// Indices of the quantities that are informed, ascending. They are the coordinates, unless these are the frequencies.
+    pub quantities: Vec<usize>,
     /// Their standardised means, `[o]`.
     pub mean: DVector<f64>,
     /// Covariance of their errors as stated, `[o, o]`.
@@ -71,14 +86,38 @@ impl BatchEstimate {
             let (a, b) = (informed[i], informed[j]);
             self.covariance[a * d + b] / (quantities[a].unit * quantities[b].unit)
         };
-        let covariate = |j: usize, _: usize| self.covariates[j].map_or(0.0, |c| covariates[j].standardised(c));
         Observation {
             steps,
             mean: DVector::from_fn(o, value),
             covariance: DMatrix::from_fn(o, o, element),
-            covariates: DVector::from_fn(covariates.len(), covariate),
+            covariates: self.standardised_covariates(covariates),
+            quantities: informed.clone(),
             informed,
         }
+    }
+
+    /// The frequencies in standardised units, `modes` are their scales, `steps` after the batch before.
+    pub(super) fn standardised_frequencies(&self, modes: &[Scale], covariates: &[Scale], steps: f64) -> Observation {
+        let ratio = |mode: usize| self.frequencies.as_ref().and_then(|f| f.ln_ratio[mode]);
+        let informed: Vec<usize> = (0..modes.len()).filter(|mode| ratio(*mode).is_some()).collect();
+        let o = informed.len();
+        let value = |mode: &usize| modes[*mode].standardised(ratio(*mode).unwrap_or(modes[*mode].origin));
+        let variance = |mode: &usize| {
+            self.frequencies.as_ref().map_or(0.0, |frequencies| frequencies.variance[*mode]) / modes[*mode].unit.powi(2)
+        };
+        Observation {
+            steps,
+            mean: DVector::from_iterator(o, informed.iter().map(value)),
+            covariance: DMatrix::from_diagonal(&DVector::from_iterator(o, informed.iter().map(variance))),
+            covariates: self.standardised_covariates(covariates),
+            quantities: (0..self.mean.len()).filter(|k| self.mean[*k].is_some()).collect(),
+            informed,
+        }
+    }
+
+    fn standardised_covariates(&self, scales: &[Scale]) -> DVector<f64> {
+        let covariate = |j: usize, _: usize| self.covariates[j].map_or(0.0, |c| scales[j].standardised(c));
+        DVector::from_fn(scales.len(), covariate)
     }
 }
 

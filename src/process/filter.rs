@@ -18,8 +18,10 @@ pub struct Known {
 /// What an observation adds to the prediction from those before it.
 #[derive(Debug, Clone)]
 pub struct Innovation {
-    /// Indices of the quantities that are informed, `[o]`.
+    /// Indices of the coordinates that are informed, `[o]`.
     pub informed: Vec<usize>,
+    /// Indices of the quantities that are informed.
+    pub quantities: Vec<usize>,
     /// Difference ν of observation and prediction, `[o]`.
     pub difference: DVector<f64>,
     /// Inverse of its covariance S, `[o, o]`.
@@ -30,7 +32,7 @@ pub struct Innovation {
     pub gain: DMatrix<f64>,
     /// Factor by which each state decayed since the observation before, `[q + d]`.
     pub decay: DVector<f64>,
-    /// The prediction of all quantities in standardised units, `[d]`.
+    /// The prediction of all coordinates in standardised units, `[d]`.
     pub predicted: DVector<f64>,
 }
 
@@ -38,6 +40,8 @@ pub struct Innovation {
 pub struct Filter {
     numbers: Numbers,
     contributions: DMatrix<f64>,
+    /// E, `[d, quantities]`.
+    effects: DMatrix<f64>,
     /// What the reference leaves unknown; `None` if the numbers are taken as known exactly.
     unknown: Option<Unknown>,
 }
@@ -56,7 +60,8 @@ impl Filter {
     /// The filter with numbers that are taken as known exactly, as in the likelihood.
     pub fn exact(numbers: Numbers) -> Self {
         let contributions = numbers.contributions();
-        Self { numbers, contributions, unknown: None }
+        let d = contributions.nrows();
+        Self { numbers, contributions, effects: DMatrix::identity(d, d), unknown: None }
     }
 
     /// The filter of a fitted process. What its reference leaves unknown about the common factors widens the predictions, and so do
@@ -67,7 +72,7 @@ impl Filter {
             coverage: process.coverage.clone(),
             covariate_scales: process.covariate_scales.clone(),
         };
-        Self { unknown: Some(unknown), ..Self::exact(process.in_operation()) }
+        Self { unknown: Some(unknown), effects: process.effects(), ..Self::exact(process.in_operation()) }
     }
 
     /// The numbers of the process.
@@ -78,6 +83,11 @@ impl Filter {
     /// H, `[d, q + d]`.
     pub fn contributions(&self) -> &DMatrix<f64> {
         &self.contributions
+    }
+
+    /// E: effect of each quantity on each coordinate, `[d, quantities]`.
+    pub fn effects(&self) -> &DMatrix<f64> {
+        &self.effects
     }
 
     /// Before any observation: the stationary distribution.
@@ -135,6 +145,7 @@ impl Filter {
         let log_det = 2.0 * factored.l_dirty().diagonal().iter().map(|l| l.ln()).sum::<f64>();
         let innovation = Innovation {
             informed: informed.clone(),
+            quantities: observation.quantities.clone(),
             difference,
             precision: factored.inverse(),
             log_det,

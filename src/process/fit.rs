@@ -1,38 +1,24 @@
 //! The process that is most probable for the batches of an undamaged reference.
 
-use std::cell::RefCell;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::AtomicUsize;
 
-use argmin::core::{CostFunction, Error as SearchError, Executor, Gradient, State as _};
-use argmin::solver::linesearch::MoreThuenteLineSearch;
-use argmin::solver::quasinewton::LBFGS;
-use nalgebra::{DMatrix, DVector, SymmetricEigen};
+use nalgebra::{DMatrix, DVector};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
+use super::choice::misfits_help;
 use super::coverage::Coverage;
 use super::estimate::{BatchEstimate, Observation, Scale};
-use super::likelihood::{information, log_density, log_posterior};
-use super::model::{Process, Sizes};
+use super::likelihood::log_density;
+use super::model::{Modes, Process, Sizes};
+use super::search::{most_probable, Candidate};
+pub use super::search::{Progress, Watch};
 use crate::parameter::DamageDirection;
 use crate::stats;
 
 /// Fewest batches of a reference from which a process is learned.
 pub const FEWEST_BATCHES: usize = 20;
-
-/// Most common factors.
-const MOST_FACTORS: usize = 3;
-
-/// Steps of the search, and the vectors that it remembers.
-const ITERATIONS: u64 = 300;
-const REMEMBERED: usize = 10;
-
-/// A search ends when a step lowers its cost, minus the log density for each observation, by less than this, nats.
-const LEAST_GAIN: f64 = 1e-11;
-
-/// Cost where the density cannot be computed. The line search needs finite numbers.
-const IMPOSSIBLE: f64 = 1e6;
 
 /// Posterior draws that are kept, and those among which they are chosen by importance.
 pub const DRAWS: usize = 100;
@@ -45,9 +31,6 @@ const LARGEST_WEIGHT: f64 = 20.0;
 /// Seed of the draws. It is fixed, so that the process depends on nothing but the batches.
 const SEED: u64 = 1;
 
-/// Least eigenvalue of the information: an unknown is never known less well than its prior says, whose widest standard deviation is 3.
-const LEAST_INFORMATION: f64 = 0.1;
-
 /// The quantities of a process.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Quantities {
@@ -57,6 +40,9 @@ pub struct Quantities {
     pub units: Vec<String>,
     /// Which change of each indicates damage.
     pub directions: Vec<DamageDirection>,
+    /// ∂ ln f/∂quantity of each mode at the mean of the reference, `[modes, quantities]`; `None` if it is not known, or if the estimates
+    /// are based on more than the frequencies.
+    pub effects: Option<DMatrix<f64>>,
 }
 
 /// Why no process could be fitted.
@@ -90,83 +76,6 @@ pub enum Error {
     Search(String),
 }
 
-/// What a fit has done, for those who wait for it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Progress {
-    /// Evaluations of the density in the search for the most probable process; their number is not known before.
-    Search {
-        /// Evaluations so far.
-        evaluations: usize,
-    },
-    /// Operations that were simulated for the limits.
-    Limits {
-        /// Operations so far.
-        done: usize,
-        /// Operations in total.
-        all: usize,
-    },
-}
-
-/// Is called from several threads while a process is fitted.
-pub type Watch<'a> = &'a (dyn Fn(Progress) + Sync);
-
-/// The density, nats, and its gradient.
-type Density = (f64, Vec<f64>);
-
-/// What the search minimises: minus the log density for each observation, so that its slopes are of the order of 1.
-struct Target<'a> {
-    sizes: Sizes,
-    observations: &'a [Observation],
-    /// The last point and its density: the search asks for cost and gradient of the same point one after the other.
-    last: RefCell<Option<(Vec<f64>, Option<Density>)>>,
-    evaluations: &'a AtomicUsize,
-    watch: Watch<'a>,
-}
-
-impl Target<'_> {
-    /// The density at some unknowns, with its gradient; `None` where it cannot be computed.
-    fn density(&self, unknowns: &[f64]) -> Option<Density> {
-        if let Some((point, density)) = self.last.borrow().as_ref() {
-            if point == unknowns {
-                return density.clone();
-            }
-        }
-        let found = log_posterior(unknowns, self.sizes, self.observations);
-        *self.last.borrow_mut() = Some((unknowns.to_vec(), found.clone()));
-        let evaluations = self.evaluations.fetch_add(1, Ordering::Relaxed) + 1;
-        (self.watch)(Progress::Search { evaluations });
-        found
-    }
-}
-
-impl CostFunction for Target<'_> {
-    type Param = Vec<f64>;
-    type Output = f64;
-
-    fn cost(&self, unknowns: &Vec<f64>) -> Result<f64, SearchError> {
-        Ok(self.density(unknowns).map_or(IMPOSSIBLE, |(density, _)| -density / self.observations.len() as f64))
-    }
-}
-
-impl Gradient for Target<'_> {
-    type Param = Vec<f64>;
-    type Gradient = Vec<f64>;
-
-    fn gradient(&self, unknowns: &Vec<f64>) -> Result<Vec<f64>, SearchError> {
-        let (_, gradient) = self.density(unknowns).ok_or_else(|| SearchError::msg("the density cannot be computed"))?;
-        Ok(gradient.into_iter().map(|slope| -slope / self.observations.len() as f64).collect())
-    }
-}
-
-/// A fit with a number of factors.
-struct Candidate {
-    factors: usize,
-    unknowns: Vec<f64>,
-    /// A factor L of their covariance L Lᵀ by Laplace's method.
-    factor: DMatrix<f64>,
-    log_evidence: f64,
-}
-
 /// Fits the process to the estimates of the batches of a reference, in the order of their times. The number of common factors is that
 /// with the largest evidence by Laplace's method.
 ///
@@ -183,19 +92,15 @@ pub fn fit(
         return Err(Error::TooFewBatches { batches });
     }
     let mut process = unfitted(quantities, covariates, estimates)?;
-    let observations = observations(&process, estimates);
-    let d = quantities.names.len();
-    let most = if d == 1 { 0 } else { MOST_FACTORS.min(d - 1) };
     let evaluations = AtomicUsize::new(0);
-    let search = |factors: usize| {
-        let sizes = Sizes { factors, ..process.sizes() };
-        let last = RefCell::new(None);
-        candidate(Target { sizes, observations: &observations, last, evaluations: &evaluations, watch })
-    };
-    let found: Vec<Result<Candidate, String>> = (0..=most).into_par_iter().map(search).collect();
-    let failure = found.iter().find_map(|c| c.as_ref().err().cloned()).unwrap_or_default();
-    let best = found.into_iter().flatten().max_by(|a, b| a.log_evidence.total_cmp(&b.log_evidence));
-    let best = best.ok_or(Error::Search(failure))?;
+    if let Some(effects) = &quantities.effects {
+        if misfits_help(&process, effects, estimates, &evaluations, watch) {
+            process.modes = modes(&process, effects, estimates);
+        }
+    }
+    process.usual_errors = usual_errors(&process, estimates).as_slice().to_vec();
+    let observations = observations(&process, estimates);
+    let best = most_probable(process.sizes(), &observations, &evaluations, watch).map_err(Error::Search)?;
     process.factors = best.factors;
     process.draws = draws(&best, process.sizes(), &observations);
     process.unknowns = best.unknowns;
@@ -256,7 +161,7 @@ fn unfitted(quantities: &Quantities, covariates: &[String], estimates: &[BatchEs
         .collect();
     gaps.sort_by(f64::total_cmp);
     let step_s = gaps.get(gaps.len() / 2).copied().ok_or(Error::NoTime)?;
-    let mut process = Process {
+    Ok(Process {
         quantities: names.clone(),
         units: quantities.units.clone(),
         scales,
@@ -270,14 +175,27 @@ fn unfitted(quantities: &Quantities, covariates: &[String], estimates: &[BatchEs
         batches,
         period: [estimates[0].at, estimates[batches - 1].at],
         coverage: Some(Coverage::of(covariates.len(), estimates)),
-    };
-    process.usual_errors = usual_errors(&process, estimates).as_slice().to_vec();
-    Ok(process)
+        modes: None,
+    })
 }
 
-/// Mean covariance of the errors of the batches that inform all quantities; of the variances alone if there is no such batch.
+/// The modes of some estimates as coordinates; `None` if a mode is informed by too few batches.
+fn modes(process: &Process, effects: &DMatrix<f64>, estimates: &[BatchEstimate]) -> Option<Modes> {
+    let scale = |mode: usize| {
+        let own =
+            |e: &BatchEstimate| e.frequencies.as_ref().and_then(|f| Some((f.ln_ratio[mode]?, f.variance[mode].sqrt())));
+        let (known, errors): (Vec<f64>, Vec<f64>) = estimates.iter().filter_map(own).unzip();
+        (known.len() >= FEWEST_BATCHES).then(|| Scale::of(&known, stats::mean(&errors)))
+    };
+    let scales = (0..effects.nrows()).map(scale).collect::<Option<Vec<_>>>()?;
+    let standardised = |mode: usize, k: usize| effects[(mode, k)] * process.scales[k].unit / scales[mode].unit;
+    let effects = DMatrix::from_fn(effects.nrows(), effects.ncols(), standardised).as_slice().to_vec();
+    Some(Modes { scales, effects })
+}
+
+/// Mean covariance of the errors of the batches that inform all coordinates; of the variances alone if there is no such batch.
 fn usual_errors(process: &Process, estimates: &[BatchEstimate]) -> DMatrix<f64> {
-    let d = process.quantities.len();
+    let d = process.sizes().quantities;
     let all = observations(process, estimates);
     let complete: Vec<&Observation> = all.iter().filter(|o| o.informed.len() == d).collect();
     if !complete.is_empty() {
@@ -293,48 +211,4 @@ fn usual_errors(process: &Process, estimates: &[BatchEstimate]) -> DMatrix<f64> 
         stats::mean(&all.iter().filter_map(of_batch).collect::<Vec<_>>())
     };
     DMatrix::from_fn(d, d, |i, j| if i == j { variance(i) } else { 0.0 })
-}
-
-fn candidate(target: Target<'_>) -> Result<Candidate, String> {
-    let Target { sizes, observations, .. } = target;
-    let solver: LBFGS<_, Vec<f64>, Vec<f64>, f64> = LBFGS::new(MoreThuenteLineSearch::new(), REMEMBERED);
-    let solver = solver.with_tolerance_cost(LEAST_GAIN).map_err(|e| e.to_string())?;
-    let executor =
-        Executor::new(target, solver).configure(|state| state.param(start(sizes, observations)).max_iters(ITERATIONS));
-    let result = executor.run().map_err(|e| e.to_string())?;
-    let unknowns = result.state().get_best_param().cloned().ok_or("the search has no result")?;
-    let singular = || "the density cannot be computed at the best fit".to_owned();
-    let (density, _) = log_posterior(&unknowns, sizes, observations).ok_or_else(singular)?;
-    let eigen = SymmetricEigen::new(information(&unknowns, sizes, observations).ok_or_else(singular)?);
-    let values = eigen.eigenvalues.map(|value| value.max(LEAST_INFORMATION));
-    let mut factor = eigen.eigenvectors;
-    for (mut column, value) in factor.column_iter_mut().zip(values.iter()) {
-        column /= value.sqrt();
-    }
-    let log_det: f64 = values.iter().map(|value| value.ln()).sum();
-    let log_evidence = density + 0.5 * (unknowns.len() as f64 * std::f64::consts::TAU.ln() - log_det);
-    Ok(Candidate { factors: sizes.factors, unknowns, factor, log_evidence })
-}
-
-/// Start of the search: factors along the principal directions of the estimates, the rest at the means of the priors.
-fn start(sizes: Sizes, observations: &[Observation]) -> Vec<f64> {
-    let d = sizes.quantities;
-    let mut unknowns: Vec<f64> = super::likelihood::priors(sizes).iter().map(|[mean, _]| *mean).collect();
-    let mut moments = DMatrix::zeros(d, d);
-    let complete: Vec<&Observation> = observations.iter().filter(|o| o.informed.len() == d).collect();
-    for o in &complete {
-        moments.ger(1.0 / complete.len() as f64, &o.mean, &o.mean, 1.0);
-    }
-    let eigen = SymmetricEigen::new(moments);
-    let mut order: Vec<usize> = (0..d).collect();
-    order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-    for (j, direction) in order.iter().take(sizes.factors).enumerate() {
-        for k in 0..d {
-            unknowns[sizes.first_loading() + j * d + k] =
-                eigen.eigenvectors[(k, *direction)] * eigen.eigenvalues[*direction].max(0.01).sqrt();
-        }
-        // Factors with the same persistence could be rotated into one another.
-        unknowns[sizes.first_logit() + j] = 2.5 - j as f64;
-    }
-    unknowns
 }

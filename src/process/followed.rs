@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::change::{of_several, Score};
-use super::filter::Innovation;
+use super::filter::{Filter, Innovation};
 use crate::quantity::Timestamp;
 
 /// Weight of a batch as a multiple of that of the next one, in the test whether a change has gone: five batches count.
@@ -61,21 +61,21 @@ impl Followed {
         onset: Timestamp,
         onset_interval: [Timestamp; 2],
         innovations: &[Innovation],
-        contributions: &DMatrix<f64>,
+        filter: &Filter,
     ) -> Self {
-        let (d, n) = contributions.shape();
+        let d = filter.effects().ncols();
         let recent = (DVector::zeros(d), DMatrix::zeros(d, d));
-        let mut followed = Self { onset, onset_interval, score: Score::new(n, d), recent };
+        let mut followed = Self { onset, onset_interval, score: Score::new(filter), recent };
         for innovation in innovations {
-            followed.add(innovation, contributions);
+            followed.add(innovation, filter);
         }
         followed
     }
 
     /// Adds the next innovation.
-    pub(super) fn add(&mut self, innovation: &Innovation, contributions: &DMatrix<f64>) {
+    pub(super) fn add(&mut self, innovation: &Innovation, filter: &Filter) {
         let (score, information) = (self.score.score.clone(), self.score.information.clone());
-        self.score.add(innovation, contributions);
+        self.score.add(innovation, filter);
         self.recent.0 = MEMORY * &self.recent.0 + &self.score.score - score;
         self.recent.1 = MEMORY * &self.recent.1 + &self.score.information - information;
     }

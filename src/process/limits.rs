@@ -48,7 +48,9 @@ pub struct Steady {
     numbers: Numbers,
     contributions: DMatrix<f64>,
     gain: DMatrix<f64>,
-    /// Gᵀ S⁻¹ for each age, `[WINDOW]` of `[d, d]`.
+    /// E, `[d, quantities]`.
+    effects: DMatrix<f64>,
+    /// Gᵀ S⁻¹ for each age, `[WINDOW]` of `[quantities, d]`.
     weights: Vec<DMatrix<f64>>,
     /// I for each of [`AGES`].
     information: Vec<DMatrix<f64>>,
@@ -70,7 +72,7 @@ struct Operation<'a> {
 impl Steady {
     /// The steady filter of a process; `None` if its covariances are not positive definite.
     pub fn new(process: &Process) -> Option<Self> {
-        let d = process.sizes().quantities;
+        let (d, quantities) = (process.sizes().quantities, process.quantities.len());
         let numbers = process.in_operation();
         let filter = Filter::exact(numbers.clone());
         // On average, the square of a factor is 1.
@@ -81,6 +83,7 @@ impl Steady {
         let observation = Observation {
             steps: 1.0,
             informed: (0..d).collect(),
+            quantities: (0..quantities).collect(),
             mean: DVector::zeros(d),
             covariance: errors,
             covariates: DVector::zeros(process.sizes().covariates),
@@ -90,11 +93,12 @@ impl Steady {
             known = filter.step(&known, &observation)?.0;
         }
         let innovation = filter.step(&known, &observation)?.1;
-        let contributions = filter.contributions().clone();
-        let mut taken = DMatrix::zeros(numbers.variance.len(), d);
-        let (mut weights, mut information, mut sum) = (Vec::new(), Vec::new(), DMatrix::zeros(d, d));
+        let (contributions, effects) = (filter.contributions().clone(), process.effects());
+        let mut taken = DMatrix::zeros(numbers.variance.len(), quantities);
+        let (mut weights, mut information) = (Vec::new(), Vec::new());
+        let mut sum = DMatrix::zeros(quantities, quantities);
         for age in 1..=WINDOW {
-            let signature = DMatrix::identity(d, d) - &contributions * &taken;
+            let signature = &effects - &contributions * &taken;
             let weighted = signature.transpose() * &innovation.precision;
             sum += &weighted * &signature;
             taken += &innovation.gain * &signature;
@@ -106,7 +110,7 @@ impl Steady {
                 information.push(sum.clone());
             }
         }
-        Some(Self { numbers, contributions, gain: innovation.gain, weights, information })
+        Some(Self { numbers, contributions, gain: innovation.gain, effects, weights, information })
     }
 
     /// The standard error of a loss of each quantity that has lasted for each of [`AGES`], standardised, `[ages][d]`.
@@ -143,7 +147,7 @@ impl<'a> Operation<'a> {
         let noise = DVector::from_fn(self.errors.nrows(), |_, _| normal());
         let mut batch = &self.truth.mean + &self.contributions * &self.state + &self.errors * noise;
         if let Some(loss) = loss {
-            batch += loss;
+            batch += &self.steady.effects * loss;
         }
         let steady = self.steady;
         self.filtered.component_mul_assign(&steady.numbers.persistence);

@@ -11,12 +11,14 @@
 //!  u_k,t = ρ_k^Δ u_k,t−1 + w_t,        stationary with variance s_k²
 //! ```
 //!
-//! x: parameters, `[d]`, standardised by the mean and scatter of the reference; c: measured covariates, `[m]`; h: common factors
+//! x: coordinates, `[d]`, which are the parameters or, where the misfits of the modes help to predict them, the logarithms of all
+//! frequencies; standardised by the mean and scatter of the reference; c: measured covariates, `[m]`; h: common factors
 //! without a measured cause, `[q]`; u: what each parameter does by itself; x̂_t and V_t: estimate of a batch and its covariance;
 //! κ: factor of the stated noise; Δ: time since the batch before, in steps of the reference.
 //!
 //! - [`estimate`]: the estimate of a batch; [`model`]: the process; [`filter`]: its Kalman filter; `smoother` and `likelihood`: its
 //!   likelihood with derivatives; [`fit`]: the most probable process and the number of its factors;
+//! - `search`: the search for it; `choice`: whether the coordinates are the parameters or the frequencies;
 //! - [`coverage`]: the conditions that the reference has seen, beyond which the predictions are wider;
 //! - [`change`]: lasting changes that the process does not explain, their onset and size; [`followed`]: a change as long as it lasts;
 //! - [`limits`]: what healthy operation reaches; [`detectable`]: the smallest losses that the charts find;
@@ -28,6 +30,7 @@
 //! detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21, 108–112, for the changes.
 
 pub mod change;
+mod choice;
 pub mod coverage;
 pub mod detectable;
 pub mod estimate;
@@ -38,6 +41,7 @@ mod likelihood;
 pub mod limits;
 pub mod model;
 pub mod reference;
+mod search;
 mod smoother;
 #[cfg(test)]
 mod tests;

@@ -13,10 +13,10 @@ const LEAST_LEVEL_VARIANCE: f64 = 1e-6;
 /// Time after which the level is forgotten, in lengths of the reference.
 const LEVEL_LASTS: f64 = 10.0;
 
-/// Numbers d of quantities, m of covariates and q of common factors.
+/// Numbers d of coordinates, m of covariates and q of common factors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Sizes {
-    /// Quantities, d.
+    /// Coordinates, d: the quantities, or the frequencies of the modes.
     pub quantities: usize,
     /// Covariates, m.
     pub covariates: usize,
@@ -118,12 +118,44 @@ pub struct Process {
     /// The conditions that they have seen; `None` in references of earlier versions of the program.
     #[serde(default)]
     pub coverage: Option<Coverage>,
+    /// The modes, if their frequencies are the coordinates x of the process; `None` if the quantities are.
+    #[serde(default)]
+    pub modes: Option<Modes>,
+}
+
+/// Modes whose frequencies are the coordinates of a process.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Modes {
+    /// Origins and units of their ln ratios, `[modes]`.
+    pub scales: Vec<Scale>,
+    /// E: effect of each quantity on each mode, both standardised, `[modes, quantities]`, by columns.
+    pub effects: Vec<f64>,
 }
 
 impl Process {
     /// Its sizes.
     pub fn sizes(&self) -> Sizes {
-        Sizes { quantities: self.quantities.len(), covariates: self.covariates.len(), factors: self.factors }
+        let coordinates = self.modes.as_ref().map_or(self.quantities.len(), |modes| modes.scales.len());
+        Sizes { quantities: coordinates, covariates: self.covariates.len(), factors: self.factors }
+    }
+
+    /// E: effect of each quantity on each coordinate, standardised, `[coordinates, quantities]`.
+    pub fn effects(&self) -> DMatrix<f64> {
+        let d = self.quantities.len();
+        self.modes.as_ref().map_or_else(
+            || DMatrix::identity(d, d),
+            |modes| DMatrix::from_column_slice(modes.scales.len(), d, &modes.effects),
+        )
+    }
+
+    /// The quantities behind some coordinates by least squares, both standardised.
+    pub(super) fn quantities_behind(&self, coordinates: &DVector<f64>) -> DVector<f64> {
+        if self.modes.is_none() {
+            return coordinates.clone();
+        }
+        let effects = self.effects();
+        let normal = effects.tr_mul(&effects).cholesky();
+        normal.map_or_else(|| DVector::zeros(effects.ncols()), |normal| normal.solve(&effects.tr_mul(coordinates)))
     }
 
     /// Its most probable numbers.
@@ -188,6 +220,9 @@ impl Process {
             let seconds = (estimate.at.micros() - before.micros()) as f64 / 1e6;
             (seconds / self.step_s).max(0.0)
         });
-        estimate.standardised(&self.scales, &self.covariate_scales, steps)
+        match &self.modes {
+            Some(modes) => estimate.standardised_frequencies(&modes.scales, &self.covariate_scales, steps),
+            None => estimate.standardised(&self.scales, &self.covariate_scales, steps),
+        }
     }
 }

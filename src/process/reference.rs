@@ -287,7 +287,7 @@ impl<'a> Chain<'a> {
         }
         let newest = self.innovations.last()?;
         if let Some(followed) = &mut self.memory.followed {
-            followed.add(newest, self.filter.contributions());
+            followed.add(newest, self.filter);
         }
         if self.has_gone() {
             // What the states took of the change for weather is given back.
@@ -297,7 +297,7 @@ impl<'a> Chain<'a> {
             self.memory.begin = Some(estimate.at);
             self.forget();
         }
-        let mut found = evidence(&self.innovations, self.filter.contributions(), &self.signs);
+        let mut found = evidence(&self.innovations, self.filter, &self.signs);
         let in_window = found.clone();
         if let Some((alone, joint)) = self.memory.followed.as_ref().map(|followed| followed.score.evidence(&self.signs))
         {
@@ -344,7 +344,7 @@ impl<'a> Chain<'a> {
         let ages = AGES.into_iter().filter(|age| *age <= self.innovations.len());
         let mut found = Evidence::NONE;
         for age in ages {
-            let since = score(&self.innovations[self.innovations.len() - age..], self.filter.contributions());
+            let since = score(&self.innovations[self.innovations.len() - age..], self.filter);
             found.take(age, followed.opposite(&since, &self.signs));
         }
         found.fast > limits.fast || found.slow > limits.slow
@@ -364,7 +364,7 @@ impl<'a> Chain<'a> {
             return;
         }
         let only = self.reference.process.quantities.iter().position(|name| name == series);
-        let found = change(&self.innovations, self.filter.contributions(), &self.signs, only);
+        let found = change(&self.innovations, self.filter, &self.signs, only);
         // A change that began before the window looks as if it had begun with its first batch.
         let is_older = self.memory.followed.as_ref().is_some_and(|followed| followed.onset < self.times[0][1]);
         if is_older && found.as_ref().is_some_and(|found| found.onset_interval[0] == 0) {
@@ -374,7 +374,7 @@ impl<'a> Chain<'a> {
             let [first, last] = found.onset_interval;
             let interval = [self.times[first][0], self.times[last][1]];
             let since = &self.innovations[found.onset..];
-            Followed::since(self.times[found.onset][1], interval, since, self.filter.contributions())
+            Followed::since(self.times[found.onset][1], interval, since, self.filter)
         });
     }
 
@@ -388,11 +388,11 @@ impl<'a> Chain<'a> {
     fn change(&self, series: &str, fast: bool) -> Option<LastingChange> {
         let process = &self.reference.process;
         let only = process.quantities.iter().position(|name| name == series);
-        let in_window = change(&self.innovations, self.filter.contributions(), &self.signs, only)?;
+        let in_window = change(&self.innovations, self.filter, &self.signs, only)?;
         // A change that began before the window is known by its score alone.
         let followed = self.memory.followed.as_ref().filter(|followed| followed.onset < self.times[0][1]);
         let predicted = followed.map_or_else(
-            || score(&self.innovations[in_window.onset..], self.filter.contributions()).predicted,
+            || score(&self.innovations[in_window.onset..], self.filter).predicted,
             |followed| followed.score.predicted.clone(),
         );
         let losses = followed.map_or(in_window.losses, |followed| followed.losses(&self.signs, only));
@@ -405,6 +405,8 @@ impl<'a> Chain<'a> {
             followed.map_or([self.times[ends[0]][0], self.times[ends[1]][1]], |followed| followed.onset_interval);
         let newest = self.innovations.last()?;
         let numbers = self.filter.numbers();
+        let usual = process.quantities_behind(&numbers.mean);
+        let explained = process.quantities_behind(&(&newest.predicted - &numbers.mean - taken));
         let quantity = |(k, loss): (usize, &Option<(f64, f64)>)| {
             let (mean, std) = (*loss)?;
             let (scale, sign) = (process.scales[k], self.signs[k]);
@@ -414,8 +416,8 @@ impl<'a> Chain<'a> {
                 unit: process.units[k].clone(),
                 change: sign * scale.unit * mean,
                 interval: [ends[0].min(ends[1]), ends[0].max(ends[1])],
-                reference_mean: scale.origin + scale.unit * numbers.mean[k],
-                explained: scale.unit * (newest.predicted[k] - numbers.mean[k] - taken[k]),
+                reference_mean: scale.origin + scale.unit * usual[k],
+                explained: scale.unit * explained[k],
             })
         };
         Some(LastingChange {

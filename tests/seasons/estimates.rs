@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use modalwatch::process::estimate::BatchEstimate;
+use modalwatch::process::estimate::{BatchEstimate, MeanFrequencies};
 use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
@@ -54,7 +54,7 @@ pub fn rows(csv: &str, modes: usize) -> Vec<Row> {
 /// not informed.
 pub fn estimate(simulator: &Simulator, rows: &[Row], at: Timestamp) -> BatchEstimate {
     let (d, modes) = (simulator.space().len(), simulator.modes());
-    let mut theta: Vec<f64> = simulator.space().iter().map(|p| f64::midpoint(p.lower, p.upper)).collect();
+    let mut theta = middle(simulator);
     let means: Vec<(f64, f64)> = (0..modes)
         .map(|mode| {
             let own: Vec<f64> = rows.iter().filter_map(|row| row.frequencies_hz[mode]).map(f64::ln).collect();
@@ -87,5 +87,46 @@ pub fn estimate(simulator: &Simulator, rows: &[Row], at: Timestamp) -> BatchEsti
         mean: (0..d).map(|k| informed(k).then_some(theta[k])).collect(),
         covariance: covariance.transpose().as_slice().to_vec(),
         covariates: Vec::new(),
+        frequencies: Some(frequencies(simulator, &means)),
     }
+}
+
+/// The middle of the priors.
+fn middle(simulator: &Simulator) -> Vec<f64> {
+    simulator.space().iter().map(|p| f64::midpoint(p.lower, p.upper)).collect()
+}
+
+/// ln of mean measured over simulated frequency of each mode, from mean and number of the logarithms.
+fn frequencies(simulator: &Simulator, means: &[(f64, f64)]) -> MeanFrequencies {
+    let usual = simulator.frequencies_hz(&middle(simulator)).unwrap();
+    let noise = |f: f64| simulator.std_hz(0, f) / f;
+    let of = |((mean, count), usual): (&(f64, f64), &f64)| (*count > 0.0).then(|| mean - usual.ln());
+    let variance = |((_, count), usual): (&(f64, f64), &f64)| noise(*usual).powi(2) / count.max(1.0);
+    MeanFrequencies {
+        ln_ratio: means.iter().zip(&usual).map(of).collect(),
+        variance: means.iter().zip(&usual).map(variance).collect(),
+    }
+}
+
+/// ∂ ln f/∂parameter at the middle of the priors, `[modes, d]`.
+pub fn effects(simulator: &Simulator) -> DMatrix<f64> {
+    let response = simulator.respond(&middle(simulator), simulator.modes(), &[], &[]).unwrap();
+    DMatrix::from_fn(simulator.modes(), simulator.space().len(), |mode, k| {
+        response.by_parameter[(mode, k)] / response.frequencies_hz[mode]
+    })
+}
+
+/// The estimate after the parameters have changed by `change`: parameters and, to first order, frequencies.
+pub fn changed(simulator: &Simulator, estimate: &BatchEstimate, change: &[f64]) -> BatchEstimate {
+    let mut changed = estimate.clone();
+    for (mean, change) in changed.mean.iter_mut().zip(change) {
+        *mean = mean.map(|mean| mean + change);
+    }
+    let shift = effects(simulator) * DVector::from_column_slice(change);
+    if let Some(frequencies) = &mut changed.frequencies {
+        for (ratio, shift) in frequencies.ln_ratio.iter_mut().zip(shift.iter()) {
+            *ratio = ratio.map(|ratio| ratio + shift);
+        }
+    }
+    changed
 }

@@ -44,6 +44,7 @@ fn world(seed: u64, lost: usize, factor: impl Fn(usize) -> f64) -> Vec<BatchEsti
             mean,
             covariance: (0..16).map(variance).collect(),
             covariates: Vec::new(),
+            frequencies: None,
         }
     };
     (0..DAYS).map(one).collect()
@@ -52,7 +53,7 @@ fn world(seed: u64, lost: usize, factor: impl Fn(usize) -> f64) -> Vec<BatchEsti
 #[test]
 #[ignore = "a study of half a minute"]
 fn simulated_years_alarm_as_rarely_as_wanted_and_losses_are_found() {
-    let quantities = quantities(&NAMES, "N/m");
+    let quantities = quantities(&NAMES, "N/m", None);
     let (mut alarms, mut batches, mut found, mut delays, mut slow) = (0_u32, 0, 0, Vec::new(), Vec::new());
     let (mut named, mut short_alarms) = (0, 0_u32);
     for seed in 0..WORLDS {

@@ -37,6 +37,7 @@ fn estimates(count: usize, onset: usize) -> Vec<BatchEstimate> {
             mean: mean.map(Some).to_vec(),
             covariance: vec![1e-5, 0.0, 0.0, 4e-5],
             covariates: Vec::new(),
+            frequencies: None,
         }
     };
     (0..count).map(one).collect()
@@ -47,6 +48,7 @@ fn reference(estimates: &[BatchEstimate]) -> UndamagedReference {
         names: ["k1", "k2"].map(str::to_owned).to_vec(),
         units: vec!["N/m".to_owned(); 2],
         directions: vec![DamageDirection::Decrease; 2],
+        effects: None,
     };
     let process = ReferenceProcess::new(&quantities, &[], estimates.to_vec(), 200.0, [1.0; 2]).unwrap();
     UndamagedReference { process: Some(Arc::new(process)), ..undamaged() }
