@@ -138,7 +138,7 @@ impl References {
             Ok(declared) => declared,
             Err(DeclareError::Monitor(Error::Store(error))) => return Err(error.into()),
             Err(error) => {
-                warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained baseline: {error}");
+                warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained model: {error}");
                 return Ok(None);
             }
         };
