@@ -226,8 +226,8 @@ impl Assessments<'_> {
 
 /// What must be known of a batch to store its assessment.
 struct Slot {
-    /// The time to store, µs: after the times of all other assessments of the batch, even if the clock was set back, because
-    /// the newest assessment is the current one. An assessment that is stored again keeps its time.
+    /// The time to store, µs: after the times of all other assessments of the batch, even if the clock stands still or was set back,
+    /// because the newest assessment is the current one.
     assessed_at_us: i64,
     /// Whether an assessment for the same trained baseline and undamaged reference is stored.
     taken: bool,
@@ -280,8 +280,7 @@ async fn slot_of(
     let Some(SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged }) = found else {
         return Ok(None);
     };
-    let after = others_us.map_or(given, |latest| given.max(latest + 1));
-    let assessed_at_us = if own_us == Some(given) { given } else { after };
+    let assessed_at_us = others_us.map_or(given, |latest| given.max(latest + 1));
     Ok(Some(Slot { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
 }
 
