@@ -12,7 +12,7 @@ use crate::baseline::library::Library;
 use crate::config::Config;
 use crate::private;
 use crate::quantity::Timestamp;
-use crate::store::backup::{self, BackupModel, Manifest, Restored};
+use crate::store::backup::{self, BackupModel, Content, DraftFolder, Manifest, Restored};
 use crate::store::Error;
 
 /// Copy the database to a folder.
@@ -23,6 +23,9 @@ pub struct BackupArgs {
     out: Option<PathBuf>,
     #[command(flatten)]
     location: LocationArgs,
+    /// Keep the secrets of webhooks in the copy; without them its webhooks are disabled
+    #[arg(long)]
+    with_secrets: bool,
     /// Print the manifest of the backup as JSON
     #[arg(long)]
     json: bool,
@@ -60,8 +63,8 @@ pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
     let manifest = if args.location.url.is_some() {
         by_service(args, &config, &out).await?
     } else {
-        let models = models_in_use(&config)?;
-        match backup::of_folder(&config.data_dir, &out, models, now).await {
+        let content = Content { models: models_in_use(&config)?, with_secrets: args.with_secrets };
+        match backup::of_folder(&config.data_dir, &out, content, now).await {
             Err(backup::Error::Store(Error::Locked(_))) => by_service(args, &config, &out).await?,
             made => made?,
         }
@@ -77,7 +80,7 @@ pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
 /// Lets the service make a backup in its data folder, and moves it to `--out` if that is given.
 async fn by_service(args: &BackupArgs, config: &Config, out: &Path) -> anyhow::Result<Manifest> {
     let service = args.location.service(config)?;
-    let request = service.request(Method::POST, "/v1/backups").json(&json!({}));
+    let request = service.request(Method::POST, "/v1/backups").json(&json!({ "with_secrets": args.with_secrets }));
     let manifest: Manifest = service.send(request).await?.json().await?;
     let made = config.data_dir.join(backup::FOLDER).join(&manifest.name);
     let elsewhere = || {
@@ -103,7 +106,7 @@ async fn by_service(args: &BackupArgs, config: &Config, out: &Path) -> anyhow::R
 fn copy_folder(from: &Path, to: &Path) -> anyhow::Result<()> {
     let parent = to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     private::create_folder(parent)?;
-    let draft = private::temporary_folder(".draft-", parent)?;
+    let draft = DraftFolder::create(parent)?;
     for entry in std::fs::read_dir(from)? {
         let entry = entry?;
         let copy = draft.path().join(entry.file_name());
@@ -112,7 +115,7 @@ fn copy_folder(from: &Path, to: &Path) -> anyhow::Result<()> {
     }
     private::narrow(draft.path())?;
     std::fs::File::open(draft.path())?.sync_all()?;
-    std::fs::rename(draft.keep(), to)?;
+    std::fs::rename(draft.keep()?, to)?;
     std::fs::File::open(parent)?.sync_all()?;
     Ok(())
 }
@@ -164,12 +167,18 @@ pub async fn restore(args: &RestoreArgs) -> anyhow::Result<()> {
     }
     let flags = crate::config::Flags { data_dir: args.data_dir.clone(), ..crate::config::Flags::default() };
     let config = Config::read_for_existing(args.config.as_deref(), &flags)?;
-    let Restored { manifest, kept_aside } =
+    let Restored { manifest, kept_aside, webhooks_without_secret } =
         backup::restore(&args.from, &config.data_dir, args.replace, Timestamp::now()).await?;
     print_manifest(&args.from, &manifest);
     if let Some(aside) = kept_aside {
         println!("The previous database is kept as {}.", aside.display());
     }
     println!("Restored to {}.", config.data_dir.display());
+    if webhooks_without_secret > 0 {
+        println!(
+            "The backup has no secrets: {webhooks_without_secret} webhooks are disabled. Give each a new secret by POST \
+             /v1/webhooks/{{id}}/secret, tell it to its receiver, and enable the webhook by PUT."
+        );
+    }
     Ok(())
 }

@@ -20,7 +20,7 @@ use crate::config::Config;
 use crate::http::access::AccessControl;
 use crate::http::server::Routes;
 use crate::http::{router, server, HttpSettings, Service};
-use crate::monitor::{declare_metrics, Monitor, Reason};
+use crate::monitor::{declare_metrics, Error as MonitorError, Monitor, Reason};
 use crate::mqtt::{self, MqttStatus};
 use crate::notify::{Mailer, Notifier};
 use crate::store::Store;
@@ -30,6 +30,21 @@ const BUCKETS_SECONDS: [f64; 12] = [0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1
 
 /// Time that the parts behind the requests have for their end even if the requests have used up the whole drain time.
 const SHORTEST_END: Duration = Duration::from_secs(1);
+
+/// The result of a step of the start that writes. On a full disk the service starts without it, for reading, and says so.
+fn or_later<E: std::fmt::Display + Into<anyhow::Error>>(
+    what: &str,
+    done: Result<(), E>,
+    is_of_the_disk: impl FnOnce(&E) -> bool,
+) -> anyhow::Result<()> {
+    match done {
+        Err(failure) if is_of_the_disk(&failure) => {
+            error!("Could not {what}; the next start does it: {failure}");
+            Ok(())
+        }
+        done => done.map_err(Into::into),
+    }
+}
 
 /// A service that is listening.
 pub struct Running {
@@ -82,12 +97,14 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
     let wake = Arc::new(Notify::new());
     let mailer = Mailer::new(store.clone(), config.email, config.notify.clone(), limits, Arc::clone(&wake))?;
     // Before the first batch is assessed, so that its alarms are addressed.
-    mailer.prepare().await?;
+    or_later("set the recipients of e-mail", mailer.prepare().await, |error| error.disk_cause().is_some())?;
     let monitor = Monitor::open(store.clone(), library, config.monitor).await?;
     let upkeep = monitor.upkeep();
     upkeep.retention().set(config.retention);
     monitor.replay().resume_all();
-    monitor.jobs().resume().await?;
+    let on_disk = |error: &MonitorError| matches!(error, MonitorError::Store(error) if error.disk_cause().is_some());
+    or_later("resume the jobs that a stop interrupted", monitor.jobs().resume().await, on_disk)?;
+    monitor.deletions().resume().await?;
     upkeep.silence().watch();
     upkeep.retention().watch();
     upkeep.diagnoses().watch(config.diagnosis);

@@ -104,6 +104,9 @@ pub struct ReferenceOrigin {
     pub first: Option<u32>,
     /// Why it was made, in the words of the person who declared it.
     pub reason: Option<String>,
+    /// For a reference that was computed again by another trained baseline: when the first one was declared, µs since 1970.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub declared_at_us: Option<i64>,
 }
 
 /// The values of a covariate in the undamaged reference.

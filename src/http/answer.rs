@@ -77,7 +77,7 @@ fn next_step(record: &BatchRecord, missing: &Missing) -> String {
     match missing {
         Missing::OutdatedReference(_) => format!("{missing}: {route}"),
         Missing::Reference => format!("{missing}: {route} {{\"batches\": [\"{}\"]}}", record.batch_id),
-        Missing::Model(_) | Missing::PartOfReference(_) | Missing::NotYet => missing.to_string(),
+        Missing::Model(_) | Missing::PartOfReference(_) | Missing::Assessment | Missing::NotYet => missing.to_string(),
     }
 }
 

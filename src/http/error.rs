@@ -173,6 +173,16 @@ impl From<monitor::JobError> for ApiError {
     }
 }
 
+impl From<monitor::DeleteError> for ApiError {
+    fn from(error: monitor::DeleteError) -> Self {
+        let detail = error.to_string();
+        match error {
+            monitor::DeleteError::HasJobs { .. } => Self::new(StatusCode::CONFLICT, "structure_has_jobs", detail),
+            monitor::DeleteError::Monitor(error) => error.into(),
+        }
+    }
+}
+
 impl From<monitor::ReloadError> for ApiError {
     fn from(error: monitor::ReloadError) -> Self {
         let detail = error.to_string();
@@ -207,6 +217,11 @@ impl From<crate::monitor::stored::Error> for ApiError {
     /// A disk failure is not an error of the program: the client is asked to repeat the request, and the answer is not
     /// a 500.
     fn from(error: crate::monitor::stored::Error) -> Self {
+        if matches!(error, crate::monitor::stored::Error::Row { .. }) {
+            error!(cause = %error, "Answering 500: {error}");
+            let detail = format!("{error}; run `modalwatch doctor`, and restore a backup if it names this");
+            return Self::new(StatusCode::INTERNAL_SERVER_ERROR, "stored_data_unreadable", detail);
+        }
         let Some(cause) = error.disk_cause() else { return Self::internal(&error) };
         let status = match cause {
             "disk_full" => StatusCode::INSUFFICIENT_STORAGE,

@@ -43,6 +43,7 @@ mod settings;
 mod shared;
 mod slow_reader;
 mod starting;
+mod structure_deletion;
 mod structure_metrics;
 mod structures;
 mod table;
@@ -99,7 +100,7 @@ pub struct Service {
 fn api() -> OpenApiRouter<Shared> {
     OpenApiRouter::with_openapi(openapi::Base::openapi())
         .routes(routes!(structures::list))
-        .routes(routes!(structures::read, structures::put))
+        .routes(routes!(structures::read, structures::put, structure_deletion::remove))
         .routes(routes!(drawing::drawing))
         .routes(routes!(batches::create))
         .routes(routes!(tables::preview))

@@ -14,7 +14,7 @@ use crate::quantity::Timestamp;
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
 /// Every `code` of a problem with its status and meaning. The codes are part of the API and never change.
-pub const CODES: [(&str, StatusCode, &str); 79] = [
+pub const CODES: [(&str, StatusCode, &str); 82] = [
     ("malformed_json", StatusCode::BAD_REQUEST, "the body is not valid JSON"),
     ("not_utf8", StatusCode::BAD_REQUEST, "the body is not UTF-8 text"),
     ("body_unreadable", StatusCode::BAD_REQUEST, "the connection broke before the end of the body"),
@@ -66,6 +66,8 @@ pub const CODES: [(&str, StatusCode, &str); 79] = [
     ("token_not_active", StatusCode::CONFLICT, "the token was revoked or has expired"),
     ("last_admin_token", StatusCode::CONFLICT, "this is the last token that can manage the service"),
     ("too_many_webhooks", StatusCode::CONFLICT, "the maximum number of webhooks exists"),
+    ("no_webhook_secret", StatusCode::CONFLICT, "the webhook was restored without its secret and needs a new one"),
+    ("structure_has_jobs", StatusCode::CONFLICT, "jobs of the structure run or wait; cancel them before it is deleted"),
     ("alarm_closed", StatusCode::CONFLICT, "a person has closed the alarm already"),
     ("alarm_not_closed", StatusCode::CONFLICT, "no person has closed the alarm"),
     ("alarm_changed", StatusCode::CONFLICT, "the alarm was assigned, closed or reopened in the meantime"),
@@ -106,6 +108,11 @@ pub const CODES: [(&str, StatusCode, &str); 79] = [
         "too many failed authentications from one address; see Retry-After",
     ),
     ("internal", StatusCode::INTERNAL_SERVER_ERROR, "an internal error; the log has its cause under the request id"),
+    (
+        "stored_data_unreadable",
+        StatusCode::INTERNAL_SERVER_ERROR,
+        "stored data cannot be read; `modalwatch doctor` names them",
+    ),
     ("queue_full", StatusCode::SERVICE_UNAVAILABLE, "the queue of assessments is full; see Retry-After"),
     (
         "too_many_computations",

@@ -167,7 +167,8 @@ struct Declared {
     summary = "Declare the undamaged reference",
     description = "Computes a new version of the undamaged reference from the named batches, or from those measured in a period. \
                    Batches that were never compared with a reference, and all batches measured after those of the reference, are \
-                   then compared with it. Batches that cannot be used as a reference are refused with the code \
+                   then compared with it. Other batches keep the reference that they were compared with, also after an import and when \
+                   another trained model assesses all batches again. Batches that cannot be used as a reference are refused with the code \
                    `unusable_baseline`, which has kept the earlier name, and `errors` names each of them; with \
                    `leave_out_doubtful` they are left out and listed in the answer. The same code refuses measurements that are worth \
                    fewer than ten independent ones. From a period they are left out, and also \

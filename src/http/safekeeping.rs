@@ -34,6 +34,8 @@ struct BackupBody {
     /// Name of the backup's folder. Default: made from the time.
     #[schema(pattern = "^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
     name: Option<String>,
+    /// Whether the secrets of webhooks are in the copy. Default `false`: its webhooks are disabled until they get new secrets.
+    with_secrets: Option<bool>,
 }
 
 /// Body of a request for a reload; may be `{}` or absent.
@@ -112,13 +114,14 @@ impl From<Reloaded> for ReloadedBody {
 #[utoipa::path(
     post, path = "/v1/backups", tag = "operations", operation_id = "create_backup",
     summary = "Create a backup",
-    description = "Makes a backup in `backups/` of the data folder while the service runs. The answer is sent when it is verified and on disk.",
+    description = "Makes a backup in `backups/` of the data folder while the service runs. The answer is sent when it is verified and on disk. \
+                   The secrets of webhooks are left out unless `with_secrets` is `true`.",
     request_body(content = Option<BackupBody>, example = json!({"name": "before-the-update"})),
     responses((status = 201, description = "Contents of the backup", body = Manifest), BodyRefused, Conflict)
 )]
 pub async fn create_backup(State(shared): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, ApiError> {
     let body: BackupBody = optional_json(&shared, &headers, body).await?;
-    let manifest = shared.monitor.upkeep().backups().make(body.name).await?;
+    let manifest = shared.monitor.upkeep().backups().make(body.name, body.with_secrets.unwrap_or(false)).await?;
     Ok((StatusCode::CREATED, Json(manifest)).into_response())
 }
 

@@ -260,13 +260,14 @@ pub async fn read(State(shared): State<Shared>, ApiPath(id): ApiPath<String>) ->
 /// `PUT /v1/webhooks/{id}`: changes URL, filter or `enabled`. The secret and pending deliveries are kept.
 ///
 /// # Errors
-/// 404; 400, 415, 422 for the body.
+/// 404; 400, 415, 422 for the body; 409 to enable a webhook without a secret.
 #[utoipa::path(
     put, path = "/v1/webhooks/{id}", tag = "webhooks", operation_id = "put_webhook",
-    summary = "Change a webhook", description = "Changes URL, filter or `enabled`. The secret and pending deliveries are kept.",
+    summary = "Change a webhook", description = "Changes URL, filter or `enabled`. The secret and pending deliveries are kept. A webhook that \
+                   was restored without its secret cannot be enabled before it has a new one.",
     params(WebhookPath),
     request_body(content = WebhookBody, example = json!({"url": "https://example.com/alarms", "enabled": false})),
-    responses((status = 200, description = "The webhook", body = WebhookItem), Unknown, BodyRefused)
+    responses((status = 200, description = "The webhook", body = WebhookItem), Unknown, BodyRefused, Conflict)
 )]
 pub async fn put(
     State(shared): State<Shared>,
@@ -274,9 +275,16 @@ pub async fn put(
     headers: HeaderMap,
     body: Body,
 ) -> Result<Response, ApiError> {
-    webhook(&shared, &id).await?;
+    let present = webhook(&shared, &id).await?;
     let body: WebhookBody = json_body(&headers, body, shared.limits).await?;
     check(&shared, &body).await?;
+    if body.enabled && present.secret.reveal().is_empty() {
+        let detail = format!(
+            "webhook {id} has no secret, because it was restored from a backup without secrets: give it a new one by POST \
+             /v1/webhooks/{id}/secret, tell it to the receiver, and enable the webhook then"
+        );
+        return Err(ApiError::new(StatusCode::CONFLICT, "no_webhook_secret", detail));
+    }
     let filter = EventFilter { events: body.events, alarm_kinds: body.alarm_kinds, structures: body.structures };
     shared.monitor.webhooks().update_webhook(&id, &body.url, filter, body.enabled, Timestamp::now()).await?;
     read(State(shared), ApiPath(id)).await

@@ -17,7 +17,7 @@ use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Dra
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedReference;
 use crate::quantity::{shown, Hertz, StructureId, Timestamp};
-use crate::store::{BatchRecord, ReferenceRecord, Store, StoredAssessment, StoredChartPoint};
+use crate::store::{BatchRecord, ComparedWith, ReferenceRecord, Store, StoredAssessment, StoredChartPoint};
 
 /// A batch to assess, and what it is assessed with.
 pub(super) struct Task {
@@ -139,8 +139,12 @@ impl Assessor {
 
     /// Computes the assessment of a batch, as soon as a thread is free.
     pub(super) async fn compute(&self, task: Task) -> Result<Computed, Error> {
-        // If a newer reference is stored in the meantime, the batch is assessed again (`settle`).
-        let undamaged = self.store.reference().undamaged_as_read(&task.record.batch.structure).await?;
+        let (references, structure) = (self.store.reference(), &task.record.batch.structure);
+        let undamaged = match task.record.kept_reference {
+            Some(kept) => references.version(structure, kept).await?,
+            // If a newer reference is stored in the meantime, the batch is assessed again (`settle`).
+            None => references.undamaged_as_read(structure).await?,
+        };
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
         let started = Instant::now();
@@ -175,8 +179,10 @@ impl Assessor {
             Ok((assessment, points)) => {
                 metrics::histogram!("modalwatch_assessment_seconds").record(seconds);
                 log_assessment(structure, id, &assessment, seconds);
-                let charted = (points, Some(newest_undamaged));
-                let insert = self.store.assessments().insert_computed(structure, id, &assessment, charted);
+                let kept = task.record.kept_reference;
+                // A batch that keeps its reference does not wait for a newer one.
+                let compared = kept.map_or(ComparedWith::Newest(newest_undamaged), ComparedWith::Kept);
+                let insert = self.store.assessments().insert_computed(structure, id, &assessment, (points, compared));
                 Ok((Box::new(assessment), insert))
             }
             Err(reason) => {
@@ -222,6 +228,10 @@ impl Assessor {
         self.events.batch_changed(structure, id, BatchState::Assessed);
         if stored.alarms_changed {
             self.alarms.report(structure).await;
+        }
+        // What it is compared with next is stored.
+        if task.record.kept_reference.is_some() {
+            return Ok(Settled::Finished(Finished::Assessed(assessment, stored.charts)));
         }
         if let Some(newer) = self.swapped_since(&task.active, &task.baseline) {
             task.baseline = newer;

@@ -25,21 +25,22 @@ impl Backups {
         Self { store, structures, running: Arc::default() }
     }
 
-    /// Makes a backup under a name, or under one derived from the time.
+    /// Makes a backup under a name, or under one derived from the time; the secrets of webhooks are left out unless they are asked for.
     ///
     /// # Errors
     /// [`BackupError`].
-    pub async fn make(&self, name: Option<String>) -> Result<backup::Manifest, BackupError> {
+    pub async fn make(&self, name: Option<String>, with_secrets: bool) -> Result<backup::Manifest, BackupError> {
         let backups = self.clone();
-        in_own_task(async move { backups.make_here(name).await }).await
+        in_own_task(async move { backups.make_here(name, with_secrets).await }).await
     }
 
-    async fn make_here(&self, name: Option<String>) -> Result<backup::Manifest, BackupError> {
+    async fn make_here(&self, name: Option<String>, with_secrets: bool) -> Result<backup::Manifest, BackupError> {
         let _turn = self.running.try_lock().map_err(|_| BackupError::Running)?;
         let now = Timestamp::now();
         let name = name.unwrap_or_else(|| backup::name_of(now));
         let started = Instant::now();
-        let made = self.store.file().backup(&name, self.models_in_use().await, now).await;
+        let content = backup::Content { models: self.models_in_use().await, with_secrets };
+        let made = self.store.file().backup(&name, content, now).await;
         let outcome = if made.is_ok() { "done" } else { "failed" };
         metrics::counter!("modalwatch_backups_total", "outcome" => outcome).increment(1);
         match &made {

@@ -47,7 +47,7 @@ pub enum Error {
     #[error(transparent)]
     TooManyReaders(#[from] TooManyReaders),
     /// The structure has batches under another definition.
-    #[error("structure {0} has batches that were measured under another definition; use another id for the new one")]
+    #[error("structure {0} has batches that were measured under another definition, or is being deleted; use another id for the new one")]
     StructureInUse(StructureId),
     /// The version of the structure changed during the operation.
     #[error("structure {0} changed to another version in the meantime: nothing was changed")]
@@ -305,4 +305,20 @@ macro_rules! from_store {
     )+};
 }
 
-from_store!(IngestError, DeclareError, JobError, ReloadError);
+/// Why a structure was not deleted.
+#[derive(Debug, thiserror::Error)]
+pub enum DeleteError {
+    /// Jobs of it run or wait.
+    #[error("structure {structure} has jobs that run or wait: cancel them first by DELETE /v1/jobs/{{id}}: {}", .jobs.join(", "))]
+    HasJobs {
+        /// The structure.
+        structure: StructureId,
+        /// Their ids.
+        jobs: Vec<String>,
+    },
+    /// Any other reason.
+    #[error(transparent)]
+    Monitor(#[from] Error),
+}
+
+from_store!(IngestError, DeclareError, JobError, ReloadError, DeleteError);

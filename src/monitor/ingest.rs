@@ -4,12 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::sync::oneshot;
-use tracing::Instrument as _;
+use tracing::{warn, Instrument as _};
 
 use super::assessor::{Assessor, Computed, Finished, Task};
 use super::compute::{Place, QueueFull};
 use super::error::{Error, IngestError};
-use super::records::{BatchView, Records};
+use super::records::{BatchView, Missing, Records};
 use super::replay::Replay;
 use super::settings::MissingCovariate;
 use super::structures::ActiveStructure;
@@ -155,6 +155,7 @@ impl Ingest {
             received_at,
             state: BatchState::Received,
             failure: None,
+            kept_reference: None,
         };
         // The assessment is computed while the batch is written to disk. No result is stored or published before the batch itself
         // is stored.
@@ -182,13 +183,26 @@ impl Ingest {
                 Ok(Ingested { view: self.inserted(record(batch, content_digest), begun).await?, replayed: false })
             }
             InsertBatch::Replayed(id) => {
-                let record = self.assessor.stored(&structure, &id).await?;
-                if let (BatchState::Received, true, Ok(Begun::NotComputed(place))) =
-                    (record.state, active.baseline.is_ok(), begun)
-                {
+                let record = match self.assessor.stored(&structure, &id).await {
+                    // Removed by the retention in the meantime: it is stored again.
+                    Err(Error::UnknownBatch { .. }) => {
+                        let place = match begun? {
+                            Begun::NotComputed(place) => place,
+                            Begun::Computed(_) => self.assessor.compute.wait().await,
+                        };
+                        return Box::pin(self.take_here(batch, place)).await;
+                    }
+                    record => record?,
+                };
+                // One that keeps its references is compared with them in their order, by the replay.
+                let waits = record.state == BatchState::Received && record.kept_reference.is_none();
+                if let (true, true, Ok(Begun::NotComputed(place))) = (waits, active.baseline.is_ok(), begun) {
+                    let waiting = record.clone();
                     let finished =
                         async { self.assessor.finish(self.assessor.task(active, record, place).await?).await }.await;
-                    self.or_resumed(&structure, finished)?;
+                    if let Err(failure) = self.or_resumed(&structure, finished) {
+                        return Ok(Ingested { view: self.waiting(waiting, &failure), replayed: true });
+                    }
                     return Ok(Ingested { view: self.records.batch(&structure, &id).await?, replayed: true });
                 }
                 Ok(Ingested { view: self.records.view(record).await?, replayed: true })
@@ -200,7 +214,8 @@ impl Ingest {
         }
     }
 
-    /// Stores the assessment of a batch that was just stored.
+    /// Stores the assessment of a batch that was just stored. If that fails, for example on a full disk, the batch is answered as it is:
+    /// stored, and waiting for its assessment, which is attempted again.
     async fn inserted(&self, record: BatchRecord, begun: Result<Begun, Error>) -> Result<BatchView, Error> {
         let structure = record.batch.structure.clone();
         let finished = match begun {
@@ -215,13 +230,22 @@ impl Ingest {
             }
             Err(failure) => Err(failure),
         };
-        match self.or_resumed(&structure, finished)? {
-            Finished::Assessed(assessment, charts) => {
+        match self.or_resumed(&structure, finished) {
+            Err(failure) => Ok(self.waiting(record, &failure)),
+            Ok(Finished::Assessed(assessment, charts)) => {
                 let record = BatchRecord { state: BatchState::Assessed, ..record };
                 self.records.view_of(record, Some(*assessment), charts).await
             }
-            Finished::Failed | Finished::OfAnotherVersion => self.records.batch(&structure, &record.batch_id).await,
+            Ok(Finished::Failed | Finished::OfAnotherVersion) => self.records.batch(&structure, &record.batch_id).await,
         }
+    }
+
+    /// A stored batch whose assessment could not be computed or stored.
+    fn waiting(&self, record: BatchRecord, failure: &Error) -> BatchView {
+        let (structure, id) = (&record.batch.structure, &record.batch_id);
+        warn!(structure.id = %structure, batch.id = %id, error = %failure, "Stored batch {id} of {structure}, which waits for its assessment: {failure}");
+        self.assessor.events.batch_changed(structure, id, record.state);
+        BatchView { record, assessment: None, charts: Vec::new(), missing: Some(Missing::Assessment) }
     }
 
     /// Returns the given result of a stored batch. If the batch has no result, its assessment is attempted again later, because the

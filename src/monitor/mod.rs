@@ -20,6 +20,7 @@ mod assessor;
 pub mod automatic_diagnoses;
 mod backups;
 pub mod compute;
+mod deletion;
 mod details;
 mod error;
 pub mod events;
@@ -57,7 +58,10 @@ use self::assessor::Assessor;
 use self::automatic_diagnoses::AutomaticDiagnoses;
 pub use self::backups::Backups;
 use self::compute::Compute;
-pub use self::error::{BackupError, DeclareError, Error, IngestError, JobError, LeftOutBatch, ReloadError};
+pub use self::deletion::{DeletedStructure, Deletions};
+pub use self::error::{
+    BackupError, DeclareError, DeleteError, Error, IngestError, JobError, LeftOutBatch, ReloadError,
+};
 use self::events::Events;
 pub use self::ingest::{Ingest, Ingested, DEFAULT_SOURCE};
 pub use self::jobs::{
@@ -99,6 +103,7 @@ pub struct Monitor {
     models: Models,
     upkeep: Upkeep,
     archive: Archive,
+    deletions: Deletions,
 }
 
 impl Monitor {
@@ -133,6 +138,7 @@ impl Monitor {
         let records = Records::new(Arc::clone(&assessor), readers.clone());
         let versions = Versions::new(store.clone(), Arc::clone(&structures), Arc::clone(&references), replay.clone());
         let jobs = Jobs::new(store.clone(), Arc::clone(&structures), versions.clone(), events.clone());
+        let deletions = Deletions::new(store.clone(), Arc::clone(&structures), jobs.clone(), events.clone());
         let models = Models::new(store.clone(), Arc::clone(&structures), references, replay.clone());
         let upkeep = Upkeep {
             store: store.clone(),
@@ -145,6 +151,7 @@ impl Monitor {
             diagnoses: AutomaticDiagnoses::new(store.clone(), Arc::clone(&structures), jobs.clone()),
             silence: Silence::new(store.clone(), Arc::clone(&structures), Arc::clone(&alarms), silence_after_s),
             sources: Arc::default(),
+            unreadable: Arc::default(),
             started: Instant::now(),
         };
         let ingest = Ingest::new(Arc::clone(&assessor), replay.clone(), records.clone());
@@ -165,6 +172,7 @@ impl Monitor {
             models,
             upkeep,
             archive,
+            deletions,
         })
     }
 
@@ -229,6 +237,11 @@ impl Monitor {
     /// The health of the service, its gauges, backups, retention, alarms of silence, and diagnoses that nobody requested.
     pub fn upkeep(&self) -> &Upkeep {
         &self.upkeep
+    }
+
+    /// Deletes structures.
+    pub fn deletions(&self) -> &Deletions {
+        &self.deletions
     }
 
     /// Exports a structure as an archive, and imports archives.

@@ -37,6 +37,8 @@ pub enum Missing {
     PartOfReference(u32),
     /// The reference of this version was made with another trained baseline: it has to be declared again.
     OutdatedReference(u32),
+    /// The assessment could not be computed or stored, and is attempted again.
+    Assessment,
     /// The comparison has not been computed yet.
     NotYet,
     /// The structure has no reference: it has to be declared.
@@ -54,6 +56,9 @@ impl fmt::Display for Missing {
                 f,
                 "the undamaged reference, version {version}, was made with another trained model: declare undamaged batches again"
             ),
+            Self::Assessment => {
+                f.write_str("the batch is stored; it could not be assessed now, which is attempted again until it succeeds")
+            }
             Self::NotYet => f.write_str("the batch has not been compared with the undamaged reference yet"),
             Self::Reference => f.write_str("there is no undamaged reference: declare undamaged batches"),
         }

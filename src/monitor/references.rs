@@ -10,8 +10,8 @@ use super::compute::Place;
 use super::error::{DeclareError, Error, LeftOutBatch};
 use crate::assessment::{BatchState, DoubtfulBatch, Draws, ReferenceBatches, ReferenceError};
 use crate::damage::{ReferenceOrigin, UndamagedReference};
-use crate::quantity::{StructureId, Timestamp};
-use crate::store::{MeasuredBatch, ReferenceRecord};
+use crate::quantity::{Digest, StructureId, Timestamp};
+use crate::store::{MeasuredBatch, NewReference, ReferenceRecord};
 
 /// The batches of an undamaged reference.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,6 +60,16 @@ struct Making {
     origin: ReferenceOrigin,
     /// Ids of the batches of the first version, whose charts watch the others; `None` without that test.
     watched_by: Option<BTreeSet<String>>,
+}
+
+/// A reference that is not stored yet.
+struct Made {
+    state: UndamagedReference,
+    model_digest: Digest,
+    batches: Vec<String>,
+    left_out: Vec<LeftOutBatch>,
+    /// The version of which it is the same reference, computed again.
+    replaces: Option<u32>,
 }
 
 /// An undamaged reference that was declared.
@@ -119,33 +129,73 @@ impl References {
         Ok(())
     }
 
-    /// Computes the newest reference of a structure again from its batches, with the trained baseline in use. Batches that cannot
-    /// be trusted with this trained baseline are left out. Returns the version of the new reference; `None` if none can be made.
+    /// Computes the newest reference of a structure again from its batches, with the trained baseline in use, and those that waiting
+    /// batches keep. Batches that cannot be trusted with this trained baseline are left out. Returns the version of the newest; `None`
+    /// if it cannot be made.
     ///
     /// # Errors
     /// [`Error::Store`], after which it should be attempted again.
     pub(super) async fn renew(&self, structure: &StructureId) -> Result<Option<u32>, Error> {
-        let Some(newest) = self.assessor.store.reference().undamaged(structure).await? else { return Ok(None) };
-        let request = ReferenceRequest {
-            choice: ReferenceChoice::Batches(newest.batches.clone()),
-            leave_out_doubtful: true,
-            threshold_probability: newest.state.threshold_probability,
-            reason: newest.state.origin.reason.clone(),
-        };
-        let place = self.assessor.compute.wait().await;
-        let origin = newest.state.origin.clone();
-        let declared = match self.declare_as(structure, request, origin, place).await {
-            Ok(declared) => declared,
-            Err(DeclareError::Monitor(Error::Store(error))) => return Err(error.into()),
-            Err(error) => {
-                warn!(structure.id = %structure, "Could not renew the undamaged reference of {structure} with its present trained model: {error}");
-                return Ok(None);
+        let references = self.assessor.store.reference();
+        let Some(newest) = references.undamaged(structure).await? else { return Ok(None) };
+        let mut earlier = Vec::new();
+        for version in self.kept_of_other_models(structure).await? {
+            let kept = references.version(structure, version).await?;
+            if let Some(kept) = kept.filter(|kept| kept.state.version != newest.state.version) {
+                earlier.extend(self.renewed(structure, &kept).await?);
             }
-        };
-        for LeftOutBatch { batch, reason } in &declared.left_out {
+        }
+        let Some(made) = self.renewed(structure, &newest).await? else { return Ok(None) };
+        for LeftOutBatch { batch, reason } in earlier.iter().chain([&made]).flat_map(|made| &made.left_out) {
             warn!(structure.id = %structure, batch.id = %batch, "Left batch {batch} out of the undamaged reference of {structure}: {reason}");
         }
-        Ok(Some(declared.record.state.version))
+        let stored = self.store(structure, earlier, made).await?;
+        Ok(Some(stored.state.version))
+    }
+
+    /// Versions of other trained baselines than the one in use that waiting batches keep.
+    async fn kept_of_other_models(&self, structure: &StructureId) -> Result<Vec<u32>, Error> {
+        let baseline = self.assessor.structures.get(structure)?.trained_baseline()?;
+        Ok(self.assessor.store.reference().kept_of_other_models(structure, baseline.digest()).await?)
+    }
+
+    /// Waiting batches that keep a reference of another trained baseline than the one in use are compared with none.
+    ///
+    /// # Errors
+    /// [`Error::Store`], after which it should be attempted again.
+    pub(super) async fn keep_comparable(&self, structure: &StructureId) -> Result<(), Error> {
+        let Ok(active) = self.assessor.structures.get(structure) else { return Ok(()) };
+        let Ok(baseline) = &active.baseline else { return Ok(()) };
+        let batches = self.assessor.store.reference().keep_none_of_other_models(structure, baseline.digest()).await?;
+        if batches > 0 {
+            warn!(
+                structure.id = %structure,
+                "{batches} batches of {structure} are not compared with their undamaged reference: it was made with another trained model"
+            );
+        }
+        Ok(())
+    }
+
+    /// A reference, computed again from its batches with the trained baseline in use; `None` if it cannot be made.
+    async fn renewed(&self, structure: &StructureId, record: &ReferenceRecord) -> Result<Option<Made>, Error> {
+        let origin = record.state.origin.clone();
+        let declared_at_us = origin.declared_at_us.or(Some(record.created_at.micros()));
+        let making = Making {
+            leave_out_doubtful: true,
+            threshold_probability: record.state.threshold_probability,
+            origin: ReferenceOrigin { declared_at_us, ..origin },
+            watched_by: None,
+        };
+        let place = self.assessor.compute.wait().await;
+        match self.make(structure, (record.batches.clone(), Vec::new()), making, place).await {
+            Ok(made) => Ok(Some(Made { replaces: Some(record.state.version), ..made })),
+            Err(DeclareError::Monitor(Error::Store(error))) => Err(error.into()),
+            Err(error) => {
+                let version = record.state.version;
+                warn!(structure.id = %structure, "Could not renew undamaged reference {version} of {structure} with its present trained model: {error}");
+                Ok(None)
+            }
+        }
     }
 
     /// Makes a reference from stored batches, and stores it. Other batches are compared with it when they are assessed again.
@@ -155,21 +205,12 @@ impl References {
         request: ReferenceRequest,
         place: Place,
     ) -> Result<DeclaredReference, DeclareError> {
-        let origin = ReferenceOrigin { reason: request.reason.clone(), ..ReferenceOrigin::default() };
-        self.declare_as(structure, request, origin, place).await
-    }
-
-    async fn declare_as(
-        &self,
-        structure: &StructureId,
-        request: ReferenceRequest,
-        origin: ReferenceOrigin,
-        place: Place,
-    ) -> Result<DeclaredReference, DeclareError> {
         let chosen = self.chosen(structure, &request.choice).await?;
-        let ReferenceRequest { leave_out_doubtful, threshold_probability, .. } = request;
+        let ReferenceRequest { leave_out_doubtful, threshold_probability, reason, .. } = request;
+        let origin = ReferenceOrigin { reason, ..ReferenceOrigin::default() };
         let making = Making { leave_out_doubtful, threshold_probability, origin, watched_by: None };
-        self.make(structure, chosen, making, place).await
+        let made = self.make(structure, chosen, making, place).await?;
+        self.declared(structure, made).await
     }
 
     /// Extends the newest reference by further batches, and stores the result as the next version.
@@ -200,23 +241,59 @@ impl References {
         let making = Making {
             leave_out_doubtful: request.leave_out_doubtful,
             threshold_probability: newest.state.threshold_probability,
-            origin: ReferenceOrigin { extends: Some(version), first: Some(first), reason: request.reason },
+            origin: ReferenceOrigin {
+                extends: Some(version),
+                first: Some(first),
+                reason: request.reason,
+                declared_at_us: None,
+            },
             watched_by: (!request.despite_alarms).then(|| of_first.into_iter().collect()),
         };
         let all = newest.batches.iter().cloned().chain(added).collect();
-        self.make(structure, (all, left_out), making, place).await
+        let made = self.make(structure, (all, left_out), making, place).await?;
+        self.declared(structure, made).await
     }
 
-    /// Makes a reference from chosen batches, beside those that were left out already, and stores it.
+    /// Stores a reference that was declared.
+    async fn declared(&self, structure: &StructureId, made: Made) -> Result<DeclaredReference, DeclareError> {
+        let left_out = made.left_out.clone();
+        Ok(DeclaredReference { record: self.store(structure, Vec::new(), made).await?, left_out })
+    }
+
+    /// Stores a reference as the newest one, after earlier ones that were made with the same trained baseline, all in one transaction.
+    async fn store(
+        &self,
+        structure: &StructureId,
+        earlier: Vec<Made>,
+        made: Made,
+    ) -> Result<Arc<ReferenceRecord>, Error> {
+        let Assessor { store, events, alarms, .. } = &*self.assessor;
+        let Made { state, model_digest, batches: batch_ids, left_out, replaces } = made;
+        // A trained baseline that was put into use meanwhile has made some of them: they stay what they were.
+        let earlier = earlier.into_iter().filter(|made| made.model_digest == model_digest);
+        let new = |state, batches, replaces| NewReference { state, batches, replaces };
+        let mut all: Vec<NewReference> = earlier.map(|made| new(made.state, made.batches, made.replaces)).collect();
+        all.push(new(state.clone(), batch_ids.clone(), replaces));
+        let created_at = Timestamp::now();
+        let version = store.reference().insert_all_undamaged(structure, all, &model_digest, created_at).await?;
+        let (batches, without) = (batch_ids.len(), left_out.len());
+        info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");
+        alarms.publish_changes(structure).await;
+        events.structure_changed(structure);
+        // It is returned as it was stored, without reading it from the database, which might fail.
+        let state = UndamagedReference { version, ..state };
+        Ok(Arc::new(ReferenceRecord { state, model_digest, created_at, batches: batch_ids }))
+    }
+
+    /// Makes a reference from chosen batches, beside those that were left out already.
     async fn make(
         &self,
         structure: &StructureId,
         (mut batch_ids, mut left_out): (Vec<String>, Vec<LeftOutBatch>),
         making: Making,
         place: Place,
-    ) -> Result<DeclaredReference, DeclareError> {
-        let Assessor { store, structures, events, alarms, .. } = &*self.assessor;
-        let baseline = structures.get(structure)?.trained_baseline()?;
+    ) -> Result<Made, DeclareError> {
+        let baseline = self.assessor.structures.get(structure)?.trained_baseline()?;
         let doubtful_already = !left_out.is_empty();
         let mut records = Vec::new();
         for id in &batch_ids {
@@ -275,17 +352,7 @@ impl References {
         })?;
         batch_ids.retain(|id| doubtful.iter().all(|left_out| left_out.batch != *id));
         left_out.extend(doubtful);
-        let created_at = Timestamp::now();
-        let version =
-            store.reference().insert_undamaged(structure, &state, &model_digest, &batch_ids, created_at).await?;
-        let (batches, without) = (batch_ids.len(), left_out.len());
-        info!(structure.id = %structure, version, "Made undamaged reference {version} of {structure} from {batches} batches, {without} left out");
-        alarms.publish_changes(structure).await;
-        events.structure_changed(structure);
-        // It is returned as it was stored, without reading it from the database, which might fail.
-        let state = UndamagedReference { version, ..state };
-        let record = Arc::new(ReferenceRecord { state, model_digest, created_at, batches: batch_ids });
-        Ok(DeclaredReference { record, left_out })
+        Ok(Made { state, model_digest, batches: batch_ids, left_out, replaces: None })
     }
 
     /// The ids of the chosen batches, and those that cannot be used whatever they contain.

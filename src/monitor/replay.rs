@@ -20,6 +20,7 @@ use super::references::{DeclaredReference, ExtensionRequest, ReferenceRequest, R
 use crate::assessment::BatchState;
 use crate::quantity::StructureId;
 use crate::store;
+use crate::store::archive::ImportedActions;
 
 /// Number of waiting batches that are read from the store at a time.
 const PAGE: usize = 500;
@@ -29,8 +30,8 @@ enum Waiting {
     Computed(Box<Computed>),
     /// It does not wait any more, or it cannot be read.
     Done,
-    /// There is no trained baseline to assess it with.
-    NoBaseline,
+    /// It waits further: there is no trained baseline to assess it with, or the reference that it keeps is computed again first.
+    Later,
 }
 
 /// Assesses waiting batches.
@@ -139,7 +140,7 @@ impl Replay {
             loop {
                 pause().await;
                 match replay.renew_and_resume(&structure).await {
-                    Ok(()) => {
+                    Ok(_) => {
                         let mut recovering = replay.recovering.lock().expect("no holder of this lock panics");
                         if recovering.insert(structure.clone(), false) != Some(true) {
                             recovering.remove(&structure);
@@ -157,11 +158,12 @@ impl Replay {
 
     /// Follows a switch of versions that was stored without being put into use, renews an outdated reference and assesses the waiting
     /// batches; in a task of its own, so that a panic is an error.
-    async fn renew_and_resume(&self, structure: &StructureId) -> Result<(), Error> {
+    async fn renew_and_resume(&self, structure: &StructureId) -> Result<ImportedActions, Error> {
         let (replay, structure) = (self.clone(), structure.clone());
         in_own_task(async move {
             replay.assessor.structures.follow_stored(&structure).await?;
             replay.references.renew_if_outdated(&structure).await?;
+            replay.references.keep_comparable(&structure).await?;
             let unexamined = || replay.unexamined.lock().expect("no holder of this lock panics");
             let examines = unexamined().remove(&structure);
             if examines {
@@ -175,24 +177,27 @@ impl Replay {
         .await
     }
 
-    /// Assesses the waiting batches of a structure.
-    pub(super) async fn resume(&self, structure: &StructureId) -> Result<(), Error> {
+    /// Assesses the waiting batches of a structure, and then stores what an archive says about their alarms.
+    pub(super) async fn resume(&self, structure: &StructureId) -> Result<ImportedActions, Error> {
         // One at a time for each structure: two would assess the same batches.
         let turn =
             Arc::clone(self.turns.lock().expect("no holder of this lock panics").entry(structure.clone()).or_default());
         let _turn = turn.lock().await;
         loop {
             let pending = self.assessor.store.batches().pending(structure, PAGE).await?;
-            if pending.is_empty() || !self.assess_all(structure, pending).await? {
-                return Ok(());
+            if pending.is_empty() {
+                return Ok(self.assessor.store.archive().settle_actions(structure).await?);
+            }
+            if !self.assess_all(structure, pending).await? {
+                return Ok(ImportedActions::default());
             }
         }
     }
 
-    /// Assesses some batches. Returns false when there is no trained baseline to assess them with.
+    /// Assesses some batches. Returns false when they have to wait further.
     async fn assess_all(&self, structure: &StructureId, batches: Vec<String>) -> Result<bool, Error> {
         let at_a_time = self.assessor.compute.places_behind();
-        let has_baseline = AtomicBool::new(true);
+        let can_proceed = AtomicBool::new(true);
         // Each in a task of its own: a future of this stream that was given a thread is not polled while a batch below is assessed
         // again, and that would wait for the thread for ever.
         let compute = |id: String| {
@@ -205,8 +210,8 @@ impl Replay {
             let queued = match waiting {
                 Waiting::Computed(computed) => Some(self.assessor.store_computed(*computed)),
                 Waiting::Done => None,
-                Waiting::NoBaseline => {
-                    has_baseline.store(false, Ordering::Relaxed);
+                Waiting::Later => {
+                    can_proceed.store(false, Ordering::Relaxed);
                     None
                 }
             };
@@ -226,7 +231,7 @@ impl Replay {
             };
             self.resume_if_superseded(structure, &finished);
         }
-        Ok(has_baseline.load(Ordering::Relaxed))
+        Ok(can_proceed.load(Ordering::Relaxed))
     }
 
     /// Resumes a structure whose version changed while one of its batches was assessed.
@@ -241,9 +246,9 @@ impl Replay {
         let place = self.assessor.compute.wait_behind().await;
         // The version may change at any time: each batch is assessed under the present one.
         let active = self.assessor.structures.get(structure)?;
-        if active.baseline.is_err() {
-            return Ok(Waiting::NoBaseline);
-        }
+        let Ok(baseline) = &active.baseline else {
+            return Ok(Waiting::Later);
+        };
         let record = match self.assessor.stored(structure, &batch_id).await {
             // Retention has deleted it meanwhile.
             Err(Error::UnknownBatch { .. }) => return Ok(Waiting::Done),
@@ -258,6 +263,12 @@ impl Replay {
         };
         if record.state != BatchState::Received {
             return Ok(Waiting::Done);
+        }
+        if let Some(kept) = record.kept_reference {
+            let reference = self.assessor.store.reference().version(structure, kept).await?;
+            if reference.is_some_and(|reference| reference.model_digest != *baseline.digest()) {
+                return Ok(Waiting::Later);
+            }
         }
         let task = self.assessor.task(active, record, place).await?;
         Ok(Waiting::Computed(Box::new(self.assessor.compute(task).await?)))

@@ -55,7 +55,7 @@ pub struct ActiveStructures {
     accept_uncalibrated: Vec<String>,
     library: RwLock<Arc<Library>>,
     active: RwLock<BTreeMap<StructureId, Arc<ActiveStructure>>>,
-    refused: BTreeMap<StructureId, String>,
+    refused: RwLock<BTreeMap<StructureId, String>>,
 }
 
 impl ActiveStructures {
@@ -71,15 +71,26 @@ impl ActiveStructures {
         }
         for (id, entry) in library.iter() {
             let json = entry.simulator.definition().canonical_json();
-            let outcome =
-                store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await?;
+            // Without a write where it is stored already: the service must start for reading on a full disk.
+            let stored = store.structures().structure(id).await?;
+            if stored.is_some_and(|stored| stored.digest == *entry.simulator.digest()) {
+                continue;
+            }
+            let put = store.structures().put_structure(id, &json, entry.simulator.digest(), Timestamp::now()).await;
+            let outcome = match put {
+                Err(full) if full.disk_cause().is_some() => {
+                    error!(structure.id = %id, "Could not store {id} of the models folder, until the next start: {full}");
+                    continue;
+                }
+                outcome => outcome?,
+            };
             if outcome == PutStructure::Refused {
                 warn!(structure.id = %id, "Kept the stored definition of {id}: it has batches, and the library's definition differs");
             }
         }
         let library = RwLock::new(Arc::new(library));
-        let (active, refused) = (RwLock::default(), BTreeMap::new());
-        let mut structures = Self { store, events, accept_uncalibrated, library, active, refused };
+        let (active, refused) = (RwLock::default(), RwLock::default());
+        let structures = Self { store, events, accept_uncalibrated, library, active, refused };
         let ids = structures.store.structures().list().await?.into_iter().map(|summary| summary.id);
         let at_a_time = std::thread::available_parallelism().map_or(1, usize::from);
         let read = stream::iter(ids).map(|id| read_stored(&structures, id)).buffered(at_a_time);
@@ -93,7 +104,7 @@ impl ActiveStructures {
                 // One invalid definition must not keep the other structures from being monitored.
                 Err(reason) => {
                     error!(structure.id = %id, "Refused the stored definition of {id}: {reason}");
-                    structures.refused.insert(id, reason.to_string());
+                    structures.refused.write().expect("no holder of this lock panics").insert(id, reason.to_string());
                 }
             }
         }
@@ -105,7 +116,7 @@ impl ActiveStructures {
     /// # Errors
     /// [`Error::UnknownStructure`]; [`Error::DefinitionRefused`] for one whose stored definition is not valid any more.
     pub fn get(&self, id: &StructureId) -> Result<Arc<ActiveStructure>, Error> {
-        self.read().get(id).cloned().ok_or_else(|| match self.refused.get(id) {
+        self.read().get(id).cloned().ok_or_else(|| match self.refused().get(id) {
             Some(reason) => Error::DefinitionRefused { structure: id.clone(), reason: reason.clone() },
             None => Error::UnknownStructure(id.clone()),
         })
@@ -122,8 +133,18 @@ impl ActiveStructures {
     }
 
     /// Stored structures that this version of the program refuses, with the reason.
-    pub fn refused(&self) -> &BTreeMap<StructureId, String> {
-        &self.refused
+    pub fn refused(&self) -> BTreeMap<StructureId, String> {
+        self.refused.read().expect("no holder of this lock panics").clone()
+    }
+
+    /// Takes a structure out of use.
+    pub(super) fn deactivate(&self, id: &StructureId) {
+        self.active.write().expect("no holder of this lock panics").remove(id);
+    }
+
+    /// A structure whose stored definition was refused is stored no more.
+    pub(super) fn forget_refused(&self, id: &StructureId) {
+        self.refused.write().expect("no holder of this lock panics").remove(id);
     }
 
     /// Structures and trained baselines on disk, as last read.
@@ -164,7 +185,7 @@ impl ActiveStructures {
     pub(super) async fn follow_stored(&self, id: &StructureId) -> Result<(), Error> {
         let Some(stored) = self.store.structures().structure(id).await? else { return Ok(()) };
         let in_use = |active: &Arc<ActiveStructure>| *active.simulator.digest() == stored.digest;
-        if self.refused.contains_key(id) || self.read().get(id).is_some_and(in_use) {
+        if self.refused().contains_key(id) || self.read().get(id).is_some_and(in_use) {
             return Ok(());
         }
         let simulator = Simulator::parse_json(&stored.definition_json)?;

@@ -1,7 +1,7 @@
 //! The health of the service, and its background tasks.
 
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
@@ -17,7 +17,10 @@ use super::retention::Retention;
 use super::silence::Silence;
 use super::structures::ActiveStructures;
 use crate::alarm::ALARM_KINDS;
-use crate::store::{FolderFigures, Store};
+use crate::store::{Error as Unreadable, FolderFigures, Store};
+
+/// How long a search for unreadable references is used.
+const UNREADABLE_FRESH_FOR: Duration = Duration::from_secs(5);
 
 /// Whether batches can be stored and assessed, and what is degraded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
@@ -46,6 +49,7 @@ pub struct Upkeep {
     pub(super) silence: Silence,
     pub(super) diagnoses: AutomaticDiagnoses,
     pub(super) sources: Arc<Mutex<Vec<FindingSource>>>,
+    pub(super) unreadable: Arc<tokio::sync::Mutex<Option<(Instant, Vec<Reason>)>>>,
     pub(super) started: Instant,
 }
 
@@ -92,8 +96,27 @@ impl Upkeep {
         if self.baselines_in_use() == 0 {
             reasons.push(Reason::new("no_model", "no trained model is in use"));
         }
-        let findings = self.findings(reasons.is_empty());
+        let mut findings = self.findings(reasons.is_empty());
+        findings.extend(self.unreadable().await);
         Health { ready: reasons.is_empty(), reasons, findings }
+    }
+
+    /// Undamaged references that cannot be read, at most some seconds old.
+    async fn unreadable(&self) -> Vec<Reason> {
+        let mut last = self.unreadable.lock().await;
+        if let Some((_, found)) = last.as_ref().filter(|(at, _)| at.elapsed() < UNREADABLE_FRESH_FOR) {
+            return found.clone();
+        }
+        let mut found = Vec::new();
+        for structure in self.structures.ids() {
+            if let Err(error @ Unreadable::Row { .. }) = self.store.reference().undamaged(&structure).await {
+                let message =
+                    format!("{structure}: {error}; its batches are stored and wait; `modalwatch doctor` has more");
+                found.push(Reason::new("stored_data_unreadable", message));
+            }
+        }
+        *last = Some((Instant::now(), found.clone()));
+        found
     }
 
     /// True unless the writer of the database hangs: a full disk is no reason to restart the service.
@@ -114,7 +137,7 @@ impl Upkeep {
             findings.push(Reason::new("model_refused", format!("{}: {}", refusal.file, refusal.reason)));
         }
         findings.extend(self.structures.calibration_findings());
-        for (structure, reason) in self.structures.refused() {
+        for (structure, reason) in &self.structures.refused() {
             let message = format!("structure {structure} is not monitored: {reason}");
             findings.push(Reason::new("definition_refused", message));
         }

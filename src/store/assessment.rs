@@ -11,6 +11,7 @@ use super::chart_point::StoredChartPoint;
 use super::column::{bad_row, elements, from_blob, list, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
+use super::kept::settle_kept;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
@@ -30,6 +31,17 @@ pub struct StoredAssessment {
     pub alarms_changed: bool,
     /// Version of the newest undamaged reference of the structure when it was stored; 0 if there is none.
     pub newest_undamaged: u32,
+}
+
+/// What a batch was compared with in its assessment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ComparedWith {
+    /// What the assessment says, whatever is stored.
+    Given,
+    /// The newest undamaged reference at the time of the computation, of this version; 0 if there was none.
+    Newest(u32),
+    /// The first of the undamaged references that the batch keeps, of this version; 0: none.
+    Kept(u32),
 }
 
 #[derive(FromRow)]
@@ -115,12 +127,12 @@ impl Assessments<'_> {
         assessment: &Assessment,
         charted: NewCharts,
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
-        self.insert_computed(structure, batch_id, assessment, (charted, None))
+        self.insert_computed(structure, batch_id, assessment, (charted, ComparedWith::Given))
     }
 
-    /// As [`Self::insert_assessment`], for an assessment that was computed when `seen` was the version of the newest undamaged reference,
-    /// 0 if there was none. If there is a newer one now, with which the batch can be compared, the batch continues to wait for an
-    /// assessment: whatever happens to the caller, it gets one.
+    /// As [`Self::insert_assessment`], with what the batch was compared with. If it was the newest reference and there is a newer one now,
+    /// with which the batch can be compared, or if the batch keeps further references, it continues to wait for an assessment: whatever
+    /// happens to the caller, it gets one.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
@@ -129,7 +141,7 @@ impl Assessments<'_> {
         structure: &StructureId,
         batch_id: &str,
         assessment: &Assessment,
-        (charted, seen): (NewCharts, Option<u32>),
+        (charted, compared): (NewCharts, ComparedWith),
     ) -> impl Future<Output = Result<Option<StoredAssessment>, Error>> + Send + 'static {
         let (structure, id, a) = (structure.to_string(), batch_id.to_owned(), assessment.clone());
         self.database.write(move |transaction| {
@@ -141,8 +153,11 @@ impl Assessments<'_> {
                 if slot.taken {
                     remove(transaction, &structure, &id, &a).await?;
                 }
+                if let ComparedWith::Kept(version) = compared {
+                    settle_kept(transaction, (&structure, &id), version).await?;
+                }
                 insert(transaction, &structure, &id, &a, slot.assessed_at_us).await?;
-                if seen.is_some_and(|seen| seen != slot.newest_undamaged) {
+                if matches!(compared, ComparedWith::Newest(seen) if seen != slot.newest_undamaged) {
                     wait_for_comparison(transaction, &structure, &id, &a).await?;
                 }
                 let batch = Charted {
@@ -150,7 +165,11 @@ impl Assessments<'_> {
                     position: (slot.measured_to_us, id.clone()),
                     now: assessed_at,
                     maintained: slot.maintained,
-                    newest_undamaged: slot.newest_undamaged,
+                    undamaged_version: match compared {
+                        ComparedWith::Kept(_) => a.undamaged_version.unwrap_or(0),
+                        ComparedWith::Newest(_) | ComparedWith::Given => slot.newest_undamaged,
+                    },
+                    succeeded_at_us: slot.succeeded_at_us,
                 };
                 let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
                 let newest_undamaged = slot.newest_undamaged;
@@ -237,6 +256,8 @@ struct Slot {
     maintained: bool,
     /// Version of the newest undamaged reference; 0 if there is none.
     newest_undamaged: u32,
+    /// When the reference after the one of the assessment was declared, µs.
+    succeeded_at_us: Option<i64>,
 }
 
 #[derive(FromRow)]
@@ -248,6 +269,7 @@ struct SlotRow {
     measured_to_us: i64,
     maintained: bool,
     newest_undamaged: u32,
+    succeeded_at_us: Option<i64>,
 }
 
 /// Reads what must be known to store an assessment. `None` if it was made for a version of the structure that is not the present
@@ -263,7 +285,9 @@ async fn slot_of(
         "select own_us, others_us, measured_to_us,
                 exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
                     and to_us > measured_from_us) as maintained,
-                (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged
+                (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged,
+                (select coalesce(json_extract(origin, '$.declared_at_us'), created_at_us) from undamaged_state
+                    where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us
          from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
                       max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
                from assessment where structure_id = $1 and batch_id = $2) a
@@ -277,11 +301,11 @@ async fn slot_of(
     .bind(a.structure_digest.as_str())
     .fetch_optional(transaction.connection())
     .await?;
-    let Some(SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged }) = found else {
-        return Ok(None);
-    };
+    let Some(found) = found else { return Ok(None) };
+    let SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged, succeeded_at_us } = found;
     let assessed_at_us = others_us.map_or(given, |latest| given.max(latest + 1));
-    Ok(Some(Slot { assessed_at_us, taken: own_us.is_some(), measured_to_us, maintained, newest_undamaged }))
+    let taken = own_us.is_some();
+    Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us }))
 }
 
 /// Marks a batch as waiting if the newest undamaged reference would be compared with it otherwise than its assessment was.
@@ -346,7 +370,10 @@ async fn insert(
     // Two statements in one call, which saves a round trip to the thread of SQLite for every batch. PostgreSQL takes them singly.
     let insert =
         "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16);
-         update measurement_batch set state = 'assessed', failure = null where structure_id = $1 and batch_id = $2";
+         update measurement_batch set failure = null,
+             state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
+                     else 'assessed' end
+         where structure_id = $1 and batch_id = $2";
     sqlx::query(insert)
         .bind(structure)
         .bind(batch_id)

@@ -59,6 +59,8 @@ pub struct BatchRecord {
     pub state: BatchState,
     /// Why its assessment failed.
     pub failure: Option<String>,
+    /// Version of the undamaged reference that it is compared with next, instead of the newest one; 0: with none.
+    pub kept_reference: Option<u32>,
 }
 
 #[derive(FromRow)]
@@ -69,6 +71,7 @@ struct BatchRow {
     received_at_us: i64,
     state: String,
     failure: Option<String>,
+    kept_reference: Option<u32>,
 }
 
 /// Batches and their measurements.
@@ -137,7 +140,9 @@ impl Batches<'_> {
 
     async fn read_batch(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
         let row: Option<BatchRow> = sqlx::query_as(
-            "select source, idempotency_key, content_digest, received_at_us, state, failure
+            "select source, idempotency_key, content_digest, received_at_us, state, failure,
+                    (select undamaged_version from kept_comparison k where k.structure_id = $1 and k.batch_id = $2
+                        order by position limit 1) as kept_reference
              from measurement_batch where structure_id = $1 and batch_id = $2",
         )
         .bind(structure.as_str())
@@ -173,6 +178,7 @@ impl Batches<'_> {
             received_at: timestamp("batch", row.received_at_us)?,
             state: batch_state(&row.state)?,
             failure: row.failure,
+            kept_reference: row.kept_reference,
         }))
     }
 
@@ -199,11 +205,25 @@ impl Batches<'_> {
         row.map(|(blob,)| frequencies("measurement", &blob)).transpose()
     }
 
-    /// Batches of a structure that wait for their assessment, oldest first.
+    /// Batches of a structure that wait for their assessment, oldest first; before them those that keep an undamaged reference, by its
+    /// version.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn pending(self, structure: &StructureId, limit: usize) -> Result<Vec<String>, Error> {
+        let kept: Vec<(String,)> = sqlx::query_as(
+            "select b.batch_id from kept_comparison k join measurement_batch b using (structure_id, batch_id)
+             where structure_id = $1 and b.state = 'received' and k.position =
+                 (select min(position) from kept_comparison f where f.structure_id = $1 and f.batch_id = b.batch_id)
+             order by k.undamaged_version, b.received_at_us, b.batch_id limit $2",
+        )
+        .bind(structure.as_str())
+        .bind(limit as i64)
+        .fetch_all(&self.database.reader)
+        .await?;
+        if !kept.is_empty() {
+            return Ok(kept.into_iter().map(|(id,)| id).collect());
+        }
         let rows: Vec<(String,)> = sqlx::query_as(
             "select batch_id from measurement_batch where structure_id = $1 and state = 'received'
              order by received_at_us, batch_id limit $2",
@@ -332,13 +352,16 @@ async fn find_stored(
     let structure = batch.structure.as_str();
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
     let found: FoundRow = sqlx::query_as(concat!(
-        "select exists (select 1 from structure where structure_id = $1) as structure_is_known,
+        "select exists (select 1 from structure s where s.structure_id = $1 and not exists
+                    (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
                 k.batch_id as key_batch, k.content_digest as key_digest,
                 h.ordinal, h.batch_id as holder_batch, h.content_digest as holder_digest,
                 (select frequency_hz from measurement where structure_id = $1 and source = $2 and measured_at_us < $5
                     order by measured_at_us desc limit 1) as previous
          from (select 1 as one) o
-         left join measurement_batch k on k.structure_id = $1 and k.idempotency_key = $4
+         left join measurement_batch k on k.structure_id = $1 and k.batch_id = coalesce(
+             (select batch_id from measurement_batch where structure_id = $1 and idempotency_key = $4),
+             (select batch_id from further_key where structure_id = $1 and idempotency_key = $4))
          left join (select t.key as ordinal, b.batch_id, b.content_digest from ",
         elements!("$3"),
         " t
@@ -364,6 +387,7 @@ async fn find_stored(
     if let (Some(ordinal), Some(batch_id), Some(content)) = (found.ordinal, found.holder_batch, found.holder_digest) {
         // Equal digests mean equal measurements, so the other batch contains all of them.
         if content == digest.as_str() {
+            remember_key(transaction, batch, &batch_id).await?;
             return Ok(InsertBatch::Replayed(batch_id));
         }
         let ordinal = ordinal as usize;
@@ -374,6 +398,18 @@ async fn find_stored(
     let readable = |blob: Vec<u8>| frequencies("measurement", &blob).inspect_err(|e| tracing::warn!("{e}")).ok();
     let previous = found.previous.and_then(readable);
     Ok(InsertBatch::Inserted { content_digest: digest, previous })
+}
+
+/// Binds the key of a batch that was stored before without it to the stored batch: once answered, a key means this content.
+async fn remember_key(transaction: &mut Transaction<'_>, batch: &MeasurementBatch, stored: &str) -> Result<(), Error> {
+    let Some(key) = &batch.idempotency_key else { return Ok(()) };
+    sqlx::query("insert into further_key values ($1, $2, $3) on conflict do nothing")
+        .bind(batch.structure.as_str())
+        .bind(key)
+        .bind(stored)
+        .execute(transaction.connection())
+        .await?;
+    Ok(())
 }
 
 /// Statements that insert measurements. Structure, batch and source are the same in all rows.

@@ -88,13 +88,13 @@ pub(super) async fn chart(
 ) -> Result<ChartOutcome, Error> {
     let mut placed = Vec::new();
     let mut changed_to = None;
-    if let Some(new) = process.filter(|new| new.undamaged_version == batch.newest_undamaged) {
+    if let Some(new) = process.filter(|new| new.undamaged_version == batch.undamaged_version) {
         let followed = process::follow(transaction, batch, &new).await?;
         points.extend(followed.points);
         changed_to = followed.changed_to;
     }
     // An undamaged reference that was stored in the meantime has ended the charts of the earlier reference.
-    let points = points.into_iter().filter(|new| [0, batch.newest_undamaged].contains(&new.undamaged_version));
+    let points = points.into_iter().filter(|new| [0, batch.undamaged_version].contains(&new.undamaged_version));
     for charts in points.collect::<Vec<_>>().chunks(CHARTS_TOGETHER) {
         let mut about = about(transaction, batch, charts).await?;
         for new in charts {

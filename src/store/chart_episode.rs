@@ -14,8 +14,10 @@ pub(super) struct Charted<'a> {
     pub now: Timestamp,
     /// Whether the batch overlaps a maintenance window.
     pub maintained: bool,
-    /// Version of the newest undamaged reference of the structure; 0 if there is none.
-    pub newest_undamaged: u32,
+    /// Version of the undamaged reference whose charts it is added to: the newest, or the one that the batch keeps; 0 if there is none.
+    pub undamaged_version: u32,
+    /// When the reference after that one was declared, µs: its alarms end then at the latest.
+    pub succeeded_at_us: Option<i64>,
 }
 
 /// A stored episode: number, opening time and batch, end, and whether it was withdrawn.
@@ -122,12 +124,13 @@ impl Episodes {
         new: &NewChartPoint,
     ) -> Result<bool, Error> {
         let structure = batch.structure;
+        let latest_end = batch.succeeded_at_us.filter(|_| new.undamaged_version > 0);
         let any = self.running.is_some() || !self.found.is_empty() || !self.stored.is_empty();
         if let Some((number, peak)) = self.running {
             sqlx::query(
                 "update alarm_episode set ended_at_us = $1, peak_shift = $2 where structure_id = $3 and episode = $4",
             )
-            .bind(self.running_end)
+            .bind(self.running_end.or(latest_end))
             .bind(peak)
             .bind(structure)
             .bind(number)
@@ -148,7 +151,7 @@ impl Episodes {
                 )
                 .bind(found.opened_at)
                 .bind(&found.batch)
-                .bind(found.ended_at)
+                .bind(found.ended_at.or(latest_end))
                 .bind(found.peak)
                 .bind(structure)
                 .bind(number)
@@ -156,7 +159,8 @@ impl Episodes {
                 .await?;
                 continue;
             }
-            let row = (new.undamaged_version, found.opened_at, Some(found.batch.as_str()), found.ended_at, found.peak);
+            let ended_at = found.ended_at.or(latest_end);
+            let row = (new.undamaged_version, found.opened_at, Some(found.batch.as_str()), ended_at, found.peak);
             insert_episode(transaction, structure, &new.series, row, batch.now).await?;
         }
         for (number, ..) in self.stored {

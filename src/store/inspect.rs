@@ -7,7 +7,8 @@ use sqlx::Connection as _;
 
 use super::column::timestamp;
 use super::error::Error;
-use super::file::{library_version, refuse_foreign, schema_version, take_lock, DATABASE_FILE};
+use super::file::{foreign_objects, library_version, refuse_foreign, schema_version, take_lock, DATABASE_FILE};
+use super::unreadable::unreadable;
 use super::version::StoredBaseline;
 use crate::quantity::Timestamp;
 
@@ -24,6 +25,10 @@ pub struct Inspection {
     pub known_schema: i64,
     /// Defects of its pages and indexes.
     pub damage: Vec<String>,
+    /// Tables, views and triggers that this program did not make.
+    pub foreign: Vec<String>,
+    /// Rows that cannot be read.
+    pub unreadable: Vec<String>,
     /// Number of rows that refer to missing rows.
     pub dangling_rows: u64,
     /// When the newest batch arrived.
@@ -57,6 +62,9 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
                 .await?;
         found_schema = version;
     }
+    let foreign =
+        if found_schema <= schema_version() { foreign_objects(connection, found_schema).await? } else { Vec::new() };
+    let unreadable = if found_schema == schema_version() { unreadable(connection).await? } else { Vec::new() };
     let (mut newest_received, mut structures) = (None, Vec::new());
     if has_table(connection, "measurement_batch").await? {
         let (newest,): (Option<i64>,) =
@@ -91,6 +99,8 @@ pub async fn inspect(data_dir: &Path) -> Result<Option<Inspection>, Error> {
         schema_version: found_schema,
         known_schema: schema_version(),
         damage: findings.into_iter().map(|(finding,)| finding).filter(|finding| finding != "ok").collect(),
+        foreign,
+        unreadable,
         dangling_rows: dangling.unsigned_abs(),
         newest_received,
         structures,

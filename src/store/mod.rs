@@ -22,6 +22,7 @@ mod chart_series;
 mod column;
 mod database;
 mod database_file;
+mod deletion;
 mod diagnosis;
 mod error;
 mod figures;
@@ -31,6 +32,7 @@ pub mod inspect;
 mod interrupted;
 mod job_end;
 mod jobs;
+mod kept;
 mod latest_quantities;
 mod mail;
 mod maintenance;
@@ -55,6 +57,7 @@ mod token;
 mod training;
 mod transaction;
 mod undamaged;
+mod unreadable;
 mod version;
 mod webhook;
 mod writer;
@@ -65,7 +68,7 @@ use std::sync::Arc;
 use crate::volume;
 use database::Database;
 use reader::Reader;
-use undamaged::Newest;
+use undamaged::Known;
 use writer::Writer;
 
 pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, OpenAlarms};
@@ -73,13 +76,14 @@ pub use alarm_action::{
     ActionKind, ActionOutcome, AlarmAction, AlarmActions, ClosingReason, Handling, NewAction, MOST_ACTIONS,
 };
 pub use archive::Archive;
-pub use assessment::{Assessments, StoredAssessment};
+pub use assessment::{Assessments, ComparedWith, StoredAssessment};
 pub use audit::{Audit, AuditEntry, AuditQuery, NewAuditEntry};
 pub use automatic::{LatestDiagnoses, RejectedEpisode};
 pub use batch::{BatchRecord, Batches, InsertBatch};
 pub use chart_point::StoredChartPoint;
 pub use chart_series::{ChartMark, ChartSeries};
 pub use database_file::DatabaseFile;
+pub use deletion::{Deletions, Removed};
 pub use diagnosis::{Diagnoses, DiagnosisRecord, DiagnosisTrigger, JobState, NewDiagnosis};
 pub use error::Error;
 pub use figures::{Figures, FolderFigures};
@@ -102,7 +106,7 @@ pub use series::{Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, Tru
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};
 pub use token::Tokens;
 pub use training::{NewTraining, TrainingJobRecord, Trainings};
-pub use undamaged::{MeasuredBatch, ReferenceRecord, References};
+pub use undamaged::{MeasuredBatch, NewReference, ReferenceRecord, References};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
 
@@ -110,7 +114,7 @@ pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
 #[derive(Clone)]
 pub struct Store {
     database: Arc<Database>,
-    newest_undamaged: Arc<Newest>,
+    known_undamaged: Arc<Known>,
 }
 
 impl Store {
@@ -145,7 +149,7 @@ impl Store {
             limits: file::Limits::of(settings),
             _lock: lock,
         };
-        Ok(Self { database: Arc::new(database), newest_undamaged: Arc::default() })
+        Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })
     }
 
     /// Writes the log back into the database and closes it.
@@ -178,7 +182,7 @@ impl Store {
 
     /// The undamaged references of the structures.
     pub fn reference(&self) -> References<'_> {
-        References { database: &self.database, newest: &self.newest_undamaged }
+        References { database: &self.database, known: &self.known_undamaged }
     }
 
     /// Alarm episodes, alarm charts and maintenance windows.
@@ -234,6 +238,11 @@ impl Store {
     /// Messages that could not become a batch.
     pub fn quarantine(&self) -> Quarantine<'_> {
         Quarantine { database: &self.database }
+    }
+
+    /// Deletes structures.
+    pub fn deletions(&self) -> Deletions<'_> {
+        Deletions { database: &self.database, known: &self.known_undamaged }
     }
 
     /// Deletes old batches, and counts those that would be deleted.

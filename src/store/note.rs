@@ -3,6 +3,7 @@
 use super::column::timestamp;
 use super::database::Database;
 use super::error::Error;
+use super::transaction::Transaction;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Maximum number of notes of a structure.
@@ -42,25 +43,7 @@ impl Notes<'_> {
     pub async fn insert(self, structure: &StructureId, note: Note) -> Result<bool, Error> {
         let structure = structure.to_string();
         self.database
-            .write(move |transaction| {
-                Box::pin(async move {
-                    let inserted = sqlx::query(
-                        "insert into note select $1, $2, $3, $4, $5, $6, $7
-                         where (select count(*) from note where structure_id = $2) < $8 on conflict do nothing",
-                    )
-                    .bind(note.id)
-                    .bind(structure)
-                    .bind(note.from.micros())
-                    .bind(note.to.map(Timestamp::micros))
-                    .bind(note.text)
-                    .bind(note.author)
-                    .bind(note.created_at.micros())
-                    .bind(MOST_NOTES as i64)
-                    .execute(transaction.connection())
-                    .await?;
-                    Ok(inserted.rows_affected() > 0)
-                })
-            })
+            .write(move |transaction| Box::pin(async move { insert_note(transaction, &structure, note).await }))
             .await
     }
 
@@ -100,4 +83,23 @@ impl Notes<'_> {
             })
             .await
     }
+}
+
+/// Stores a note unless its id is stored already or the structure has [`MOST_NOTES`] notes. Returns whether it was stored.
+pub(super) async fn insert_note(transaction: &mut Transaction<'_>, structure: &str, note: Note) -> Result<bool, Error> {
+    let inserted = sqlx::query(
+        "insert into note select $1, $2, $3, $4, $5, $6, $7
+         where (select count(*) from note where structure_id = $2) < $8 on conflict do nothing",
+    )
+    .bind(note.id)
+    .bind(structure)
+    .bind(note.from.micros())
+    .bind(note.to.map(Timestamp::micros))
+    .bind(note.text)
+    .bind(note.author)
+    .bind(note.created_at.micros())
+    .bind(MOST_NOTES as i64)
+    .execute(transaction.connection())
+    .await?;
+    Ok(inserted.rows_affected() > 0)
 }

@@ -154,7 +154,8 @@ impl Overview<'_> {
                      order by version desc limit 1) as undamaged_model,
                     (select count(*) {WAITING}) as waiting,
                     (select min(received_at_us) {WAITING}) as waiting_since_us
-             from structure s left join structure_summary c using (structure_id) order by s.structure_id"
+             from structure s left join structure_summary c using (structure_id)
+             where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id"
         );
         let rows: Vec<OverviewRow> =
             sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;

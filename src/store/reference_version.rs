@@ -1,13 +1,18 @@
-//! The versions of an undamaged reference, and the alarms during which batches were measured.
+//! The versions of an undamaged reference, those that waiting batches keep, and the alarms during which batches were measured.
+
+use std::sync::Arc;
 
 use sqlx::FromRow;
 
 use super::column::{bad_row, timestamp};
 use super::error::Error;
 use super::reference_content::{batches_of, stored_origin};
-use super::undamaged::References;
+use super::undamaged::{ReferenceRecord, References};
 use crate::damage::ReferenceOrigin;
-use crate::quantity::{StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId, Timestamp};
+
+/// Versions other than the newest that are kept in memory. Batches are compared with them one version after the other.
+const KNOWN: usize = 8;
 
 /// A version of the undamaged reference, in short.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -102,5 +107,77 @@ impl References<'_> {
         .bind(first)
         .fetch_all(&self.database.reader)
         .await?)
+    }
+
+    /// A version of the undamaged reference of a structure.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn version(self, structure: &StructureId, version: u32) -> Result<Option<Arc<ReferenceRecord>>, Error> {
+        let is =
+            |(id, record): &&(StructureId, Arc<ReferenceRecord>)| id == structure && record.state.version == version;
+        let known = self.known.earlier.lock().expect("no holder of this lock panics").iter().find(is).cloned();
+        if let Some((_, record)) = known {
+            return Ok(Some(record));
+        }
+        let Some(record) = self.read_undamaged(structure, Some(version)).await?.map(Arc::new) else { return Ok(None) };
+        let mut earlier = self.known.earlier.lock().expect("no holder of this lock panics");
+        if earlier.len() >= KNOWN {
+            earlier.remove(0);
+        }
+        earlier.push((structure.clone(), Arc::clone(&record)));
+        Ok(Some(record))
+    }
+
+    /// Versions that waiting batches keep and that were made with another trained baseline than `model`, ascending.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn kept_of_other_models(self, structure: &StructureId, model: &Digest) -> Result<Vec<u32>, Error> {
+        let versions: Vec<(u32,)> = sqlx::query_as(
+            "select distinct undamaged_version from kept_comparison k join undamaged_state s
+                 on s.structure_id = k.structure_id and s.version = k.undamaged_version
+             where k.structure_id = $1 and s.model_digest <> $2 order by undamaged_version",
+        )
+        .bind(structure.as_str())
+        .bind(model.as_str())
+        .fetch_all(&self.database.reader)
+        .await?;
+        Ok(versions.into_iter().map(|(version,)| version).collect())
+    }
+
+    /// Batches that keep a reference of another trained baseline than `model` are compared with none. Returns their number.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub async fn keep_none_of_other_models(self, structure: &StructureId, model: &Digest) -> Result<u64, Error> {
+        let (structure, model) = (structure.to_string(), model.to_string());
+        self.database
+            .write(move |transaction| {
+                Box::pin(async move {
+                    let update = "update kept_comparison set undamaged_version = 0
+                         where structure_id = $1 and undamaged_version in
+                             (select version from undamaged_state where structure_id = $1 and model_digest <> $2)";
+                    let update = sqlx::query(update).bind(&structure).bind(&model);
+                    Ok(update.execute(transaction.connection()).await?.rows_affected())
+                })
+            })
+            .await
+    }
+
+    /// Pretends that all references were made by another trained baseline.
+    #[cfg(test)]
+    pub(crate) async fn made_by_another_model(self, structure: &StructureId) {
+        let structure = structure.to_string();
+        let written = self.database.write(move |transaction| {
+            Box::pin(async move {
+                let update = sqlx::query("update undamaged_state set model_digest = 'another' where structure_id = $1");
+                update.bind(structure).execute(transaction.connection()).await?;
+                Ok(())
+            })
+        });
+        written.await.expect("the database can be written");
+        self.known.newest.lock().expect("no holder of this lock panics").clear();
+        self.known.earlier.lock().expect("no holder of this lock panics").clear();
     }
 }

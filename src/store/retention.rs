@@ -8,8 +8,16 @@ use super::error::Error;
 use crate::quantity::Timestamp;
 
 /// Tables with data of batches, in an order that respects foreign keys.
-const TABLES: [&str; 6] =
-    ["quantity_assessment", "assessment", "chart_point", "process_point", "measurement", "measurement_batch"];
+pub(super) const TABLES: [&str; 8] = [
+    "quantity_assessment",
+    "assessment",
+    "chart_point",
+    "process_point",
+    "kept_comparison",
+    "further_key",
+    "measurement",
+    "measurement_batch",
+];
 
 /// Batches that may be deleted: measured before a time, not waiting for an assessment, not part of an undamaged reference, and not
 /// measured during an alarm.

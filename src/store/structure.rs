@@ -15,7 +15,7 @@ pub enum PutStructure {
     Unchanged,
     /// It replaced another definition without batches.
     Replaced,
-    /// Another definition has batches, so nothing was changed.
+    /// Another definition has batches, or the structure is being deleted, so nothing was changed.
     Refused,
 }
 
@@ -85,56 +85,19 @@ impl Structures<'_> {
         let (id, json, digest, now) = (id.to_string(), definition_json.to_owned(), digest.to_string(), now.micros());
         self.database
             .write(move |transaction| {
-                Box::pin(async move {
-                    let stored: Option<(String,)> =
-                        sqlx::query_as("select digest from structure where structure_id = $1")
-                            .bind(&id)
-                            .fetch_optional(transaction.connection())
-                            .await?;
-                    let Some((stored,)) = stored else {
-                        sqlx::query("insert into structure values ($1, $2, $3, $4, $5)")
-                            .bind(&id)
-                            .bind(&json)
-                            .bind(&digest)
-                            .bind(now)
-                            .bind(now)
-                            .execute(transaction.connection())
-                            .await?;
-                        return Ok(PutStructure::Created);
-                    };
-                    if stored == digest {
-                        return Ok(PutStructure::Unchanged);
-                    }
-                    let (in_use,): (bool,) =
-                        sqlx::query_as("select exists (select 1 from measurement_batch where structure_id = $1)")
-                            .bind(&id)
-                            .fetch_one(transaction.connection())
-                            .await?;
-                    if in_use {
-                        return Ok(PutStructure::Refused);
-                    }
-                    sqlx::query(
-                        "update structure set definition = $1, digest = $2, updated_at_us = $3 where structure_id = $4",
-                    )
-                    .bind(&json)
-                    .bind(&digest)
-                    .bind(now)
-                    .bind(&id)
-                    .execute(transaction.connection())
-                    .await?;
-                    Ok(PutStructure::Replaced)
-                })
+                Box::pin(async move { put_definition(transaction, &id, (&json, &digest), now).await })
             })
             .await
     }
 
-    /// A stored structure.
+    /// A stored structure that is not being deleted.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn structure(self, id: &StructureId) -> Result<Option<StructureRecord>, Error> {
         let row: Option<(String, String, i64, i64)> = sqlx::query_as(
-            "select definition, digest, created_at_us, updated_at_us from structure where structure_id = $1",
+            "select definition, digest, created_at_us, updated_at_us from structure s
+             where structure_id = $1 and not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id)",
         )
         .bind(id.as_str())
         .fetch_optional(&self.database.reader)
@@ -151,14 +114,15 @@ impl Structures<'_> {
         row.map(record).transpose()
     }
 
-    /// All structures, by id.
+    /// All structures except those that are being deleted, by id.
     ///
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn list(self) -> Result<Vec<StructureSummary>, Error> {
         let rows: Vec<(String, String, i64, i64, Option<i64>)> = sqlx::query_as(
             "select s.structure_id, s.digest, s.created_at_us, coalesce(c.batches, 0), c.last_measured_us
-             from structure s left join structure_summary c using (structure_id) order by s.structure_id",
+             from structure s left join structure_summary c using (structure_id)
+             where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id",
         )
         .fetch_all(&self.database.reader)
         .await?;
@@ -173,4 +137,54 @@ impl Structures<'_> {
         };
         rows.into_iter().map(summary).collect()
     }
+}
+
+/// Stores a definition unless another definition of the same structure has batches.
+pub(super) async fn put_definition(
+    transaction: &mut Transaction<'_>,
+    id: &str,
+    (json, digest): (&str, &str),
+    now: i64,
+) -> Result<PutStructure, Error> {
+    let stored: Option<(String,)> = sqlx::query_as("select digest from structure where structure_id = $1")
+        .bind(id)
+        .fetch_optional(transaction.connection())
+        .await?;
+    let Some((stored,)) = stored else {
+        sqlx::query("insert into structure values ($1, $2, $3, $4, $5)")
+            .bind(id)
+            .bind(json)
+            .bind(digest)
+            .bind(now)
+            .bind(now)
+            .execute(transaction.connection())
+            .await?;
+        return Ok(PutStructure::Created);
+    };
+    let (deleted,): (bool,) =
+        sqlx::query_as("select exists (select 1 from structure_deletion where structure_id = $1)")
+            .bind(id)
+            .fetch_one(transaction.connection())
+            .await?;
+    if deleted {
+        return Ok(PutStructure::Refused);
+    }
+    if stored == digest {
+        return Ok(PutStructure::Unchanged);
+    }
+    let (in_use,): (bool,) = sqlx::query_as("select exists (select 1 from measurement_batch where structure_id = $1)")
+        .bind(id)
+        .fetch_one(transaction.connection())
+        .await?;
+    if in_use {
+        return Ok(PutStructure::Refused);
+    }
+    sqlx::query("update structure set definition = $1, digest = $2, updated_at_us = $3 where structure_id = $4")
+        .bind(json)
+        .bind(digest)
+        .bind(now)
+        .bind(id)
+        .execute(transaction.connection())
+        .await?;
+    Ok(PutStructure::Replaced)
 }

@@ -8,7 +8,8 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
 use super::file::APPLICATION_ID;
-use super::{schema_version, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
+use super::kept::keep;
+use super::{schema_version, ComparedWith, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedReference};
 use crate::measurement::{CovariateValue, MeasurementBatch, ModalMeasurement};
@@ -271,7 +272,8 @@ async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() 
     let declared =
         store.reference().insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap();
     let insert = async |id: &str, model: &str, compared: Option<u32>, seen: u32| {
-        let (assessment, charted) = (assessment(model, compared, at(2)), (NewCharts::default(), Some(seen)));
+        let (assessment, charted) =
+            (assessment(model, compared, at(2)), (NewCharts::default(), ComparedWith::Newest(seen)));
         store.assessments().insert_computed(&bridge(), id, &assessment, charted).await.unwrap().unwrap();
         store.batches().pending(&bridge(), 9).await.unwrap()
     };
@@ -279,6 +281,61 @@ async fn an_assessment_made_before_a_newer_reference_leaves_its_batch_waiting() 
     assert_eq!(insert("b1", "m", None, 0).await, ["b1"]);
     assert_eq!(insert("b1", "m", Some(declared), declared).await, [""; 0]);
     assert_eq!(insert("b1", "other", None, 0).await, [""; 0], "the reference is of another trained baseline");
+}
+
+#[tokio::test]
+async fn the_assessment_that_was_stored_last_is_the_current_one_even_when_the_clock_stands_still() {
+    let (store, _folder) = open().await;
+    for id in ["b0", "b1"] {
+        store.batches().insert_batch(&batch(id, 0, None), id, at(0)).await.unwrap();
+    }
+    let digest = Digest::of(&[b"m"]);
+    let declared =
+        store.reference().insert_undamaged(&bridge(), &undamaged(), &digest, &["b0".to_owned()], at(1)).await.unwrap();
+    // One task has seen the reference, another has not; the second is stored later, and the batch is assessed once more.
+    for (compared, seen) in [(Some(declared), declared), (None, 0), (Some(declared), declared)] {
+        let (assessment, charted) =
+            (assessment("m", compared, at(2)), (NewCharts::default(), ComparedWith::Newest(seen)));
+        store.assessments().insert_computed(&bridge(), "b1", &assessment, charted).await.unwrap().unwrap();
+        let current = store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap();
+        assert_eq!(current.undamaged_version, compared);
+    }
+    assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), ["b0"]);
+}
+
+#[tokio::test]
+async fn a_batch_is_compared_with_the_references_that_it_keeps_and_then_with_newer_ones() {
+    let (store, _folder) = open().await;
+    // Only b2 was measured after the batches of the references.
+    for (id, begins) in [("b0", 0), ("b1", 0), ("b2", 9)] {
+        store.batches().insert_batch(&batch(id, begins, None), id, at(0)).await.unwrap();
+    }
+    let digest = Digest::of(&[b"m"]);
+    let declare = async || {
+        let members = ["b0".to_owned()];
+        store.reference().insert_undamaged(&bridge(), &undamaged(), &digest, &members, at(1)).await.unwrap()
+    };
+    assert_eq!((declare().await, declare().await), (1, 2));
+    for id in ["b0", "b1", "b2"] {
+        let given = assessment("m", Some(1).filter(|_| id != "b0"), at(2));
+        store.assessments().insert_assessment(&bridge(), id, &given, NewCharts::default()).await.unwrap();
+        let kept = store
+            .database
+            .write(move |transaction| Box::pin(async move { keep(transaction, (bridge().as_str(), id), &[1]).await }));
+        kept.await.unwrap();
+    }
+    assert_eq!(declare().await, 3);
+    let compare = async |id: &str| {
+        let kept = store.batches().batch(&bridge(), id).await.unwrap().unwrap().kept_reference?;
+        let assessment = assessment("m", Some(kept), at(3));
+        let charted = (NewCharts::default(), ComparedWith::Kept(kept));
+        store.assessments().insert_computed(&bridge(), id, &assessment, charted).await.unwrap().unwrap();
+        Some(kept)
+    };
+    assert_eq!((compare("b1").await, compare("b1").await), (Some(1), None));
+    assert_eq!((compare("b2").await, compare("b2").await, compare("b2").await), (Some(1), Some(3), None));
+    assert_eq!(compare("b0").await, Some(1));
+    assert_eq!(store.batches().pending(&bridge(), 9).await.unwrap(), [""; 0]);
 }
 
 #[tokio::test]

@@ -8,9 +8,10 @@ use sqlx::FromRow;
 
 use super::assessment::CURRENT_FIRST;
 use super::batch::batch_state;
-use super::column::{bad_row, from_blob, timestamp, to_blob};
+use super::column::{bad_row, elements, from_blob, timestamp, to_blob};
 use super::database::Database;
 use super::error::Error;
+use super::kept::{keep_newer, replace_kept};
 use super::reference_content::{batches_of, stored_origin};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
@@ -61,14 +62,31 @@ struct MeasuredRow {
     maintenance: Option<String>,
 }
 
-/// The newest undamaged references that were read, by structure.
-pub(super) type Newest = Mutex<BTreeMap<StructureId, Arc<ReferenceRecord>>>;
+/// Undamaged references that were read. A stored version never changes.
+#[derive(Default)]
+pub(super) struct Known {
+    /// The newest ones, by structure.
+    pub newest: Mutex<BTreeMap<StructureId, Arc<ReferenceRecord>>>,
+    /// Earlier versions that batches are compared with.
+    pub earlier: Mutex<Vec<(StructureId, Arc<ReferenceRecord>)>>,
+}
+
+/// A reference to store.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NewReference {
+    /// The reference.
+    pub state: UndamagedReference,
+    /// Ids of its batches.
+    pub batches: Vec<String>,
+    /// The version of which this is the same reference, computed again: batches that keep that one keep this one instead.
+    pub replaces: Option<u32>,
+}
 
 /// Undamaged references.
 #[derive(Clone, Copy)]
 pub struct References<'s> {
     pub(super) database: &'s Database,
-    pub(super) newest: &'s Newest,
+    pub(super) known: &'s Known,
 }
 
 impl References<'_> {
@@ -87,35 +105,34 @@ impl References<'_> {
         batch_ids: &[String],
         now: Timestamp,
     ) -> Result<u32, Error> {
-        let (id, state) = (structure.to_string(), state.clone());
-        let (digest, batches) = (model_digest.clone(), batch_ids.to_vec());
+        let new = NewReference { state: state.clone(), batches: batch_ids.to_vec(), replaces: None };
+        self.insert_all_undamaged(structure, vec![new], model_digest, now).await
+    }
+
+    /// As [`Self::insert_undamaged`], for several references in one transaction. Returns the version of the last one.
+    ///
+    /// # Errors
+    /// As [`Self::insert_undamaged`].
+    pub async fn insert_all_undamaged(
+        self,
+        structure: &StructureId,
+        references: Vec<NewReference>,
+        model_digest: &Digest,
+        now: Timestamp,
+    ) -> Result<u32, Error> {
+        let (id, digest) = (structure.to_string(), model_digest.clone());
         let written = self.database.write(move |transaction| {
             Box::pin(async move {
-                let (version,): (u32,) =
-                    sqlx::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = $1")
-                        .bind(&id)
-                        .fetch_one(transaction.connection())
-                        .await?;
-                insert_state(transaction, (&id, version), &state, &digest, now).await?;
-                insert_batches(transaction, (&id, version), &batches).await?;
-                insert_quantities(transaction, (&id, version), &state.quantities).await?;
-                insert_process(transaction, (&id, version), &state).await?;
-                // The open alarms refer to the earlier reference: the new charts raise them again where they persist.
-                sqlx::query(
-                    "update alarm_episode set ended_at_us = $1
-                     where structure_id = $2 and kind = 'damage' and ended_at_us is null",
-                )
-                .bind(now.micros())
-                .bind(&id)
-                .execute(transaction.connection())
-                .await?;
-                requeue(transaction, (&id, version)).await?;
-                Ok(version)
+                let mut last = 0;
+                for new in references {
+                    last = insert_reference(transaction, &id, &new, (&digest, now)).await?;
+                }
+                Ok(last)
             })
         });
         let version = written.await?;
         // The next call of `undamaged_as_read` reads the new reference.
-        self.newest.lock().expect("no holder of this lock panics").remove(structure);
+        self.known.newest.lock().expect("no holder of this lock panics").remove(structure);
         Ok(version)
     }
 
@@ -206,8 +223,8 @@ impl References<'_> {
         if let Some(record) = self.known_undamaged(structure).filter(|record| record.state.version == newest) {
             return Ok(Some(record));
         }
-        let Some(record) = self.read_undamaged(structure).await?.map(Arc::new) else { return Ok(None) };
-        let mut all = self.newest.lock().expect("no holder of this lock panics");
+        let Some(record) = self.read_undamaged(structure, None).await?.map(Arc::new) else { return Ok(None) };
+        let mut all = self.known.newest.lock().expect("no holder of this lock panics");
         all.insert(structure.clone(), Arc::clone(&record));
         Ok(Some(record))
     }
@@ -226,7 +243,7 @@ impl References<'_> {
     }
 
     fn known_undamaged(self, structure: &StructureId) -> Option<Arc<ReferenceRecord>> {
-        self.newest.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
+        self.known.newest.lock().expect("no holder of this lock panics").get(structure).map(Arc::clone)
     }
 
     /// The process of a reference, or why there is none; neither for a reference of an earlier version of the program.
@@ -245,13 +262,19 @@ impl References<'_> {
         Ok((process.map(|text| stored_process(&text)).transpose()?.map(Arc::new), without))
     }
 
-    async fn read_undamaged(self, structure: &StructureId) -> Result<Option<ReferenceRecord>, Error> {
+    /// A version of the reference; `None`: the newest.
+    pub(super) async fn read_undamaged(
+        self,
+        structure: &StructureId,
+        version: Option<u32>,
+    ) -> Result<Option<ReferenceRecord>, Error> {
         let row: Option<StateRow> = sqlx::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint,
                     origin
-             from undamaged_state where structure_id = $1 order by version desc limit 1",
+             from undamaged_state where structure_id = $1 and ($2 is null or version = $2) order by version desc limit 1",
         )
         .bind(structure.as_str())
+        .bind(version)
         .fetch_optional(&self.database.reader)
         .await?;
         let Some((
@@ -298,6 +321,38 @@ impl References<'_> {
             batches,
         }))
     }
+}
+
+/// Stores a reference under the next version, which is returned, and marks batches to be assessed again.
+async fn insert_reference(
+    transaction: &mut Transaction<'_>,
+    id: &str,
+    NewReference { state, batches, replaces }: &NewReference,
+    (digest, now): (&Digest, Timestamp),
+) -> Result<u32, Error> {
+    let (version,): (u32,) =
+        sqlx::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = $1")
+            .bind(id)
+            .fetch_one(transaction.connection())
+            .await?;
+    insert_state(transaction, (id, version), state, digest, now).await?;
+    insert_batches(transaction, (id, version), batches).await?;
+    insert_quantities(transaction, (id, version), &state.quantities).await?;
+    insert_process(transaction, (id, version), state).await?;
+    // The open alarms refer to the earlier reference: the new charts raise them again where they persist.
+    sqlx::query(
+        "update alarm_episode set ended_at_us = $1 where structure_id = $2 and kind = 'damage' and ended_at_us is null",
+    )
+    .bind(now.micros())
+    .bind(id)
+    .execute(transaction.connection())
+    .await?;
+    match replaces {
+        Some(replaced) => replace_kept(transaction, id, (*replaced, version)).await?,
+        None => keep_newer(transaction, id, version).await?,
+    }
+    requeue(transaction, (id, version), "[]").await?;
+    Ok(version)
 }
 
 /// Stores the process of a reference, or why there is none.
@@ -349,7 +404,7 @@ async fn insert_state(
     Ok(())
 }
 
-async fn insert_batches(
+pub(super) async fn insert_batches(
     transaction: &mut Transaction<'_>,
     (structure, version): Key<'_>,
     batches: &[String],
@@ -396,8 +451,12 @@ async fn insert_quantities(
 
 /// Marks batches to be assessed again: those that were never compared with a reference, and all that came after the batches of
 /// the new reference, because its charts begin there. The current assessment decides whether a batch was compared, since one
-/// with an earlier trained baseline is not comparable.
-async fn requeue(transaction: &mut Transaction<'_>, (structure, version): Key<'_>) -> Result<(), Error> {
+/// with an earlier trained baseline is not comparable. Batches of the list `except` are left as they are.
+pub(super) async fn requeue(
+    transaction: &mut Transaction<'_>,
+    (structure, version): Key<'_>,
+    except: &str,
+) -> Result<(), Error> {
     let update = format!(
         "update measurement_batch set state = 'received'
          where structure_id = $1 and state = 'assessed'
@@ -407,9 +466,11 @@ async fn requeue(transaction: &mut Transaction<'_>, (structure, version): Key<'_
                    order by {CURRENT_FIRST} limit 1)
                or measured_from_us > (select max(b.measured_to_us) from measurement_batch b
                    join undamaged_batch u using (structure_id, batch_id)
-                   where u.structure_id = $1 and u.version = $2))"
+                   where u.structure_id = $1 and u.version = $2))
+           and batch_id not in (select value from {})",
+        elements!("$3")
     );
-    let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version);
+    let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version).bind(except);
     update.execute(transaction.connection()).await?;
     Ok(())
 }

@@ -2,6 +2,7 @@
 
 use sqlx::FromRow;
 
+use super::assessment::IS_CURRENT;
 use super::error::Error;
 use super::structure::{is_present, Structures};
 use super::transaction::Transaction;
@@ -37,7 +38,8 @@ pub struct StoredBaseline {
 
 impl Structures<'_> {
     /// Makes another version the present version of a structure and stores the baseline trained for it. The earlier version and
-    /// the assessments for it are kept, and all batches are assessed again for the new one. Changes nothing and returns false if
+    /// the assessments for it are kept, and all batches are assessed again for the new one; they keep the undamaged references that they
+    /// are compared with. Changes nothing and returns false if
     /// `expected` is not the present version.
     ///
     /// # Errors
@@ -86,6 +88,7 @@ impl Structures<'_> {
                     .bind(&structure)
                     .execute(transaction.connection())
                     .await?;
+                    keep_all(transaction, &structure).await?;
                     sqlx::query(
                         "update measurement_batch set state = 'received', failure = null where structure_id = $1",
                     )
@@ -160,5 +163,21 @@ async fn insert_baseline(
     .bind(now_us)
     .execute(transaction.connection())
     .await?;
+    Ok(())
+}
+
+/// All batches of a structure are to be assessed again: those that are compared with another reference than the newest keep theirs.
+async fn keep_all(transaction: &mut Transaction<'_>, structure: &str) -> Result<(), Error> {
+    sqlx::query("delete from kept_comparison where structure_id = $1")
+        .bind(structure)
+        .execute(transaction.connection())
+        .await?;
+    let insert = format!(
+        "insert into kept_comparison
+         select a.structure_id, a.batch_id, 0, a.undamaged_version from assessment a
+         where a.structure_id = $1 and a.undamaged_version > 0
+           and a.undamaged_version < (select max(version) from undamaged_state where structure_id = $1) and {IS_CURRENT}"
+    );
+    sqlx::query(sqlx::AssertSqlSafe(insert)).bind(structure).execute(transaction.connection()).await?;
     Ok(())
 }

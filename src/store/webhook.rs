@@ -196,7 +196,7 @@ impl Webhooks<'_> {
         self.database.write(move |transaction| {
             Box::pin(async move {
                 let updated = sqlx::query(
-                    "update webhook set previous_secret = secret, previous_until_us = $1, secret = $2, updated_at_us = $3
+                    "update webhook set previous_secret = nullif(secret, ''), previous_until_us = iif(secret = '', null, $1), secret = $2, updated_at_us = $3
                      where webhook_id = $4",
                 )
                 .bind(previous_until.micros())

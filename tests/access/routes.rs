@@ -31,7 +31,7 @@ enum About {
 }
 use About::{List, Service, Structure};
 
-const TABLE: [(&str, &str, Needs, About); 80] = [
+const TABLE: [(&str, &str, Needs, About); 81] = [
     ("GET", "/v1/structures", Read, List),
     ("GET", "/v1/structures/{}", Read, Structure),
     ("PUT", "/v1/structures/{}", Admin, Structure),
@@ -89,6 +89,7 @@ const TABLE: [(&str, &str, Needs, About); 80] = [
     ("GET", "/v1/structures/{}/measurements", Read, Structure),
     ("GET", "/v1/structures/{}/export", Read, Structure),
     ("POST", "/v1/structures/{}/model/reload", Admin, Structure),
+    ("DELETE", "/v1/structures/{}", Admin, Structure),
     ("GET", "/v1/backups", Admin, Service),
     ("POST", "/v1/backups", Admin, Service),
     ("GET", "/v1/retention", Admin, Service),

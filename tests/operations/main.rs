@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking, in its helpers too")]
 
 mod archive;
+mod archive_references;
 mod backup;
 mod doctor;
 #[path = "../api/helpers.rs"]
@@ -14,5 +15,6 @@ mod monitoring;
 mod output;
 mod prometheus;
 mod storage;
+mod stored;
 mod supervision;
 mod world;

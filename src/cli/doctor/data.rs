@@ -118,8 +118,14 @@ pub async fn database(config: &Config) -> DatabaseChecks {
         let found = format!("{} can corrupt a database", inspection.sqlite_version);
         Check::fail("SQLite", found, "build modalwatch with the bundled SQLite, 3.51.3 or later")
     });
-    checks.push(if inspection.damage.is_empty() && inspection.dangling_rows == 0 {
-        Check::ok("integrity", "all pages and references are intact")
+    checks.push(if !inspection.foreign.is_empty() {
+        let found = format!("another program has changed the schema: {}", inspection.foreign.join("; "));
+        Check::fail("integrity", found, restore)
+    } else if !inspection.unreadable.is_empty() {
+        let found = format!("stored data cannot be read: {}", inspection.unreadable.join("; "));
+        Check::fail("integrity", found, restore)
+    } else if inspection.damage.is_empty() && inspection.dangling_rows == 0 {
+        Check::ok("integrity", "all pages and references are intact, and stored texts can be read")
     } else {
         let dangling = format!("{} rows refer to rows that do not exist", inspection.dangling_rows);
         let found = if inspection.damage.is_empty() { dangling } else { inspection.damage.join("; ") };
@@ -138,6 +144,15 @@ pub async fn database(config: &Config) -> DatabaseChecks {
         Ordering::Equal => Check::ok("schema", format!("version {found}")),
     });
     DatabaseChecks { checks, inspection: Some(inspection), in_use: false }
+}
+
+/// Folders of backups and restorations that were broken off; `None` if there are none.
+pub fn left_behind(config: &Config) -> Option<Check> {
+    let folders = [config.data_dir.clone(), config.data_dir.join(backup::FOLDER)];
+    let left: Vec<String> =
+        folders.iter().flat_map(|folder| backup::left_behind(folder)).map(|path| path.display().to_string()).collect();
+    let next = "nothing to do: the next start of the service or the next backup removes them";
+    (!left.is_empty()).then(|| Check::warn("broken-off backups", left.join(", "), next))
 }
 
 /// The backups in the data folder; `None` if there is neither a backup nor data.

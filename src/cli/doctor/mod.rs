@@ -56,6 +56,7 @@ async fn checks(args: &DoctorArgs) -> Vec<Check> {
     checks.extend(database.checks);
     let newest = database.inspection.as_ref().and_then(|inspection| inspection.newest_received);
     checks.extend(data::backups(&config, newest.is_some()));
+    checks.extend(data::left_behind(&config));
     checks.extend(models::library(&config));
     if let Some(inspection) = &database.inspection {
         checks.extend(models::trained(inspection));

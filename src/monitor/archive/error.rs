@@ -38,6 +38,9 @@ impl ImportError {
             Self::Monitor(Error::Store(crate::store::Error::Row { what, detail })) => {
                 Self::Line { line, reason: format!("{what}: {detail}") }
             }
+            Self::Monitor(Error::Store(crate::store::Error::Sqlite(error))) => {
+                Self::Line { line, reason: format!("it cannot be stored: {error}") }
+            }
             other => other,
         }
     }

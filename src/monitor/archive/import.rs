@@ -1,28 +1,25 @@
 //! Import of a structure from an archive.
 
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::Arc;
 
 use serde::Serialize;
 use tokio::sync::mpsc::channel;
 
-use super::error::{invalid, ImportError};
+use super::check::Checker;
+use super::error::ImportError;
 use super::lines::{check_whole, each_line};
 use crate::baseline::Baseline;
-use crate::measurement::check::{check_measurements, FieldPath, RawMeasurement};
-use crate::measurement::MeasurementBatch;
 use crate::monitor::assessor::Assessor;
 use crate::monitor::error::Error;
 use crate::monitor::replay::Replay;
-use crate::quantity::{shown, Digest, StructureId, Timestamp};
+use crate::quantity::{Digest, StructureId};
 use crate::simulator::Simulator;
-use crate::store::archive::{Acknowledged, ArchivedAction, ArchivedModel, Batch, Record};
+use crate::store::archive::{Head, ImportedActions, Record, Stored};
 
 /// Lines buffered between the file and the store.
 const BUFFERED: usize = 64;
-
-/// Batches stored in one transaction.
-const AT_A_TIME: usize = 100;
 
 /// The result of an import.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -51,54 +48,70 @@ pub struct Imported {
     pub warnings: Vec<String>,
 }
 
-/// Imports an archive.
+/// Imports an archive: checks all of it, stores it in one transaction, and assesses its batches.
 pub(super) async fn import(assessor: &Assessor, replay: &Replay, path: &Path) -> Result<Imported, ImportError> {
     let file = path.to_owned();
     let checked = tokio::task::spawn_blocking(move || {
-        let mut simulator = None;
-        check_whole(&file, |head, record| check_record(&head.structure, record, &mut simulator))
+        let mut checker: Option<Checker> = None;
+        let head = check_whole(&file, |head, record| {
+            let checker = checker.get_or_insert_with(|| Checker::new(head.structure.clone()));
+            if let Record::Model(model) = &record {
+                checker.check_model(model)?;
+            }
+            checker.check(record).map(drop)
+        })?;
+        let checker = checker.unwrap_or_else(|| Checker::new(head.structure.clone()));
+        Ok::<_, ImportError>((head, checker.into_present()?))
     });
-    let checked = checked.await;
-    let head = checked.map_err(|_| Error::Panicked)??;
-    let mut import = Import {
-        assessor,
-        replay,
-        acknowledgements: Vec::new(),
-        actions: Vec::new(),
-        waiting: Vec::new(),
-        simulator: None,
-        done: Imported {
-            structure: head.structure.clone(),
-            versions: 0,
-            models: 0,
-            batches: 0,
-            batches_new: 0,
-            undamaged_states: 0,
-            maintenance_windows: 0,
-            acknowledgements: 0,
-            alarm_actions: 0,
-            notes: 0,
-            warnings: Vec::new(),
-        },
-    };
+    let (head, simulator) = checked.await.map_err(|_| Error::Panicked)??;
+    let stored = store(assessor, path, &head).await?;
+    let mut warnings = Vec::new();
     if head.settings != assessor.settings.of_answers() {
-        let warning = format!(
+        warnings.push(format!(
             "the archive was written with settings that differ from those of this service ({}): assessments may differ",
             head.settings
-        );
-        import.done.warnings.push(warning);
+        ));
     }
+    let actions = assess(assessor, replay, simulator, &mut warnings).await?;
+    Ok(Imported {
+        structure: head.structure,
+        versions: stored.versions,
+        models: stored.models,
+        batches: stored.batches,
+        batches_new: stored.batches_new,
+        undamaged_states: stored.undamaged_states,
+        maintenance_windows: stored.maintenance_windows,
+        acknowledgements: actions.acknowledgements,
+        alarm_actions: actions.actions,
+        notes: stored.notes,
+        warnings,
+    })
+}
+
+/// Stores the records of a checked archive in one transaction.
+async fn store(assessor: &Assessor, path: &Path, head: &Head) -> Result<Stored, ImportError> {
     // A separate thread reads the lines, so that a large file neither fills the memory nor blocks an async thread.
-    let (sender, mut lines) = channel(BUFFERED);
-    let file = path.to_owned();
+    let (sender, lines) = channel(BUFFERED);
+    let (file, structure) = (path.to_owned(), head.structure.clone());
     let reader = tokio::task::spawn_blocking(move || {
-        each_line(&file, |number, record| sender.blocking_send((number, record)).map_err(|_| stopped(number)))
+        let mut checker = Checker::new(structure);
+        each_line(&file, |number, record| {
+            let checked = checker.check(record).map_err(|error| error.at_line(number))?;
+            sender.blocking_send((number, checked)).map_err(|_| stopped(number))
+        })
     });
-    while let Some((number, record)) = lines.recv().await {
-        import.take(record).await.map_err(|error| error.at_line(number))?;
+    let library = assessor.structures.library();
+    let in_library = library.get(&head.structure).and_then(|entry| entry.baseline.as_ref());
+    let known_model = in_library.map(|baseline| baseline.digest().clone());
+    let line = Arc::new(AtomicU64::new(0));
+    let stored = assessor.store.archive().import(&head.structure, known_model, lines, Arc::clone(&line)).await;
+    let read = reader.await.map_err(|_| Error::Panicked)?;
+    match (stored, read) {
+        (Ok(stored), _) => Ok(stored),
+        // The file has changed since it was checked.
+        (Err(_), Err(read @ (ImportError::File { .. } | ImportError::NotWhole(_)))) => Err(read),
+        (Err(error), _) => Err(ImportError::from(error).at_line(line.load(Ordering::Relaxed))),
     }
-    reader.await.map_err(|_| Error::Panicked)??;
-    import.finish().await
 }
 
 /// The error that ends the reading thread when the import has stopped.
@@ -106,220 +119,44 @@ fn stopped(line: u64) -> ImportError {
     ImportError::Line { line, reason: "the import was stopped".to_owned() }
 }
 
-/// A running import.
-struct Import<'a> {
-    assessor: &'a Assessor,
-    replay: &'a Replay,
-    simulator: Option<Simulator>,
-    waiting: Vec<(String, MeasurementBatch, Timestamp)>,
-    acknowledgements: Vec<Acknowledged>,
-    actions: Vec<ArchivedAction>,
-    done: Imported,
-}
-
-impl Import<'_> {
-    async fn take(&mut self, record: Record) -> Result<(), ImportError> {
-        if !matches!(record, Record::Batch(_)) {
-            self.store_waiting().await?;
-        }
-        let (store, structure) = (&self.assessor.store, self.done.structure.clone());
-        match record {
-            Record::Archive(_) | Record::End(_) => {}
-            Record::Structure(present) => {
-                let simulator = simulator_of(&structure, &present.digest, &present.definition)?;
-                self.assessor.structures.put(simulator.clone()).await?;
-                self.simulator = Some(simulator);
-            }
-            Record::Version(version) => {
-                simulator_of(&structure, &version.digest, &version.definition)?;
-                self.done.versions += u64::from(store.archive().import_version(&structure, version).await?);
-            }
-            Record::Model(model) => self.take_model(model).await?,
-            Record::Batch(batch) => {
-                let simulator =
-                    self.simulator.as_ref().ok_or_else(|| invalid(&"a batch comes before the structure"))?;
-                let (measured, received_at) = checked_batch(&batch, simulator)?;
-                self.done.batches += 1;
-                self.waiting.push((batch.batch, measured, received_at));
-                if self.waiting.len() >= AT_A_TIME {
-                    self.store_waiting().await?;
-                }
-            }
-            Record::UndamagedReference(state) => {
-                self.done.undamaged_states += u64::from(store.archive().import_undamaged(&structure, state).await?);
-            }
-            Record::Maintenance(window) => {
-                self.done.maintenance_windows +=
-                    u64::from(store.archive().import_maintenance(&structure, window).await?);
-            }
-            Record::Acknowledgement(note) => self.acknowledgements.push(note),
-            Record::AlarmAction(action) => self.actions.push(action),
-            Record::Note(note) => {
-                self.done.notes += u64::from(store.archive().import_note(&structure, note).await?);
-            }
-        }
-        Ok(())
+/// Assesses the batches with the imported trained model, and stores what people did with the alarms that this raises.
+async fn assess(
+    assessor: &Assessor,
+    replay: &Replay,
+    simulator: Simulator,
+    warnings: &mut Vec<String>,
+) -> Result<ImportedActions, ImportError> {
+    let structure = simulator.id().clone();
+    let baseline = assessor.structures.baseline_for(&simulator).await?;
+    if let Err(reason) = &baseline {
+        warnings.push(format!("batches wait for their assessment: {reason}"));
     }
-
-    async fn store_waiting(&mut self) -> Result<(), ImportError> {
-        if !self.waiting.is_empty() {
-            let waiting = std::mem::take(&mut self.waiting);
-            self.done.batches_new += self.assessor.store.archive().import_batches(waiting).await?;
-        }
-        Ok(())
-    }
-
-    /// Stores a trained baseline that is not stored yet, after its self-test.
-    async fn take_model(&mut self, model: ArchivedModel) -> Result<(), ImportError> {
-        let structure = self.done.structure.clone();
-        let library = self.assessor.structures.library();
-        let in_library = library.get(&structure).and_then(|entry| entry.baseline.as_ref());
-        if in_library.is_some_and(|baseline| baseline.digest().as_str() == model.model_digest) {
-            return Ok(());
-        }
-        let version = Digest::from_stored(model.structure_digest.clone());
-        let stored = self.assessor.store.structures().structure_version(&structure, &version).await?;
-        let simulator = match (&self.simulator, stored) {
-            (Some(present), _) if *present.digest() == version => present.clone(),
-            (_, Some((definition, _))) => simulator_of(&structure, version.as_str(), &definition)?,
-            _ => {
-                return Err(
-                    invalid(&format!("a trained model is for version {version}, which the archive lacks")).into()
-                )
-            }
-        };
-        let weights = model.weights().map_err(|e| invalid(&e))?;
-        let manifest = model.manifest.clone().into_bytes();
-        let loaded = tokio::task::spawn_blocking(move || Baseline::load(&manifest, &weights, &simulator)).await;
-        let loaded = loaded.map_err(|_| Error::Panicked)?.map_err(|e| invalid(&e))?;
-        if loaded.digest().as_str() != model.model_digest {
-            return Err(invalid(&"a trained model does not match its digest").into());
-        }
-        self.done.models +=
-            u64::from(self.assessor.store.archive().import_model(&structure, model, Timestamp::now()).await?);
-        Ok(())
-    }
-
-    /// Assesses the batches with the imported trained baseline, and stores what people did with the alarms that this raises.
-    async fn finish(mut self) -> Result<Imported, ImportError> {
-        self.store_waiting().await?;
-        let structure = self.done.structure.clone();
-        let simulator = self.simulator.ok_or_else(|| invalid(&"the archive has no structure"))?;
-        let baseline = self.assessor.structures.baseline_for(&simulator).await?;
-        if let Err(reason) = &baseline {
-            self.done.warnings.push(format!("batches wait for their assessment: {reason}"));
-        }
-        let in_use = baseline.as_ref().ok().map(|baseline: &Arc<Baseline>| baseline.digest().clone());
-        self.assessor.structures.activate(simulator, baseline);
-        if let Some(state) = self.assessor.store.reference().undamaged(&structure).await? {
-            if in_use.as_ref().is_some_and(|digest| *digest != state.model_digest) {
-                self.done.warnings.push(format!(
+    let in_use: Option<Digest> = baseline.as_ref().ok().map(|baseline: &Arc<Baseline>| baseline.digest().clone());
+    assessor.structures.activate(simulator, baseline);
+    if let Some(in_use) = in_use {
+        if let Some(state) = assessor.store.reference().undamaged(&structure).await? {
+            if in_use != state.model_digest {
+                warnings.push(format!(
                     "the undamaged reference {} was made with the trained model {}, which is not in use here: batches are not \
                      compared with it",
                     state.state.version, state.model_digest
                 ));
             }
         }
-        self.replay.resume(&structure).await?;
-        let acknowledgements = std::mem::take(&mut self.acknowledgements);
-        for acknowledgement in acknowledgements {
-            self.done.acknowledgements +=
-                u64::from(self.assessor.store.archive().import_acknowledgement(&structure, acknowledgement).await?);
-        }
-        let mut lost = 0;
-        for action in std::mem::take(&mut self.actions) {
-            match self.assessor.store.archive().import_action(&structure, action).await? {
-                Some(new) => self.done.alarm_actions += u64::from(new),
-                None => lost += 1,
-            }
-        }
-        if lost > 0 {
-            let warning =
-                format!("{lost} comments and other actions have no alarm here: alarms are computed again on import");
-            self.done.warnings.push(warning);
-        }
-        Ok(self.done)
-    }
-}
-
-/// Checks the content of one record before anything of the archive is stored; `simulator` is that of the structure, once its record has
-/// come.
-fn check_record(
-    structure: &StructureId,
-    record: &Record,
-    simulator: &mut Option<Simulator>,
-) -> Result<(), ImportError> {
-    let time = |text: &str| Timestamp::parse(text).map(drop).map_err(|e| invalid(&format!("{}: {e}", shown(text))));
-    match record {
-        Record::Archive(_) | Record::End(_) => {}
-        Record::Acknowledgement(note) => time(&note.at)?,
-        Record::AlarmAction(action) => {
-            [Some(&action.at), Some(&action.opened_at), action.ended_at.as_ref()]
-                .into_iter()
-                .flatten()
-                .try_for_each(|text| time(text))?;
-        }
-        Record::Structure(present) => *simulator = Some(simulator_of(structure, &present.digest, &present.definition)?),
-        Record::Version(version) => {
-            simulator_of(structure, &version.digest, &version.definition)?;
-            time(&version.created_at)?;
-        }
-        Record::Model(model) => drop(model.weights().map_err(|e| invalid(&e))?),
-        Record::Batch(batch) => {
-            let simulator = simulator.as_ref().ok_or_else(|| invalid(&"a batch comes before the structure"))?;
-            checked_batch(batch, simulator)?;
-        }
-        Record::UndamagedReference(state) => state.check()?,
-        Record::Maintenance(window) => {
-            [&window.from, &window.to, &window.created_at].into_iter().try_for_each(|text| time(text))?;
-        }
-        Record::Note(note) => {
-            [Some(&note.from), note.to.as_ref(), Some(&note.created_at)]
-                .into_iter()
-                .flatten()
-                .try_for_each(|text| time(text))?;
+        let batches = assessor.store.reference().keep_none_of_other_models(&structure, &in_use).await?;
+        if batches > 0 {
+            warnings.push(format!(
+                "{batches} batches were compared with an undamaged reference of another trained baseline, which is not in use here: \
+                 they are not compared with it"
+            ));
         }
     }
-    Ok(())
-}
-
-fn simulator_of(structure: &StructureId, digest: &str, definition: &str) -> Result<Simulator, ImportError> {
-    let simulator = Simulator::parse_json(definition).map_err(Error::from)?;
-    if simulator.id() != structure || simulator.digest().as_str() != digest {
-        return Err(invalid(&format!("the definition of {structure} does not match its digest {digest}")).into());
+    let actions = replay.resume(&structure).await?;
+    if actions.without_alarm > 0 {
+        warnings.push(format!(
+            "{} comments and other actions have no alarm here: alarms are computed again on import",
+            actions.without_alarm
+        ));
     }
-    Ok(simulator)
-}
-
-/// Checks a batch of the archive in the same way as a batch that is sent to the service.
-fn checked_batch(batch: &Batch, simulator: &Simulator) -> Result<(MeasurementBatch, Timestamp), Error> {
-    let raw = |(index, m): (usize, &crate::store::archive::Measurement)| RawMeasurement {
-        path: FieldPath::Json { index },
-        measured_at: Some(m.measured_at.clone()),
-        frequencies_hz: m.frequencies_hz.clone(),
-        std_hz: m.std_hz.clone(),
-        mode_shapes: m.mode_shapes.clone(),
-        covariates: m.covariates.clone(),
-        settings: m.settings.clone(),
-    };
-    let expectation = simulator.expectation(Timestamp::now(), usize::MAX);
-    let raw = batch.measurements.iter().enumerate().map(raw).collect();
-    let measurements = check_measurements(raw, &expectation).map_err(|problems| {
-        let first = problems.first().map_or_else(String::new, |p| format!("{}: {}", p.pointer, p.message));
-        invalid(&format!("batch {}: {first}", batch.batch))
-    })?;
-    if uuid::Uuid::parse_str(&batch.batch).is_err() {
-        return Err(invalid(&format!("{} is not a valid batch id", crate::quantity::shown(&batch.batch))));
-    }
-    let measured = MeasurementBatch {
-        structure: simulator.id().clone(),
-        source: batch.source.clone(),
-        idempotency_key: batch.idempotency_key.clone(),
-        measurements,
-    };
-    if measured.content_digest().as_str() != batch.content_digest {
-        return Err(invalid(&format!("batch {} does not match its digest", batch.batch)));
-    }
-    let received_at = Timestamp::parse(&batch.received_at).map_err(|e| invalid(&e))?;
-    Ok((measured, received_at))
+    Ok(actions)
 }

@@ -24,7 +24,7 @@ pub(super) fn line_of(record: &Record) -> Vec<u8> {
 /// by `check`.
 pub(super) fn check_whole(
     path: &Path,
-    mut check: impl FnMut(&Head, &Record) -> Result<(), ImportError>,
+    mut check: impl FnMut(&Head, Record) -> Result<(), ImportError>,
 ) -> Result<Head, ImportError> {
     let incomplete = |what: &str| ImportError::NotWhole(what.to_owned());
     let mut head: Option<Head> = None;
@@ -43,7 +43,7 @@ pub(super) fn check_whole(
             (_, Record::End(_)) => ended = true,
             (_, record) => {
                 let head = head.as_ref().ok_or_else(|| incomplete("its first line is missing"))?;
-                check(head, &record).map_err(|error| error.at_line(number))?;
+                check(head, record).map_err(|error| error.at_line(number))?;
             }
         }
         Ok(())

@@ -1,8 +1,10 @@
 //! Moving a structure from one installation to another.
 //!
 //! An import stores what was measured and declared; the assessments are computed again. They are functions of measurements, trained
-//! baseline, undamaged reference and seed, all of which are in the archive, so they are the same to the last bit.
+//! baseline, undamaged reference and seed, all of which are in the archive, so they are the same to the last bit. Each batch is compared
+//! with the references that it was compared with, in the same order.
 
+mod check;
 mod error;
 mod export;
 mod import;
@@ -40,11 +42,11 @@ impl Archive {
         export::export(&self.assessor, structure).await
     }
 
-    /// Imports an archive: stores what is new, assesses the batches that wait, and stores the acknowledgements. Repeating an import
-    /// changes nothing, so an interrupted import is completed by repeating it.
+    /// Imports an archive: stores what is new in one transaction, assesses the batches that wait, and stores the acknowledgements. If it is
+    /// interrupted after the transaction, the next start of the service completes it. Repeating an import changes nothing.
     ///
     /// # Errors
-    /// [`ImportError`]; an incomplete or changed file is refused before anything is stored.
+    /// [`ImportError`]; then nothing was stored.
     pub async fn import(&self, path: &Path) -> Result<Imported, ImportError> {
         import::import(&self.assessor, &self.replay, path).await
     }

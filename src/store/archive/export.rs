@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use sqlx::FromRow;
 use tokio::sync::mpsc::Sender;
 
+use super::super::assessment::CURRENT_FIRST;
 use super::super::column::{bad_row, elements, from_blob, list, timestamp};
 use super::super::database::Database;
 use super::super::error::Error;
@@ -37,8 +38,8 @@ struct ExportedMeasurement {
     settings: String,
 }
 
-/// Columns of a batch: id, source, idempotency key, content digest, time of arrival in µs.
-type BatchRow = (String, String, Option<String>, String, i64);
+/// Columns of a batch: id, source, idempotency key, content digest, time of arrival in µs, state.
+type BatchRow = (String, String, Option<String>, String, i64, String);
 
 /// Columns of an undamaged reference: version, model digest, creation in µs, threshold probability, number of measurements,
 /// conditions, doubts, joint probability, origin, process, why there is none.
@@ -97,7 +98,7 @@ impl Archive<'_> {
         let (mut received, mut last) = (i64::MIN, String::new());
         loop {
             let rows: Vec<BatchRow> = sqlx::query_as(
-                "select batch_id, source, idempotency_key, content_digest, received_at_us from measurement_batch
+                "select batch_id, source, idempotency_key, content_digest, received_at_us, state from measurement_batch
                  where structure_id = $1 and (received_at_us, batch_id) > ($2, $3) order by received_at_us, batch_id limit $4",
             )
             .bind(structure.as_str())
@@ -123,13 +124,53 @@ impl Archive<'_> {
             for row in measured {
                 by_batch.entry(row.batch_id.clone()).or_default().push(measurement(row)?);
             }
-            for (batch, source, idempotency_key, content_digest, received) in rows {
+            let mut compared = self.comparisons(structure, &ids).await?;
+            let ids: Vec<(String, bool)> = rows.iter().map(|row| (row.0.clone(), row.5 == "assessed")).collect();
+            for (id, assessed) in ids {
+                let found = compared.entry(id).or_default();
+                // A batch that waits for the newest reference, or that failed, says nothing.
+                found.stated = assessed || !found.kept.is_empty();
+            }
+            for (batch, source, idempotency_key, content_digest, received, _) in rows {
                 let measurements = by_batch.remove(&batch).unwrap_or_default();
                 let received_at = timestamp("batch", received)?.to_string();
-                let record = Batch { batch, source, idempotency_key, content_digest, received_at, measurements };
+                let compared_with = compared.remove(&batch).and_then(Compared::versions);
+                let record =
+                    Batch { batch, source, idempotency_key, content_digest, received_at, compared_with, measurements };
                 records.send(Record::Batch(record)).await.map_err(receiver_dropped)?;
             }
         }
+    }
+
+    /// What batches were compared with, and are still to be compared with, by batch.
+    async fn comparisons(self, structure: &StructureId, ids: &[&String]) -> Result<BTreeMap<String, Compared>, Error> {
+        let select = format!(
+            "select batch_id, undamaged_version, model_digest from assessment
+             where structure_id = $1 and batch_id in (select value from {}) order by batch_id, {CURRENT_FIRST}",
+            elements!("$2")
+        );
+        let assessed: Vec<(String, u32, String)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            .bind(structure.as_str())
+            .bind(list(ids))
+            .fetch_all(&self.database.reader)
+            .await?;
+        let kept: Vec<(String, u32)> = sqlx::query_as(concat!(
+            "select batch_id, undamaged_version from kept_comparison where structure_id = $1 and batch_id in (select value from ",
+            elements!("$2"),
+            ") order by batch_id, position"
+        ))
+        .bind(structure.as_str())
+        .bind(list(ids))
+        .fetch_all(&self.database.reader)
+        .await?;
+        let mut all = BTreeMap::<String, Compared>::new();
+        for (batch, version, model) in assessed {
+            all.entry(batch).or_default().assessed.push((version, model));
+        }
+        for (batch, version) in kept {
+            all.entry(batch).or_default().kept.push(version);
+        }
+        Ok(all)
     }
 
     async fn export_states(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
@@ -197,17 +238,18 @@ impl Archive<'_> {
             let window = Maintenance { from: time(from)?, to: time(to)?, reason, created_at: time(created)? };
             records.send(Record::Maintenance(window)).await.map_err(receiver_dropped)?;
         }
-        let seen: Vec<(String, String, String, i64, String, Option<String>)> = sqlx::query_as(
-            "select kind, series, opened_batch, acknowledged_at_us, acknowledged_by, acknowledgement_note
+        let seen: Vec<(String, String, u32, String, i64, String, Option<String>)> = sqlx::query_as(
+            "select kind, series, undamaged_version, opened_batch, acknowledged_at_us, acknowledged_by, acknowledgement_note
              from alarm_episode where structure_id = $1 and acknowledged_at_us is not null and acknowledged_by is not null
                and opened_batch is not null and withdrawn = 0 order by episode",
         )
         .bind(structure.as_str())
         .fetch_all(&self.database.reader)
         .await?;
-        for (kind, series, opened_batch, at, by, note) in seen {
+        for (kind, series, version, opened_batch, at, by, note) in seen {
             let at = timestamp("acknowledgement", at)?.to_string();
-            let record = Acknowledged { kind, series, opened_batch, at, by, note };
+            let undamaged_version = Some(version);
+            let record = Acknowledged { kind, series, undamaged_version, opened_batch, at, by, note };
             records.send(Record::Acknowledgement(record)).await.map_err(receiver_dropped)?;
         }
         Ok(())
@@ -229,6 +271,33 @@ impl Archive<'_> {
             ArchivedModel::new(&version, &digest, &manifest, &weights, accepted)
         };
         Ok(rows.into_iter().map(model).collect())
+    }
+}
+
+/// What a batch was compared with.
+#[derive(Default)]
+struct Compared {
+    /// Undamaged reference and trained baseline of its assessments, the current one first.
+    assessed: Vec<(u32, String)>,
+    /// References that it is still to be compared with.
+    kept: Vec<u32>,
+    /// Whether this is all that it is compared with.
+    stated: bool,
+}
+
+impl Compared {
+    /// The references of its assessments by the trained baseline of the current one, in their order.
+    fn versions(self) -> Option<Vec<u32>> {
+        let model = self.assessed.first().map(|(_, model)| model.clone());
+        let of_model = self.assessed.into_iter().rev().filter(|(_, of)| Some(of) == model.as_ref());
+        let mut all: Vec<u32> = of_model.map(|(version, _)| version).chain(self.kept).collect();
+        let last = *all.last()?;
+        // That it was compared with none before is of no interest.
+        all.retain(|version| *version > 0);
+        if last == 0 {
+            all.push(0);
+        }
+        self.stated.then_some(all)
     }
 }
 

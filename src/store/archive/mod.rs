@@ -14,17 +14,21 @@
 //!  {"record":"end", …}                count and SHA-256 of all lines before
 //! ```
 //!
-//! The first line states the version of the format: 2, or 1 for archives without actions and notes, which are read as well.
+//! The first line states the version of the format: 3; 2 for archives that do not state what a batch was compared with, and 1 for those
+//! without actions and notes are read as well.
 //!
 //! Assessments, charts and alarms are not part of it, because the importing installation computes them again from these data
-//! with the same seeds.
+//! with the same seeds. Each batch is compared with the undamaged references that it was compared with.
 
 mod export;
 mod import;
 mod people;
 mod record;
+mod undamaged;
 
 pub use export::Archive;
+pub use import::{Checked, CheckedBatch, Stored};
+pub use people::ImportedActions;
 pub use record::{
     Acknowledged, ArchivedAction, ArchivedModel, ArchivedNote, Batch, End, Head, Maintenance, Measurement, Record,
     Structure, Undamaged, UndamagedQuantity, Version, FORMAT, NOT_CARRIED,

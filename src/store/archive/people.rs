@@ -6,8 +6,9 @@ use super::super::alarm_action::{insert_action, kind_of_row, NewAction};
 use super::super::column::{bad_row, timestamp};
 use super::super::error::Error;
 use super::super::note::{Note, Notes};
+use super::super::transaction::Transaction;
 use super::export::{receiver_dropped, Archive};
-use super::record::{ArchivedAction, ArchivedNote, Record};
+use super::record::{Acknowledged, ArchivedAction, ArchivedNote, Record};
 use crate::quantity::{StructureId, Timestamp};
 
 impl Archive<'_> {
@@ -16,7 +17,7 @@ impl Archive<'_> {
     pub(super) async fn export_people(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
         let rows = sqlx::query(
             "select e.kind, e.series, e.opened_batch, e.opened_at_us, e.ended_at_us, a.uid, a.kind, a.at_us, a.author, a.text, a.reason,
-                    a.assignee
+                    a.assignee, e.undamaged_version
              from alarm_action a join alarm_episode e using (structure_id, episode)
              where a.structure_id = $1 and e.opened_batch is not null and (e.withdrawn = 0 or a.kind = 'comment') order by a.action_id",
         )
@@ -43,62 +44,166 @@ impl Archive<'_> {
         Ok(())
     }
 
-    /// Stores an action with its alarm: the alarm of the same series that the same batch opened, otherwise the newest one that overlaps it
-    /// in time, because only the alarms of the newest undamaged reference are computed again. Returns whether the action is stored and
-    /// was new; `None` if there is no such alarm here.
+    /// Stores the acknowledgements and other actions of an archive with their alarms, once its batches are assessed.
     ///
     /// # Errors
-    /// [`Error::Row`] if a time or the kind cannot be read.
-    pub async fn import_action(self, structure: &StructureId, action: ArchivedAction) -> Result<Option<bool>, Error> {
-        let time = |text: &str| Timestamp::parse(text).map_err(|e| bad_row("action of the archive")(&e));
-        let (opened, at) = (time(&action.opened_at)?, time(&action.at)?);
-        let ended = action.ended_at.as_deref().map(time).transpose()?;
-        let kind = kind_of_row(&action.kind, action.text, action.reason.as_deref(), action.assignee)?;
-        let new = NewAction { kind, at, author: action.author, seen: None };
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn settle_actions(self, structure: &StructureId) -> Result<ImportedActions, Error> {
+        let (any,): (bool,) = sqlx::query_as("select exists (select 1 from imported_action where structure_id = $1)")
+            .bind(structure.as_str())
+            .fetch_one(&self.database.reader)
+            .await?;
+        if !any {
+            return Ok(ImportedActions::default());
+        }
         let structure = structure.to_string();
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let alarm: Option<(i64,)> = sqlx::query_as(
-                        "select episode from alarm_episode
-                         where structure_id = $1 and kind = $2 and series = $3 and withdrawn = 0
-                           and (opened_batch = $4 or opened_at_us <= $6 and coalesce(ended_at_us, 9e18) >= $5)
-                         order by opened_batch = $4 desc, episode desc limit 1",
-                    )
-                    .bind(&structure)
-                    .bind(&action.alarm_kind)
-                    .bind(&action.series)
-                    .bind(&action.opened_batch)
-                    .bind(opened.micros())
-                    .bind(ended.map_or(i64::MAX, Timestamp::micros))
-                    .fetch_optional(transaction.connection())
-                    .await?;
-                    let Some((alarm,)) = alarm else { return Ok(None) };
-                    Ok(Some(insert_action(transaction, (&structure, alarm), &action.uid, &new, true).await?))
+                    let records: Vec<(String,)> =
+                        sqlx::query_as("select record from imported_action where structure_id = $1 order by position")
+                            .bind(&structure)
+                            .fetch_all(transaction.connection())
+                            .await?;
+                    let mut done = ImportedActions::default();
+                    for (record,) in records {
+                        match serde_json::from_str(&record).map_err(|e| bad_row("action of an archive")(&e))? {
+                            Record::Acknowledgement(note) => {
+                                done.acknowledgements += u64::from(acknowledge(transaction, &structure, note).await?);
+                            }
+                            Record::AlarmAction(action) => {
+                                match import_action(transaction, &structure, action).await? {
+                                    Some(new) => done.actions += u64::from(new),
+                                    None => done.without_alarm += 1,
+                                }
+                            }
+                            _ => {}
+                        }
+                    }
+                    sqlx::query("delete from imported_action where structure_id = $1")
+                        .bind(&structure)
+                        .execute(transaction.connection())
+                        .await?;
+                    Ok(done)
                 })
             })
             .await
     }
+}
 
-    /// Stores a note unless it is stored already. Returns whether it was new.
+/// What people did with the alarms of an archive, as it was stored here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ImportedActions {
+    /// Acknowledgements whose alarm exists and was not acknowledged before.
+    pub acknowledgements: u64,
+    /// Comments, assignments, closings and reopenings that were new.
+    pub actions: u64,
+    /// Those without an alarm here.
+    pub without_alarm: u64,
+}
+
+impl Acknowledged {
+    /// Checks that it can be stored.
     ///
     /// # Errors
-    /// [`Error::Row`] if a time cannot be parsed.
-    pub async fn import_note(self, structure: &StructureId, note: ArchivedNote) -> Result<bool, Error> {
-        let time = |text: &str| Timestamp::parse(text).map_err(|e| bad_row("note of the archive")(&e));
+    /// [`Error::Row`] with what is wrong.
+    pub fn check(&self) -> Result<(), Error> {
+        Timestamp::parse(&self.at).map(drop).map_err(|e| bad_row("acknowledgement of the archive")(&e))
+    }
+}
+
+impl ArchivedAction {
+    /// Checks that it can be stored.
+    ///
+    /// # Errors
+    /// [`Error::Row`] with what is wrong.
+    pub fn check(&self) -> Result<(), Error> {
+        let time = |text: &str| Timestamp::parse(text).map(drop).map_err(|e| bad_row("action of the archive")(&e));
+        time(&self.opened_at)?;
+        time(&self.at)?;
+        self.ended_at.as_deref().map(time).transpose()?;
+        uuid::Uuid::parse_str(&self.uid).map_err(|e| bad_row("action of the archive")(&e))?;
+        kind_of_row(&self.kind, self.text.clone(), self.reason.as_deref(), self.assignee.clone()).map(drop)
+    }
+}
+
+impl ArchivedNote {
+    /// The note, checked.
+    ///
+    /// # Errors
+    /// [`Error::Row`] with what is wrong.
+    pub fn check(&self) -> Result<Note, Error> {
+        let bad = bad_row("note of the archive");
+        let time = |text: &str| Timestamp::parse(text).map_err(|e| bad(&e));
+        uuid::Uuid::parse_str(&self.note).map_err(|e| bad(&e))?;
         let note = Note {
-            from: time(&note.from)?,
-            to: note.to.as_deref().map(time).transpose()?,
-            created_at: time(&note.created_at)?,
-            id: note.note,
-            text: note.text,
-            author: note.author,
+            from: time(&self.from)?,
+            to: self.to.as_deref().map(time).transpose()?,
+            created_at: time(&self.created_at)?,
+            id: self.note.clone(),
+            text: self.text.clone(),
+            author: self.author.clone(),
         };
         if note.to.is_some_and(|to| to <= note.from) {
-            return Err(bad_row("note of the archive")(&"its end is not after its beginning"));
+            return Err(bad(&"its end is not after its beginning"));
         }
-        Notes { database: self.database }.insert(structure, note).await
+        Ok(note)
     }
+}
+
+/// Stores an acknowledgement with its alarm. Returns whether something changed, which it does not if the alarm does not exist here or is
+/// acknowledged already.
+async fn acknowledge(transaction: &mut Transaction<'_>, structure: &str, note: Acknowledged) -> Result<bool, Error> {
+    let at = Timestamp::parse(&note.at).map_err(|e| bad_row("acknowledgement of the archive")(&e))?;
+    let updated = sqlx::query(
+        "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2, acknowledgement_note = $3
+         where structure_id = $4 and kind = $5 and series = $6 and opened_batch = $7 and withdrawn = 0
+           and acknowledged_at_us is null and ($8 is null or undamaged_version = $8)",
+    )
+    .bind(at.micros())
+    .bind(&note.by)
+    .bind(&note.note)
+    .bind(structure)
+    .bind(&note.kind)
+    .bind(&note.series)
+    .bind(&note.opened_batch)
+    .bind(note.undamaged_version)
+    .execute(transaction.connection())
+    .await?;
+    Ok(updated.rows_affected() > 0)
+}
+
+/// Stores an action with its alarm: the alarm of the same series and undamaged reference that the same batch opened, otherwise one that
+/// the same batch opened, otherwise the newest one that overlaps it in time. Returns whether the action is stored and was new; `None`
+/// if there is no such alarm here.
+async fn import_action(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    action: ArchivedAction,
+) -> Result<Option<bool>, Error> {
+    let time = |text: &str| Timestamp::parse(text).map_err(|e| bad_row("action of the archive")(&e));
+    let (opened, at) = (time(&action.opened_at)?, time(&action.at)?);
+    let ended = action.ended_at.as_deref().map(time).transpose()?;
+    let kind = kind_of_row(&action.kind, action.text, action.reason.as_deref(), action.assignee)?;
+    let new = NewAction { kind, at, author: action.author, seen: None };
+    let alarm: Option<(i64,)> = sqlx::query_as(
+        "select episode from alarm_episode
+         where structure_id = $1 and kind = $2 and series = $3 and withdrawn = 0
+           and (opened_batch = $4 or opened_at_us <= $6 and coalesce(ended_at_us, 9e18) >= $5)
+         order by undamaged_version is $7 and opened_batch = $4 desc, opened_batch = $4 desc, undamaged_version is $7 desc, episode desc
+         limit 1",
+    )
+    .bind(structure)
+    .bind(&action.alarm_kind)
+    .bind(&action.series)
+    .bind(&action.opened_batch)
+    .bind(opened.micros())
+    .bind(ended.map_or(i64::MAX, Timestamp::micros))
+    .bind(action.undamaged_version)
+    .fetch_optional(transaction.connection())
+    .await?;
+    let Some((alarm,)) = alarm else { return Ok(None) };
+    Ok(Some(insert_action(transaction, (structure, alarm), &action.uid, &new, true).await?))
 }
 
 fn action(row: &sqlx::sqlite::SqliteRow) -> Result<ArchivedAction, Error> {
@@ -118,5 +223,6 @@ fn action(row: &sqlx::sqlite::SqliteRow) -> Result<ArchivedAction, Error> {
         text: row.try_get(9)?,
         reason: row.try_get(10)?,
         assignee: row.try_get(11)?,
+        undamaged_version: Some(row.try_get(12)?),
     })
 }

@@ -10,8 +10,9 @@ use sqlx::FromRow;
 use crate::measurement::CovariateValue;
 use crate::quantity::StructureId;
 
-/// Version of the format. Version 2 added actions on alarms and notes; version 1 is read as well.
-pub const FORMAT: u32 = 2;
+/// Version of the format. Version 2 added actions on alarms and notes, version 3 the undamaged references that each batch is compared with;
+/// versions 1 and 2 are read as well.
+pub const FORMAT: u32 = 3;
 
 /// What an archive does not contain, as its first line says.
 pub const NOT_CARRIED: &str =
@@ -120,6 +121,10 @@ pub struct Batch {
     pub content_digest: String,
     /// When it arrived.
     pub received_at: String,
+    /// Versions of the undamaged references that it was compared with, in this order, 0 for none; the last is the present one. Absent for a
+    /// batch that waits, that failed, or in archives of versions that did not state it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub compared_with: Option<Vec<u32>>,
     /// Its measurements.
     pub measurements: Vec<Measurement>,
 }
@@ -227,6 +232,9 @@ pub struct Acknowledged {
     pub kind: String,
     /// Series of the alarm.
     pub series: String,
+    /// Version of the undamaged reference of the alarm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub undamaged_version: Option<u32>,
     /// Batch that opened the alarm.
     pub opened_batch: String,
     /// When the alarm was acknowledged.
@@ -245,6 +253,9 @@ pub struct ArchivedAction {
     pub alarm_kind: String,
     /// Series of the alarm.
     pub series: String,
+    /// Version of the undamaged reference of the alarm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub undamaged_version: Option<u32>,
     /// Batch that opened the alarm.
     pub opened_batch: String,
     /// When the alarm was opened.

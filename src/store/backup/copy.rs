@@ -11,7 +11,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
 use super::super::error::Error as StoreError;
-use super::super::file::{refuse_foreign, schema_version};
+use super::super::file::{foreign_objects, refuse_foreign, schema_version};
 use super::error::{at, Error};
 use super::manifest::{read_manifest, BackupModel, Manifest};
 
@@ -23,6 +23,8 @@ pub(super) struct Contents {
     pub schema_version: i64,
     pub rows: BTreeMap<String, u64>,
     pub trained: Vec<BackupModel>,
+    /// Webhooks whose secret was left out.
+    pub webhooks_without_secret: u64,
 }
 
 /// Checks every page of a copy and counts its rows, without writing to it.
@@ -62,8 +64,18 @@ pub(super) async fn read_contents(database: &Path) -> Result<Contents, Error> {
         let model = |(structure, digest)| BackupModel { structure, digest, kept_in: "database".to_owned() };
         trained = stored.into_iter().map(model).collect();
     }
+    let mut webhooks_without_secret = 0;
+    if rows.contains_key("webhook") {
+        let (without,): (i64,) =
+            sqlx::query_as("select count(*) from webhook where secret = ''").fetch_one(&mut connection).await?;
+        webhooks_without_secret = without.unsigned_abs();
+    }
+    let foreign = foreign_objects(&mut connection, schema_version).await?;
     connection.close().await?;
-    Ok(Contents { schema_version, rows, trained })
+    if !foreign.is_empty() {
+        return Err(Error::Foreign { path: database.to_owned(), reason: foreign.join("; ") });
+    }
+    Ok(Contents { schema_version, rows, trained, webhooks_without_secret })
 }
 
 /// Checks a backup: SHA-256, every page, schema version and row counts.
@@ -77,7 +89,7 @@ pub async fn verify(backup: &Path) -> Result<Manifest, Error> {
 }
 
 /// Checks that a copy is what its manifest says.
-pub(super) async fn check_copy(database: &Path, manifest: &Manifest) -> Result<(), Error> {
+pub(super) async fn check_copy(database: &Path, manifest: &Manifest) -> Result<Contents, Error> {
     let damaged = |reason: String| Error::Damaged { path: database.to_owned(), reason };
     if manifest.schema_version > schema_version() {
         return Err(Error::TooNew { found: manifest.schema_version, known: schema_version() });
@@ -96,7 +108,7 @@ pub(super) async fn check_copy(database: &Path, manifest: &Manifest) -> Result<(
     if contents.rows != manifest.rows {
         return Err(damaged("its numbers of rows differ from those of the manifest".to_owned()));
     }
-    Ok(())
+    Ok(contents)
 }
 
 /// SHA-256 of a file. It is read in chunks, because a database may be larger than the memory.

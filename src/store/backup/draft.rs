@@ -3,13 +3,14 @@
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection, SqliteSynchronous};
 use sqlx::Connection as _;
 
 use super::super::database_file::DatabaseFile;
 use super::super::error::Error as StoreError;
 use super::super::file::{refuse_foreign, take_lock, DATABASE_FILE};
 use super::copy::{read_contents, sha256, sync_folder, Contents};
+use super::draft_folder::DraftFolder;
 use super::error::{at, Error};
 use super::manifest::{check_name, read_manifest, BackupModel, Manifest, FOLDER, FORMAT, MANIFEST_FILE};
 use crate::private;
@@ -21,7 +22,7 @@ impl DatabaseFile<'_> {
     ///
     /// # Errors
     /// [`Error::Name`], [`Error::Exists`], [`Error::NoRoom`], [`Error::Damaged`] if the copy fails its check.
-    pub async fn backup(self, name: &str, models: Vec<BackupModel>, now: Timestamp) -> Result<Manifest, Error> {
+    pub async fn backup(self, name: &str, content: Content, now: Timestamp) -> Result<Manifest, Error> {
         check_name(name)?;
         let target = self.folder().join(FOLDER).join(name);
         let pages: (i64,) = sqlx::query_as("select page_count * page_size from pragma_page_count, pragma_page_size")
@@ -31,7 +32,7 @@ impl DatabaseFile<'_> {
         let mut reader = self.database.reader.acquire().await?;
         vacuum_into(&mut reader, &draft.database()).await?;
         drop(reader);
-        draft.finish(models, now).await
+        draft.finish(content, now).await
     }
 
     /// The manifests of the backups in the data folder, newest first, and the names of folders whose manifest cannot be read.
@@ -67,12 +68,7 @@ impl DatabaseFile<'_> {
 ///
 /// # Errors
 /// [`StoreError::Locked`] when a service has the folder open, otherwise as [`DatabaseFile::backup`].
-pub async fn of_folder(
-    data_dir: &Path,
-    target: &Path,
-    models: Vec<BackupModel>,
-    now: Timestamp,
-) -> Result<Manifest, Error> {
+pub async fn of_folder(data_dir: &Path, target: &Path, content: Content, now: Timestamp) -> Result<Manifest, Error> {
     let database = data_dir.join(DATABASE_FILE);
     let bytes = fs::metadata(&database).map_err(|_| Error::NoDatabase(data_dir.to_owned()))?.len();
     let _lock = take_lock(data_dir)?;
@@ -81,7 +77,38 @@ pub async fn of_folder(
     let mut connection = SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(&database)).await?;
     vacuum_into(&mut connection, &draft.database()).await?;
     connection.close().await?;
-    draft.finish(models, now).await
+    draft.finish(content, now).await
+}
+
+/// What a backup contains beside the data.
+#[derive(Debug, Clone, Default)]
+pub struct Content {
+    /// Trained baselines in use that are not in the database.
+    pub models: Vec<BackupModel>,
+    /// Whether the secrets of webhooks are in the copy.
+    pub with_secrets: bool,
+}
+
+/// Removes the secrets of webhooks from a copy, and disables the webhooks: without a secret their messages cannot be signed.
+async fn remove_secrets(database: &Path) -> Result<(), Error> {
+    // Freed bytes are overwritten, and the journal, which has the bytes from before, is in memory only.
+    let options = SqliteConnectOptions::new()
+        .filename(database)
+        .pragma("secure_delete", "on")
+        .pragma("journal_mode", "memory")
+        .synchronous(SqliteSynchronous::Full);
+    let mut connection = SqliteConnection::connect_with(&options).await?;
+    let (any,): (bool,) =
+        sqlx::query_as("select exists (select 1 from sqlite_schema where type = 'table' and name = 'webhook')")
+            .fetch_one(&mut connection)
+            .await?;
+    if any {
+        sqlx::query("update webhook set secret = '', previous_secret = null, previous_until_us = null, enabled = 0")
+            .execute(&mut connection)
+            .await?;
+    }
+    connection.close().await?;
+    Ok(())
 }
 
 async fn vacuum_into(connection: &mut SqliteConnection, file: &Path) -> Result<(), Error> {
@@ -91,7 +118,7 @@ async fn vacuum_into(connection: &mut SqliteConnection, file: &Path) -> Result<(
 
 /// An unfinished backup in a temporary folder, which is removed when this is dropped.
 struct Draft {
-    folder: tempfile::TempDir,
+    folder: DraftFolder,
     target: PathBuf,
 }
 
@@ -106,7 +133,7 @@ impl Draft {
         if free < needed {
             return Err(Error::NoRoom { needed, free, path: parent.to_owned() });
         }
-        let folder = private::temporary_folder(".draft-", parent).map_err(at(parent))?;
+        let folder = DraftFolder::create(parent).map_err(at(parent))?;
         Ok(Self { folder, target: target.to_owned() })
     }
 
@@ -115,9 +142,13 @@ impl Draft {
     }
 
     /// Checks the copy, writes the manifest, and renames the folder after both were synced to disk.
-    async fn finish(self, mut models: Vec<BackupModel>, now: Timestamp) -> Result<Manifest, Error> {
+    async fn finish(self, content: Content, now: Timestamp) -> Result<Manifest, Error> {
+        let Content { mut models, with_secrets } = content;
         let database = self.database();
-        let Contents { schema_version, rows, trained } = read_contents(&database).await?;
+        if !with_secrets {
+            remove_secrets(&database).await?;
+        }
+        let Contents { schema_version, rows, trained, .. } = read_contents(&database).await?;
         models.extend(trained);
         models.sort();
         let blocking = tokio::task::spawn_blocking(move || {
@@ -135,6 +166,7 @@ impl Draft {
                 sha256: sha256(&database)?,
                 rows,
                 models,
+                with_secrets,
             };
             let record = self.folder.path().join(MANIFEST_FILE);
             let text = serde_json::to_vec_pretty(&manifest).expect("a manifest is plain data");
@@ -142,7 +174,7 @@ impl Draft {
             File::open(&record).and_then(|file| file.sync_all()).map_err(at(&record))?;
             private::narrow(self.folder.path()).map_err(at(self.folder.path()))?;
             sync_folder(self.folder.path())?;
-            let draft = self.folder.keep();
+            let draft = self.folder.keep().map_err(at(&self.target))?;
             // A rename never replaces a folder that is not empty, so two backups with the same name cannot mix.
             fs::rename(&draft, &self.target).map_err(|error| {
                 let _ = fs::remove_dir_all(&draft);

@@ -50,6 +50,14 @@ pub enum Error {
         /// What is wrong.
         reason: String,
     },
+    /// The copy has tables, views or triggers that this program did not make.
+    #[error("{path} was changed by another program: {reason}; nothing was changed; use another backup")]
+    Foreign {
+        /// The copy.
+        path: PathBuf,
+        /// What was changed.
+        reason: String,
+    },
     /// The backup was made by a newer program.
     #[error("the backup has schema version {found}, newer than this program's {known}: use the newer modalwatch")]
     TooNew {

@@ -38,6 +38,14 @@ pub struct Manifest {
     pub rows: BTreeMap<String, u64>,
     /// Trained baselines that the stored data depend on.
     pub models: Vec<BackupModel>,
+    /// Whether the secrets of webhooks are in the copy. Without them its webhooks are disabled and need new ones. Backups of versions that
+    /// did not state it have them.
+    #[serde(default = "yes")]
+    pub with_secrets: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 /// A trained baseline.

@@ -22,6 +22,8 @@ pub struct Restored {
     pub manifest: Manifest,
     /// New path of the database that was replaced.
     pub kept_aside: Option<PathBuf>,
+    /// Webhooks that are disabled because the backup has no secrets.
+    pub webhooks_without_secret: u64,
 }
 
 /// Copies the database of a backup into a data folder that no service has open. If it fails, the folder keeps its database.
@@ -57,7 +59,7 @@ pub async fn restore(backup: &Path, data_dir: &Path, replace: bool, now: Timesta
     });
     copied.await.map_err(|_| Error::Store(StoreError::Panicked))??;
     // Checks the file in the data folder and not the one it was copied from.
-    check_copy(&copy, &manifest).await?;
+    let webhooks_without_secret = check_copy(&copy, &manifest).await?.webhooks_without_secret;
     let kept_aside = if there { Some(keep_aside(&database, now).await?) } else { None };
     for beside in ["-wal", "-shm"] {
         let path = with_suffix(&database, beside);
@@ -69,7 +71,7 @@ pub async fn restore(backup: &Path, data_dir: &Path, replace: bool, now: Timesta
     // The rename is atomic: before it the folder has the old database, after it the new one.
     fs::rename(&copy, &database).map_err(at(&database))?;
     sync_folder(data_dir)?;
-    Ok(Restored { manifest, kept_aside })
+    Ok(Restored { manifest, kept_aside, webhooks_without_secret })
 }
 
 /// Gives the present database a second name, which remains when the first is replaced.

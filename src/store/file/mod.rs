@@ -3,6 +3,7 @@
 mod folder;
 mod identity;
 mod opening;
+mod schema;
 mod settings;
 
 pub(super) use folder::{prepare_folder, take_lock};
@@ -12,5 +13,6 @@ pub(super) use identity::APPLICATION_ID;
 pub(super) use identity::{refuse_foreign, OpenedFile};
 pub use opening::schema_version;
 pub(super) use opening::{library_version, open, Opened};
+pub(super) use schema::foreign_objects;
 pub(super) use settings::Limits;
 pub use settings::StoreSettings;

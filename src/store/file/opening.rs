@@ -26,7 +26,7 @@ const READERS: u32 = 8;
 const ROWS_AT_A_TIME: usize = 1_000;
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-static MIGRATIONS: Migrator = sqlx::migrate!();
+pub(super) static MIGRATIONS: Migrator = sqlx::migrate!();
 
 /// The newest schema version that this program knows, which is that of every open store.
 pub fn schema_version() -> i64 {
@@ -63,8 +63,12 @@ pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
         return Err(Error::LibraryTooOld(sqlite_version));
     }
     // The application id is set after the checks, because it is a write and a damaged file must stay as it is.
-    let mark = format!("pragma application_id = {APPLICATION_ID}");
-    sqlx::query(sqlx::AssertSqlSafe(mark)).execute(&writer).await?;
+    let (application_id,): (i64,) = sqlx::query_as("pragma application_id").fetch_one(&writer).await?;
+    // It is not written again: a service must start on a full disk, for reading.
+    if application_id != APPLICATION_ID {
+        let mark = format!("pragma application_id = {APPLICATION_ID}");
+        sqlx::query(sqlx::AssertSqlSafe(mark)).execute(&writer).await?;
+    }
     MIGRATIONS.run(&writer).await.map_err(|error| match error {
         MigrateError::VersionMissing(found) => {
             Error::SchemaTooNew { path: path.to_owned(), found, known: schema_version() }

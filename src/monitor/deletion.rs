@@ -1,0 +1,108 @@
+//! Deleting a structure with all its data.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde::Serialize;
+use tracing::{info, warn};
+
+use super::error::{DeleteError, Error};
+use super::events::Events;
+use super::jobs::Jobs;
+use super::own_task::in_own_task;
+use super::structures::ActiveStructures;
+use crate::quantity::{StructureId, Timestamp};
+use crate::store::Store;
+
+/// Jobs among which those of a structure are searched.
+const JOBS: usize = 1_000;
+
+/// Pause after a transaction that failed, for example on a busy disk.
+const BETWEEN_ATTEMPTS: Duration = Duration::from_secs(2);
+
+/// A structure that was deleted.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+pub struct DeletedStructure {
+    /// The structure.
+    pub structure: StructureId,
+    /// Its batches.
+    pub batches: u64,
+    /// Their measurements.
+    pub measurements: u64,
+}
+
+/// Deletes structures.
+#[derive(Clone)]
+pub struct Deletions {
+    store: Store,
+    structures: Arc<ActiveStructures>,
+    jobs: Jobs,
+    events: Events,
+}
+
+impl Deletions {
+    pub(super) fn new(store: Store, structures: Arc<ActiveStructures>, jobs: Jobs, events: Events) -> Self {
+        Self { store, structures, jobs, events }
+    }
+
+    /// Deletes a structure with its batches, references, alarms, notes, diagnoses, and the models that the service trained for it. If the
+    /// service stops meanwhile, the next start goes on.
+    ///
+    /// # Errors
+    /// [`Error::UnknownStructure`]; [`DeleteError::HasJobs`].
+    pub async fn delete(&self, structure: &StructureId) -> Result<DeletedStructure, DeleteError> {
+        let (deletions, structure) = (self.clone(), structure.clone());
+        in_own_task(async move {
+            let jobs = deletions.jobs.list(JOBS).await?;
+            let open = jobs.into_iter().filter(|(job, status)| job.structure == structure && status.is_some());
+            let open: Vec<String> = open.map(|(job, _)| job.id).collect();
+            if !open.is_empty() {
+                return Err(DeleteError::HasJobs { structure, jobs: open });
+            }
+            if !deletions.store.deletions().begin(&structure, Timestamp::now()).await.map_err(Error::from)? {
+                return Err(Error::UnknownStructure(structure).into());
+            }
+            deletions.structures.deactivate(&structure);
+            Ok(deletions.proceed(structure).await?)
+        })
+        .await
+    }
+
+    /// Goes on with deletions that a stop of the service interrupted, in the background.
+    ///
+    /// # Errors
+    /// [`Error::Store`].
+    pub async fn resume(&self) -> Result<(), Error> {
+        for structure in self.store.deletions().begun().await? {
+            let deletions = self.clone();
+            tokio::spawn(async move {
+                while let Err(error) = deletions.proceed(structure.clone()).await {
+                    if deletions.store.file().is_closed() {
+                        return;
+                    }
+                    warn!(structure.id = %structure, %error, "Could not go on deleting {structure}, trying again: {error}");
+                    tokio::time::sleep(BETWEEN_ATTEMPTS).await;
+                }
+            });
+        }
+        Ok(())
+    }
+
+    async fn proceed(&self, structure: StructureId) -> Result<DeletedStructure, Error> {
+        let mut done = DeletedStructure { structure, batches: 0, measurements: 0 };
+        loop {
+            // Each step is one write, between which those of others are stored.
+            let removed = self.store.deletions().proceed(&done.structure).await?;
+            done.batches += removed.batches;
+            done.measurements += removed.measurements;
+            if removed.complete {
+                break;
+            }
+        }
+        let DeletedStructure { structure, batches, .. } = &done;
+        self.structures.forget_refused(structure);
+        info!(structure.id = %structure, batches, "Deleted structure {structure} with {batches} batches");
+        self.events.structure_changed(structure);
+        Ok(done)
+    }
+}
