@@ -243,7 +243,7 @@ mod tests {
         for series in ["k1", "group:k1+k2"] {
             assert_eq!(parameter(series).as_deref(), Some(series));
         }
-        for series in [FIT_SERIES, "structure:joint", "structure:silence"] {
+        for series in [FIT_SERIES, "structure:joint", "structure:silence", "structure:not_assessed"] {
             assert_eq!(parameter(series), None, "{series}");
         }
     }

@@ -14,7 +14,7 @@ pub mod severity;
 use serde::{Deserialize, Serialize};
 
 /// Names of the kinds of alarms, as stored and as used in the API.
-pub const ALARM_KINDS: [&str; 3] = ["damage", "simulation_does_not_fit", "silence"];
+pub const ALARM_KINDS: [&str; 4] = ["damage", "simulation_does_not_fit", "silence", "not_assessed"];
 
 /// How alarms are raised.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -81,7 +81,7 @@ impl From<[f64; 3]> for BatchChange {
 /// What is stored of an alarm that its severity follows from.
 #[derive(Debug, Clone, Copy)]
 pub struct AlarmFacts<'a> {
-    /// `damage`, `simulation_does_not_fit` or `silence`.
+    /// `damage`, `simulation_does_not_fit`, `silence` or `not_assessed`.
     pub kind: &'a str,
     /// The lasting change; `None` without a process behind the undamaged reference.
     pub change: Option<&'a LastingChange>,
@@ -144,6 +144,9 @@ impl SeverityLimits {
         };
         match alarm.kind {
             "silence" => return unknown("no measurements arrive, so that a loss would not be seen."),
+            "not_assessed" => {
+                return unknown("the newest batches cannot be assessed, so that a loss would not be seen.")
+            }
             "simulation_does_not_fit" => {
                 return unknown(
                     "the simulation does not fit the measurements, so that the size of a loss cannot be stated.",
@@ -258,9 +261,12 @@ mod tests {
         let batch = BatchChange { change: -0.12, interval: [-0.17, -0.07] };
         let found = limits.severity(AlarmFacts { kind: "damage", change: None, batch_change: Some(batch) });
         assert!(found.grade == Grade::Severe && found.sentence.contains("7.0 %"), "{found:?}");
-        for (kind, words) in
-            [("silence", "no measurements"), ("simulation_does_not_fit", "does not fit"), ("damage", "not known")]
-        {
+        for (kind, words) in [
+            ("silence", "no measurements"),
+            ("not_assessed", "cannot be assessed"),
+            ("simulation_does_not_fit", "does not fit"),
+            ("damage", "not known"),
+        ] {
             let found = limits.severity(AlarmFacts { kind, change: None, batch_change: None });
             assert_eq!((found.grade, found.certain_loss_percent), (Grade::Moderate, None));
             assert!(found.sentence.contains(words), "{found:?}");

@@ -15,7 +15,7 @@ use crate::quantity::Timestamp;
 pub struct AlarmItem {
     /// Its number.
     alarm: i64,
-    /// `damage`, `simulation_does_not_fit` or `silence`.
+    /// `damage`, `simulation_does_not_fit`, `silence` or `not_assessed`.
     kind: String,
     /// Only for a damage alarm; absent if the parameters together raised it.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -120,6 +120,8 @@ fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) 
         Condition::Silent
     } else if model.is_none() {
         Condition::NoModel
+    } else if found.failing {
+        Condition::NotJudged
     } else if waits {
         Condition::Judging
     } else if found.latest.is_none() {
@@ -135,6 +137,11 @@ fn condition(found: &StructureOverview, model: Option<&Digest>, now: Timestamp) 
 
 /// Why the batches are not judged, if they are not.
 fn why_not_judged(found: &StructureOverview, model: Option<&Digest>) -> Option<String> {
+    if found.failing {
+        return Some(
+            "Not judged: the newest batches cannot be assessed; the reason is stated with each of them.".to_owned(),
+        );
+    }
     let Some(version) = found.undamaged_version else {
         return Some("Not judged: no undamaged reference has been declared.".to_owned());
     };
@@ -309,6 +316,7 @@ mod tests {
             open_alarms: 0,
             unacknowledged_alarms: 0,
             silent: false,
+            failing: false,
             undamaged_version: Some(1),
             undamaged_model: Some(digest()),
             charts: BTreeMap::from([

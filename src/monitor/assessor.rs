@@ -49,7 +49,9 @@ pub(super) struct Stored {
 
 enum Outcome {
     Assessed(Box<Assessment>, StoredAssessment),
-    Failed,
+    Failed {
+        alarm_opened: bool,
+    },
     /// Not stored, because the structure has another version in the meantime.
     OfAnotherVersion,
 }
@@ -201,13 +203,10 @@ impl Assessor {
                     }
                     None => Outcome::OfAnotherVersion,
                 },
-                Err(mark) => {
-                    if mark.await? {
-                        Outcome::Failed
-                    } else {
-                        Outcome::OfAnotherVersion
-                    }
-                }
+                Err(mark) => match mark.await? {
+                    Some(marked) => Outcome::Failed { alarm_opened: marked.alarm_opened },
+                    None => Outcome::OfAnotherVersion,
+                },
             };
             Ok(Stored { task, newest_undamaged, outcome })
         }
@@ -219,8 +218,11 @@ impl Assessor {
         let (structure, id) = (&task.record.batch.structure, &task.record.batch_id);
         let (assessment, stored) = match outcome {
             Outcome::Assessed(assessment, stored) => (assessment, stored),
-            Outcome::Failed => {
+            Outcome::Failed { alarm_opened } => {
                 self.events.batch_changed(structure, id, BatchState::Failed);
+                if alarm_opened {
+                    self.alarms.report(structure).await;
+                }
                 return Ok(Settled::Finished(Finished::Failed));
             }
             Outcome::OfAnotherVersion => return Ok(Settled::Finished(Finished::OfAnotherVersion)),

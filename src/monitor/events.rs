@@ -33,7 +33,7 @@ pub enum News {
         structure: StructureId,
         /// Its number.
         alarm: i64,
-        /// `damage`, `simulation_does_not_fit` or `silence`.
+        /// `damage`, `simulation_does_not_fit`, `silence` or `not_assessed`.
         kind: String,
         /// `open`, `ended`, `withdrawn`; or what a person just did: `acknowledged`, `commented`, `assigned`, `closed`, `reopened`.
         state: &'static str,

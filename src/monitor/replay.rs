@@ -256,7 +256,11 @@ impl Replay {
             Err(Error::Store(damaged @ store::Error::Row { .. })) => {
                 error!(structure.id = %structure, batch.id = %batch_id, "Batch {batch_id} of {structure}: {damaged}");
                 let version = active.simulator.digest();
-                self.assessor.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string()).await?;
+                let failed =
+                    self.assessor.store.batches().mark_failed(structure, &batch_id, version, &damaged.to_string());
+                if failed.await?.is_some_and(|failed| failed.alarm_opened) {
+                    self.assessor.alarms.report(structure).await;
+                }
                 return Ok(Waiting::Done);
             }
             record => record?,

@@ -58,6 +58,9 @@ fn happened(kind: &str, action: Option<&ActionFacts>) -> String {
 fn what(facts: &Facts) -> String {
     match (facts.kind.as_str(), &facts.change, parameter_of(facts.series.clone())) {
         ("silence", ..) => "No measurements have arrived within the configured time.".to_owned(),
+        ("not_assessed", ..) => {
+            "The newest batches could not be assessed; the reason is stated with each of them.".to_owned()
+        }
         ("simulation_does_not_fit", ..) => "The simulation does not fit the measurements.".to_owned(),
         (_, Some(change), _) => change.sentence(),
         (_, None, Some(name)) => {
@@ -83,6 +86,7 @@ fn in_short(facts: &Facts) -> String {
     };
     let short = match facts.kind.as_str() {
         "silence" => return "no measurements".to_owned(),
+        "not_assessed" => return "batches cannot be assessed".to_owned(),
         "simulation_does_not_fit" => return "the simulation does not fit".to_owned(),
         _ => facts.change.as_ref().map(of_change).filter(|text| !text.is_empty()),
     };

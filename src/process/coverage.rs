@@ -4,6 +4,7 @@ use nalgebra::{DMatrix, DVector, RowDVector};
 use serde::{Deserialize, Serialize};
 
 use super::estimate::{BatchEstimate, Scale};
+use crate::measurement::unit_of_name;
 
 /// Beyond the range seen, the slope of a quantity over a covariate is known to within this multiple of itself: it may vanish or double.
 /// The stiffness of a bridge deck that freezes, for example, rises several times faster below 0 °C than above.
@@ -74,7 +75,8 @@ impl Coverage {
         for ((name, range), value) in names.iter().zip(&self.covariates).zip(&estimate.covariates) {
             let (Some([low, high]), Some(value)) = (range, value) else { continue };
             if distance(*value, [*low, *high]) > 0.0 {
-                let seen = format!("{value:.1} (seen: {low:.1} to {high:.1})").replace('-', "−");
+                let unit = unit_of_name(name).map_or_else(String::new, |unit| format!(" {unit}"));
+                let seen = format!("{value:.1}{unit} (seen: {low:.1} to {high:.1}{unit})").replace('-', "−");
                 found.push(format!("{name} of {seen}"));
             }
         }

@@ -17,14 +17,17 @@ use crate::quantity::{StructureId, Timestamp};
 /// Series name of alarms about missing data.
 pub const SILENCE_SERIES: &str = "structure:silence";
 
+/// Series name of alarms about batches that cannot be assessed.
+pub(super) const NOT_ASSESSED_SERIES: &str = "structure:not_assessed";
+
 /// An alarm from its beginning to its end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// Number within the structure, from 1.
     pub number: i64,
-    /// `damage`, `simulation_does_not_fit` or `silence`.
+    /// `damage`, `simulation_does_not_fit`, `silence` or `not_assessed`.
     pub kind: String,
-    /// The parameter of a damage alarm, otherwise `simulation:fit` or `structure:silence`.
+    /// The parameter of a damage alarm, otherwise `simulation:fit`, `structure:silence` or `structure:not_assessed`.
     pub series: String,
     /// Version of the undamaged reference of a damage alarm; 0 for the other kinds.
     pub undamaged_version: u32,
@@ -185,6 +188,7 @@ pub(super) fn kind_of(series: &str) -> &'static str {
     match series {
         FIT_SERIES => "simulation_does_not_fit",
         SILENCE_SERIES => "silence",
+        NOT_ASSESSED_SERIES => "not_assessed",
         _ => "damage",
     }
 }

@@ -7,8 +7,9 @@ use serde::Deserialize;
 use sqlx::sqlite::SqliteRow;
 use sqlx::Row as _;
 
-use super::assessment::{kind_of, IS_CURRENT};
+use super::assessment::kind_of;
 use super::column::{bad_row, elements, list};
+use super::current::IS_CURRENT;
 use super::error::Error;
 use super::plotted::{trust_values, Plotted};
 use super::series::{bounds, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};

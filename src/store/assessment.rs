@@ -9,9 +9,11 @@ use super::chart::{chart, ChartOutcome};
 use super::chart_episode::Charted;
 use super::chart_point::StoredChartPoint;
 use super::column::{bad_row, elements, from_blob, list, timestamp, to_blob};
+use super::comparison::{settle_kept, wait_for_comparison};
+use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
-use super::kept::settle_kept;
+use super::failed::end_alarm;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
 use super::transaction::Transaction;
@@ -97,16 +99,6 @@ struct QuantityAssessmentRow {
 static INSERT_QUANTITIES: InsertStatements =
     InsertStatements::new("insert into quantity_assessment", 29, &[0, 1, 2, 3]);
 
-/// Order of the assessments of a batch in which the current one is first.
-pub(super) const CURRENT_FIRST: &str = "assessed_at_us desc, undamaged_version desc, model_digest";
-
-/// Condition that an assessment `a` is the current one of its batch: the first in the order [`CURRENT_FIRST`].
-pub(super) const IS_CURRENT: &str = "not exists (
-    select 1 from assessment n where n.structure_id = a.structure_id and n.batch_id = a.batch_id
-       and (n.assessed_at_us > a.assessed_at_us or n.assessed_at_us = a.assessed_at_us
-            and (n.undamaged_version > a.undamaged_version or n.undamaged_version = a.undamaged_version
-                 and n.model_digest < a.model_digest)))";
-
 /// Assessments of batches.
 #[derive(Clone, Copy)]
 pub struct Assessments<'s> {
@@ -114,8 +106,8 @@ pub struct Assessments<'s> {
 }
 
 impl Assessments<'_> {
-    /// Stores an assessment with its points on the alarm charts and marks its batch as assessed. Storing the same assessment
-    /// again changes nothing. Returns `None` without storing it if it was made for a version of the structure that is no longer
+    /// Stores an assessment with its points on the alarm charts and marks its batch as assessed. What is stored
+    /// last is the current one. Returns `None` without storing it if it was made for a version of the structure that is no longer
     /// the present one; the batch then waits for an assessment for the present version.
     ///
     /// # Errors
@@ -173,6 +165,7 @@ impl Assessments<'_> {
                 };
                 let ChartOutcome { points: charts, alarms_changed } = chart(transaction, &batch, charted).await?;
                 let newest_undamaged = slot.newest_undamaged;
+                let alarms_changed = end_alarm(transaction, &structure, assessed_at).await? || alarms_changed;
                 Ok(Some(StoredAssessment { assessed_at, charts, alarms_changed, newest_undamaged }))
             })
         })
@@ -306,31 +299,6 @@ async fn slot_of(
     let assessed_at_us = others_us.map_or(given, |latest| given.max(latest + 1));
     let taken = own_us.is_some();
     Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us }))
-}
-
-/// Marks a batch as waiting if the newest undamaged reference would be compared with it otherwise than its assessment was.
-async fn wait_for_comparison(
-    transaction: &mut Transaction<'_>,
-    structure: &str,
-    batch_id: &str,
-    a: &Assessment,
-) -> Result<(), Error> {
-    sqlx::query(
-        "update measurement_batch set state = 'received'
-         where structure_id = $1 and batch_id = $2
-           and $4 <> coalesce((select version from undamaged_state u
-               where u.structure_id = $1 and u.model_digest = $3
-                 and u.version = (select max(version) from undamaged_state where structure_id = $1)
-                 and not exists (select 1 from undamaged_batch b
-                     where b.structure_id = $1 and b.version = u.version and b.batch_id = $2)), 0)",
-    )
-    .bind(structure)
-    .bind(batch_id)
-    .bind(a.model_digest.as_str())
-    .bind(a.undamaged_version.unwrap_or(0))
-    .execute(transaction.connection())
-    .await?;
-    Ok(())
 }
 
 /// Removes the stored assessment for the same trained baseline and undamaged reference.

@@ -235,37 +235,6 @@ impl Batches<'_> {
         Ok(rows.into_iter().map(|(id,)| id).collect())
     }
 
-    /// Marks a batch whose assessment failed, unless the structure has another version now. Returns whether it was marked.
-    ///
-    /// # Errors
-    /// [`Error::Sqlite`].
-    pub fn mark_failed(
-        self,
-        structure: &StructureId,
-        batch_id: &str,
-        version: &Digest,
-        reason: &str,
-    ) -> impl Future<Output = Result<bool, Error>> + Send + 'static {
-        let (structure, id, reason) = (structure.to_string(), batch_id.to_owned(), reason.to_owned());
-        let version = version.clone();
-        self.database.write(move |transaction| {
-            Box::pin(async move {
-                if !is_present(transaction, &structure, &version).await? {
-                    return Ok(false);
-                }
-                sqlx::query(
-                    "update measurement_batch set state = 'failed', failure = $1 where structure_id = $2 and batch_id = $3",
-                )
-                .bind(reason)
-                .bind(structure)
-                .bind(id)
-                .execute(transaction.connection())
-                .await?;
-                Ok(true)
-            })
-        })
-    }
-
     /// When the newest batch of a structure arrived.
     ///
     /// # Errors

@@ -2,9 +2,10 @@
 
 use sqlx::FromRow;
 
-use super::assessment::{Assessments, CURRENT_FIRST};
+use super::assessment::Assessments;
 use super::batch::batch_state;
 use super::column::timestamp;
+use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
 use crate::assessment::{Assessment, BatchState};

@@ -2,8 +2,8 @@
 
 use sqlx::FromRow;
 
-use super::assessment::IS_CURRENT;
 use super::chart_point::CHARTS;
+use super::current::IS_CURRENT;
 use super::error::Error;
 use super::overview::Overview;
 use crate::quantity::StructureId;

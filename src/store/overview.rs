@@ -6,9 +6,9 @@ use serde::de::IgnoredAny;
 use serde::Deserialize;
 use sqlx::FromRow;
 
-use super::assessment::IS_CURRENT;
 use super::chart_point::{state_of, CHARTS};
 use super::column::{bad_row, timestamp};
+use super::current::IS_CURRENT;
 use super::database::Database;
 use super::error::Error;
 use crate::alarm::machine::State;
@@ -34,6 +34,8 @@ pub struct StructureOverview {
     pub unacknowledged_alarms: u64,
     /// True while an alarm about missing data is open.
     pub silent: bool,
+    /// Whether the newest batches cannot be assessed, which an open alarm states.
+    pub failing: bool,
     /// Version of its newest undamaged reference.
     pub undamaged_version: Option<u32>,
     /// Digest of the trained baseline with which that reference was made.
@@ -83,6 +85,7 @@ struct OverviewRow {
     open_alarms: i64,
     unacknowledged: i64,
     silent: bool,
+    failing: bool,
     undamaged_version: Option<u32>,
     undamaged_model: Option<String>,
     waiting: i64,
@@ -148,6 +151,7 @@ impl Overview<'_> {
                     (select count(*) {OPEN}) as open_alarms,
                     (select count(*) {OPEN} and acknowledged_at_us is null) as unacknowledged,
                     exists (select 1 {OPEN} and kind = 'silence') as silent,
+                    exists (select 1 {OPEN} and kind = 'not_assessed') as failing,
                     (select max(version) from undamaged_state u where u.structure_id = s.structure_id)
                         as undamaged_version,
                     (select model_digest from undamaged_state u where u.structure_id = s.structure_id
@@ -172,6 +176,7 @@ impl Overview<'_> {
                 open_alarms: row.open_alarms.unsigned_abs(),
                 unacknowledged_alarms: row.unacknowledged.unsigned_abs(),
                 silent: row.silent,
+                failing: row.failing,
                 undamaged_version: row.undamaged_version,
                 undamaged_model: row.undamaged_model.map(Digest::from_stored),
                 charts: charts.remove(&row.structure_id).unwrap_or_default(),

@@ -26,7 +26,7 @@ pub(super) const TABLES: [&str; 8] = [
 const EXPIRED: &str = "from measurement_batch b
      where b.measured_to_us < $1 and b.state <> 'received'
        and not exists (select 1 from undamaged_batch u where u.structure_id = b.structure_id and u.batch_id = b.batch_id)
-       and not exists (select 1 from alarm_episode e where e.structure_id = b.structure_id and e.kind <> 'silence'
+       and not exists (select 1 from alarm_episode e where e.structure_id = b.structure_id and e.kind not in ('silence', 'not_assessed')
            and (e.opened_batch = b.batch_id or (e.withdrawn = 0 and b.measured_to_us >= e.opened_at_us
                and (e.ended_at_us is null or b.measured_to_us <= e.ended_at_us))))";
 

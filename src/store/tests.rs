@@ -7,8 +7,8 @@ use std::path::Path;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
+use super::comparison::keep;
 use super::file::APPLICATION_ID;
-use super::kept::keep;
 use super::{schema_version, ComparedWith, Error, HistoryQuery, InsertBatch, PutStructure, Store, DATABASE_FILE};
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind, UndamagedReference};

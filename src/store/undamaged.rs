@@ -6,12 +6,12 @@ use std::sync::{Arc, Mutex};
 use serde::Serialize;
 use sqlx::FromRow;
 
-use super::assessment::CURRENT_FIRST;
 use super::batch::batch_state;
-use super::column::{bad_row, elements, from_blob, timestamp, to_blob};
+use super::column::{bad_row, from_blob, timestamp, to_blob};
+use super::comparison::{keep_newer, replace_kept, requeue};
+use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
-use super::kept::{keep_newer, replace_kept};
 use super::reference_content::{batches_of, stored_origin};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
@@ -446,32 +446,6 @@ async fn insert_quantities(
             .execute(transaction.connection())
             .await?;
     }
-    Ok(())
-}
-
-/// Marks batches to be assessed again: those that were never compared with a reference, and all that came after the batches of
-/// the new reference, because its charts begin there. The current assessment decides whether a batch was compared, since one
-/// with an earlier trained baseline is not comparable. Batches of the list `except` are left as they are.
-pub(super) async fn requeue(
-    transaction: &mut Transaction<'_>,
-    (structure, version): Key<'_>,
-    except: &str,
-) -> Result<(), Error> {
-    let update = format!(
-        "update measurement_batch set state = 'received'
-         where structure_id = $1 and state = 'assessed'
-           and batch_id not in (select batch_id from undamaged_batch where structure_id = $1 and version = $2)
-           and (0 = (select undamaged_version from assessment a
-                   where a.structure_id = $1 and a.batch_id = measurement_batch.batch_id
-                   order by {CURRENT_FIRST} limit 1)
-               or measured_from_us > (select max(b.measured_to_us) from measurement_batch b
-                   join undamaged_batch u using (structure_id, batch_id)
-                   where u.structure_id = $1 and u.version = $2))
-           and batch_id not in (select value from {})",
-        elements!("$3")
-    );
-    let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version).bind(except);
-    update.execute(transaction.connection()).await?;
     Ok(())
 }
 

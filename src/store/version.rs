@@ -2,7 +2,7 @@
 
 use sqlx::FromRow;
 
-use super::assessment::IS_CURRENT;
+use super::current::IS_CURRENT;
 use super::error::Error;
 use super::structure::{is_present, Structures};
 use super::transaction::Transaction;

@@ -247,4 +247,24 @@ async fn noise_that_is_stated_too_large_does_not_silence_a_loss() {
             assert!(codes.contains(&"noise_overstated"), "{percent}: {answer}");
         }
     }
+
+    // With more than that, nothing can be said about the structure. The third batch in a row raises an alarm of its own kind.
+    let about = async || {
+        let alarms = service.read("/v1/structures/three-dof/alarms").await;
+        let of_kind = |alarm: &&Value| alarm["kind"] == "not_assessed";
+        let alarms: Vec<Value> = alarms["items"].as_array().unwrap().iter().filter(of_kind).cloned().collect();
+        alarms
+    };
+    for number in 0..4 {
+        let unusable = rows([3.2, 5.0, 6.0], 20, (60 + 5 * number) * DAY_S, Some(0.08));
+        let answer = service.post_batch("three-dof", &unusable).await;
+        assert_eq!(answer["state"], "failed", "{answer}");
+        let alarms = about().await;
+        assert_eq!(alarms.len(), usize::from(number >= 2), "after {} batches: {alarms:?}", number + 1);
+    }
+    let alarms = about().await;
+    assert_eq!((&alarms[0]["state"], &alarms[0]["severity"]["grade"]), (&json!("open"), &json!("moderate")));
+    let usable = rows([3.2, 5.0, 6.0], 20, 80 * DAY_S, None);
+    assert!(is_above(&service.post_batch("three-dof", &usable).await));
+    assert_eq!(about().await[0]["state"], "ended");
 }

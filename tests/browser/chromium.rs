@@ -174,6 +174,17 @@ impl Page {
         }
     }
 
+    /// Drags a finger from one point to another.
+    pub fn swipe(&mut self, from: [f64; 2], to: [f64; 2]) {
+        let middle = [0, 1].map(|i| 0.5 * (from[i] + to[i]));
+        for (kind, points) in
+            [("touchStart", vec![from]), ("touchMove", vec![middle]), ("touchMove", vec![to]), ("touchEnd", Vec::new())]
+        {
+            let points: Vec<Value> = points.into_iter().map(|[x, y]| json!({ "x": x, "y": y })).collect();
+            self.call("Input.dispatchTouchEvent", &json!({ "type": kind, "touchPoints": points }));
+        }
+    }
+
     /// Types into the focused element.
     pub fn type_text(&mut self, text: &str) {
         self.call("Input.insertText", &json!({ "text": text }));

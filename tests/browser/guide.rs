@@ -16,8 +16,8 @@ fn press_next(page: &mut Page) {
     page.evaluate("document.querySelector('.guide [data-state=next] button.primary').click()");
 }
 
-/// Drags over the first chart of k1, from its left edge to a share of its width.
-fn drag_to(page: &mut Page, share: f64) {
+/// The ends of a drag over the first chart of k1, from its left edge to a share of its width.
+fn over_k1(page: &mut Page, share: f64) -> [[f64; 2]; 2] {
     page.evaluate("document.querySelector('[data-figure=parameter-k1]').scrollIntoView({ block: 'center' })");
     let place = page.evaluate(
         "(() => { const { left, top, width, height } = document.querySelector('[data-figure=parameter-k1] .u-over').getBoundingClientRect();
@@ -25,7 +25,12 @@ fn drag_to(page: &mut Page, share: f64) {
     );
     let [left, top, width, height] = [0, 1, 2, 3].map(|i| place[i].as_f64().unwrap());
     let y = top + height / 2.0;
-    page.drag([left + 1.0, y], [left + share * width, y]);
+    [[left + 1.0, y], [left + share * width, y]]
+}
+
+fn drag_to(page: &mut Page, share: f64) {
+    let [from, to] = over_k1(page, share);
+    page.drag(from, to);
 }
 
 async fn week(service: &Service) -> Vec<Value> {
@@ -90,6 +95,15 @@ async fn dragging_over_a_chart_marks_the_healthy_period() {
     page.wait_for(
         "!location.hash.includes('from=') && document.querySelector('.spans .fine').textContent.includes('6 batches')",
     );
+
+    // A finger marks as well; giving up leaves everything as it was.
+    press_next(&mut page);
+    page.wait_for("document.querySelector('.marking') !== null");
+    let [from, to] = over_k1(&mut page, 0.5);
+    page.swipe(from, to);
+    page.wait_for("document.querySelector('dialog[open] input[name=from]') !== null");
+    page.press("Escape");
+    page.wait_for("document.querySelector('dialog[open]') === null && document.querySelector('.marking') === null");
 
     // The axis shows five days and three hours with a margin of a hundredth: 68 % of it end between the fourth and the fifth batch.
     press_next(&mut page);

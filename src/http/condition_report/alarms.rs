@@ -54,6 +54,7 @@ fn table(alarms: &[Episode], handling: &BTreeMap<i64, Handling>, limits: Severit
         ("damage", Some(change)) => format!("Chart of {}: {}", in_words(&e.series), change.sentence()),
         ("damage", None) => format!("{} has shifted towards damage", in_words(&e.series)),
         ("silence", _) => "no measurement within the configured time".to_owned(),
+        ("not_assessed", _) => "the newest batches could not be assessed".to_owned(),
         _ => "the simulation does not fit the measurements".to_owned(),
     };
     let noted = |e: &Episode| {

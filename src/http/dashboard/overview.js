@@ -114,7 +114,7 @@ export function overview() {
               class: alarm.acknowledgement ? "seen" : "unseen",
               dataset: { key: `${alarm.structure} ${alarm.alarm}` },
             },
-            icon(alarm.kind === "silence" ? "silent" : "alarm"),
+            icon(["silence", "not_assessed"].includes(alarm.kind) ? "silent" : "alarm"),
             h(
               "span",
               { class: "grow" },

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use sqlx::FromRow;
 use tokio::sync::mpsc::Sender;
 
-use super::super::assessment::CURRENT_FIRST;
 use super::super::column::{bad_row, elements, from_blob, list, timestamp};
+use super::super::current::CURRENT_FIRST;
 use super::super::database::Database;
 use super::super::error::Error;
 use super::super::measurement_row::mode_shapes;

@@ -8,12 +8,11 @@ use tokio::sync::mpsc::Receiver;
 
 use super::super::batch::import_batch;
 use super::super::column::{bad_row, list};
+use super::super::comparison::{keep, requeue};
 use super::super::error::Error;
-use super::super::kept::keep;
 use super::super::note::insert_note;
 use super::super::structure::{put_definition, PutStructure};
 use super::super::transaction::Transaction;
-use super::super::undamaged::requeue;
 use super::export::Archive;
 use super::record::{ArchivedModel, Head, Maintenance, Record, Undamaged, Version};
 use super::undamaged::import_undamaged;

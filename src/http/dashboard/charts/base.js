@@ -237,6 +237,32 @@ export class TimeGroup {
     for (const u of this.sync.plots) u.setSelect(NOTHING, false);
   }
 
+  /** Lets a finger mark a period on a chart, which otherwise hears a mouse only. */
+  markByTouch(u) {
+    let from = null;
+    const span = (event) => {
+      const box = u.over.getBoundingClientRect();
+      const now = Math.min(box.width, Math.max(0, event.clientX - box.left));
+      return { left: Math.min(from ?? now, now), width: Math.abs((from ?? now) - now), now };
+    };
+    const show = (event, ended) => {
+      const { left, width } = span(event);
+      u.setSelect({ left, width, top: 0, height: u.over.clientHeight }, ended);
+    };
+    u.over.addEventListener("pointerdown", (event) => {
+      if (!this.onMark || event.pointerType !== "touch" || !event.isPrimary) return;
+      from = span(event).now;
+      u.over.setPointerCapture(event.pointerId);
+    });
+    u.over.addEventListener("pointermove", (event) => from !== null && event.isPrimary && show(event, false));
+    u.over.addEventListener("pointerup", (event) => {
+      if (from === null || !event.isPrimary) return;
+      show(event, true);
+      from = null;
+    });
+    u.over.addEventListener("pointercancel", () => (from = null));
+  }
+
   /** uPlot options common to all charts of the group. */
   options() {
     const zoom = (u) => {
@@ -260,7 +286,7 @@ export class TimeGroup {
         drag: { x: true, y: false, setScale: false, dist: 8 },
         bind: { dblclick: () => () => this.onZoom(null) },
       },
-      hooks: { setSelect: [zoom] },
+      hooks: { ready: [(u) => this.markByTouch(u)], setSelect: [zoom] },
     };
   }
 }

@@ -21,7 +21,7 @@ const options = (select, values, words) => {
 /** Time spans of the alarms about the structure, in seconds; an open alarm has no end. */
 const alarmed = (alarms) =>
   alarms
-    .filter((a) => a.kind !== "silence" && a.state !== "withdrawn")
+    .filter((a) => !["silence", "not_assessed"].includes(a.kind) && a.state !== "withdrawn")
     .map((a) => [seconds(a.opened_at), a.ended_at ? seconds(a.ended_at) : Infinity]);
 
 export function scatter() {

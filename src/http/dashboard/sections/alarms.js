@@ -46,6 +46,7 @@ export function alarmWords(alarm) {
   if (alarm.kind === "damage")
     return `${inWords(alarm.parameter)} has shifted towards damage${Number.isFinite(alarm.peak_shift_standard_errors) ? ` by up to ${number(alarm.peak_shift_standard_errors, 3)} standard errors` : ""}`;
   if (alarm.kind === "simulation_does_not_fit") return "the simulation does not fit the measurements";
+  if (alarm.kind === "not_assessed") return "the newest batches could not be assessed; the reason is stated with each of them";
   if (alarm.kind === "silence") return "no measurement within the configured time";
   return words(alarm.kind).toLowerCase();
 }

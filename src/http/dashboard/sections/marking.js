@@ -9,7 +9,7 @@ export function marking(group, propose) {
     "p",
     { class: "callout", role: "status", hidden: true },
     icon("note"),
-    "Drag over the healthy period on any chart. Escape ends this. Without a mouse, choose the time span by “From … to …”, and then “Use this time span as undamaged reference”.",
+    "Drag over the healthy period on any chart, with the mouse or a finger. Escape ends this. With the keyboard, choose the time span by “From … to …”, and then “Use this time span as undamaged reference”.",
   );
   /** Whether the dialog is open: all charts report the same drag. */
   let asking = false;

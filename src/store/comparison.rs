@@ -1,10 +1,64 @@
-//! Undamaged references that waiting batches are compared with instead of the newest one.
+//! Which undamaged references batches are compared with: the newest one, or those that a batch keeps.
 //!
 //! A batch keeps the reference that it was compared with: one that is imported is compared with the same references as where it comes
 //! from, and one that is assessed again by another trained model is compared with the same reference, computed again by that model.
 
+use super::column::elements;
+use super::current::CURRENT_FIRST;
 use super::error::Error;
 use super::transaction::Transaction;
+use crate::assessment::Assessment;
+
+/// Marks a batch as waiting if the newest undamaged reference would be compared with it otherwise than its assessment was.
+pub(super) async fn wait_for_comparison(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    batch_id: &str,
+    a: &Assessment,
+) -> Result<(), Error> {
+    sqlx::query(
+        "update measurement_batch set state = 'received'
+         where structure_id = $1 and batch_id = $2
+           and $4 <> coalesce((select version from undamaged_state u
+               where u.structure_id = $1 and u.model_digest = $3
+                 and u.version = (select max(version) from undamaged_state where structure_id = $1)
+                 and not exists (select 1 from undamaged_batch b
+                     where b.structure_id = $1 and b.version = u.version and b.batch_id = $2)), 0)",
+    )
+    .bind(structure)
+    .bind(batch_id)
+    .bind(a.model_digest.as_str())
+    .bind(a.undamaged_version.unwrap_or(0))
+    .execute(transaction.connection())
+    .await?;
+    Ok(())
+}
+
+/// Marks batches to be assessed again: those that were never compared with a reference, and all that came after the batches of
+/// the new reference, because its charts begin there. The current assessment decides whether a batch was compared, since one
+/// with an earlier trained baseline is not comparable. Batches of the list `except` are left as they are.
+pub(super) async fn requeue(
+    transaction: &mut Transaction<'_>,
+    (structure, version): (&str, u32),
+    except: &str,
+) -> Result<(), Error> {
+    let update = format!(
+        "update measurement_batch set state = 'received'
+         where structure_id = $1 and state = 'assessed'
+           and batch_id not in (select batch_id from undamaged_batch where structure_id = $1 and version = $2)
+           and (0 = (select undamaged_version from assessment a
+                   where a.structure_id = $1 and a.batch_id = measurement_batch.batch_id
+                   order by {CURRENT_FIRST} limit 1)
+               or measured_from_us > (select max(b.measured_to_us) from measurement_batch b
+                   join undamaged_batch u using (structure_id, batch_id)
+                   where u.structure_id = $1 and u.version = $2))
+           and batch_id not in (select value from {})",
+        elements!("$3")
+    );
+    let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version).bind(except);
+    update.execute(transaction.connection()).await?;
+    Ok(())
+}
 
 /// Batches that keep one version keep another instead, which is the same reference computed again.
 pub(super) async fn replace_kept(

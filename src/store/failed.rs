@@ -1,0 +1,97 @@
+//! Batches that cannot be assessed, and the alarm about them: while they come, a loss would not be seen.
+
+use std::future::Future;
+
+use super::alarm::{insert_episode, NOT_ASSESSED_SERIES};
+use super::batch::Batches;
+use super::error::Error;
+use super::structure::is_present;
+use super::transaction::Transaction;
+use crate::quantity::{Digest, StructureId, Timestamp};
+
+/// Number of the newest batches, by their arrival, that raise an alarm if none of them can be assessed. One or two may be a passing mistake of
+/// their sender.
+const IN_A_ROW: i64 = 3;
+
+/// A batch that was marked as failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MarkedFailed {
+    /// Whether it has opened an alarm.
+    pub alarm_opened: bool,
+}
+
+impl Batches<'_> {
+    /// Marks a batch whose assessment failed, unless the structure has another version now: then `None`. If it is the last of some batches in
+    /// a row, an alarm is opened, unless one is open or the batch was measured during maintenance.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`].
+    pub fn mark_failed(
+        self,
+        structure: &StructureId,
+        batch_id: &str,
+        version: &Digest,
+        reason: &str,
+    ) -> impl Future<Output = Result<Option<MarkedFailed>, Error>> + Send + 'static {
+        let (structure, id, reason) = (structure.to_string(), batch_id.to_owned(), reason.to_owned());
+        let version = version.clone();
+        self.database.write(move |transaction| {
+            Box::pin(async move {
+                if !is_present(transaction, &structure, &version).await? {
+                    return Ok(None);
+                }
+                sqlx::query(
+                    "update measurement_batch set state = 'failed', failure = $1 where structure_id = $2 and batch_id = $3",
+                )
+                .bind(reason)
+                .bind(&structure)
+                .bind(&id)
+                .execute(transaction.connection())
+                .await?;
+                let alarm_opened = open_alarm(transaction, &structure, &id).await?;
+                Ok(Some(MarkedFailed { alarm_opened }))
+            })
+        })
+    }
+}
+
+/// Opens the alarm if it is due. Returns whether it was.
+async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str, batch_id: &str) -> Result<bool, Error> {
+    let due: Option<(i64,)> = sqlx::query_as(
+        "select measured_to_us from measurement_batch b
+         where structure_id = $1 and batch_id = $2
+           and $3 = (select count(*) filter (where state = 'failed') from
+               (select state from measurement_batch where structure_id = $1 order by batch_id desc limit $3))
+           and not exists (select 1 from alarm_episode
+               where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null)
+           and not exists (select 1 from maintenance_window m
+               where m.structure_id = $1 and m.from_us <= b.measured_to_us and m.to_us > b.measured_from_us)",
+    )
+    .bind(structure)
+    .bind(batch_id)
+    .bind(IN_A_ROW)
+    .fetch_optional(transaction.connection())
+    .await?;
+    let Some((measured_to_us,)) = due else { return Ok(false) };
+    let row = (0, measured_to_us, Some(batch_id), None, 0.0);
+    insert_episode(transaction, structure, NOT_ASSESSED_SERIES, row, Timestamp::now()).await?;
+    Ok(true)
+}
+
+/// Ends the alarm if the newest batch has not failed. Returns whether it was open.
+pub(super) async fn end_alarm(
+    transaction: &mut Transaction<'_>,
+    structure: &str,
+    now: Timestamp,
+) -> Result<bool, Error> {
+    let ended = sqlx::query(
+        "update alarm_episode set ended_at_us = $2
+         where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null
+           and 'failed' <> (select state from measurement_batch where structure_id = $1 order by batch_id desc limit 1)",
+    )
+    .bind(structure)
+    .bind(now.micros())
+    .execute(transaction.connection())
+    .await?;
+    Ok(ended.rows_affected() > 0)
+}
