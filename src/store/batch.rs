@@ -10,7 +10,6 @@ use super::database::Database;
 use super::error::Error;
 use super::measurement_row::{frequencies, measurement, MeasurementRow};
 use super::rows::{parts, InsertStatements};
-use super::structure::is_present;
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::measurement::{MeasurementBatch, ModalMeasurement};

@@ -30,7 +30,7 @@ async fn refused(service: &Service, kind: &str, body: String) -> (Value, f64) {
 }
 
 /// A file in which every spring has several mistakes.
-fn mistakes(springs: usize) -> String {
+pub fn mistakes(springs: usize) -> String {
     let mut text = "id = \"bad\"\nmodes = 1\n[[mass]]\nname = \"m\"\nkg = 1\n".to_owned();
     for _ in 0..springs {
         text += "[[spring]]\nname=\"s\"\nfrom=\"x\"\nto=\"y\"\nn_per_m=-1\n";

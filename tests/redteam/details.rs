@@ -17,7 +17,7 @@ fn detail_of(batch: &str) -> String {
 }
 
 /// Asks for details of these batches, many at a time, until the set is dropped.
-fn attack(target: &Arc<Target>, reader: &str, batches: &[String], at_a_time: usize) -> JoinSet<()> {
+pub fn attack(target: &Arc<Target>, reader: &str, batches: &[String], at_a_time: usize) -> JoinSet<()> {
     let mut asking = JoinSet::new();
     for number in 0..at_a_time {
         let (target, reader) = (Arc::clone(target), reader.to_owned());
@@ -35,7 +35,7 @@ fn attack(target: &Arc<Target>, reader: &str, batches: &[String], at_a_time: usi
 }
 
 /// Batches of different sizes about `size`, so that none is like another.
-async fn batches(target: &Target, count: usize, size: usize) -> Vec<String> {
+pub async fn batches(target: &Target, count: usize, size: usize) -> Vec<String> {
     let mut all = Vec::new();
     for number in 0..count {
         let days_s = 86_400 * 60 * number;

@@ -11,6 +11,7 @@ mod details;
 #[allow(dead_code, reason = "shared with tests/api, which uses all of it")]
 mod helpers;
 mod slow_readers;
+mod soak;
 mod streams;
 mod structures;
 mod target;

@@ -24,8 +24,15 @@ async fn slow_reader(address: SocketAddr) -> Option<TcpStream> {
     Some(stream)
 }
 
+/// Lets this process open enough files for the attack in its full size.
+pub fn allow_many_sockets() {
+    let files = getrlimit(Resource::Nofile);
+    let wanted = Rlimit { current: files.maximum.or(Some(8_192)).map(|most| most.min(8_192)), ..files };
+    setrlimit(Resource::Nofile, wanted).unwrap();
+}
+
 /// Opens the sockets, and says how many are open.
-async fn attack(target: &Target, sockets: usize) -> Vec<TcpStream> {
+pub async fn attack(target: &Target, sockets: usize) -> Vec<TcpStream> {
     let address: SocketAddr = target.service.address().parse().unwrap();
     let opening: Vec<_> = (0..sockets).map(|_| tokio::spawn(slow_reader(address))).collect();
     let mut open = Vec::new();
@@ -81,9 +88,7 @@ async fn slow_readers_keep_neither_supervisors_nor_token_holders_nor_for_long_ot
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "a minute, with 1,040 sockets"]
 async fn a_thousand_slow_readers_do_not_silence_the_probes() {
-    let files = getrlimit(Resource::Nofile);
-    let wanted = Rlimit { current: files.maximum.or(Some(8_192)).map(|most| most.min(8_192)), ..files };
-    setrlimit(Resource::Nofile, wanted).unwrap();
+    allow_many_sockets();
     let target = Target::start(&[]);
     let mut sockets = attack(&target, 1_040).await;
     for _ in 0..6 {
