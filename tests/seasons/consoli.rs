@@ -59,7 +59,7 @@ fn daily(simulator: &Simulator, rows: &[Row], days: &[i64]) -> Vec<(i64, BatchEs
 }
 
 #[test]
-#[ignore = "a study of a minute"]
+#[ignore = "a study of some minutes"]
 fn charts_of_the_process_over_the_second_year_of_the_consoli_palace() {
     let Some(csv) = data("consoli-palace/consoli_frequencies.csv") else { return };
     let (rows, days) = (rows(&csv, 5), days(&csv));

@@ -65,7 +65,7 @@ fn a_year_of_the_z24_bridge_raises_no_alarm_and_the_settlement_of_its_pier_does(
 }
 
 #[test]
-#[ignore = "a study of two minutes"]
+#[ignore = "a study of some minutes"]
 fn references_of_any_length_from_60_batches_on_raise_no_false_alarm_on_the_z24_bridge() {
     let Some((estimates, first_damaged)) = batches() else { return };
     let quantities = quantities(&["ei", "pier", "gj"], "ln");
