@@ -3,18 +3,25 @@
 use modalwatch::process::change::AGES;
 use modalwatch::process::estimate::BatchEstimate;
 use modalwatch::process::limits::Steady;
+use modalwatch::process::reference::ReferenceProcess;
 use modalwatch::quantity::Timestamp;
 use modalwatch::simulator::definition::StructureDefinition;
 use modalwatch::simulator::Simulator;
 
 use super::estimates::{data, estimate, rows, simulator, Row};
-use super::watch::{episodes, quantities, reference, watch};
+use super::watch::{episodes, quantities, reference, watch, Changes};
 
 /// Fewest frequencies of a mode in a day that make a mean of it.
 const FEWEST: usize = 6;
 
 /// Rows of the semi-synthetic loss of f1 in the README of the data, and its size, Hz.
 const F1_LOSS: (std::ops::RangeInclusive<usize>, f64) = (24_999..=36_329, 0.029_825_53);
+
+/// Days below all limits after which an alarm has ended.
+const RECOVERY: usize = 3;
+
+/// Days within which a loss of 3 % is to be found.
+const DAYS_TO_FIND: i64 = 10;
 
 /// Days since the first one of the rows, from the column `time_local`.
 fn days(csv: &str) -> Vec<i64> {
@@ -52,14 +59,19 @@ fn daily(simulator: &Simulator, rows: &[Row], days: &[i64]) -> Vec<(i64, BatchEs
 }
 
 #[test]
-#[ignore = "a study of a minute"]
+#[ignore = "a study of some minutes"]
 fn charts_of_the_process_over_the_second_year_of_the_consoli_palace() {
     let Some(csv) = data("consoli-palace/consoli_frequencies.csv") else { return };
     let (rows, days) = (rows(&csv, 5), days(&csv));
     println!("== walls and upper parts");
-    study(&simulator("consoli-palace.toml"), &rows, &days, &["walls", "upper"]);
+    let of_two = study(&simulator("consoli-palace.toml"), &rows, &days, &["walls", "upper"]);
     println!("== one stiffness for each mode");
-    study(&modal(), &rows, &days, &["k1", "k2", "k3", "k4", "k5"]);
+    let of_five = study(&modal(), &rows, &days, &["k1", "k2", "k3", "k4", "k5"]);
+    assert!(of_two.episodes <= 2 && of_five.episodes <= 4, "{} and {}", of_two.episodes, of_five.episodes);
+    assert!(of_two.f1_days <= 1 && of_five.f1_days <= 1, "{} and {}", of_two.f1_days, of_five.f1_days);
+    // One stiffness for each mode finds a loss of the walls in most places, two stiffnesses do not: see docs/real-structures.md.
+    let ([five, of_five], [two, of_two]) = (of_five.found[0], of_two.found[0]);
+    assert!(2 * five > of_five && 2 * two < of_two, "{five} of {of_five} and {two} of {of_two}");
 }
 
 /// One body for each mode, each with a stiffness of its own: the frequencies without a model of the palace.
@@ -83,26 +95,26 @@ fn modal() -> Simulator {
     Simulator::new(StructureDefinition::parse_toml(&text).unwrap()).unwrap()
 }
 
-fn study(simulator: &Simulator, rows: &[Row], days: &[i64], names: &[&str]) {
-    // Shares of the walls in the stiffness of each mode, from the structure file: what a loss of the walls does to each mode.
-    let shares = if names.len() == 2 { vec![1.0, 0.0] } else { vec![0.8, 0.7, 0.4, 0.3, 0.6] };
+/// What a study found.
+struct Found {
+    /// False alarms in the second year.
+    episodes: usize,
+    /// Days from the loss of f1 to the first chart that is above its limit because of it.
+    f1_days: i64,
+    /// For each loss of 3 %, placements in which it was found, and those that could be tried.
+    found: Vec<[usize; 2]>,
+}
+
+fn study(simulator: &Simulator, rows: &[Row], days: &[i64], names: &[&str]) -> Found {
     let healthy = daily(simulator, rows, days);
     let split = healthy.iter().position(|(day, _)| *day >= 365).unwrap();
     let all: Vec<BatchEstimate> = healthy.iter().map(|(_, e)| e.clone()).collect();
     let quantities = quantities(names, "ln");
     let reference = reference(&quantities, &all[..split], 1_095.0);
-    let numbers = reference.process.numbers();
-    println!(
-        "{} days, {split} of them reference; {} factors, persistence {:.3?}, noise {:.2}, limits {:.2?}",
-        all.len(),
-        reference.process.factors,
-        numbers.persistence.as_slice(),
-        numbers.noise,
-        reference.limits
-    );
+    describe(&reference, all.len());
     let changes = watch(&reference, &all[split..]);
     let above: Vec<bool> = changes.iter().map(|c| !c.is_empty()).collect();
-    let begins = episodes(&above, 3);
+    let begins = episodes(&above, RECOVERY);
     println!("healthy: {} episodes, {} days above", begins.len(), above.iter().filter(|a| **a).count());
     for t in &begins {
         println!("  day {}: {}", healthy[split + t].0, changes[*t][0].1.sentence());
@@ -116,35 +128,73 @@ fn study(simulator: &Simulator, rows: &[Row], days: &[i64], names: &[&str]) {
     let onset = days[rows.iter().position(|row| row.number == *F1_LOSS.0.start()).unwrap()];
     let damaged = daily(simulator, &lowered, days);
     let estimates: Vec<BatchEstimate> = damaged[split..].iter().map(|(_, e)| e.clone()).collect();
-    let changes = watch(&reference, &estimates);
-    let first = damaged[split..].iter().zip(&changes).find(|((day, _), c)| *day >= onset && !c.is_empty());
+    let lowered = watch(&reference, &estimates);
+    // A chart that is above its limit because of the loss: in the same batch without the loss it is not.
+    let is_new = |t: usize| lowered[t].iter().any(|(series, _)| !changes[t].iter().any(|(other, _)| other == series));
+    let first = (0..lowered.len()).find(|t| damaged[split + t].0 >= onset && is_new(*t)).unwrap();
+    let f1_days = damaged[split + first].0 - onset;
+    println!("f1 lowered from day {onset}: after {f1_days} days: {}", lowered[first][0].1.sentence());
+    // A loss of the walls or of the upper parts; that of the walls by their shares in the stiffness of each mode, from the structure file.
+    let losses: Vec<Vec<f64>> =
+        if names.len() == 2 { vec![vec![1.0, 0.0], vec![0.0, 1.0]] } else { vec![vec![0.8, 0.7, 0.4, 0.3, 0.6]] };
+    let second_year = SecondYear { reference: &reference, batches: &healthy[split..] };
+    let found = losses.iter().map(|shares| second_year.placements(&changes, shares)).collect();
+    Found { episodes: begins.len(), f1_days, found }
+}
+
+/// Prints what a reference has learned from its batches.
+fn describe(reference: &ReferenceProcess, days: usize) {
+    let numbers = reference.process.numbers();
+    println!(
+        "{days} days, {} of them reference; {} factors, persistence {:.3?}, noise {:.2}, limits {:.2?}",
+        reference.process.batches,
+        reference.process.factors,
+        numbers.persistence.as_slice(),
+        numbers.noise,
+        reference.limits
+    );
     let scale: Vec<f64> = reference.process.scales.iter().map(|s| 100.0 * s.unit).collect();
     let errors = Steady::new(&reference.process).unwrap().standard_errors();
     for (age, errors) in AGES.iter().zip(errors) {
         let percent: Vec<f64> = errors.iter().zip(&scale).map(|(e, s)| e * s).collect();
         println!("  standard error of a loss that has lasted {age} days, %: {percent:.2?}");
     }
-    println!("f1 lowered from day {onset}: {:?}", first.map(|((day, _), c)| (day - onset, c[0].1.sentence())));
-    let (mut found, mut quiet) = (0, 0);
-    for placement in 0..20 {
-        let onset = 395 + placement * 17;
-        let lost = |(day, e): &(i64, BatchEstimate)| {
-            let mut e = e.clone();
-            if *day >= onset {
-                for (mean, share) in e.mean.iter_mut().zip(&shares) {
-                    *mean = mean.map(|mean| mean + f64::ln(1.0 - 0.03 * share));
+}
+
+/// The second year, which is compared with the first.
+struct SecondYear<'a> {
+    reference: &'a ReferenceProcess,
+    batches: &'a [(i64, BatchEstimate)],
+}
+
+impl SecondYear<'_> {
+    /// Puts a loss of 3 % times `shares`, `[d]`, into 20 places of the year. `healthy`: the charts without a loss. A place can be tried if
+    /// no chart is above its limit there without the loss, from [`RECOVERY`] days before the onset to the end of the days that count.
+    fn placements(&self, healthy: &[Changes], shares: &[f64]) -> [usize; 2] {
+        let (mut found, mut tried) = (0, 0);
+        for placement in 0..20 {
+            let onset = 395 + placement * 17;
+            let lost = |(day, e): &(i64, BatchEstimate)| {
+                let mut e = e.clone();
+                if *day >= onset {
+                    for (mean, share) in e.mean.iter_mut().zip(shares) {
+                        *mean = mean.map(|mean| mean + f64::ln(1.0 - 0.03 * share));
+                    }
                 }
+                e
+            };
+            let alarm = |changes: &[Changes], from: i64| {
+                let counts = |day: i64| (from..=onset + DAYS_TO_FIND).contains(&day);
+                self.batches.iter().zip(changes).any(|((day, _), c)| counts(*day) && !c.is_empty())
+            };
+            if alarm(healthy, onset - RECOVERY as i64) {
+                continue;
             }
-            e
-        };
-        let estimates: Vec<BatchEstimate> = healthy[split..].iter().map(lost).collect();
-        let changes = watch(&reference, &estimates);
-        let alarm = |from: i64, to: i64| {
-            healthy[split..].iter().zip(&changes).any(|((day, _), c)| (from..to).contains(day) && !c.is_empty())
-        };
-        let before = alarm(onset - 30, onset);
-        quiet += usize::from(!before);
-        found += usize::from(!before && alarm(onset, onset + 10));
+            let estimates: Vec<BatchEstimate> = self.batches.iter().map(lost).collect();
+            tried += 1;
+            found += usize::from(alarm(&watch(self.reference, &estimates), onset));
+        }
+        println!("loss of 3 % of {shares:?}: found within {DAYS_TO_FIND} days in {found} of {tried} placements, of 20, without a false alarm");
+        [found, tried]
     }
-    println!("loss of 3 %: found within 10 days in {found} of {quiet} placements without an alarm before");
 }

@@ -20,8 +20,11 @@ pub fn reference(quantities: &Quantities, estimates: &[BatchEstimate], mean_run_
     ReferenceProcess::new(quantities, &[], estimates.to_vec(), mean_run_batches, [1.0; 2]).unwrap()
 }
 
-/// For each batch the changes on the charts that are above their limits, with their series.
-pub fn watch(reference: &ReferenceProcess, estimates: &[BatchEstimate]) -> Vec<Vec<(String, LastingChange)>> {
+/// The changes on the charts of a batch that are above their limits, with their series.
+pub type Changes = Vec<(String, LastingChange)>;
+
+/// [`Changes`] of each batch.
+pub fn watch(reference: &ReferenceProcess, estimates: &[BatchEstimate]) -> Vec<Changes> {
     let filter = Filter::of(&reference.process);
     let Some(first) = estimates.first() else { return Vec::new() };
     let mut chain = Chain::start(reference, &filter, first.at);
