@@ -218,7 +218,8 @@ async fn invalid_ids_and_keys_are_refused() {
     }
     problem(service.get("/v2/structures").send().await.unwrap(), 404, "unknown_route").await;
     let delete = service.request(reqwest::Method::DELETE, "/v1/structures/three-dof").send().await.unwrap();
-    problem(delete, 405, "method_not_allowed").await;
+    // Without the confirmation.
+    problem(delete, 422, "invalid").await;
     nothing_is_stored(&service).await;
 }
 

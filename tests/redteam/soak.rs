@@ -4,15 +4,19 @@
 //! |---|---|---|
 //! | `MODALWATCH_SOAK_S` | 120 | length, seconds: a quarter without attacks, half with them, a quarter without |
 //! | `MODALWATCH_SOAK_BATCHES_PER_S` | 8 | batches of 20 measurements due each second |
+//! | `MODALWATCH_SOAK_ATTACKS` | readers,definitions,details | the attacks |
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use reqwest::{Client, Method};
+use rustix::process::setpriority_process;
 use serde_json::{json, Value};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
+use tokio::runtime::Builder;
+use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 
 use crate::definitions::mistakes;
@@ -87,27 +91,55 @@ async fn load(target: &Target, token: &str, during: Duration, number: &mut usize
     Arc::into_inner(seen).unwrap().into_inner().unwrap()
 }
 
-/// All attacks at once, until the set is dropped.
-fn attacks(target: &Arc<Target>, reader: &str, batches: &[String]) -> JoinSet<()> {
-    let mut all = details::attack(target, reader, batches, 100);
-    let own = Arc::clone(target);
-    all.spawn(async move {
-        loop {
-            let sockets = slow_readers::attack(&own, 1_040).await;
-            tokio::time::sleep(Duration::from_secs(15)).await;
-            drop(sockets);
-        }
+/// Names of the attacks.
+const ATTACKS: [&str; 3] = ["readers", "definitions", "details"];
+
+/// The attacks, on a thread of their own, until the answer is dropped. The attackers of a real service have processors of their own; here
+/// they share two with it, so that their thread yields to everybody.
+fn attacks(target: &Arc<Target>, reader: &str, batches: &[String]) -> oneshot::Sender<()> {
+    let (target, reader, batches) = (Arc::clone(target), reader.to_owned(), batches.to_vec());
+    let (sender, ended) = oneshot::channel();
+    std::thread::spawn(move || {
+        setpriority_process(None, 19).unwrap();
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let all = begin(&target, &reader, &batches);
+            let _ = ended.await;
+            drop(all);
+        });
     });
-    let own = Arc::clone(target);
-    all.spawn(async move {
-        let text = mistakes(SPRINGS);
-        loop {
-            let put = own.ask(Method::PUT, "/v1/structures/bad", Some(&own.admin), PATIENCE);
-            if put.header("content-type", "application/toml").body(text.clone()).send().await.is_err() {
-                tokio::time::sleep(Duration::from_millis(100)).await;
+    sender
+}
+
+fn begin(target: &Arc<Target>, reader: &str, batches: &[String]) -> JoinSet<()> {
+    let chosen = std::env::var("MODALWATCH_SOAK_ATTACKS").unwrap_or_else(|_| ATTACKS.join(","));
+    let is_chosen = |name: &str| chosen.split(',').any(|own| own == name);
+    let mut all = JoinSet::new();
+    if is_chosen("details") {
+        all = details::attack(target, reader, batches, 100);
+    }
+    if is_chosen("readers") {
+        let own = Arc::clone(target);
+        all.spawn(async move {
+            loop {
+                let sockets = slow_readers::attack(&own, 1_040).await;
+                tokio::time::sleep(Duration::from_secs(15)).await;
+                drop(sockets);
             }
-        }
-    });
+        });
+    }
+    if is_chosen("definitions") {
+        let own = Arc::clone(target);
+        all.spawn(async move {
+            let text = mistakes(SPRINGS);
+            loop {
+                let put = own.ask(Method::PUT, "/v1/structures/bad", Some(&own.admin), PATIENCE);
+                if put.header("content-type", "application/toml").body(text.clone()).send().await.is_err() {
+                    tokio::time::sleep(Duration::from_millis(100)).await;
+                }
+            }
+        });
+    }
     all
 }
 
