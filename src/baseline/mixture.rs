@@ -163,7 +163,7 @@ mod tests {
         let mixture = mixture();
         let (nu, d) = (DEGREES_OF_FREEDOM, 2.0);
         let log_constant = ln_gamma(0.5 * (nu + d)) - ln_gamma(0.5 * nu) - 0.5 * d * (nu * std::f64::consts::PI).ln();
-        let count = 40_000;
+        let count = 320_000;
         let drawn = mixture.draw(count, &mut stats::stream(4, "test"));
         // E_q[p/q] = ∫ p = 1 for normal densities p whose mass is where that of q is, one of them on each component.
         for (mean, std) in [([0.5, 0.0], 0.5), ([-0.5, 0.2], 0.03), ([0.0, 0.0], 0.3)] {
