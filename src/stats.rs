@@ -180,8 +180,37 @@ pub fn weights(log_weights: &[f64], effective: f64) -> Option<Vec<f64>> {
         return None;
     }
     let weights: Vec<f64> = log_weights.iter().map(|w| (w - largest).exp()).collect();
+    (effective_number(&weights) >= effective * weights.len() as f64).then_some(weights)
+}
+
+/// Effective number (Σ w)²/Σ w² of draws with the weights w, `[n]`.
+pub fn effective_number(weights: &[f64]) -> f64 {
     let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
-    (sum * sum / squares >= effective * weights.len() as f64).then_some(weights)
+    sum * sum / squares
+}
+
+/// The weights w^β for the largest β ≤ 1 that leaves `wanted` effective draws, `[n]`, from ln w, nats, `[n]`; `None` where the draws with a
+/// weight are fewer.
+pub fn tempered_weights(log_weights: &[f64], wanted: f64) -> Option<Vec<f64>> {
+    let raised = |beta: f64| {
+        let raised: Vec<f64> = log_weights.iter().map(|weight| weight * beta).collect();
+        weights(&raised, 0.0)
+    };
+    let untempered = raised(1.0)?;
+    if effective_number(&untempered) >= wanted {
+        return Some(untempered);
+    }
+    if (log_weights.iter().filter(|weight| weight.is_finite()).count() as f64) < wanted {
+        return None;
+    }
+    // The effective number falls with β, so that bisection in its logarithm finds the largest one.
+    let (mut low, mut high) = (-40.0_f64, 0.0_f64);
+    for _ in 0..24 {
+        let middle = 0.5 * (low + high);
+        let enough = raised(middle.exp()).is_some_and(|weights| effective_number(&weights) >= wanted);
+        *(if enough { &mut low } else { &mut high }) = middle;
+    }
+    raised(low.exp())
 }
 
 /// Indices of `draws` samples by systematic resampling with the weights w, `[n]`, in random order. Index i occurs `draws`·wᵢ/Σw

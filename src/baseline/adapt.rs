@@ -1,9 +1,13 @@
 //! Adaptive importance sampling in the latent space of the flow, for measurements whose posterior the flow does not match.
 //!
 //! The flow maps z to parameters x, and its own draws have z ~ N(0, I). A flow that is wider than the posterior, or lies beside it,
-//! leaves few effective draws: accurate frequencies give a thin curved posterior. The posterior of z is then no longer N(0, I), but
-//! nearer to a normal distribution than that of x, because the flow has removed most of the curvature. Stage by stage, a Student
-//! distribution of z is fitted to the weighted draws of all stages before and proposes the next ones:
+//! leaves few effective draws: accurate frequencies give a thin curved posterior. The first draws are then moved onto the posterior, and a
+//! mixture of local normal approximations about them proposes, see `src/baseline/local.rs`.
+//!
+//! Where that does not give enough effective draws, as with many directions that the frequencies do not determine, the proposals adapt
+//! in the space of z, in which the posterior is nearer to a normal distribution than in that of x, because the flow has removed most of
+//! the curvature. Stage by stage, a Student distribution of z is fitted to the weighted draws of all stages before and proposes the next
+//! ones:
 //!
 //! ```text
 //!  q_0 = N(0, I),    q_t = t_ν(m_t, S_t),    q(z) = Σ_t n_t q_t(z) / Σ_t n_t
@@ -20,6 +24,7 @@ use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
 use super::error::InferenceError;
+use super::local::{Target, STARTS};
 use super::model::Baseline;
 use super::observation::Observation;
 use super::proposal::Proposal;
@@ -95,12 +100,31 @@ impl Baseline {
                     break;
                 }
                 adapted.simulations += self.next_stage((part, &context), &open, many, &mut searches)?;
+                if stage == 0 {
+                    let searches = searches.par_iter_mut().zip(part);
+                    let simulations = searches.map(|(search, one)| self.sample_locally(search, one, draws, needed));
+                    adapted.simulations += simulations.sum::<usize>();
+                }
                 let judge = |search: &mut Search| search.judge(stage + 1, needed);
                 searches.par_iter_mut().filter(|search| search.is_open()).for_each(judge);
             }
             adapted.found.extend(searches.iter_mut().map(|search| search.resampled(draws)));
         }
         Ok(adapted)
+    }
+
+    /// Ends a search whose first draws were those of the flow, where the mixture about them gives enough effective draws, see
+    /// `src/baseline/local.rs`. Returns the number of simulations.
+    fn sample_locally(&self, search: &mut Search, observation: &Observation, draws: usize, needed: f64) -> usize {
+        // They are independent, so that the first ones are a sample as well.
+        let inside = (0..search.log_target.len()).filter(|row| search.log_target[*row].is_finite());
+        let rows: Vec<usize> = inside.take(STARTS).collect();
+        let starts = DMatrix::from_fn(rows.len(), search.d, |row, k| search.theta[rows[row] * search.d + k]);
+        let mut target = Target::new(&self.simulator, observation);
+        if let Some(theta) = target.sample(&starts, draws, needed, &mut search.stream) {
+            search.state = State::Sampled(theta);
+        }
+        target.simulations
     }
 
     /// A search that begins with the draws of the flow; for noise beyond the training, for which these are too narrow, with draws that
@@ -178,6 +202,8 @@ enum State {
     Open,
     /// The weights of the draws, which have enough effective ones.
     Enough(Vec<f64>),
+    /// Samples of the mixture about the first draws, `[draws, d]`, parameter units.
+    Sampled(DMatrix<f64>),
     GivenUp,
 }
 
@@ -230,21 +256,21 @@ impl Search {
             self.state = State::GivenUp;
             return;
         };
-        let effective = effective(&weights);
+        let effective = stats::effective_number(&weights);
         if effective >= needed {
             self.state = State::Enough(weights);
             return;
         }
         let hopeless = stages >= STAGES_BEFORE_DOUBT && effective < HOPEFUL * weights.len() as f64;
-        match self.fitted(&log_weights, weights).filter(|_| !hopeless) {
+        match self.fitted(&log_weights).filter(|_| !hopeless) {
             Some(proposal) => self.proposals.push(proposal),
             None => self.state = State::GivenUp,
         }
     }
 
     /// The Student distribution with the moments of the draws under w^β.
-    fn fitted(&self, log_weights: &[f64], weights: Vec<f64>) -> Option<Proposal> {
-        let weights = tempered(log_weights, weights, EFFECTIVE_PER_DIMENSION * (self.d + 1) as f64)?;
+    fn fitted(&self, log_weights: &[f64]) -> Option<Proposal> {
+        let weights = stats::tempered_weights(log_weights, EFFECTIVE_PER_DIMENSION * (self.d + 1) as f64)?;
         let total: f64 = weights.iter().sum();
         let draws = || self.latent.chunks_exact(self.d).zip(&weights).filter(|(_, weight)| **weight > 0.0);
         let mut mean = DVector::zeros(self.d);
@@ -267,46 +293,17 @@ impl Search {
     fn resampled(&mut self, draws: usize) -> Option<Found> {
         let (weights, complete) = match &self.state {
             State::Enough(weights) => (weights.clone(), true),
+            State::Sampled(theta) => return Some(Found { theta: theta.clone(), complete: true }),
             State::Open | State::GivenUp => {
                 let log_weights = self.log_weights();
-                let weights = stats::weights(&log_weights, 0.0)?;
-                let usable = weights.iter().filter(|weight| **weight > 0.0).count() as f64;
-                (tempered(&log_weights, weights, EFFECTIVE.max(draws as f64).min(0.5 * usable))?, false)
+                let usable = stats::weights(&log_weights, 0.0)?.iter().filter(|weight| **weight > 0.0).count() as f64;
+                (stats::tempered_weights(&log_weights, EFFECTIVE.max(draws as f64).min(0.5 * usable))?, false)
             }
         };
         let chosen = stats::systematic(&weights, draws, &mut self.stream);
         let theta = DMatrix::from_fn(draws, self.d, |row, column| self.theta[chosen[row] * self.d + column]);
         Some(Found { theta, complete })
     }
-}
-
-/// The weights w^β for the largest β ≤ 1 that leaves `wanted` effective draws, or as many as there are; `None` where the draws with a
-/// weight are fewer.
-fn tempered(log_weights: &[f64], weights: Vec<f64>, wanted: f64) -> Option<Vec<f64>> {
-    if effective(&weights) >= wanted {
-        return Some(weights);
-    }
-    if (log_weights.iter().filter(|weight| weight.is_finite()).count() as f64) < wanted {
-        return None;
-    }
-    let raised = |beta: f64| {
-        let raised: Vec<f64> = log_weights.iter().map(|weight| weight * beta).collect();
-        stats::weights(&raised, 0.0)
-    };
-    // The effective number falls with β, so that bisection in its logarithm finds the largest one.
-    let (mut low, mut high) = (-40.0_f64, 0.0_f64);
-    for _ in 0..24 {
-        let middle = 0.5 * (low + high);
-        let enough = raised(middle.exp()).is_some_and(|weights| effective(&weights) >= wanted);
-        *(if enough { &mut low } else { &mut high }) = middle;
-    }
-    raised(low.exp())
-}
-
-/// Effective number (Σ w)²/Σ w² of draws with the weights w.
-fn effective(weights: &[f64]) -> f64 {
-    let (sum, squares) = weights.iter().fold((0.0, 0.0), |(s, q), w| (s + w, q + w * w));
-    sum * sum / squares
 }
 
 /// ln(eᵃ + eᵇ).

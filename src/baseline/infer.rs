@@ -40,10 +40,11 @@ impl Baseline {
     /// Posterior samples of each measurement, `[n·draws, d]` for n observations, in parameter units.
     ///
     /// The flow proposes two draws for each sample, and sampling–importance resampling corrects them by the exact
-    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where fewer than half of them are effective, the
-    /// proposals are adapted to the posterior, see `src/baseline/adapt.rs`. Draws of the flow that the simulation has not corrected are stretched as the manifest's
-    /// [`spread`](super::manifest::Manifest::spread) says. Where a covariate is missing, the samples go
-    /// through its possible values in turn:
+    /// likelihood; see `src/baseline/resample.rs` for where this is done. Where fewer than half of them are effective, a mixture of local
+    /// normal approximations about them proposes others, see `src/baseline/local.rs`, or the proposals adapt to the posterior, see
+    /// `src/baseline/adapt.rs`. Draws of the flow that the simulation has not corrected are stretched as the manifest's
+    /// [`spread`](super::manifest::Manifest::spread) says. Where a covariate is missing, the samples go through its possible values in
+    /// turn:
     ///
     /// ```text
     ///  p(x | y) ≈ 1/C Σ_c p(x | y, c)
@@ -213,8 +214,8 @@ impl Baseline {
         Ok(Corrected { samples, weighted: uncorrected() })
     }
 
-    /// Sampling–importance resampling of the flow's draws, and adaptive importance sampling for the measurements for which they do
-    /// not suffice.
+    /// Sampling–importance resampling of the flow's draws, and importance sampling with other proposals for the measurements for which
+    /// they do not suffice.
     fn infer_weighted(
         &self,
         observations: &[Observation],

@@ -5,7 +5,8 @@
 //! ```
 //!
 //! `MODALWATCH_FORTY=0..10` restricts the seeds, so that the forty can be trained in parts. `MODALWATCH_FORTY_EPOCHS=20` trains a single round of
-//! so many epochs, which is quicker and harder to pass.
+//! so many epochs, which is quicker and harder to pass. `MODALWATCH_FORTY_KEEP=FOLDER` keeps each structure and its model in a folder of
+//! FOLDER with the number of its seed.
 
 #![expect(
     clippy::format_push_string,
@@ -150,6 +151,7 @@ fn each_random_structure_is_valid() {
         let simulator = simulator(&text);
         assert!((2..=6).contains(&simulator.space().len()), "{described}");
         assert!(simulator.modes() >= simulator.space().len(), "{described}");
+        println!("{seed}: {described}");
     }
 }
 
@@ -180,7 +182,15 @@ fn forty_random_structures_train_to_passed_by_default() {
                     Progress::Start(_) | Progress::Epoch { .. } | Progress::Cell { .. } => {}
                 }
             });
-        let manifest = trained.unwrap().baseline.manifest().clone();
+        let trained = trained.unwrap();
+        if let Ok(folder) = std::env::var("MODALWATCH_FORTY_KEEP") {
+            let folder = std::path::Path::new(&folder).join(seed.to_string());
+            std::fs::create_dir_all(&folder).unwrap();
+            std::fs::write(folder.join("structure.toml"), &text).unwrap();
+            std::fs::write(folder.join("model.json"), &trained.manifest_json).unwrap();
+            std::fs::write(folder.join("model.safetensors"), &trained.weights).unwrap();
+        }
+        let manifest = trained.baseline.manifest().clone();
         let outcome = manifest.calibration.outcome();
         count += 1;
         passed += usize::from(outcome == Outcome::Passed);

@@ -8,6 +8,7 @@ mod exact;
 mod identifiability;
 mod population;
 mod priors;
+mod thin;
 mod trust;
 
 use std::sync::Arc;
