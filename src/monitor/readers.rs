@@ -20,10 +20,10 @@ const MOST_CHECKS: usize = 16;
 type Pool = LazyLock<Option<ThreadPool>>;
 
 /// Threads of details and drawings, which anybody with a token may ask for: they give way to everything else.
-static OF_DETAILS: Pool = LazyLock::new(|| pool("detail", at_a_time(), 10));
+static OF_DETAILS: Pool = LazyLock::new(|| pool("detail", at_a_time(), 19));
 
 /// The thread of checks, which only an administrator asks for.
-static OF_CHECKS: Pool = LazyLock::new(|| pool("check", 1, 5));
+static OF_CHECKS: Pool = LazyLock::new(|| pool("check", 1, 15));
 
 /// Threads that are further from the processor by `nice` than those of new batches.
 fn pool(name: &'static str, threads: usize, nice: i32) -> Option<ThreadPool> {

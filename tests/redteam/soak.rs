@@ -188,10 +188,8 @@ async fn a_load_beside_all_attacks_loses_nothing_and_stays_quick() {
     assert!(service.stop("TERM").success());
     let options = SqliteConnectOptions::new().filename(folder.path().join("modalwatch.sqlite")).read_only(true);
     let mut database = SqliteConnection::connect_with(&options).await.unwrap();
-    let rows: Vec<(String, String)> = sqlx::query_as("select batch_id, state from measurement_batch")
-        .fetch_all(&mut database)
-        .await
-        .unwrap();
+    let rows: Vec<(String, String)> =
+        sqlx::query_as("select batch_id, state from measurement_batch").fetch_all(&mut database).await.unwrap();
     let stored: BTreeMap<String, String> = rows.into_iter().collect();
     let acknowledged: Vec<&String> =
         [&alone, &attacked, &after].into_iter().flat_map(|seen| &seen.acknowledged).collect();
