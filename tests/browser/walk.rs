@@ -123,7 +123,7 @@ fn upload(page: &mut Page, table: &str) {
     set(page, "#upload-zone", "UTC");
     set(page, "#upload-split", "1d");
     let status = page.wait_for(
-        "(() => { const text = document.querySelector('.upload-status').textContent; return text.includes('time zone') ? null : text; })()",
+        "(() => { const text = document.querySelector('.upload-status').textContent; return text.includes('in 100 batches') ? text : null; })()",
     );
     assert!(status.as_str().unwrap().contains("in 100 batches"), "{status}");
     let shown = page.evaluate("document.querySelector('.upload-dialog').textContent");
