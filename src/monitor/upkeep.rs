@@ -36,6 +36,9 @@ pub struct Health {
 /// Returns findings whenever the health is read; it must not block.
 type FindingSource = Box<dyn Fn() -> Vec<Reason> + Send + Sync>;
 
+/// What stored data cannot be read, and when this was looked for.
+pub(super) type LookedFor = (Instant, Vec<Reason>);
+
 /// The health of the service, and its background tasks.
 #[derive(Clone)]
 pub struct Upkeep {
@@ -49,7 +52,7 @@ pub struct Upkeep {
     pub(super) silence: Silence,
     pub(super) diagnoses: AutomaticDiagnoses,
     pub(super) sources: Arc<Mutex<Vec<FindingSource>>>,
-    pub(super) unreadable: Arc<tokio::sync::Mutex<Option<(Instant, Vec<Reason>)>>>,
+    pub(super) unreadable: Arc<tokio::sync::Mutex<Option<LookedFor>>>,
     pub(super) started: Instant,
 }
 

@@ -169,6 +169,9 @@ async fn an_import_that_is_killed_has_stored_nothing_or_is_completed_by_the_next
     );
 }
 
+/// Kind of the record that is changed first, the change, and what the refusal says.
+type Change<'c> = (&'c str, &'c dyn Fn(&mut Value), &'c str);
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_archive_that_contradicts_what_is_stored_or_cannot_be_true_stores_nothing() {
     let (service, folder) = spawn();
@@ -189,7 +192,6 @@ async fn an_archive_that_contradicts_what_is_stored_or_cannot_be_true_stores_not
     assert_same(&before, &answers(&Service::start(there.path())).await, &[]);
 
     let long = "x".repeat(1 << 20);
-    type Change<'c> = (&'c str, &'c dyn Fn(&mut Value), &'c str);
     let changes: [Change<'_>; 8] = [
         ("batch", &|line: &mut Value| line["idempotency_key"] = json!(long), "128 visible ASCII characters"),
         ("batch", &|line: &mut Value| line["source"] = json!("a b"), "/source"),

@@ -143,7 +143,7 @@ async fn what_killed_backups_leave_is_seen_and_removed() {
     service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 4, 0)).await;
     service.stop("TERM");
     let elsewhere = tempfile::tempdir().unwrap();
-    let old = || std::time::SystemTime::now() - std::time::Duration::from_secs(3_600);
+    let old = || std::time::SystemTime::now() - std::time::Duration::from_hours(1);
     let leave = |folder: &Path, lock: bool| {
         let draft = folder.join(".draft-killed");
         std::fs::create_dir_all(&draft).unwrap();

@@ -41,7 +41,7 @@ impl Checker {
     /// Checks a record, except for the weights of a trained baseline.
     pub(super) fn check(&mut self, record: Record) -> Result<Checked, ImportError> {
         match &record {
-            Record::Archive(_) | Record::End(_) => {}
+            Record::Archive(_) | Record::End(_) | Record::Model(_) => {}
             Record::Structure(present) => {
                 self.stored_at(&present.created_at)?;
                 self.present = Some(self.simulator_of(&present.digest, &present.definition)?);
@@ -51,7 +51,6 @@ impl Checker {
                 let simulator = self.simulator_of(&version.digest, &version.definition)?;
                 self.versions.insert(version.digest.clone(), simulator);
             }
-            Record::Model(_) => {}
             Record::Batch(batch) => return Ok(Checked::Batch(Box::new(self.batch(batch)?))),
             Record::UndamagedReference(state) => {
                 self.stored_at(&state.created_at)?;

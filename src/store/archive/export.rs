@@ -238,7 +238,7 @@ impl Archive<'_> {
             let window = Maintenance { from: time(from)?, to: time(to)?, reason, created_at: time(created)? };
             records.send(Record::Maintenance(window)).await.map_err(receiver_dropped)?;
         }
-        let seen: Vec<(String, String, u32, String, i64, String, Option<String>)> = sqlx::query_as(
+        let seen: Vec<AcknowledgedRow> = sqlx::query_as(
             "select kind, series, undamaged_version, opened_batch, acknowledged_at_us, acknowledged_by, acknowledgement_note
              from alarm_episode where structure_id = $1 and acknowledged_at_us is not null and acknowledged_by is not null
                and opened_batch is not null and withdrawn = 0 order by episode",
@@ -273,6 +273,9 @@ impl Archive<'_> {
         Ok(rows.into_iter().map(model).collect())
     }
 }
+
+/// Kind, series, version of the reference, opening batch, time in µs, person and note of an acknowledgement.
+type AcknowledgedRow = (String, String, u32, String, i64, String, Option<String>);
 
 /// What a batch was compared with.
 #[derive(Default)]

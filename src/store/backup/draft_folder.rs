@@ -73,12 +73,9 @@ pub fn left_behind(parent: &Path) -> Vec<PathBuf> {
 
 /// Whether a running program uses a temporary folder. One without a lock may be just being created.
 fn is_held(folder: &Path) -> bool {
-    match File::open(folder.join(LOCK_FILE)) {
-        Ok(lock) => matches!(lock.try_lock(), Err(TryLockError::WouldBlock)),
-        Err(_) => {
-            let age =
-                fs::metadata(folder).and_then(|folder| folder.modified()).map(|at| at.elapsed().unwrap_or_default());
-            age.is_ok_and(|age| age.as_secs() < 60)
-        }
+    if let Ok(lock) = File::open(folder.join(LOCK_FILE)) {
+        return matches!(lock.try_lock(), Err(TryLockError::WouldBlock));
     }
+    let age = fs::metadata(folder).and_then(|folder| folder.modified()).map(|at| at.elapsed().unwrap_or_default());
+    age.is_ok_and(|age| age.as_secs() < 60)
 }
