@@ -341,9 +341,11 @@ async fn events_report_batches_alarms_structures_and_jobs() {
     let damaged = service.post_batch("three-dof", &measurements([4.0, 4.4, 6.0], 20, 100_000)).await;
     assert_eq!(watcher.next().await.unwrap().1["batch"], damaged["batch"]);
     let alarm = |state: &str| json!({ "structure": "three-dof", "alarm": 1, "kind": "damage", "state": state });
-    assert_eq!(watcher.next().await.unwrap(), ("alarm".to_owned(), alarm("open")));
+    // The replay behind the declaration may assess the batch as well, which is reported too.
+    let next_alarm = async |watcher: &mut Watcher| watcher.until("alarm", |_| true).await.pop().unwrap().1;
+    assert_eq!(next_alarm(&mut watcher).await, alarm("open"));
     service.post("/v1/structures/three-dof/alarms/1/acknowledgement", &json!({ "by": "A. Engineer" })).await;
-    assert_eq!(watcher.next().await.unwrap(), ("alarm".to_owned(), alarm("acknowledged")));
+    assert_eq!(next_alarm(&mut watcher).await, alarm("acknowledged"));
     for i in 2..=4 {
         service.post_batch("three-dof", &measurements([4.0, 5.0, 6.0], 20, 100_000 * i)).await;
     }
