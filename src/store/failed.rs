@@ -63,7 +63,7 @@ async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str, batch_id
            and $3 = (select count(*) filter (where state = 'failed') from
                (select state from measurement_batch where structure_id = $1 order by batch_id desc limit $3))
            and not exists (select 1 from alarm_episode
-               where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null)
+               where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null and withdrawn = 0)
            and not exists (select 1 from maintenance_window m
                where m.structure_id = $1 and m.from_us <= b.measured_to_us and m.to_us > b.measured_from_us)",
     )
@@ -86,7 +86,7 @@ pub(super) async fn end_alarm(
 ) -> Result<bool, Error> {
     let ended = sqlx::query(
         "update alarm_episode set ended_at_us = $2
-         where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null
+         where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null and withdrawn = 0
            and 'failed' <> (select state from measurement_batch where structure_id = $1 order by batch_id desc limit 1)",
     )
     .bind(structure)
