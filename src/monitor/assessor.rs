@@ -16,7 +16,7 @@ use super::structures::{ActiveStructure, ActiveStructures};
 use crate::assessment::{self, chart_points, Assessment, BatchState, Context, Draws, KnownLimits, NewCharts};
 use crate::baseline::{assessment_seed, Baseline};
 use crate::damage::UndamagedReference;
-use crate::quantity::{shown, Hertz, StructureId, Timestamp};
+use crate::quantity::{shown, Digest, Hertz, StructureId, Timestamp};
 use crate::store::{BatchRecord, ComparedWith, ReferenceRecord, Store, StoredAssessment, StoredChartPoint};
 
 /// A batch to assess, and what it is assessed with.
@@ -150,7 +150,7 @@ impl Assessor {
         let newest_undamaged = undamaged.as_ref().map_or(0, |record| record.state.version);
         let undamaged = undamaged.filter(|record| task.is_comparable(record));
         let started = Instant::now();
-        let draws = self.draws(&task.baseline, &task.record);
+        let draws = self.draws(&task.baseline, &task.record.content_digest);
         let (baseline, record, previous) =
             (Arc::clone(&task.baseline), Arc::clone(&task.record), Arc::clone(&task.previous));
         let (known, settings) = (Arc::clone(&self.known_limits), self.settings.alarm);
@@ -260,11 +260,11 @@ impl Assessor {
     }
 
     /// The numbers of posterior samples and the seed for a batch.
-    pub(super) fn draws(&self, baseline: &Baseline, record: &BatchRecord) -> Draws {
+    pub(super) fn draws(&self, baseline: &Baseline, content_digest: &Digest) -> Draws {
         Draws {
             per_measurement: self.settings.draws_per_measurement,
             for_population: self.settings.draws_for_population,
-            seed: assessment_seed(&record.content_digest, baseline.digest()),
+            seed: assessment_seed(content_digest, baseline.digest()),
         }
     }
 }

@@ -7,21 +7,39 @@ use super::assessor::Assessor;
 use super::error::Error;
 use super::readers::Readers;
 use crate::assessment::{detail, draw, BatchDetail, BatchState, Draws};
-use crate::quantity::{Digest, Hertz, StructureId};
+use crate::baseline::Baseline;
+use crate::quantity::{Digest, Hertz, StructureId, Timestamp};
 use crate::store::{BatchRecord, ReferenceRecord};
 
 /// Details that are kept.
 const KEPT: usize = 32;
 
-/// A detail and the digest of what it depends on.
-type Kept = (Digest, Arc<BatchDetail>);
+/// A detail that was computed.
+#[derive(Clone)]
+struct Kept {
+    of: Measured,
+    /// Digest of all that it depends on.
+    key: Digest,
+    detail: Arc<BatchDetail>,
+}
+
+/// What a detail depends on of the batch itself, which never changes.
+#[derive(Clone)]
+struct Measured {
+    structure: StructureId,
+    batch_id: String,
+    content_digest: Digest,
+    source: String,
+    /// Time of the first measurement.
+    from: Timestamp,
+}
 
 /// Computes the details of batches, and keeps the last ones.
 #[derive(Clone)]
 pub(super) struct Details {
     assessor: Arc<Assessor>,
     readers: Readers,
-    /// The last ones by the digest of what they depend on, the newest last.
+    /// The last ones, the newest last.
     kept: Arc<Mutex<VecDeque<Kept>>>,
 }
 
@@ -36,22 +54,24 @@ impl Details {
         let turn = self.readers.turn().await?;
         let Assessor { store, structures, .. } = &*self.assessor;
         let active = structures.get(structure)?;
-        let record = self.assessor.stored(structure, batch_id).await?;
         let baseline = active.trained_baseline()?;
+        // A detail that is kept does not need the thousands of measurements that it was computed from.
+        let batches = store.batches();
+        if let (Some(kept), Some(now)) = (self.kept(structure, batch_id), batches.state(structure, batch_id).await?) {
+            let unchanged = now == (BatchState::Assessed, kept.of.content_digest.clone());
+            if unchanged && self.inputs(&baseline, &kept.of).await?.key == kept.key {
+                return Ok(kept.detail);
+            }
+        }
+        let record = self.assessor.stored(structure, batch_id).await?;
         let not_assessed = |reason: String| Error::NotAssessed { batch: batch_id.to_owned(), reason };
         match record.state {
             BatchState::Assessed => {}
             BatchState::Received => return Err(not_assessed("it still waits for its assessment".to_owned())),
             BatchState::Failed => return Err(not_assessed(record.failure.unwrap_or_default())),
         }
-        let draws = self.assessor.draws(&baseline, &record);
-        let (source, from) = (&record.batch.source, record.batch.time_span().0);
-        let previous = store.batches().frequencies_before(structure, source, from).await?;
-        let reference = store.reference().undamaged(structure).await?.filter(|u| u.model_digest == *baseline.digest());
-        let key = key(&record, baseline.digest(), draws, previous.as_deref(), reference.as_deref());
-        if let Some(kept) = self.kept(&key) {
-            return Ok(kept);
-        }
+        let of = Measured::of(&record);
+        let Inputs { draws, previous, reference, key } = self.inputs(&baseline, &of).await?;
         let work = move |wanted: &super::readers::Wanted| {
             let measurements = &record.batch.measurements;
             let samples = draw(&baseline, measurements, previous.as_deref(), draws)?;
@@ -64,29 +84,66 @@ impl Details {
         let done: Result<_, crate::assessment::Error> = turn.run(work).await.map_err(|_| Error::Panicked)?;
         let detail = done.map_err(|error| not_assessed(error.to_string()))?;
         let detail = Arc::new(detail.expect("the caller waits for it"));
-        self.keep(key, Arc::clone(&detail));
+        self.keep(Kept { of, key, detail: Arc::clone(&detail) });
         Ok(detail)
     }
 
-    fn kept(&self, key: &Digest) -> Option<Arc<BatchDetail>> {
-        let kept = self.kept.lock().expect("no holder of this lock panics");
-        kept.iter().find(|(found, _)| found == key).map(|(_, detail)| Arc::clone(detail))
+    /// What a detail depends on beside the measurements of its batch.
+    async fn inputs(&self, baseline: &Baseline, of: &Measured) -> Result<Inputs, Error> {
+        let store = &self.assessor.store;
+        let draws = self.assessor.draws(baseline, &of.content_digest);
+        let previous = store.batches().frequencies_before(&of.structure, &of.source, of.from).await?;
+        let reference = store.reference().undamaged(&of.structure).await?;
+        let reference = reference.filter(|found| found.model_digest == *baseline.digest());
+        let key = key(of, baseline.digest(), draws, previous.as_deref(), reference.as_deref());
+        Ok(Inputs { draws, previous, reference, key })
     }
 
-    fn keep(&self, key: Digest, detail: Arc<BatchDetail>) {
+    fn kept(&self, structure: &StructureId, batch_id: &str) -> Option<Kept> {
+        let kept = self.kept.lock().expect("no holder of this lock panics");
+        kept.iter().find(|found| found.of.is(structure, batch_id)).cloned()
+    }
+
+    fn keep(&self, new: Kept) {
         let mut kept = self.kept.lock().expect("no holder of this lock panics");
-        kept.retain(|(found, _)| *found != key);
+        kept.retain(|found| !found.of.is(&new.of.structure, &new.of.batch_id));
         if kept.len() >= KEPT {
             kept.pop_front();
         }
-        kept.push_back((key, detail));
+        kept.push_back(new);
     }
+}
+
+impl Measured {
+    fn of(record: &BatchRecord) -> Self {
+        Self {
+            structure: record.batch.structure.clone(),
+            batch_id: record.batch_id.clone(),
+            content_digest: record.content_digest.clone(),
+            source: record.batch.source.clone(),
+            from: record.batch.time_span().0,
+        }
+    }
+
+    fn is(&self, structure: &StructureId, batch_id: &str) -> bool {
+        self.structure == *structure && self.batch_id == batch_id
+    }
+}
+
+/// What a detail depends on beside the measurements of its batch.
+struct Inputs {
+    draws: Draws,
+    /// Frequencies of the measurement before the batch.
+    previous: Option<Vec<Option<Hertz>>>,
+    reference: Option<Arc<ReferenceRecord>>,
+    /// Digest of all that the detail depends on.
+    key: Digest,
 }
 
 /// Digest of all that a detail depends on: the measurements, the trained model, the numbers of samples, the measurement before the
 /// batch, and the undamaged reference.
 fn key(
-    record: &BatchRecord,
+    of: &Measured,
     model: &Digest,
     draws: Draws,
     previous: Option<&[Option<Hertz>]>,
@@ -95,9 +152,9 @@ fn key(
     let reference = reference.map(|found| (found.state.version, &found.batches));
     let rest = format!("{draws:?} {previous:?} {reference:?}");
     Digest::of(&[
-        record.batch.structure.as_str().as_bytes(),
-        record.batch_id.as_bytes(),
-        record.content_digest.as_str().as_bytes(),
+        of.structure.as_str().as_bytes(),
+        of.batch_id.as_bytes(),
+        of.content_digest.as_str().as_bytes(),
         model.as_str().as_bytes(),
         rest.as_bytes(),
     ])

@@ -299,7 +299,8 @@ impl References {
         for id in &batch_ids {
             records.push(self.assessor.stored(structure, id).await?);
         }
-        let drawn: Vec<Draws> = records.iter().map(|record| self.assessor.draws(&baseline, record)).collect();
+        let drawn: Vec<Draws> =
+            records.iter().map(|record| self.assessor.draws(&baseline, &record.content_digest)).collect();
         let model_digest = baseline.digest().clone();
         let settings = self.assessor.settings.alarm;
         let known_limits = Arc::clone(&self.assessor.known_limits);

@@ -137,6 +137,22 @@ impl Batches<'_> {
         }
     }
 
+    /// State and digest of the content of a batch, without its measurements.
+    ///
+    /// # Errors
+    /// [`Error::Sqlite`], [`Error::Row`].
+    pub async fn state(self, structure: &StructureId, batch_id: &str) -> Result<Option<(BatchState, Digest)>, Error> {
+        fault_point!("store::read", |_| Err(super::error::unreadable()));
+        let row: Option<(String, String)> = sqlx::query_as(
+            "select state, content_digest from measurement_batch where structure_id = $1 and batch_id = $2",
+        )
+        .bind(structure.as_str())
+        .bind(batch_id)
+        .fetch_optional(&self.database.reader)
+        .await?;
+        row.map(|(state, digest)| Ok((batch_state(&state)?, Digest::from_stored(digest)))).transpose()
+    }
+
     async fn read_batch(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
         let row: Option<BatchRow> = sqlx::query_as(
             "select source, idempotency_key, content_digest, received_at_us, state, failure,
