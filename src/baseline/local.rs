@@ -242,7 +242,7 @@ impl<'a> Target<'a> {
     /// Residuals r, `[modes present]`, and J = −∂r/∂u, `[modes present, d]`; `None` where the simulation fails.
     fn linearised(&self, at: &DVector<f64>) -> Option<(DVector<f64>, DMatrix<f64>)> {
         let theta: Vec<f64> = self.space.iter().zip(at.iter()).map(|(parameter, u)| parameter.from_unit(*u)).collect();
-        let (frequencies_hz, jacobian) = self.under_effects.frequencies_and_jacobian(&theta).ok()?;
+        let (frequencies_hz, jacobian) = self.under_effects.frequencies_and_slopes(&theta)?;
         let present: Vec<(usize, f64)> =
             self.observation.frequencies_hz.iter().enumerate().filter_map(|(mode, f)| f.map(|f| (mode, f))).collect();
         let mut residuals = DVector::zeros(present.len());

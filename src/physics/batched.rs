@@ -1,18 +1,23 @@
-//! Batched eigensolver: natural frequencies of a small structure at many stiffnesses, eight at a time, one in each SIMD lane.
+//! Batched eigensolver: natural frequencies of a structure at many stiffnesses, eight at a time, one in each SIMD lane.
 //!
-//! Weighting posterior samples takes thousands of runs of the same small structure. Solved one by one, most of the time of a
-//! run goes into assembly and into the branches of the iteration.
+//! Weighting posterior samples takes thousands of runs of the same structure. Solved one by one, most of the time of a run goes into
+//! assembly and into the branches of the iteration. Small matrices are diagonalised by rotations, larger ones are reduced to tridiagonal
+//! form, see `src/physics/tridiagonal.rs`.
 
 use std::f64::consts::PI;
 
 use super::modes::{Scaled, SINGULAR};
 use super::structure::Structure;
+use super::tridiagonal::Tridiagonal;
 
-/// Largest number of degrees of freedom: the work of a sweep grows with its cube.
-pub const MOST_DOFS: usize = 8;
+/// Largest number of degrees of freedom: beyond it the matrices of eight runs no longer fit into the cache of a core.
+pub const MOST_DOFS: usize = 80;
+
+/// Largest number of degrees of freedom whose matrices are diagonalised by rotations: the work of each of the sweeps grows with its cube.
+pub const MOST_DOFS_ROTATED: usize = 8;
 
 /// Runs per batch: the number of `f64` lanes in the widest vector register.
-const LANES: usize = 8;
+pub(super) const LANES: usize = 8;
 
 /// Largest number of sweeps: the iteration converges quadratically from about the third sweep on.
 const MOST_SWEEPS: usize = 15;
@@ -24,10 +29,14 @@ const NEGLIGIBLE: f64 = 1e-14;
 /// One number of each run, aligned to a cache line.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-struct Lanes([f64; LANES]);
+pub(super) struct Lanes(pub(super) [f64; LANES]);
 
-/// The lower triangle of a symmetric matrix of each run.
-type Matrices = [[Lanes; MOST_DOFS]; MOST_DOFS];
+impl Lanes {
+    pub(super) const ZERO: Self = Self([0.0; LANES]);
+}
+
+/// The lower triangle of a small symmetric matrix of each run.
+type Matrices = [[Lanes; MOST_DOFS_ROTATED]; MOST_DOFS_ROTATED];
 
 /// Solves the eigenproblem of a structure some of whose stiffnesses change from run to run.
 ///
@@ -78,43 +87,55 @@ impl BatchedEigensolver {
         let springs = self.units.len();
         assert!(n_per_m.len().is_multiple_of(springs), "{} stiffnesses for {springs} springs", n_per_m.len());
         let mut frequencies = Vec::with_capacity(n_per_m.len() / springs * self.modes);
+        let mut lower = vec![Lanes::ZERO; self.fixed.len()];
         for runs in n_per_m.chunks(LANES * springs) {
-            let mut matrices = [[Lanes([0.0; LANES]); MOST_DOFS]; MOST_DOFS];
             // Unused lanes repeat the last run.
             let count = runs.len() / springs;
             let stiffness =
                 |spring: usize| Lanes(std::array::from_fn(|lane| runs[lane.min(count - 1) * springs + spring]));
             let stiffnesses: Vec<Lanes> = (0..springs).map(stiffness).collect();
-            assemble(&mut matrices, &self.fixed, &self.units, &stiffnesses);
-            diagonalise(&mut matrices, self.dofs);
-            for lane in 0..count {
+            assemble(&mut lower, &self.fixed, &self.units, &stiffnesses);
+            let solved = if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.bisected(&mut lower) };
+            for (lane, (eigenvalues, largest)) in solved.into_iter().take(count).enumerate() {
                 let given = &runs[lane * springs..(lane + 1) * springs];
                 let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
-                let mut all: [f64; MOST_DOFS] = std::array::from_fn(|i| matrices[i][i].0[lane]);
-                let eigenvalues = &mut all[..self.dofs];
-                eigenvalues.sort_unstable_by(f64::total_cmp);
-                let (smallest, largest) = (eigenvalues[0], eigenvalues[self.dofs - 1]);
-                let solved = valid && smallest > SINGULAR * largest && largest.is_finite();
+                let solved = valid && eigenvalues[0] > SINGULAR * largest && largest.is_finite();
                 let frequency = |eigenvalue: &f64| if solved { eigenvalue.sqrt() / (2.0 * PI) } else { f64::NAN };
-                frequencies.extend(eigenvalues[..self.modes].iter().map(frequency));
+                frequencies.extend(eigenvalues.iter().map(frequency));
             }
         }
         frequencies
+    }
+
+    /// The lowest eigenvalues of each run and its largest.
+    fn rotated(&self, lower: &[Lanes]) -> Vec<(Vec<f64>, f64)> {
+        let mut matrices = [[Lanes::ZERO; MOST_DOFS_ROTATED]; MOST_DOFS_ROTATED];
+        let entries = matrices.iter_mut().enumerate().flat_map(|(row, entries)| &mut entries[..=row]);
+        entries.zip(lower).for_each(|(entry, value)| *entry = *value);
+        diagonalise(&mut matrices, self.dofs);
+        let of_lane = |lane: usize| {
+            let mut all: Vec<f64> = (0..self.dofs).map(|i| matrices[i][i].0[lane]).collect();
+            all.sort_unstable_by(f64::total_cmp);
+            let largest = all[self.dofs - 1];
+            all.truncate(self.modes);
+            (all, largest)
+        };
+        (0..LANES).map(of_lane).collect()
+    }
+
+    /// The lowest eigenvalues of each run, and a bound of the largest, which is at most twice as large.
+    fn bisected(&self, lower: &mut [Lanes]) -> Vec<(Vec<f64>, f64)> {
+        let found = Tridiagonal::of(lower, self.dofs).lowest(self.modes);
+        let of_lane = |lane: usize| (found.eigenvalues.iter().map(|all| all.0[lane]).collect(), found.bound.0[lane]);
+        (0..LANES).map(of_lane).collect()
     }
 }
 
 /// Computes A(k) of each run.
 #[pulp::with_simd(assemble = pulp::Arch::new())]
 #[inline(always)]
-fn assemble_simd<S: pulp::Simd>(
-    _: S,
-    matrices: &mut Matrices,
-    fixed: &[f64],
-    units: &[Vec<f64>],
-    stiffnesses: &[Lanes],
-) {
-    let lower = matrices.iter_mut().enumerate().flat_map(|(row, entries)| &mut entries[..=row]);
-    for (place, (entry, fixed)) in lower.zip(fixed).enumerate() {
+fn assemble_simd<S: pulp::Simd>(_: S, lower: &mut [Lanes], fixed: &[f64], units: &[Vec<f64>], stiffnesses: &[Lanes]) {
+    for (place, (entry, fixed)) in lower.iter_mut().zip(fixed).enumerate() {
         let mut sum = [*fixed; LANES];
         for (unit, stiffnesses) in units.iter().zip(stiffnesses) {
             let unit = unit[place];

@@ -35,6 +35,7 @@ pub mod shapes;
 mod structure;
 pub mod tangent;
 pub mod tracked;
+mod tridiagonal;
 
 pub use modes::{
     frequency_sensitivity, modes, natural_frequencies_hz, natural_frequencies_with, FrequencySensitivity, Modes,

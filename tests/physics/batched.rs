@@ -1,15 +1,17 @@
 //! The batched eigensolver compared with single runs.
 
 use modalwatch::baseline::library::find_structure;
-use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS};
+use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS, MOST_DOFS_ROTATED};
 use modalwatch::physics::{natural_frequencies_with, Node, Structure};
+use modalwatch::simulator::definition::StructureDefinition;
+use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use nalgebra::DMatrix;
 use rand::Rng as _;
 
 use super::{chain, mass, random_structure, spring};
 
-/// Both are exact to rounding, about 1e-15 of the largest eigenvalue, which here is at most a thousand times the smallest.
+/// Both are exact to rounding, about 1e-15 of the largest eigenvalue, which here is at most ten thousand times the smallest.
 const ROUNDING: f64 = 1e-11;
 
 fn agree(found: f64, expected: f64) -> bool {
@@ -47,39 +49,116 @@ fn batched_frequencies_of_random_structures_are_those_of_single_runs() {
         // Numbers of runs that are multiples of the number of lanes, and others.
         as_one_by_one(&structure, &changing, 1 + seed as usize, seed);
     }
-    for dofs in 1..=MOST_DOFS {
+    for dofs in (1..=20).chain([37, MOST_DOFS]) {
         as_one_by_one(&chain(dofs, 0.7, 1300.0), &(0..dofs).collect::<Vec<_>>(), 19, 7);
     }
     assert!(BatchedEigensolver::new(&chain(MOST_DOFS + 1, 0.7, 1300.0), &[0], 1).is_none());
     assert!(BatchedEigensolver::new(&chain(2, 0.7, 1300.0), &[0], 3).is_none());
 }
 
+/// Separate oscillators on springs of 4 N/m, as many as this.
+fn oscillators(count: usize) -> Structure {
+    let own = |i: usize| spring(i, Node::Ground, Node::Dof(i), 4.0);
+    Structure::new((0..count).map(|i| mass(i, 1.0)).collect(), (0..count).map(own).collect()).unwrap()
+}
+
 #[test]
 fn equal_eigenvalues_come_out_equal() {
-    // Three separate oscillators: two are equal, and the third has a much higher frequency.
-    let own = |i: usize| spring(i, Node::Ground, Node::Dof(i), 4.0);
-    let structure = Structure::new((0..3).map(|i| mass(i, 1.0)).collect(), (0..3).map(own).collect()).unwrap();
-    let found = BatchedEigensolver::new(&structure, &[0, 1, 2], 3).unwrap().frequencies_hz(&[4.0, 4.0, 4.0e6]);
-    let hz = |n_per_m: f64| n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
-    for (found, expected) in found.iter().zip([hz(4.0), hz(4.0), hz(4.0e6)]) {
-        assert!(agree(*found, expected), "{found} Hz, expected {expected} Hz");
+    // All are equal but the last one, which has a much higher frequency.
+    for count in [3, MOST_DOFS_ROTATED + 1, 30] {
+        let springs: Vec<usize> = (0..count).collect();
+        let mut n_per_m = vec![4.0; count];
+        n_per_m[count - 1] = 4.0e6;
+        let found = BatchedEigensolver::new(&oscillators(count), &springs, count).unwrap().frequencies_hz(&n_per_m);
+        for (found, n_per_m) in found.iter().zip(&n_per_m) {
+            let expected = n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
+            // Bisection ends at rounding errors of the largest eigenvalue, here a million times the others.
+            assert!((found / expected - 1.0).abs() < 1e-9, "{count}: {found} Hz, expected {expected} Hz");
+        }
     }
 }
 
 #[test]
 fn a_run_without_frequencies_spoils_no_other() {
-    let structure = chain(3, 0.5, 100.0);
-    let runs = BatchedEigensolver::new(&structure, &[0, 1, 2], 2).unwrap();
-    let good = [80.0, 90.0, 110.0];
-    let alone = runs.frequencies_hz(&good);
-    // A mechanism, and invalid stiffnesses.
-    for bad in [[0.0, 90.0, 110.0], [80.0, -1.0, 110.0], [80.0, f64::NAN, 110.0], [f64::INFINITY, 1.0, 1.0]] {
-        let found = runs.frequencies_hz(&[good, bad, good].concat());
-        assert!(found[2..4].iter().all(|f| f.is_nan()), "{bad:?}: {found:?}");
-        for at in [0, 1, 4, 5] {
-            assert!(agree(found[at], alone[at % 2]), "{bad:?}: {found:?}, alone {alone:?}");
+    for dofs in [3, 12] {
+        let structure = chain(dofs, 0.5, 100.0);
+        let runs = BatchedEigensolver::new(&structure, &[0, 1, 2], 2).unwrap();
+        let good = [80.0, 90.0, 110.0];
+        let alone = runs.frequencies_hz(&good);
+        // A mechanism, and invalid stiffnesses.
+        for bad in [[0.0, 90.0, 110.0], [80.0, -1.0, 110.0], [80.0, f64::NAN, 110.0], [f64::INFINITY, 1.0, 1.0]] {
+            let found = runs.frequencies_hz(&[good, bad, good].concat());
+            assert!(found[2..4].iter().all(|f| f.is_nan()), "{bad:?}: {found:?}");
+            for at in [0, 1, 4, 5] {
+                assert!(agree(found[at], alone[at % 2]), "{bad:?}: {found:?}, alone {alone:?}");
+            }
         }
     }
+}
+
+/// A beam of two spans on an elastic bearing, of 17 degrees of freedom.
+const BEAM: &str = r#"
+id = "beam"
+simulation = "beam"
+modes = 4
+measurement_noise = { relative = 0.001 }
+[[node]]
+name = "a"
+x_m = 0.0
+support = "pinned"
+[[node]]
+name = "b"
+x_m = 10.0
+support = "free"
+[[node]]
+name = "c"
+x_m = 23.0
+support = "pinned"
+[[beam]]
+name = "left"
+from = "a"
+to = "b"
+mass_kg_per_m = 800.0
+bending_stiffness_n_m2 = 4e8
+elements = 4
+[[beam]]
+name = "right"
+from = "b"
+to = "c"
+mass_kg_per_m = 900.0
+bending_stiffness_n_m2 = 3e8
+elements = 4
+[[spring]]
+name = "bearing"
+from = "ground"
+to = "b"
+n_per_m = 2e7
+[[parameter]]
+name = "p-left"
+prior = { uniform = [2e8, 6e8] }
+sets = { beam = "left" }
+[[parameter]]
+name = "p-bearing"
+prior = { uniform = [1e7, 3e7] }
+sets = { spring = "bearing" }
+"#;
+
+/// Differences over a share h of the prior have relative errors of about h, and rounding errors of 1e-11/h.
+#[test]
+fn slopes_for_a_search_are_those_of_the_modes() {
+    let simulator = Simulator::new(StructureDefinition::parse_toml(BEAM).unwrap()).unwrap();
+    for theta in [[2.1e8, 2.9e7], [4.4e8, 1.2e7], [5.9e8, 2.0e7]] {
+        let (exact_hz, exact) = simulator.frequencies_and_jacobian(&theta).unwrap();
+        let (found_hz, found) = simulator.frequencies_and_slopes(&theta).unwrap();
+        for (mode, (found_hz, exact_hz)) in found_hz.iter().zip(&exact_hz).enumerate() {
+            assert!((found_hz / exact_hz - 1.0).abs() < 1e-10, "{found_hz} Hz, {exact_hz} Hz");
+            for (k, parameter) in simulator.space().iter().enumerate() {
+                let share = (found[(mode, k)] - exact[(mode, k)]) * (parameter.upper - parameter.lower) / exact_hz;
+                assert!(share.abs() < 1e-4, "mode {mode}, parameter {k}: {share:e}");
+            }
+        }
+    }
+    assert!(simulator.frequencies_and_slopes(&[-1.0, 2e7]).is_none());
 }
 
 #[test]
