@@ -6,6 +6,7 @@
 
 use std::f64::consts::PI;
 
+use super::lanes::{Lanes, LANES};
 use super::modes::{Scaled, SINGULAR};
 use super::structure::Structure;
 use super::tridiagonal::Tridiagonal;
@@ -16,24 +17,12 @@ pub const MOST_DOFS: usize = 80;
 /// Largest number of degrees of freedom whose matrices are diagonalised by rotations: the work of each of the sweeps grows with its cube.
 pub const MOST_DOFS_ROTATED: usize = 8;
 
-/// Runs per batch: the number of `f64` lanes in the widest vector register.
-pub(super) const LANES: usize = 8;
-
 /// Largest number of sweeps: the iteration converges quadratically from about the third sweep on.
 const MOST_SWEEPS: usize = 15;
 
 /// The iteration ends when the norm of the off-diagonal entries, relative to the norm of the matrix, falls below this. The
 /// remaining error of an eigenvalue is of the order of its square, divided by the gap to the next eigenvalue.
 const NEGLIGIBLE: f64 = 1e-14;
-
-/// One number of each run, aligned to a cache line.
-#[derive(Clone, Copy)]
-#[repr(C, align(64))]
-pub(super) struct Lanes(pub(super) [f64; LANES]);
-
-impl Lanes {
-    pub(super) const ZERO: Self = Self([0.0; LANES]);
-}
 
 /// The lower triangle of a small symmetric matrix of each run.
 type Matrices = [[Lanes; MOST_DOFS_ROTATED]; MOST_DOFS_ROTATED];

@@ -29,6 +29,7 @@ pub mod batched;
 pub mod beam;
 pub mod effect;
 pub mod eigen;
+mod lanes;
 pub mod modes;
 pub mod shaped;
 pub mod shapes;

@@ -1,6 +1,6 @@
 //! Eigenvalues of eight symmetric matrices at once, one in each SIMD lane: reduction to tridiagonal form, then bisection for the lowest.
 
-use super::batched::{Lanes, LANES};
+use super::lanes::{Lanes, LANES};
 
 /// Most bisections of an interval; each halves it, and about 53 reach the rounding errors of the largest eigenvalue.
 const MOST_BISECTIONS: usize = 80;
