@@ -52,18 +52,15 @@ impl Details {
     pub(super) async fn of_batch(&self, structure: &StructureId, batch_id: &str) -> Result<Arc<BatchDetail>, Error> {
         // The turn comes first, so that no more batches are in memory than are computed.
         let turn = self.readers.turn().await?;
-        let Assessor { store, structures, .. } = &*self.assessor;
-        let active = structures.get(structure)?;
-        let baseline = active.trained_baseline()?;
-        // A detail that is kept does not need the thousands of measurements that it was computed from.
-        let batches = store.batches();
-        if let (Some(kept), Some(now)) = (self.kept(structure, batch_id), batches.state(structure, batch_id).await?) {
-            let unchanged = now == (BatchState::Assessed, kept.of.content_digest.clone());
-            if unchanged && self.inputs(&baseline, &kept.of).await?.key == kept.key {
-                return Ok(kept.detail);
+        let active = self.assessor.structures.get(structure)?;
+        let baseline = active.trained_baseline();
+        if let Ok(baseline) = &baseline {
+            if let Some(detail) = self.known(baseline, structure, batch_id).await? {
+                return Ok(detail);
             }
         }
         let record = self.assessor.stored(structure, batch_id).await?;
+        let baseline = baseline?;
         let not_assessed = |reason: String| Error::NotAssessed { batch: batch_id.to_owned(), reason };
         match record.state {
             BatchState::Assessed => {}
@@ -86,6 +83,19 @@ impl Details {
         let detail = Arc::new(detail.expect("the caller waits for it"));
         self.keep(Kept { of, key, detail: Arc::clone(&detail) });
         Ok(detail)
+    }
+
+    /// A kept detail, if all that it depends on is still the same. This does not read the thousands of measurements of the batch.
+    async fn known(
+        &self,
+        baseline: &Baseline,
+        structure: &StructureId,
+        batch_id: &str,
+    ) -> Result<Option<Arc<BatchDetail>>, Error> {
+        let Some(Kept { of, key, detail }) = self.kept(structure, batch_id) else { return Ok(None) };
+        let stored = self.assessor.store.batches().state(structure, batch_id).await?;
+        let unchanged = stored.is_some_and(|stored| stored == (BatchState::Assessed, of.content_digest.clone()));
+        Ok((unchanged && self.inputs(baseline, &of).await?.key == key).then_some(detail))
     }
 
     /// What a detail depends on beside the measurements of its batch.

@@ -3,15 +3,13 @@
 use modalwatch::baseline::library::find_structure;
 use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS, MOST_DOFS_ROTATED};
 use modalwatch::physics::{natural_frequencies_with, Node, Structure};
-use modalwatch::simulator::definition::StructureDefinition;
-use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use nalgebra::DMatrix;
 use rand::Rng as _;
 
 use super::{chain, mass, random_structure, spring};
 
-/// Both are exact to rounding, about 1e-15 of the largest eigenvalue, which here is at most ten thousand times the smallest.
+/// Both are exact to rounding, about 1e-15 of the largest eigenvalue, which here is at most some thirty thousand times the smallest.
 const ROUNDING: f64 = 1e-11;
 
 fn agree(found: f64, expected: f64) -> bool {
@@ -72,8 +70,10 @@ fn equal_eigenvalues_come_out_equal() {
         let found = BatchedEigensolver::new(&oscillators(count), &springs, count).unwrap().frequencies_hz(&n_per_m);
         for (found, n_per_m) in found.iter().zip(&n_per_m) {
             let expected = n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
-            // Bisection ends at rounding errors of the largest eigenvalue, here a million times the others.
-            assert!((found / expected - 1.0).abs() < 1e-9, "{count}: {found} Hz, expected {expected} Hz");
+            // Bisection ends at rounding errors of the largest eigenvalue, here a million times the others; rotations do not mix them.
+            let close =
+                if count > MOST_DOFS_ROTATED { (found / expected - 1.0).abs() < 1e-9 } else { agree(*found, expected) };
+            assert!(close, "{count}: {found} Hz, expected {expected} Hz");
         }
     }
 }
@@ -94,71 +94,6 @@ fn a_run_without_frequencies_spoils_no_other() {
             }
         }
     }
-}
-
-/// A beam of two spans on an elastic bearing, of 17 degrees of freedom.
-const BEAM: &str = r#"
-id = "beam"
-simulation = "beam"
-modes = 4
-measurement_noise = { relative = 0.001 }
-[[node]]
-name = "a"
-x_m = 0.0
-support = "pinned"
-[[node]]
-name = "b"
-x_m = 10.0
-support = "free"
-[[node]]
-name = "c"
-x_m = 23.0
-support = "pinned"
-[[beam]]
-name = "left"
-from = "a"
-to = "b"
-mass_kg_per_m = 800.0
-bending_stiffness_n_m2 = 4e8
-elements = 4
-[[beam]]
-name = "right"
-from = "b"
-to = "c"
-mass_kg_per_m = 900.0
-bending_stiffness_n_m2 = 3e8
-elements = 4
-[[spring]]
-name = "bearing"
-from = "ground"
-to = "b"
-n_per_m = 2e7
-[[parameter]]
-name = "p-left"
-prior = { uniform = [2e8, 6e8] }
-sets = { beam = "left" }
-[[parameter]]
-name = "p-bearing"
-prior = { uniform = [1e7, 3e7] }
-sets = { spring = "bearing" }
-"#;
-
-/// Differences over a share h of the prior have relative errors of about h, and rounding errors of 1e-11/h.
-#[test]
-fn slopes_for_a_search_are_those_of_the_modes() {
-    let simulator = Simulator::new(StructureDefinition::parse_toml(BEAM).unwrap()).unwrap();
-    for theta in [[2.1e8, 2.9e7], [4.4e8, 1.2e7], [5.9e8, 2.0e7]] {
-        let (exact_hz, exact) = simulator.frequencies_and_jacobian(&theta).unwrap();
-        let (found_hz, found) = simulator.frequencies_and_slopes(&theta).unwrap();
-        for (mode, (found_hz, exact_hz)) in found_hz.iter().zip(&exact_hz).enumerate() {
-            assert!((found_hz / exact_hz - 1.0).abs() < 1e-10, "{found_hz} Hz, {exact_hz} Hz");
-            for (k, parameter) in simulator.space().iter().enumerate() {
-                let share = (found[(mode, k)] - exact[(mode, k)]) * (parameter.upper - parameter.lower) / exact_hz;
-                assert!(share.abs() < 1e-4, "mode {mode}, parameter {k}: {share:e}");
-            }
-        }
-    }
-    assert!(simulator.frequencies_and_slopes(&[-1.0, 2e7]).is_none());
 }
 
 #[test]
