@@ -84,7 +84,8 @@ impl BatchedEigensolver {
                 |spring: usize| Lanes(std::array::from_fn(|lane| runs[lane.min(count - 1) * springs + spring]));
             let stiffnesses: Vec<Lanes> = (0..springs).map(stiffness).collect();
             assemble(&mut lower, &self.fixed, &self.units, &stiffnesses);
-            let solved = if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.bisected(&mut lower) };
+            let solved =
+                if self.dofs <= MOST_DOFS_ROTATED { self.rotated(&lower) } else { self.tridiagonal(&mut lower) };
             for (lane, (eigenvalues, largest)) in solved.into_iter().take(count).enumerate() {
                 let given = &runs[lane * springs..(lane + 1) * springs];
                 let valid = given.iter().all(|k| k.is_finite() && *k >= 0.0);
@@ -113,7 +114,7 @@ impl BatchedEigensolver {
     }
 
     /// The lowest eigenvalues of each run, and a bound of the largest, which is at most twice as large.
-    fn bisected(&self, lower: &mut [Lanes]) -> Vec<(Vec<f64>, f64)> {
+    fn tridiagonal(&self, lower: &mut [Lanes]) -> Vec<(Vec<f64>, f64)> {
         let found = Tridiagonal::of(lower, self.dofs).lowest(self.modes);
         let of_lane = |lane: usize| (found.eigenvalues.iter().map(|all| all.0[lane]).collect(), found.bound.0[lane]);
         (0..LANES).map(of_lane).collect()

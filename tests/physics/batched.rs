@@ -3,6 +3,8 @@
 use modalwatch::baseline::library::find_structure;
 use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS, MOST_DOFS_ROTATED};
 use modalwatch::physics::{natural_frequencies_with, Node, Structure};
+use modalwatch::simulator::definition::StructureDefinition;
+use modalwatch::simulator::Simulator;
 use modalwatch::stats;
 use nalgebra::DMatrix;
 use rand::Rng as _;
@@ -70,11 +72,68 @@ fn equal_eigenvalues_come_out_equal() {
         let found = BatchedEigensolver::new(&oscillators(count), &springs, count).unwrap().frequencies_hz(&n_per_m);
         for (found, n_per_m) in found.iter().zip(&n_per_m) {
             let expected = n_per_m.sqrt() / (2.0 * std::f64::consts::PI);
-            // Bisection ends at rounding errors of the largest eigenvalue, here a million times the others; rotations do not mix them.
+            // The search ends at rounding errors of the largest eigenvalue, here a million times the others; rotations do not mix them.
             let close =
                 if count > MOST_DOFS_ROTATED { (found / expected - 1.0).abs() < 1e-9 } else { agree(*found, expected) };
             assert!(close, "{count}: {found} Hz, expected {expected} Hz");
         }
+    }
+}
+
+/// A bridge of four spans of different lengths, two elements each, on a spring at its second support.
+fn bridge() -> Simulator {
+    let mut text = String::from(
+        "id = \"bridge\"\nsimulation = \"beam\"\nmodes = 5\nmeasurement_noise = { relative = 0.001 }\n\
+         [[node]]\nname = \"n0\"\nx_m = 0.0\nsupport = \"pinned\"\n",
+    );
+    for (i, (x_m, support)) in [(9.0, "pinned"), (21.5, "free"), (30.0, "pinned"), (44.0, "pinned")].iter().enumerate()
+    {
+        let (from, to) = (format!("n{i}"), format!("n{}", i + 1));
+        text += &format!(
+            "[[node]]\nname = \"{to}\"\nx_m = {x_m}\nsupport = \"{support}\"\n\
+             [[beam]]\nname = \"s{i}\"\nfrom = \"{from}\"\nto = \"{to}\"\nmass_kg_per_m = 900\n\
+             bending_stiffness_n_m2 = 4e8\nelements = 2\n\
+             [[parameter]]\nname = \"p{i}\"\nprior = {{ uniform = [2e8, 6e8] }}\nsets = {{ beam = \"s{i}\" }}\n"
+        );
+    }
+    text += "[[spring]]\nname = \"bearing\"\nfrom = \"ground\"\nto = \"n2\"\nn_per_m = 2e7\n";
+    Simulator::new(StructureDefinition::parse_toml(&text).unwrap()).unwrap()
+}
+
+#[test]
+fn each_frequency_of_a_bridge_has_the_rounding_error_of_the_highest() {
+    let simulator = bridge();
+    let structure = simulator.structure().unwrap();
+    let beams: Vec<usize> =
+        (0..structure.springs().len()).filter(|s| structure.springs()[*s].name != "bearing").collect();
+    let given = stiffnesses(structure, &beams, 40, 5);
+    let dofs = structure.dofs();
+    assert!(dofs > MOST_DOFS_ROTATED, "{dofs}");
+    // Few eigenvalues are searched in another order than all.
+    for modes in [1, 5, dofs] {
+        let found = BatchedEigensolver::new(structure, &beams, modes).unwrap().frequencies_hz(&given);
+        for (own, found) in given.chunks(beams.len()).zip(found.chunks(modes)) {
+            let changes: Vec<(usize, f64)> = beams.iter().copied().zip(own.iter().copied()).collect();
+            let expected = natural_frequencies_with(structure, &changes, dofs).unwrap();
+            for (found, expected_hz) in found.iter().zip(&expected) {
+                // Eigenvalues are squares of frequencies; each method has an error of some units in the last place of the largest one.
+                let rounding = 20.0 * f64::EPSILON * (expected[dofs - 1] / expected_hz).powi(2);
+                assert!((found / expected_hz - 1.0).abs() < rounding, "{found} Hz, expected {expected_hz} Hz");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_run_does_not_depend_on_the_runs_beside_it() {
+    for dofs in [3, 12, 37] {
+        let structure = chain(dofs, 0.7, 1300.0);
+        let springs: Vec<usize> = (0..dofs).collect();
+        let given = stiffnesses(&structure, &springs, 19, 3);
+        let runs = BatchedEigensolver::new(&structure, &springs, dofs.min(5)).unwrap();
+        let together = runs.frequencies_hz(&given);
+        let alone: Vec<f64> = given.chunks(dofs).flat_map(|own| runs.frequencies_hz(own)).collect();
+        assert_eq!(together, alone, "{dofs} degrees of freedom");
     }
 }
 
