@@ -88,6 +88,8 @@ export function compare(query) {
 
   const iso = (time_s) => new Date(1000 * time_s).toISOString();
   function writeAddress() {
+    // The address of another view stays as it is, see the view of a structure.
+    if (location.hash.split("?")[0] !== "#/compare") return;
     const parts = new URLSearchParams();
     for (const [side] of SIDES) if (chosen[side]) parts.set(side, `${chosen[side].structure}/${chosen[side].parameter}`);
     if (group.range) {

@@ -153,8 +153,10 @@ export function structure(id, query) {
     return `#/structures/${encodeURIComponent(id)}`;
   }
 
-  /** Writes what is shown into the address, so that it can be kept and passed on. */
+  /** Writes what is shown into the address, so that it can be kept and passed on. The address of another view stays as it is: a link that
+   * was followed a moment ago is opened only after the work that is being done now. */
   function writeAddress() {
+    if (location.hash.split("?")[0] !== address()) return;
     const parts = new URLSearchParams();
     if (shown !== "condition") parts.set("section", shown);
     if (group.range && length === undefined) {
