@@ -217,9 +217,9 @@ fn search_simd<S: pulp::Simd>(_: S, matrix: &Tridiagonal, searches: &mut [Search
     found.bound.0 = bound;
     for one in searches.iter_mut() {
         (one.high.0, one.below_high.0) = (bound, [n as f64; LANES]);
-        for lane in 0..LANES {
+        for (lane, bound) in bound.iter().enumerate() {
             // A matrix of zeros, or one that is not finite.
-            one.is_found.0[lane] = if bound[lane] > 0.0 { 0.0 } else { 1.0 };
+            one.is_found.0[lane] = if *bound > 0.0 { 0.0 } else { 1.0 };
             one.x.0[lane] = one.between(lane, count);
         }
     }
@@ -286,6 +286,10 @@ fn evaluate(matrix: &Tridiagonal, searches: &mut [Search]) {
 
 impl Search {
     /// Narrows the interval by `below` eigenvalues below `x`.
+    #[expect(
+        clippy::needless_bitwise_bool,
+        reason = "without branches, a loop over the lanes becomes vector instructions"
+    )]
     #[inline(always)]
     fn narrow(&mut self, x: &Lanes, below: &Lanes) {
         let index = self.index as f64;
@@ -301,6 +305,10 @@ impl Search {
     }
 
     /// Chooses the next x, and stores the eigenvalue as far as it is known. Returns whether it is found in all lanes.
+    #[expect(
+        clippy::needless_bitwise_bool,
+        reason = "without branches, a loop over the lanes becomes vector instructions"
+    )]
     #[inline(always)]
     fn advance(&mut self, bound: &[f64; LANES], count: usize, take_newton: bool, eigenvalues: &mut [Lanes]) -> bool {
         let eigenvalue = &mut eigenvalues[self.index].0;

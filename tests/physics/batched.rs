@@ -1,5 +1,7 @@
 //! The batched eigensolver compared with single runs.
 
+use std::fmt::Write as _;
+
 use modalwatch::baseline::library::find_structure;
 use modalwatch::physics::batched::{BatchedEigensolver, MOST_DOFS, MOST_DOFS_ROTATED};
 use modalwatch::physics::{natural_frequencies_with, Node, Structure};
@@ -89,7 +91,8 @@ fn bridge() -> Simulator {
     for (i, (x_m, support)) in [(9.0, "pinned"), (21.5, "free"), (30.0, "pinned"), (44.0, "pinned")].iter().enumerate()
     {
         let (from, to) = (format!("n{i}"), format!("n{}", i + 1));
-        text += &format!(
+        let _ = write!(
+            text,
             "[[node]]\nname = \"{to}\"\nx_m = {x_m}\nsupport = \"{support}\"\n\
              [[beam]]\nname = \"s{i}\"\nfrom = \"{from}\"\nto = \"{to}\"\nmass_kg_per_m = 900\n\
              bending_stiffness_n_m2 = 4e8\nelements = 2\n\
