@@ -127,7 +127,7 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         broker.into_iter().chain(webhooks).chain(mails).collect()
     });
     let routes = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
-    declare_metrics(store.file().sqlite_version());
+    declare_metrics(store.file().version());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
     let (events, jobs) = (monitor.events().clone(), monitor.jobs().clone());

@@ -276,7 +276,7 @@ impl Monitor {
 
     /// Version of SQLite.
     pub fn sqlite_version(&self) -> &str {
-        self.store.file().sqlite_version()
+        self.store.file().version()
     }
 
     /// The store, for the command line and tests, which open and close it.

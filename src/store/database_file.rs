@@ -3,9 +3,11 @@
 use std::path::Path;
 use std::sync::atomic::Ordering;
 
-use super::database::Database;
+use super::database::{Database, Place};
 use super::error::Error;
 use super::file::StoreSettings;
+use super::sql;
+use super::transaction::Transaction;
 
 /// The database file of an open store.
 #[derive(Clone, Copy)]
@@ -42,9 +44,11 @@ impl<'s> DatabaseFile<'s> {
         self.database.check_free_space()
     }
 
-    /// Version of the SQLite library.
-    pub fn sqlite_version(self) -> &'s str {
-        &self.database.sqlite_version
+    /// Version of the SQLite library, or of the PostgreSQL server.
+    pub fn version(self) -> &'s str {
+        match &self.database.place {
+            Place::File { version, .. } | Place::Server { version, .. } => version,
+        }
     }
 
     /// Writes to the database file, which shows that a batch could be stored now.
@@ -54,8 +58,13 @@ impl<'s> DatabaseFile<'s> {
     pub async fn is_writable(self) -> Result<(), Error> {
         let written = self.database.write(|transaction| {
             Box::pin(async move {
-                // An update without a matching row would not reach the file. This sets a header field that nothing reads.
-                sqlx::query("pragma user_version = 1").execute(transaction.connection()).await?;
+                // An update without a matching row would not reach the disk.
+                let touch = match transaction {
+                    // A header field that nothing reads.
+                    Transaction::Sqlite(_) => "pragma user_version = 1",
+                    Transaction::Postgres(_) => "update application set probes = probes + 1",
+                };
+                sql::query(touch).execute(&mut *transaction).await?;
                 Ok(())
             })
         });

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use sqlx::migrate::MigrateError;
+use sqlx::postgres::PgDatabaseError;
+use sqlx::sqlite::SqliteError;
 
 /// Why an operation of the store failed.
 #[derive(Debug, thiserror::Error)]
@@ -57,6 +59,9 @@ pub enum Error {
     /// The linked SQLite library has a defect that can corrupt a database.
     #[error("SQLite {0} can corrupt a database (WAL reset): version 3.51.3 or later is needed")]
     LibraryTooOld(String),
+    /// The PostgreSQL server is older than version 15.
+    #[error("the PostgreSQL server has version {0}: version 15 or later is needed")]
+    ServerTooOld(String),
     /// The structure is not stored.
     #[error("there is no structure {0}")]
     UnknownStructure(String),
@@ -114,6 +119,9 @@ pub enum Error {
 impl From<sqlx::Error> for Error {
     /// Maps failures of the disk to variants of their own, because they are temporary and not programming errors.
     fn from(error: sqlx::Error) -> Self {
+        if let Some(state) = sql_state(&error) {
+            return Self::of_server(&state, error);
+        }
         match primary_code(&error) {
             Some(13) => Self::DiskFull(error.to_string()),
             // SQLITE_IOERR, and SQLITE_CANTOPEN, which opening the write-ahead log can return at any time.
@@ -132,13 +140,35 @@ impl From<sqlx::Error> for Error {
     }
 }
 
+/// The state that a PostgreSQL server gives with an error, five characters.
+fn sql_state(error: &sqlx::Error) -> Option<String> {
+    let error = error.as_database_error()?.try_downcast_ref::<PgDatabaseError>()?;
+    Some(error.code().to_owned())
+}
+
 /// The primary result code of SQLite, without its extension.
 fn primary_code(error: &sqlx::Error) -> Option<i32> {
-    let code = error.as_database_error()?.code()?;
+    let error = error.as_database_error()?;
+    error.try_downcast_ref::<SqliteError>()?;
+    let code = error.code()?;
     code.parse::<i32>().ok().map(|code| code & 0xff)
 }
 
 impl Error {
+    /// The error of a PostgreSQL server. Source: PostgreSQL 15, appendix A.
+    fn of_server(state: &str, error: sqlx::Error) -> Self {
+        match state {
+            "53100" => Self::DiskFull(error.to_string()),
+            "58030" => Self::Disk(error.to_string()),
+            "25006" => Self::BecameReadOnly(error.to_string()),
+            // Serialization failure, deadlock, lock not available, too many connections, shutting down, starting up.
+            "40001" | "40P01" | "55P03" | "53300" | "57P01" | "57P02" | "57P03" => Self::Busy(error.to_string()),
+            // Connection exceptions.
+            state if state.starts_with("08") => Self::Busy(error.to_string()),
+            _ => Self::Sqlite(Arc::new(error)),
+        }
+    }
+
     /// Short name of the cause if it is the disk and not the request, for metrics and for `/readyz`.
     pub fn disk_cause(&self) -> Option<&'static str> {
         match self {
@@ -208,7 +238,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let settings = StoreSettings { min_free_bytes: 0, ..StoreSettings::default() };
         let store = Store::open_with(folder.path(), &settings).await.unwrap();
-        let pool = &store.database.writer.pool;
+        let super::super::WriterPool::Sqlite(pool, _) = &store.database.writer.pool else { unreachable!() };
         let pages: (i64,) = sqlx::query_as("pragma page_count").fetch_one(pool).await.unwrap();
         let limit = format!("pragma max_page_count = {}", pages.0 + 2);
         sqlx::query(sqlx::AssertSqlSafe(limit)).execute(pool).await.unwrap();
@@ -255,8 +285,8 @@ mod tests {
         let store = Store::open(folder.path()).await.unwrap();
         let broken = store.database.write(|transaction| {
             Box::pin(async move {
-                let insert = sqlx::query("insert into structure values (null, null, null, null, null)");
-                insert.execute(transaction.connection()).await?;
+                let insert = crate::store::sql::query("insert into structure values (null, null, null, null, null)");
+                insert.execute(&mut *transaction).await?;
                 Ok(())
             })
         });

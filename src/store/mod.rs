@@ -52,6 +52,8 @@ mod reference_version;
 mod retention;
 mod rows;
 mod series;
+mod server;
+mod sql;
 mod structure;
 #[cfg(test)]
 mod tests;
@@ -68,10 +70,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::volume;
-use database::Database;
+use database::{Database, Place};
 use reader::Reader;
 use undamaged::Known;
-use writer::Writer;
+use writer::{Writer, WriterPool};
 
 pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, OpenAlarms};
 pub use alarm_action::{
@@ -144,21 +146,34 @@ impl Store {
         let file::Opened { writer, reader, sqlite_version } = file::open(&path).await?;
         let opened = file::OpenedFile::of(path.clone())?;
         let database = Database {
-            writer: Arc::new(Writer::new(writer, opened)),
-            reader: Reader::new(reader),
-            path,
-            sqlite_version,
+            writer: Arc::new(Writer::new(WriterPool::Sqlite(writer, opened))),
+            reader: Reader::Sqlite(reader),
+            place: Place::File { path, version: sqlite_version, _lock: lock },
             limits: file::Limits::of(settings),
-            _lock: lock,
         };
         Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })
     }
 
-    /// Writes the log back into the database and closes it.
+    /// Opens a database of a PostgreSQL server, which is migrated to the schema of this program. `data_dir` is the folder of this process
+    /// for what is not in the database.
+    ///
+    /// # Errors
+    /// [`Error`], with one variant for each cause, whose message says what to do.
+    pub async fn open_postgres(url: &str, data_dir: &Path, settings: &StoreSettings) -> Result<Self, Error> {
+        let server::Opened { writer, reader, version } = server::open(url).await?;
+        let database = Database {
+            writer: Arc::new(Writer::new(WriterPool::Postgres(writer))),
+            reader: Reader::Postgres(reader),
+            place: Place::Server { folder: data_dir.to_owned(), version },
+            limits: file::Limits::of(settings),
+        };
+        Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })
+    }
+
+    /// Closes the database, for SQLite after its log was written back.
     pub async fn close(&self) {
         let Database { reader, writer, .. } = &*self.database;
         reader.close().await;
-        let _ = sqlx::query("pragma wal_checkpoint(truncate)").execute(&writer.pool).await;
         writer.pool.close().await;
     }
 

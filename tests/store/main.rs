@@ -46,9 +46,21 @@ fn batch(source: &str, start: i64, count: i64) -> MeasurementBatch {
     }
 }
 
+/// A new store: a SQLite file, or a database of the server that `MODALWATCH_TEST_POSTGRES` names by host and port.
+async fn new_store(folder: &std::path::Path) -> Store {
+    let Ok(server) = std::env::var("MODALWATCH_TEST_POSTGRES") else { return Store::open(folder).await.unwrap() };
+    let (host, port) = server.split_once(':').unwrap();
+    let name = folder.file_name().unwrap().to_string_lossy().trim_start_matches('.').to_lowercase();
+    let created =
+        std::process::Command::new("createdb").args(["-h", host, "-p", port, "-U", "modalwatch", &name]).status();
+    assert!(created.unwrap().success());
+    let url = format!("postgres://modalwatch@{server}/{name}");
+    Store::open_postgres(&url, folder, &modalwatch::store::StoreSettings::default()).await.unwrap()
+}
+
 async fn open() -> (Store, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
-    let store = Store::open(folder.path()).await.unwrap();
+    let store = new_store(folder.path()).await;
     let digest = Digest::of(&[b"v1"]);
     assert_eq!(store.structures().put_structure(&bridge(), "{}", &digest, at(0)).await.unwrap(), PutStructure::Created);
     (store, folder)

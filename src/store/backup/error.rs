@@ -13,6 +13,9 @@ pub enum Error {
     /// A backup with this name exists.
     #[error("there is a backup {0} already: give another name")]
     Exists(String),
+    /// The database is not a file.
+    #[error("the database is on a PostgreSQL server: back it up with pg_dump or by its write-ahead log")]
+    Server,
     /// The folder has no database.
     #[error("{0} has no database: give the --data-dir of a service")]
     NoDatabase(PathBuf),
