@@ -59,12 +59,20 @@ export function batch(structure, onChoice) {
     element.classList.add("busy");
     try {
       const path = at(structure, `/batches/${encodeURIComponent(id)}`);
-      // A batch that could not be assessed has no detail; its other data are shown nevertheless.
-      const [info, detail] = await Promise.all([read(path), read(`${path}/detail`).catch((error) => ({ error }))]);
+      const info = await read(path);
+      // A batch that waits for its assessment or could not be assessed has no detail; its other data are shown nevertheless.
+      const isAssessed = info.state === "assessed";
+      const detail = isAssessed ? await read(`${path}/detail`).catch((error) => ({ error })) : null;
       if (id !== chosen) return;
-      fill(description, describe(info), detail.error && info.assessment && problem(detail.error, show));
-      drawn.hidden = Boolean(detail.error);
-      if (!detail.error) {
+      const waits = info.state === "received" && info.assessment;
+      fill(
+        description,
+        describe(info),
+        waits && h("p", { class: "callout" }, icon("note"), "The batch waits to be assessed again; its distributions are shown after that."),
+        detail?.error && info.assessment && problem(detail.error, show),
+      );
+      drawn.hidden = !isAssessed || Boolean(detail.error);
+      if (!drawn.hidden) {
         density.update(detail);
         mode.update(detail);
         await shape.update(id, detail.mode_shapes);
