@@ -4,7 +4,7 @@
 pub(super) const LANES: usize = 8;
 
 /// One number of each run, aligned to a cache line.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub(super) struct Lanes(pub(super) [f64; LANES]);
 

@@ -60,13 +60,14 @@ impl Tridiagonal {
     /// Source: Golub & Van Loan (2013), §8.4, for the sequences.
     pub(super) fn lowest(&self, count: usize) -> Lowest {
         let mut found = Lowest { eigenvalues: vec![Lanes::ZERO; count], bound: Lanes::ZERO };
-        let mut searches: Vec<Search> = (0..count).map(Search::new).collect();
+        let mut searches: Vec<Search> = (0..count).map(|index| Search { index, ..Search::default() }).collect();
         search(self, &mut searches, &mut found);
         found
     }
 }
 
 /// The search for one eigenvalue in each lane.
+#[derive(Default)]
 struct Search {
     /// Its number, counted from 0.
     index: usize,
@@ -87,23 +88,6 @@ struct Search {
 }
 
 impl Search {
-    fn new(index: usize) -> Self {
-        let zero = Lanes::ZERO;
-        Self {
-            index,
-            low: zero,
-            high: zero,
-            below_low: zero,
-            below_high: zero,
-            x: zero,
-            q: zero,
-            slope: zero,
-            sum: zero,
-            below: zero,
-            is_found: zero,
-        }
-    }
-
     /// Where the sequence is evaluated next in a lane, if not at the point of Newton's method: eigenvalues that are wanted divide their
     /// interval evenly in x^¼, in which those of a beam are evenly spaced.
     #[inline(always)]
@@ -112,6 +96,55 @@ impl Search {
         let (first, end) = (self.below_low.0[lane], self.below_high.0[lane].min(count as f64));
         let root = low + (self.index as f64 - first + 0.5) / (end - first) * (high - low);
         (root * root) * (root * root)
+    }
+
+    /// Narrows the interval by `below` eigenvalues below `x`.
+    #[expect(
+        clippy::needless_bitwise_bool,
+        reason = "without branches, a loop over the lanes becomes vector instructions"
+    )]
+    #[inline(always)]
+    fn narrow(&mut self, x: &Lanes, below: &Lanes) {
+        let index = self.index as f64;
+        for lane in 0..LANES {
+            let (x, below) = (x.0[lane], below.0[lane]);
+            let from_above = (below > index) & (x < self.high.0[lane]);
+            let from_below = (below <= index) & (x > self.low.0[lane]);
+            self.high.0[lane] = if from_above { x } else { self.high.0[lane] };
+            self.below_high.0[lane] = if from_above { below } else { self.below_high.0[lane] };
+            self.low.0[lane] = if from_below { x } else { self.low.0[lane] };
+            self.below_low.0[lane] = if from_below { below } else { self.below_low.0[lane] };
+        }
+    }
+
+    /// Chooses the next x, and stores the eigenvalue as far as it is known. Returns whether it is found in all lanes.
+    #[expect(
+        clippy::needless_bitwise_bool,
+        reason = "without branches, a loop over the lanes becomes vector instructions"
+    )]
+    #[inline(always)]
+    fn advance(&mut self, bound: &[f64; LANES], count: usize, take_newton: bool, eigenvalues: &mut [Lanes]) -> bool {
+        let eigenvalue = &mut eigenvalues[self.index].0;
+        let mut are_found = 0.0;
+        for lane in 0..LANES {
+            let (low, high, x) = (self.low.0[lane], self.high.0[lane], self.x.0[lane]);
+            let is_alone = self.below_high.0[lane] - self.below_low.0[lane] < 1.5;
+            let newton = x - 1.0 / self.sum.0[lane];
+            // False for NaN. Newton's method leaves the interval where it is drawn to another eigenvalue.
+            let is_near = is_alone & (newton >= low) & (newton <= high);
+            let is_last = is_near & ((newton - x).abs() <= LAST_STEP * newton);
+            let is_narrow = high - low <= f64::EPSILON * bound[lane];
+            let was_found = self.is_found.0[lane] > 0.0;
+            let known = if is_last { newton } else { 0.5 * (low + high) };
+            eigenvalue[lane] = if was_found { eigenvalue[lane] } else { known };
+            let is_found = was_found | is_last | is_narrow;
+            let next = if is_near & take_newton { newton } else { self.between(lane, count) };
+            // Where the eigenvalue is found, x stays, so that its sequence tells the others nothing new.
+            self.x.0[lane] = if is_found { x } else { next };
+            self.is_found.0[lane] = if is_found { 1.0 } else { 0.0 };
+            are_found += self.is_found.0[lane];
+        }
+        are_found > LANES as f64 - 0.5
     }
 }
 
@@ -281,56 +314,5 @@ fn evaluate(matrix: &Tridiagonal, searches: &mut [Search]) {
         for lane in 0..LANES {
             one.sum.0[lane] += one.slope.0[lane] * inverse(one.q.0[lane]);
         }
-    }
-}
-
-impl Search {
-    /// Narrows the interval by `below` eigenvalues below `x`.
-    #[expect(
-        clippy::needless_bitwise_bool,
-        reason = "without branches, a loop over the lanes becomes vector instructions"
-    )]
-    #[inline(always)]
-    fn narrow(&mut self, x: &Lanes, below: &Lanes) {
-        let index = self.index as f64;
-        for lane in 0..LANES {
-            let (x, below) = (x.0[lane], below.0[lane]);
-            let from_above = (below > index) & (x < self.high.0[lane]);
-            let from_below = (below <= index) & (x > self.low.0[lane]);
-            self.high.0[lane] = if from_above { x } else { self.high.0[lane] };
-            self.below_high.0[lane] = if from_above { below } else { self.below_high.0[lane] };
-            self.low.0[lane] = if from_below { x } else { self.low.0[lane] };
-            self.below_low.0[lane] = if from_below { below } else { self.below_low.0[lane] };
-        }
-    }
-
-    /// Chooses the next x, and stores the eigenvalue as far as it is known. Returns whether it is found in all lanes.
-    #[expect(
-        clippy::needless_bitwise_bool,
-        reason = "without branches, a loop over the lanes becomes vector instructions"
-    )]
-    #[inline(always)]
-    fn advance(&mut self, bound: &[f64; LANES], count: usize, take_newton: bool, eigenvalues: &mut [Lanes]) -> bool {
-        let eigenvalue = &mut eigenvalues[self.index].0;
-        let mut are_found = 0.0;
-        for lane in 0..LANES {
-            let (low, high, x) = (self.low.0[lane], self.high.0[lane], self.x.0[lane]);
-            let is_alone = self.below_high.0[lane] - self.below_low.0[lane] < 1.5;
-            let newton = x - 1.0 / self.sum.0[lane];
-            // False for NaN. Newton's method leaves the interval where it is drawn to another eigenvalue.
-            let is_near = is_alone & (newton >= low) & (newton <= high);
-            let is_last = is_near & ((newton - x).abs() <= LAST_STEP * newton);
-            let is_narrow = high - low <= f64::EPSILON * bound[lane];
-            let was_found = self.is_found.0[lane] > 0.0;
-            let known = if is_last { newton } else { 0.5 * (low + high) };
-            eigenvalue[lane] = if was_found { eigenvalue[lane] } else { known };
-            let is_found = was_found | is_last | is_narrow;
-            let next = if is_near & take_newton { newton } else { self.between(lane, count) };
-            // Where the eigenvalue is found, x stays, so that its sequence tells the others nothing new.
-            self.x.0[lane] = if is_found { x } else { next };
-            self.is_found.0[lane] = if is_found { 1.0 } else { 0.0 };
-            are_found += self.is_found.0[lane];
-        }
-        are_found > LANES as f64 - 0.5
     }
 }

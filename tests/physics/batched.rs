@@ -112,7 +112,7 @@ fn each_frequency_of_a_bridge_has_the_rounding_error_of_the_highest() {
     let given = stiffnesses(structure, &beams, 40, 5);
     let dofs = structure.dofs();
     assert!(dofs > MOST_DOFS_ROTATED, "{dofs}");
-    // Few eigenvalues are searched in another order than all.
+    // Where the search begins depends on how many frequencies are wanted.
     for modes in [1, 5, dofs] {
         let found = BatchedEigensolver::new(structure, &beams, modes).unwrap().frequencies_hz(&given);
         for (own, found) in given.chunks(beams.len()).zip(found.chunks(modes)) {

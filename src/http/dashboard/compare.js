@@ -4,7 +4,7 @@ import { at, read } from "./api.js";
 import { TimeGroup, band, chart, curve, edge, fewPoints, merged, rule, seconds, shade, timeAxis, valueAxis, withGaps } from "./charts/base.js";
 import { figure } from "./charts/figure.js";
 import { alarmSpans, signed } from "./charts/parameters.js";
-import { fill, h } from "./dom.js";
+import { fill, h, keepInAddress } from "./dom.js";
 import { changePercent, count, local, timeElement, zone } from "./format.js";
 
 const POINTS = 1000;
@@ -88,15 +88,13 @@ export function compare(query) {
 
   const iso = (time_s) => new Date(1000 * time_s).toISOString();
   function writeAddress() {
-    // The address of another view stays as it is, see the view of a structure.
-    if (location.hash.split("?")[0] !== "#/compare") return;
     const parts = new URLSearchParams();
     for (const [side] of SIDES) if (chosen[side]) parts.set(side, `${chosen[side].structure}/${chosen[side].parameter}`);
     if (group.range) {
       parts.set("from", iso(group.range[0]));
       parts.set("to", iso(group.range[1]));
     }
-    history.replaceState(null, "", `#/compare?${parts}`);
+    keepInAddress("#/compare", parts);
   }
 
   function zoom(range) {

@@ -178,3 +178,13 @@ export function throttled(work, wait_ms) {
     }, rest);
   };
 }
+
+/**
+ * Writes what the view at `path` shows into the address, so that it can be kept and passed on. If the user has just followed a link, the
+ * address is that of another view already, although this one is still shown: it then stays as it is.
+ */
+export function keepInAddress(path, parts) {
+  if (location.hash.split("?")[0] !== path) return;
+  const text = parts.toString();
+  history.replaceState(null, "", text ? `${path}?${text}` : path);
+}

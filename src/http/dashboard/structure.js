@@ -8,7 +8,7 @@ import { parameters } from "./charts/parameters.js";
 import { scatter } from "./charts/scatter.js";
 import { tracks } from "./charts/tracks.js";
 import { trust } from "./charts/trust.js";
-import { ask, fieldTime, fill, h, icon, notify, throttled } from "./dom.js";
+import { ask, fieldTime, fill, h, keepInAddress, icon, notify, throttled } from "./dom.js";
 import { age, count, inWords, local, percent, zone } from "./format.js";
 import { help } from "./help.js";
 import { alarms } from "./sections/alarms.js";
@@ -153,10 +153,8 @@ export function structure(id, query) {
     return `#/structures/${encodeURIComponent(id)}`;
   }
 
-  /** Writes what is shown into the address, so that it can be kept and passed on. The address of another view stays as it is: a link that
-   * was followed a moment ago is opened only after the work that is being done now. */
+  /** Writes what is shown into the address. */
   function writeAddress() {
-    if (location.hash.split("?")[0] !== address()) return;
     const parts = new URLSearchParams();
     if (shown !== "condition") parts.set("section", shown);
     if (group.range && length === undefined) {
@@ -164,8 +162,7 @@ export function structure(id, query) {
       parts.set("to", iso(group.range[1]));
     }
     if (state.batch) parts.set("batch", state.batch);
-    const text = parts.toString();
-    history.replaceState(null, "", text ? `${address()}?${text}` : address());
+    keepInAddress(address(), parts);
   }
 
   /** Shows one section. Without any batch, only those that do not need one can be shown. */
