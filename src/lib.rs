@@ -16,7 +16,7 @@
 //!  mqtt                                  batches from a message broker
 //!  monitor                               the application: ingest, replay, jobs, upkeep
 //!  notify                                webhooks and e-mail
-//!  store                                 the database; the only module with SQL
+//!  store                                 the database, SQLite or PostgreSQL; the only module with SQL
 //!  access                                tokens and scopes
 //!  assessment                            from the measurements of a batch to its assessment and its chart points
 //!  alarm                                 control charts, their limits, and the states of alarms

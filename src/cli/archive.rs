@@ -79,7 +79,7 @@ pub async fn export(args: &ExportArgs) -> anyhow::Result<()> {
 pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
     let config = args.location.read()?;
     let library = Library::open(config.models_dir.as_deref())?;
-    let store = Store::open_with(&config.data_dir, &config.store).await?;
+    let store = Store::open_with(&config.data_dir, &config.store.without_waiting()).await?;
     let monitor = Monitor::open(store, library, config.monitor).await?;
     let imported = monitor.archive().import(&args.from).await;
     monitor.store().close().await;
@@ -102,14 +102,14 @@ pub async fn import(args: &ImportArgs) -> anyhow::Result<()> {
 
 /// Opens the data folder; `None` if a service has it open.
 async fn open(config: &Config) -> anyhow::Result<Option<Monitor>> {
-    let database = config.data_dir.join(DATABASE_FILE);
-    anyhow::ensure!(database.exists(), "{} has no database: give --data-dir or --url", config.data_dir.display());
-    match Store::open_with(&config.data_dir, &config.store).await {
+    let exists = config.store.url.is_some() || config.data_dir.join(DATABASE_FILE).exists();
+    anyhow::ensure!(exists, "{} has no database: give --data-dir or --url", config.data_dir.display());
+    match Store::open_with(&config.data_dir, &config.store.without_waiting()).await {
         Ok(store) => {
             let library = Library::open(config.models_dir.as_deref())?;
             Ok(Some(Monitor::open(store, library, config.monitor.clone()).await?))
         }
-        Err(Error::Locked(_)) => Ok(None),
+        Err(Error::Locked(_) | Error::ServedElsewhere(_)) => Ok(None),
         Err(error) => Err(error.into()),
     }
 }

@@ -57,6 +57,9 @@ pub struct RestoreArgs {
 /// Whatever prevents a complete backup; then there is none.
 pub async fn backup(args: &BackupArgs) -> anyhow::Result<()> {
     let config = args.location.read()?;
+    if config.store.url.is_some() {
+        return Err(backup::Error::Server.into());
+    }
     let now = Timestamp::now();
     let out = args.out.clone().unwrap_or_else(|| config.data_dir.join(backup::FOLDER).join(backup::name_of(now)));
     anyhow::ensure!(!out.exists(), "{} already exists: give another folder with --out", out.display());

@@ -12,6 +12,7 @@ mod diagnose;
 mod doctor;
 mod healthcheck;
 mod measurements;
+mod migrate;
 mod model;
 mod new;
 mod next;
@@ -97,6 +98,8 @@ enum Command {
     Backup(backup::BackupArgs),
     /// Restore the database of a backup to a data folder.
     Restore(backup::RestoreArgs),
+    /// Make or change the schema of a PostgreSQL database, or move everything that is stored between it and a data folder.
+    Migrate(migrate::MigrateArgs),
     /// Write one structure with its measurements, references and trained models to a file for another installation.
     Export(archive::ExportArgs),
     /// Read a file that `export` wrote.
@@ -188,6 +191,7 @@ pub fn run() -> anyhow::Result<()> {
         Command::Doctor(args) => block_on(doctor::doctor(&args)),
         Command::Backup(args) => block_on(backup::backup(&args)),
         Command::Restore(args) => block_on(backup::restore(&args)),
+        Command::Migrate(args) => block_on(migrate::migrate(&args)),
         Command::Export(args) => block_on(archive::export(&args)),
         Command::Import(args) => block_on(archive::import(&args)),
         Command::Report(args) => block_on(report::report(&args)),

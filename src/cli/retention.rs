@@ -29,14 +29,14 @@ pub async fn retention(args: &RetentionArgs) -> anyhow::Result<()> {
     let config = args.location.read()?;
     let mut settings = config.retention;
     settings.measurements_days = args.days.unwrap_or(settings.measurements_days);
-    let database = config.data_dir.join(DATABASE_FILE);
+    let exists = config.store.url.is_some() || config.data_dir.join(DATABASE_FILE).exists();
     let opened = if args.location.url.is_some() {
         None
     } else {
-        anyhow::ensure!(database.exists(), "{} has no database: give --data-dir", config.data_dir.display());
-        match Store::open_with(&config.data_dir, &config.store).await {
+        anyhow::ensure!(exists, "{} has no database: give --data-dir", config.data_dir.display());
+        match Store::open_with(&config.data_dir, &config.store.without_waiting()).await {
             Ok(store) => Some(store),
-            Err(Error::Locked(_)) => None,
+            Err(Error::Locked(_) | Error::ServedElsewhere(_)) => None,
             Err(error) => return Err(error.into()),
         }
     };

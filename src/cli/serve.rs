@@ -127,14 +127,17 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         broker.into_iter().chain(webhooks).chain(mails).collect()
     });
     let routes = router(Service { monitor: monitor.clone(), notifier, access, metrics }, &config.http);
-    declare_metrics(store.file().sqlite_version());
+    declare_metrics(monitor.database());
     let (data_dir, baselines) = (config.data_dir.display().to_string(), upkeep.baselines_in_use());
     info!(%address, data_dir, baselines, "Listening on http://{address} with {baselines} trained models");
     let (events, jobs) = (monitor.events().clone(), monitor.jobs().clone());
     publish.send_replace(Some(routes));
     let drain = Duration::from_secs(config.http.drain_s);
     let task = tokio::spawn(async move {
-        shutdown.await;
+        let taken_over = tokio::select! { () = shutdown => None, taken = store.file().taken_over() => Some(taken) };
+        if let Some(taken) = &taken_over {
+            error!("Stopping: {taken}");
+        }
         let begun = Instant::now();
         supervisor::stopping();
         // Jobs that compute end at their next epoch or step, while open requests finish.
@@ -150,7 +153,8 @@ pub async fn start(config: Config, shutdown: impl Future<Output = ()> + Send + '
         }
         drop(publish);
         let left = drain.saturating_sub(begun.elapsed()).max(SHORTEST_END);
-        end_parts(background, usize::from(served.is_err()), &store, left).await
+        let ended = end_parts(background, usize::from(served.is_err()), &store, left).await;
+        taken_over.map_or(ended, |taken| Err(taken.into()))
     });
     Ok(Running { address, task, monitor })
 }

@@ -74,11 +74,14 @@ pub async fn token(args: TokenArgs) -> anyhow::Result<()> {
     }
     let flags = Flags { data_dir: args.data_dir, ..Flags::default() };
     let config = Config::read_for_existing(args.config.as_deref(), &flags)?;
-    let store = Store::open(&config.data_dir).await.map_err(|error| match error {
+    let store = Store::open_with(&config.data_dir, &config.store.without_waiting()).await.map_err(|error| match error {
         store::Error::Locked(folder) => anyhow::anyhow!(
             "the service is running on {}: use its API (POST /v1/tokens, DELETE /v1/tokens/{{id}}, POST \
              /v1/tokens/{{id}}/rotation), or stop it first",
             folder.display()
+        ),
+        store::Error::ServedElsewhere(reason) => anyhow::anyhow!(
+            "{reason}; a running service makes and revokes tokens by its API (POST /v1/tokens, DELETE /v1/tokens/{{id}})"
         ),
         other => other.into(),
     })?;

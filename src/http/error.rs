@@ -237,9 +237,16 @@ impl From<crate::monitor::stored::Error> for ApiError {
             "database_gone" => {
                 "the database was deleted or replaced while it was open: nothing can be stored until it is restored"
             }
+            "database_unreachable" => {
+                "the database server does not answer: whether the request was stored is not known; repeat it, which stores nothing twice"
+            }
             _ => "the database is busy: nothing was stored; repeat the request",
         };
-        let wait = if cause == "database_busy" { RETRY_AFTER_SECONDS } else { RETRY_AFTER_DISK_SECONDS };
+        let wait = if matches!(cause, "database_busy" | "database_unreachable") {
+            RETRY_AFTER_SECONDS
+        } else {
+            RETRY_AFTER_DISK_SECONDS
+        };
         Self { retry_after_s: Some(wait), ..Self::new(status, cause, detail) }
     }
 }

@@ -12,7 +12,7 @@ use super::shared::Shared;
 use super::structure_metrics::{self, StructureState};
 use super::verdict::Judged;
 use crate::baseline::library::Refusal;
-use crate::monitor::stored::schema_version;
+use crate::monitor::stored::Engine;
 use crate::monitor::{Error, Health};
 
 /// The process is running.
@@ -22,12 +22,16 @@ struct Alive {
     status: &'static str,
 }
 
-/// Versions of the program and of SQLite.
+/// Versions of the program and of its database.
 #[derive(Debug, Serialize, ToSchema)]
 struct Version {
     name: &'static str,
     version: &'static str,
-    sqlite_version: String,
+    /// `SQLite` or `PostgreSQL`.
+    database: &'static str,
+    database_version: String,
+    /// `database_version` of SQLite; null with a PostgreSQL server.
+    sqlite_version: Option<String>,
     /// Number of the last migration of the database.
     schema_version: i64,
     /// Format version of the manifests of trained models.
@@ -122,18 +126,21 @@ async fn of_structures(shared: &Shared) -> Result<String, Error> {
     Ok(structure_metrics::text(&states, &quantities, &points))
 }
 
-/// `GET /version`: versions of the program and of SQLite.
+/// `GET /version`: versions of the program and of its database.
 #[utoipa::path(
     get, path = "/version", tag = "operations", operation_id = "version",
-    summary = "Version", description = "Versions of the program and of SQLite.",
+    summary = "Version", description = "Versions of the program and of its database.",
     responses((status = 200, description = "The versions", body = Version))
 )]
 pub async fn version(State(shared): State<Shared>) -> Response {
+    let (engine, database_version) = shared.monitor.database();
     let version = Version {
         name: env!("CARGO_PKG_NAME"),
         version: env!("CARGO_PKG_VERSION"),
-        sqlite_version: shared.monitor.sqlite_version().to_owned(),
-        schema_version: schema_version(),
+        database: engine.as_str(),
+        database_version: database_version.to_owned(),
+        sqlite_version: (engine == Engine::Sqlite).then(|| database_version.to_owned()),
+        schema_version: shared.monitor.schema_version(),
         manifest_format: crate::baseline::manifest::FORMAT,
     };
     Json(version).into_response()

@@ -1,6 +1,7 @@
 //! The metrics of the service: their descriptions, and the figures of the process.
 
 use crate::alarm::ALARM_KINDS;
+use crate::store::Engine;
 
 /// Descriptions of the metrics; the unit is at the end of the name.
 const MEANINGS: [(&str, &str); 40] = [
@@ -11,7 +12,7 @@ const MEANINGS: [(&str, &str); 40] = [
     ("modalwatch_backups_total", "Backups, by outcome."),
     ("modalwatch_baselines_in_use", "Structures with a trained model in use."),
     ("modalwatch_batches_received_total", "New batches stored."),
-    ("modalwatch_build_info", "Program and SQLite; always 1."),
+    ("modalwatch_build_info", "Program and database; always 1."),
     ("modalwatch_connections_refused_total", "Requests that found no free connection."),
     ("modalwatch_database_bytes", "Size of the database file."),
     ("modalwatch_disk_free_bytes", "Free bytes on the volume of the database."),
@@ -51,7 +52,7 @@ const MEANINGS: [(&str, &str); 40] = [
 
 /// Declares the metrics that would otherwise appear only with their first event: a rate over a counter that starts at 1 misses that
 /// event, and an alert on a missing metric never fires. It must be called after the recorder is installed.
-pub fn declare_metrics(sqlite_version: &str) {
+pub fn declare_metrics((engine, version): (Engine, &str)) {
     for (name, meaning) in MEANINGS {
         match name {
             _ if name.ends_with("_total") => metrics::describe_counter!(name, meaning),
@@ -61,7 +62,12 @@ pub fn declare_metrics(sqlite_version: &str) {
             _ => metrics::describe_gauge!(name, meaning),
         }
     }
-    let labels = [("version", env!("CARGO_PKG_VERSION").to_owned()), ("sqlite_version", sqlite_version.to_owned())];
+    let sqlite_version = if engine == Engine::Sqlite { version } else { "" };
+    let labels = [
+        ("version", env!("CARGO_PKG_VERSION").to_owned()),
+        ("database", format!("{} {version}", engine.as_str())),
+        ("sqlite_version", sqlite_version.to_owned()),
+    ];
     metrics::gauge!("modalwatch_build_info", &labels).set(1.0);
     for name in [
         "modalwatch_batches_received_total",

@@ -84,7 +84,7 @@ pub use self::upkeep::{Health, Upkeep};
 pub use self::versions::Versions;
 use crate::baseline::library::Library;
 use crate::quantity::StructureId;
-use crate::store::{Audit, Outbox, Quarantine, Store, Webhooks};
+use crate::store::{Audit, Engine, Outbox, Quarantine, Store, Webhooks};
 
 /// The application. It gives access to its parts; cloning it is cheap.
 #[derive(Clone)]
@@ -274,9 +274,14 @@ impl Monitor {
         self.store.audit()
     }
 
-    /// Version of SQLite.
-    pub fn sqlite_version(&self) -> &str {
-        self.store.file().sqlite_version()
+    /// The program behind the database, and its version.
+    pub fn database(&self) -> (Engine, &str) {
+        (self.store.file().engine(), self.store.file().version())
+    }
+
+    /// Number of the last migration of the database.
+    pub fn schema_version(&self) -> i64 {
+        self.store.file().schema_version()
     }
 
     /// The store, for the command line and tests, which open and close it.

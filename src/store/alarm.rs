@@ -8,6 +8,7 @@ use super::column::{bad_row, elements, list, timestamp};
 use super::database::Database;
 use super::diagnosis::{job_state, JobState};
 use super::error::Error;
+use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::alarm::chart::FIT_SERIES;
 use crate::alarm::severity::{AlarmFacts, BatchChange, Grade, Severity, SeverityLimits};
@@ -122,7 +123,7 @@ struct EpisodeRow {
     episode: i64,
     kind: String,
     series: String,
-    undamaged_version: u32,
+    undamaged_version: Whole<u32>,
     opened_at_us: i64,
     opened_batch: Option<String>,
     ended_at_us: Option<i64>,
@@ -136,7 +137,7 @@ struct EpisodeRow {
     diagnosis_state: Option<String>,
     diagnosis_verdict: Option<String>,
     change: Option<String>,
-    superseded_by: Option<u32>,
+    superseded_by: Option<Whole<u32>>,
     continues: Option<i64>,
     batch_change: Option<String>,
     grade: Option<i64>,
@@ -202,10 +203,10 @@ pub(super) async fn insert_episode(
     (version, opened_at, batch, ended_at, peak): (u32, i64, Option<&str>, Option<i64>, f64),
     now: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "insert into alarm_episode (structure_id, episode, kind, series, undamaged_version, opened_at_us, opened_batch,
              ended_at_us, withdrawn, peak_shift, noticed_at_us)
-         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, 0, $8, $9
+         select $1, coalesce(max(episode), 0) + 1, $2, $3, $4, $5, $6, $7, false, $8, $9
          from alarm_episode where structure_id = $1",
     )
     .bind(structure)
@@ -217,7 +218,7 @@ pub(super) async fn insert_episode(
     .bind(ended_at)
     .bind(peak)
     .bind(now.micros())
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }
@@ -234,7 +235,7 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn episodes(self, structure: &StructureId, query: EpisodeQuery) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(concat!(
+        let rows: Vec<EpisodeRow> = sql::query_as(select_episodes!(concat!(
             "e.structure_id = $1 and episode < $2 and ($3 = 0 or (ended_at_us is null and withdrawn = 0))
                and ($4 = 1 or ",
             superseding_version!(),
@@ -255,7 +256,7 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn open_damage(self) -> Result<OpenAlarms, Error> {
-        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(
+        let rows: Vec<EpisodeRow> = sql::query_as(select_episodes!(
             "e.kind = 'damage' and ended_at_us is null and withdrawn = 0 order by e.opened_at_us desc, e.episode limit 1000"
         ))
         .fetch_all(&self.database.reader)
@@ -278,9 +279,9 @@ impl Alarms<'_> {
         newest: i64,
         numbers: &[i64],
     ) -> Result<Vec<Episode>, Error> {
-        let rows: Vec<EpisodeRow> = sqlx::query_as(select_episodes!(concat!(
+        let rows: Vec<EpisodeRow> = sql::query_as(select_episodes!(concat!(
             "e.structure_id = $1
-               and (episode > $2 or (ended_at_us is null and withdrawn = 0) or episode in (select value from ",
+               and (episode > $2 or (ended_at_us is null and withdrawn = 0) or episode in (select cast(value as bigint) from ",
             elements!("$3"),
             ")) order by episode",
         )))
@@ -306,7 +307,7 @@ impl Alarms<'_> {
         let row = self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2, acknowledgement_note = $3
                          where structure_id = $4 and episode = $5 and acknowledged_at_us is null",
                     )
@@ -315,13 +316,13 @@ impl Alarms<'_> {
                     .bind(acknowledgement.note)
                     .bind(&id)
                     .bind(number)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     let row: Option<EpisodeRow> =
-                        sqlx::query_as(select_episodes!("e.structure_id = $1 and episode = $2"))
+                        sql::query_as(select_episodes!("e.structure_id = $1 and episode = $2"))
                             .bind(&id)
                             .bind(number)
-                            .fetch_optional(transaction.connection())
+                            .fetch_optional(&mut *transaction)
                             .await?;
                     Ok(row)
                 })
@@ -340,14 +341,14 @@ impl Alarms<'_> {
             .write(move |transaction| {
                 Box::pin(async move {
                     for (number, grade) in grades {
-                        sqlx::query(
+                        sql::query(
                             "update alarm_episode set grade = $1
                              where structure_id = $2 and episode = $3 and coalesce(grade, -1) < $1",
                         )
                         .bind(grade.number())
                         .bind(&id)
                         .bind(number)
-                        .execute(transaction.connection())
+                        .execute(&mut *transaction)
                         .await?;
                     }
                     Ok(())
@@ -370,12 +371,12 @@ impl Alarms<'_> {
         let id = structure.to_string();
         self.database.write(move |transaction| {
             Box::pin(async move {
-                let open: Option<(i64,)> = sqlx::query_as(
+                let open: Option<(i64,)> = sql::query_as(
                     "select episode from alarm_episode where structure_id = $1 and kind = 'silence' and ended_at_us is null
                      order by episode desc limit 1",
                 )
                 .bind(&id)
-                .fetch_optional(transaction.connection())
+                .fetch_optional(&mut *transaction)
                 .await?;
                 match (open, since) {
                     (None, Some(since)) => {
@@ -384,11 +385,11 @@ impl Alarms<'_> {
                         Ok(true)
                     }
                     (Some((number,)), None) => {
-                        sqlx::query("update alarm_episode set ended_at_us = $1 where structure_id = $2 and episode = $3")
+                        sql::query("update alarm_episode set ended_at_us = $1 where structure_id = $2 and episode = $3")
                             .bind(now.micros())
                             .bind(&id)
                             .bind(number)
-                            .execute(transaction.connection())
+                            .execute(&mut *transaction)
                             .await?;
                         Ok(true)
                     }
@@ -416,7 +417,7 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         number: row.episode,
         kind: row.kind,
         series: row.series,
-        undamaged_version: row.undamaged_version,
+        undamaged_version: row.undamaged_version.0,
         opened_at: timestamp(what, row.opened_at_us)?,
         opened_batch: row.opened_batch,
         ended_at: row.ended_at_us.map(|at| timestamp(what, at)).transpose()?,
@@ -426,7 +427,7 @@ fn episode(row: EpisodeRow) -> Result<Episode, Error> {
         acknowledgement,
         diagnosis,
         change: row.change.map(|text| serde_json::from_str(&text).map_err(|e| bad_row(what)(&e))).transpose()?,
-        superseded_by: row.superseded_by,
+        superseded_by: row.superseded_by.map(|version| version.0),
         continues: row.continues,
         batch_change: row
             .batch_change

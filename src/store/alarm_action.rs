@@ -15,6 +15,7 @@ use sqlx::FromRow;
 use super::column::{bad_row, elements, list, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::quantity::{StructureId, Timestamp};
 
@@ -199,7 +200,7 @@ pub struct Handling {
 struct Member {
     root: i64,
     episode: i64,
-    undamaged_version: u32,
+    undamaged_version: Whole<u32>,
     withdrawn: bool,
 }
 
@@ -218,7 +219,7 @@ struct ActionRow {
 /// The alarms of a list with all alarms that they continue, which overlap them in time.
 const MEMBERS: &str = concat!(
     "with recursive chain (root, episode) as (
-         select value, value from ",
+         select cast(value as bigint), cast(value as bigint) from ",
     elements!("$2"),
     "    union
          select c.root, o.episode from chain c
@@ -233,7 +234,7 @@ const MEMBERS: &str = concat!(
 
 const ACTIONS: &str = concat!(
     "select action_id, episode, kind, at_us, author, text, reason, assignee from alarm_action
-     where structure_id = $1 and episode in (select value from ",
+     where structure_id = $1 and episode in (select cast(value as bigint) from ",
     elements!("$2"),
     ") order by action_id"
 );
@@ -252,10 +253,10 @@ impl AlarmActions<'_> {
     pub async fn of(self, structure: &StructureId, alarms: &[i64]) -> Result<BTreeMap<i64, Handling>, Error> {
         let mut reader = self.database.reader.acquire().await?;
         let members: Vec<Member> =
-            sqlx::query_as(MEMBERS).bind(structure.as_str()).bind(list(alarms)).fetch_all(&mut *reader).await?;
+            sql::query_as(MEMBERS).bind(structure.as_str()).bind(list(alarms)).fetch_all(&mut reader).await?;
         let all: Vec<i64> = members.iter().map(|member| member.episode).collect();
         let rows: Vec<ActionRow> =
-            sqlx::query_as(ACTIONS).bind(structure.as_str()).bind(list(&all)).fetch_all(&mut *reader).await?;
+            sql::query_as(ACTIONS).bind(structure.as_str()).bind(list(&all)).fetch_all(&mut reader).await?;
         let actions: Vec<AlarmAction> = rows.into_iter().map(action).collect::<Result<_, _>>()?;
         Ok(alarms.iter().map(|&alarm| (alarm, handling(alarm, &members, &actions))).collect())
     }
@@ -276,7 +277,7 @@ impl AlarmActions<'_> {
                     let uid = uuid::Uuid::now_v7().to_string();
                     insert_action(transaction, (&structure, alarm), &uid, &new, false).await?;
                     if matches!(new.kind, ActionKind::Closing { .. }) {
-                        sqlx::query(
+                        sql::query(
                             "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2
                              where structure_id = $3 and episode = $4 and acknowledged_at_us is null",
                         )
@@ -284,7 +285,7 @@ impl AlarmActions<'_> {
                         .bind(&new.author)
                         .bind(&structure)
                         .bind(alarm)
-                        .execute(transaction.connection())
+                        .execute(&mut *transaction)
                         .await?;
                     }
                     Ok(ActionOutcome::Stored)
@@ -302,7 +303,7 @@ pub(super) async fn insert_action(
     new: &NewAction,
     imported: bool,
 ) -> Result<bool, Error> {
-    let inserted = sqlx::query(
+    let inserted = sql::query(
         "insert into alarm_action (structure_id, episode, uid, kind, at_us, author, text, reason, assignee, imported)
          values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10) on conflict (structure_id, uid) do nothing",
     )
@@ -316,7 +317,7 @@ pub(super) async fn insert_action(
     .bind(new.kind.reason().map(ClosingReason::as_str))
     .bind(new.kind.assignee())
     .bind(imported)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(inserted.rows_affected() > 0)
 }
@@ -329,13 +330,13 @@ async fn refusal(
     new: &NewAction,
 ) -> Result<Option<ActionOutcome>, Error> {
     let members: Vec<Member> =
-        sqlx::query_as(MEMBERS).bind(structure).bind(list(&[alarm])).fetch_all(transaction.connection()).await?;
+        sql::query_as(MEMBERS).bind(structure).bind(list(&[alarm])).fetch_all(&mut *transaction).await?;
     if members.is_empty() {
         return Ok(Some(ActionOutcome::UnknownAlarm));
     }
     let all: Vec<i64> = members.iter().map(|member| member.episode).collect();
     let rows: Vec<ActionRow> =
-        sqlx::query_as(ACTIONS).bind(structure).bind(list(&all)).fetch_all(transaction.connection()).await?;
+        sql::query_as(ACTIONS).bind(structure).bind(list(&all)).fetch_all(&mut *transaction).await?;
     let actions: Vec<AlarmAction> = rows.into_iter().map(action).collect::<Result<_, _>>()?;
     let present = handling(alarm, &members, &actions);
     let own = actions.iter().filter(|action| action.alarm == alarm).count();
@@ -356,10 +357,11 @@ fn handling(alarm: i64, members: &[Member], actions: &[AlarmAction]) -> Handling
     let own: Vec<&Member> = members.iter().filter(|member| member.root == alarm).collect();
     // The alarm itself, then the latest alarm of an earlier reference, then the one that this continues, and so on.
     let mut line = vec![alarm];
-    let version = |episode: i64| own.iter().find(|member| member.episode == episode).map_or(0, |m| m.undamaged_version);
+    let version =
+        |episode: i64| own.iter().find(|member| member.episode == episode).map_or(0, |m| m.undamaged_version.0);
     while let Some(next) = own
         .iter()
-        .filter(|member| !member.withdrawn && member.undamaged_version < version(line[line.len() - 1]))
+        .filter(|member| !member.withdrawn && member.undamaged_version.0 < version(line[line.len() - 1]))
         .map(|member| member.episode)
         .max()
     {

@@ -4,8 +4,6 @@ use std::collections::{BTreeMap, HashMap};
 
 use futures_util::TryStreamExt as _;
 use serde::Deserialize;
-use sqlx::sqlite::SqliteRow;
-use sqlx::Row as _;
 
 use super::assessment::kind_of;
 use super::column::{bad_row, elements, list};
@@ -13,6 +11,7 @@ use super::current::IS_CURRENT;
 use super::error::Error;
 use super::plotted::{trust_values, Plotted};
 use super::series::{bounds, Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
+use super::sql::{self, Row as StoredRow, Whole};
 use crate::damage::QuantityKind;
 use crate::quantity::StructureId;
 use crate::reduction::{Reduced, Reducer, Row};
@@ -118,7 +117,7 @@ impl Series<'_> {
                and b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3
                and b.state = 'assessed' and a.plotted is not null and {IS_CURRENT}"
         );
-        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+        let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(from)
             .bind(to)
@@ -126,15 +125,16 @@ impl Series<'_> {
         // The quantities of an assessment depend on its trained baseline only.
         let mut known: HashMap<String, Vec<usize>> = HashMap::new();
         while let Some(row) = rows.try_next().await? {
-            let (time, batch): (i64, &str) = (row.try_get_unchecked(0)?, row.try_get_unchecked(1)?);
-            let model: &str = row.try_get_unchecked(2)?;
+            let (time, batch): (i64, &str) = (row.get(0)?, row.get(1)?);
+            let model: &str = row.get(2)?;
             if !known.contains_key(model) {
-                let quantities = self.quantities_of(structure, batch, model, row.try_get_unchecked(3)?).await?;
+                let Whole(version) = row.get(3)?;
+                let quantities = self.quantities_of(structure, batch, model, version).await?;
                 let indices = quantities.into_iter().map(|quantity| tracks.index_of(quantity)).collect();
                 known.insert(model.to_owned(), indices);
             }
             let indices = &known[model];
-            let plotted = Plotted::read(row.try_get_unchecked(4)?, indices.len())?;
+            let plotted = Plotted::read(row.get(4)?, indices.len())?;
             tracks.trust.push(time, &plotted.trust(), || batch.to_owned());
             for (position, index) in indices.iter().enumerate() {
                 let quantity = plotted.quantity(position);
@@ -158,7 +158,7 @@ impl Series<'_> {
         model: &str,
         undamaged_version: u32,
     ) -> Result<Vec<(String, String, QuantityKind, i64)>, Error> {
-        let rows: Vec<(String, String, String, i64)> = sqlx::query_as(
+        let rows: Vec<(String, String, String, i64)> = sql::query_as(
             "select quantity, unit, kind, position from quantity_assessment
              where structure_id = $1 and batch_id = $2 and model_digest = $3 and undamaged_version = $4 order by position",
         )
@@ -188,16 +188,16 @@ impl Series<'_> {
             "select b.measured_to_us, b.batch_id, a.trust
              from measurement_batch b cross join assessment a {of_window}"
         );
-        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+        let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(from)
             .bind(to)
             .fetch(&self.database.reader);
         while let Some(row) = rows.try_next().await? {
-            let trust = SeriesTrust::of(row.try_get_unchecked(2)?)?;
+            let trust = SeriesTrust::of(row.get(2)?)?;
             let values = trust_values(trust.p_value, trust.verdict, trust.findings.len());
-            let batch = || row.try_get_unchecked(1);
-            tracks.trust.try_push(row.try_get_unchecked(0)?, &values, batch).map_err(sqlx_error)?;
+            let batch = || row.get(1);
+            tracks.trust.try_push(row.get(0)?, &values, batch).map_err(sqlx_error)?;
         }
         drop(rows);
         // Joined in this order, the current assessment is determined once per batch and not once per quantity.
@@ -211,28 +211,28 @@ impl Series<'_> {
                and q.structure_id = a.structure_id and q.batch_id = a.batch_id and q.model_digest = a.model_digest
                and q.undamaged_version = a.undamaged_version"
         );
-        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+        let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(from)
             .bind(to)
             .fetch(&self.database.reader);
         while let Some(row) = rows.try_next().await? {
-            let name: &str = row.try_get_unchecked(0)?;
+            let name: &str = row.get(0)?;
             let index = match tracks.indices.get(name) {
                 Some(index) => *index,
                 None => tracks.index_of(named(&row)?),
             };
-            let number = |column: usize| row.try_get_unchecked::<Option<f64>, _>(column);
-            let values = [row.try_get_unchecked(2)?, number(3)?.unwrap_or(f64::NAN)];
+            let number = |column: usize| row.get::<Option<f64>>(column);
+            let values = [row.get(2)?, number(3)?.unwrap_or(f64::NAN)];
             let mark = || {
                 Ok(QuantityMark {
-                    batch: row.try_get_unchecked(4)?,
+                    batch: row.get(4)?,
                     mean_interval: [number(5)?, number(6)?],
                     probability_interval: [number(7)?, number(8)?],
                 })
             };
             let batches = &mut tracks.quantities[index].batches;
-            batches.try_push(row.try_get_unchecked(1)?, &values, mark).map_err(sqlx_error)?;
+            batches.try_push(row.get(1)?, &values, mark).map_err(sqlx_error)?;
         }
         Ok(())
     }
@@ -245,7 +245,7 @@ impl Series<'_> {
              where a.structure_id = $1 and a.batch_id in (select value from {}) and {IS_CURRENT}",
             elements!("$2")
         );
-        let found: Vec<(String, Option<String>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let found: Vec<(String, Option<String>)> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(list(&batches))
             .fetch_all(&self.database.reader)
@@ -266,9 +266,9 @@ impl Series<'_> {
     }
 }
 
-fn named(row: &SqliteRow) -> Result<(String, String, QuantityKind, i64), Error> {
-    let kind = kind_of(row.try_get_unchecked(10)?)?;
-    Ok((row.try_get_unchecked(0)?, row.try_get_unchecked(9)?, kind, row.try_get_unchecked(11)?))
+fn named(row: &StoredRow) -> Result<(String, String, QuantityKind, i64), Error> {
+    let kind = kind_of(row.get(10)?)?;
+    Ok((row.get(0)?, row.get(9)?, kind, row.get(11)?))
 }
 
 fn sqlx_error(error: sqlx::Error) -> Error {

@@ -16,6 +16,7 @@ use super::error::Error;
 use super::failed::end_alarm;
 use super::plotted;
 use super::rows::{parts, InsertStatements};
+use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::assessment::{Assessment, NewCharts};
 use crate::damage::{Damage, Hyperparameters, QuantityAssessment, QuantityKind};
@@ -50,7 +51,7 @@ pub enum ComparedWith {
 struct AssessmentRow {
     batch_id: String,
     model_digest: String,
-    undamaged_version: u32,
+    undamaged_version: Whole<u32>,
     structure_digest: String,
     seed: i64,
     draws_per_measurement: i64,
@@ -68,7 +69,7 @@ struct AssessmentRow {
 struct QuantityAssessmentRow {
     batch_id: String,
     model_digest: String,
-    undamaged_version: u32,
+    undamaged_version: Whole<u32>,
     quantity: String,
     unit: String,
     kind: String,
@@ -196,12 +197,12 @@ impl Assessments<'_> {
              order by batch_id, {CURRENT_FIRST}",
             elements!("$2")
         );
-        let rows: Vec<AssessmentRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<AssessmentRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(&ids)
             .fetch_all(&self.database.reader)
             .await?;
-        let quantities: Vec<QuantityAssessmentRow> = sqlx::query_as(concat!(
+        let quantities: Vec<QuantityAssessmentRow> = sql::query_as(concat!(
             "select batch_id, model_digest, undamaged_version, quantity, unit, kind, mean, std, variance_within,
                     variance_between, edge_mass, threshold, probability_of_damage, exceeds, relative_change, mean_low,
                     mean_high, std_low, std_high, pooled_mean, pooled_std, probability_low, probability_high,
@@ -221,13 +222,13 @@ impl Assessments<'_> {
         for row in rows {
             // The first assessment of each batch is the current one.
             if !current.contains_key(&row.batch_id) {
-                let key = (row.model_digest.clone(), row.undamaged_version);
+                let key = (row.model_digest.clone(), row.undamaged_version.0);
                 current.insert(row.batch_id.clone(), (key, assessment(row)?));
             }
         }
         for row in quantities {
             if let Some((key, assessment)) = current.get_mut(&row.batch_id) {
-                if *key == (row.model_digest.clone(), row.undamaged_version) {
+                if *key == (row.model_digest.clone(), row.undamaged_version.0) {
                     assessment.quantities.push(quantity_assessment(row)?);
                 }
             }
@@ -261,7 +262,7 @@ struct SlotRow {
     others_us: Option<i64>,
     measured_to_us: i64,
     maintained: bool,
-    newest_undamaged: u32,
+    newest_undamaged: Whole<u32>,
     succeeded_at_us: Option<i64>,
 }
 
@@ -274,17 +275,17 @@ async fn slot_of(
     a: &Assessment,
 ) -> Result<Option<Slot>, Error> {
     let given = a.assessed_at.micros();
-    let found: Option<SlotRow> = sqlx::query_as(
+    let found: Option<SlotRow> = sql::query_as(
         "select own_us, others_us, measured_to_us,
                 exists (select 1 from maintenance_window where structure_id = $1 and from_us <= measured_to_us
                     and to_us > measured_from_us) as maintained,
                 (select coalesce(max(version), 0) from undamaged_state where structure_id = $1) as newest_undamaged,
-                (select coalesce(json_extract(origin, '$.declared_at_us'), created_at_us) from undamaged_state
+                (select coalesce(cast(origin ->> '$.declared_at_us' as bigint), created_at_us) from undamaged_state
                     where structure_id = $1 and version > $4 order by version limit 1) as succeeded_at_us
          from (select max(assessed_at_us) filter (where model_digest = $3 and undamaged_version = $4) as own_us,
                       max(assessed_at_us) filter (where not (model_digest = $3 and undamaged_version = $4)) as others_us
-               from assessment where structure_id = $1 and batch_id = $2) a
-         cross join measurement_batch b where structure_id = $1 and batch_id = $2
+               from assessment where structure_id = $1 and batch_id = $2) a, measurement_batch b
+         where structure_id = $1 and batch_id = $2
              and exists (select 1 from structure where structure_id = $1 and digest = $5)",
     )
     .bind(structure)
@@ -292,10 +293,17 @@ async fn slot_of(
     .bind(a.model_digest.as_str())
     .bind(a.undamaged_version.unwrap_or(0))
     .bind(a.structure_digest.as_str())
-    .fetch_optional(transaction.connection())
+    .fetch_optional(&mut *transaction)
     .await?;
     let Some(found) = found else { return Ok(None) };
-    let SlotRow { own_us, others_us, measured_to_us, maintained, newest_undamaged, succeeded_at_us } = found;
+    let SlotRow {
+        own_us,
+        others_us,
+        measured_to_us,
+        maintained,
+        newest_undamaged: Whole(newest_undamaged),
+        succeeded_at_us,
+    } = found;
     let assessed_at_us = others_us.map_or(given, |latest| given.max(latest + 1));
     let taken = own_us.is_some();
     Ok(Some(Slot { assessed_at_us, taken, measured_to_us, maintained, newest_undamaged, succeeded_at_us }))
@@ -313,12 +321,12 @@ async fn remove(
             "delete from {table}
              where structure_id = $1 and batch_id = $2 and model_digest = $3 and undamaged_version = $4"
         );
-        sqlx::query(sqlx::AssertSqlSafe(delete))
+        sql::query(sqlx::AssertSqlSafe(delete))
             .bind(structure)
             .bind(batch_id)
             .bind(a.model_digest.as_str())
             .bind(a.undamaged_version.unwrap_or(0))
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
     }
     Ok(())
@@ -335,14 +343,9 @@ async fn insert(
     let version = a.undamaged_version.unwrap_or(0);
     let trust = serde_json::to_string(&a.trust).map_err(|e| bad_row("assessment")(&e))?;
     let joint = a.joint.as_ref().map(serde_json::to_string).transpose().map_err(|e| bad_row("assessment")(&e))?;
-    // Two statements in one call, which saves a round trip to the thread of SQLite for every batch. PostgreSQL takes them singly.
     let insert =
-        "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16);
-         update measurement_batch set failure = null,
-             state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
-                     else 'assessed' end
-         where structure_id = $1 and batch_id = $2";
-    sqlx::query(insert)
+        "insert into assessment values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12, $13, $14, $15, $16)";
+    sql::query(insert)
         .bind(structure)
         .bind(batch_id)
         .bind(a.model_digest.as_str())
@@ -359,10 +362,20 @@ async fn insert(
         .bind(trust)
         .bind(plotted::pack(a))
         .bind(joint)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
+    sql::query(
+        "update measurement_batch set failure = null,
+             state = case when exists (select 1 from kept_comparison where structure_id = $1 and batch_id = $2) then 'received'
+                     else 'assessed' end
+         where structure_id = $1 and batch_id = $2",
+    )
+    .bind(structure)
+    .bind(batch_id)
+    .execute(&mut *transaction)
+    .await?;
     for rows in parts(a.quantities.len()) {
-        let mut insert = sqlx::query(INSERT_QUANTITIES.of(rows.len()))
+        let mut insert = sql::query(INSERT_QUANTITIES.of(rows.len()))
             .bind(structure)
             .bind(batch_id)
             .bind(a.model_digest.as_str())
@@ -397,7 +410,7 @@ async fn insert(
                 .bind(damage.and_then(|d| d.relative_change_interval).map(|i| i[1]))
                 .bind(&q.group);
         }
-        insert.execute(transaction.connection()).await?;
+        insert.execute(&mut *transaction).await?;
     }
     Ok(())
 }
@@ -408,7 +421,7 @@ fn assessment(row: AssessmentRow) -> Result<Assessment, Error> {
         estimate: None,
         model_digest: Digest::from_stored(row.model_digest),
         structure_digest: Digest::from_stored(row.structure_digest),
-        undamaged_version: Some(row.undamaged_version).filter(|version| *version > 0),
+        undamaged_version: Some(row.undamaged_version.0).filter(|version| *version > 0),
         seed: row.seed.cast_unsigned(),
         draws_per_measurement: row.draws_per_measurement as usize,
         measurements_used: row.measurements_used as usize,

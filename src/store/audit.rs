@@ -7,6 +7,7 @@ use sqlx::FromRow;
 use super::column::timestamp;
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::quantity::Timestamp;
 
 /// Status of a command that succeeded.
@@ -104,7 +105,7 @@ impl Audit<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let (number,): (i64,) = sqlx::query_as(
+                    let (number,): (i64,) = sql::query_as(
                     "insert into audit_entry (at_us, actor, actor_name, peer, request_id, action, structure_id, subject)
                      values ($1, $2, $3, $4, $5, $6, $7, $8) returning entry_id",
                 )
@@ -116,7 +117,7 @@ impl Audit<'_> {
                 .bind(&entry.action)
                 .bind(&entry.structure)
                 .bind(&entry.subject)
-                .fetch_one(transaction.connection())
+                .fetch_one(&mut *transaction)
                 .await?;
                     Ok(number)
                 })
@@ -132,14 +133,14 @@ impl Audit<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "update audit_entry set status = $1, subject = coalesce($2, subject)
                      where entry_id = $3 and status is null",
                     )
                     .bind(status)
                     .bind(made)
                     .bind(number)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -168,7 +169,7 @@ impl Audit<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self, query: &AuditQuery) -> Result<Vec<AuditEntry>, Error> {
-        let rows: Vec<AuditRow> = sqlx::query_as(
+        let rows: Vec<AuditRow> = sql::query_as(
             "select entry_id, at_us, actor, actor_name, peer, request_id, action, structure_id, subject, status
              from audit_entry
              where ($1 is null or at_us >= $1) and ($2 is null or at_us < $2) and ($3 is null or entry_id < $3)

@@ -4,6 +4,7 @@ use super::alarm::kind_of;
 use super::column::{bad_row, timestamp};
 use super::diagnosis::Diagnoses;
 use super::error::Error;
+use super::sql;
 use crate::alarm::chart::FIT_SERIES;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -34,10 +35,12 @@ impl Diagnoses<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn rejected_episodes(self) -> Result<Vec<RejectedEpisode>, Error> {
         let what = "alarm episode";
-        let rows: Vec<(String, i64, i64)> = sqlx::query_as(
-            "select structure_id, max(episode), noticed_at_us from alarm_episode
+        let rows: Vec<(String, i64, i64)> = sql::query_as(
+            "select structure_id, episode, noticed_at_us from alarm_episode e
              where kind = $1 and ended_at_us is null and withdrawn = 0
-             group by structure_id",
+               and not exists (select 1 from alarm_episode later where later.structure_id = e.structure_id and later.kind = e.kind
+                   and later.ended_at_us is null and later.withdrawn = 0 and later.episode > e.episode)
+             order by structure_id",
         )
         .bind(kind_of(FIT_SERIES))
         .fetch_all(&self.database.reader)
@@ -55,7 +58,7 @@ impl Diagnoses<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn latest(self, structure: &StructureId, until: Timestamp) -> Result<LatestDiagnoses, Error> {
-        let (any, automatic): (Option<i64>, Option<i64>) = sqlx::query_as(
+        let (any, automatic): (Option<i64>, Option<i64>) = sql::query_as(
             "select max(created_at_us), max(created_at_us) filter (where started_by <> 'requested')
              from diagnosis where structure_id = $1 and created_at_us < $2",
         )
@@ -77,7 +80,7 @@ impl Diagnoses<'_> {
         version: &Digest,
         since: Timestamp,
     ) -> Result<bool, Error> {
-        let (found,): (bool,) = sqlx::query_as(
+        let (found,): (bool,) = sql::query_as(
             "select exists (select 1 from diagnosis
                  where structure_id = $1 and created_at_us >= $2 and structure_digest = $3
                    and result ->> 'verdict' in ('cause', 'several', 'ambiguous'))",

@@ -10,6 +10,7 @@ use super::database::Database;
 use super::error::Error;
 use super::measurement_row::{frequencies, measurement, MeasurementRow};
 use super::rows::{parts, InsertStatements};
+use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::measurement::{MeasurementBatch, ModalMeasurement};
@@ -70,7 +71,7 @@ struct BatchRow {
     received_at_us: i64,
     state: String,
     failure: Option<String>,
-    kept_reference: Option<u32>,
+    kept_reference: Option<Whole<u32>>,
 }
 
 /// Batches and their measurements.
@@ -143,7 +144,7 @@ impl Batches<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn state(self, structure: &StructureId, batch_id: &str) -> Result<Option<(BatchState, Digest)>, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        let row: Option<(String, String)> = sqlx::query_as(
+        let row: Option<(String, String)> = sql::query_as(
             "select state, content_digest from measurement_batch where structure_id = $1 and batch_id = $2",
         )
         .bind(structure.as_str())
@@ -154,7 +155,7 @@ impl Batches<'_> {
     }
 
     async fn read_batch(self, structure: &StructureId, batch_id: &str) -> Result<Option<BatchRecord>, Error> {
-        let row: Option<BatchRow> = sqlx::query_as(
+        let row: Option<BatchRow> = sql::query_as(
             "select source, idempotency_key, content_digest, received_at_us, state, failure,
                     (select undamaged_version from kept_comparison k where k.structure_id = $1 and k.batch_id = $2
                         order by position limit 1) as kept_reference
@@ -166,7 +167,7 @@ impl Batches<'_> {
         .await?;
         let Some(row) = row else { return Ok(None) };
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        let measurements: Vec<MeasurementRow> = sqlx::query_as(
+        let measurements: Vec<MeasurementRow> = sql::query_as(
             "select measured_at_us, frequency_hz, std_hz, mode_shapes, covariates, settings
              from measurement where structure_id = $1 and batch_id = $2 order by ordinal",
         )
@@ -193,7 +194,7 @@ impl Batches<'_> {
             received_at: timestamp("batch", row.received_at_us)?,
             state: batch_state(&row.state)?,
             failure: row.failure,
-            kept_reference: row.kept_reference,
+            kept_reference: row.kept_reference.map(|version| version.0),
         }))
     }
 
@@ -208,7 +209,7 @@ impl Batches<'_> {
         before: Timestamp,
     ) -> Result<Option<Vec<Option<Hertz>>>, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        let row: Option<(Vec<u8>,)> = sqlx::query_as(
+        let row: Option<(Vec<u8>,)> = sql::query_as(
             "select frequency_hz from measurement where structure_id = $1 and source = $2 and measured_at_us < $3
              order by measured_at_us desc limit 1",
         )
@@ -226,7 +227,7 @@ impl Batches<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn pending(self, structure: &StructureId, limit: usize) -> Result<Vec<String>, Error> {
-        let kept: Vec<(String,)> = sqlx::query_as(
+        let kept: Vec<(String,)> = sql::query_as(
             "select b.batch_id from kept_comparison k join measurement_batch b using (structure_id, batch_id)
              where structure_id = $1 and b.state = 'received' and k.position =
                  (select min(position) from kept_comparison f where f.structure_id = $1 and f.batch_id = b.batch_id)
@@ -239,7 +240,7 @@ impl Batches<'_> {
         if !kept.is_empty() {
             return Ok(kept.into_iter().map(|(id,)| id).collect());
         }
-        let rows: Vec<(String,)> = sqlx::query_as(
+        let rows: Vec<(String,)> = sql::query_as(
             "select batch_id from measurement_batch where structure_id = $1 and state = 'received'
              order by received_at_us, batch_id limit $2",
         )
@@ -256,7 +257,7 @@ impl Batches<'_> {
     /// [`Error::Sqlite`].
     pub async fn last_received(self, structure: &StructureId) -> Result<Option<Timestamp>, Error> {
         // The ids of batches are in the order of their arrival.
-        let row: Option<(i64,)> = sqlx::query_as(
+        let row: Option<(i64,)> = sql::query_as(
             "select received_at_us from measurement_batch where structure_id = $1 order by batch_id desc limit 1",
         )
         .bind(structure.as_str())
@@ -270,7 +271,7 @@ impl Batches<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn first_received(self, structure: &StructureId) -> Result<Option<Timestamp>, Error> {
-        let row: Option<(i64,)> = sqlx::query_as(
+        let row: Option<(i64,)> = sql::query_as(
             "select received_at_us from measurement_batch where structure_id = $1 order by batch_id limit 1",
         )
         .bind(structure.as_str())
@@ -284,7 +285,7 @@ impl Batches<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn batch_sizes(self, structure: &StructureId) -> Result<Vec<(String, usize)>, Error> {
-        let rows: Vec<(String, i64)> = sqlx::query_as(
+        let rows: Vec<(String, i64)> = sql::query_as(
             "select batch_id, measurement_count from measurement_batch where structure_id = $1
              order by measured_from_us, batch_id",
         )
@@ -335,7 +336,7 @@ async fn find_stored(
 ) -> Result<InsertBatch, Error> {
     let structure = batch.structure.as_str();
     let times: Vec<i64> = batch.measurements.iter().map(|m| m.measured_at.micros()).collect();
-    let found: FoundRow = sqlx::query_as(concat!(
+    let found: FoundRow = sql::query_as(concat!(
         "select exists (select 1 from structure s where s.structure_id = $1 and not exists
                     (select 1 from structure_deletion d where d.structure_id = s.structure_id)) as structure_is_known,
                 k.batch_id as key_batch, k.content_digest as key_digest,
@@ -351,7 +352,7 @@ async fn find_stored(
         " t
                     cross join measurement m
                     join measurement_batch b on b.structure_id = m.structure_id and b.batch_id = m.batch_id
-                    where m.structure_id = $1 and m.source = $2 and m.measured_at_us = t.value
+                    where m.structure_id = $1 and m.source = $2 and m.measured_at_us = cast(t.value as bigint)
                     order by t.key limit 1) h on true",
     ))
     .bind(structure)
@@ -359,7 +360,7 @@ async fn find_stored(
     .bind(list(&times))
     .bind(&batch.idempotency_key)
     .bind(batch.time_span().0.micros())
-    .fetch_one(transaction.connection())
+    .fetch_one(&mut *transaction)
     .await?;
     if !found.structure_is_known {
         return Err(Error::UnknownStructure(structure.to_owned()));
@@ -387,11 +388,11 @@ async fn find_stored(
 /// Binds the key of a batch that was stored before without it to the stored batch: once answered, a key means this content.
 async fn remember_key(transaction: &mut Transaction<'_>, batch: &MeasurementBatch, stored: &str) -> Result<(), Error> {
     let Some(key) = &batch.idempotency_key else { return Ok(()) };
-    sqlx::query("insert into further_key values ($1, $2, $3) on conflict do nothing")
+    sql::query("insert into further_key values ($1, $2, $3) on conflict do nothing")
         .bind(batch.structure.as_str())
         .bind(key)
         .bind(stored)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     Ok(())
 }
@@ -407,7 +408,7 @@ async fn insert(
     received_at: Timestamp,
 ) -> Result<(), Error> {
     let (from, to) = batch.time_span();
-    sqlx::query(
+    sql::query(
         "insert into measurement_batch (structure_id, batch_id, source, idempotency_key, content_digest, received_at_us,
              measured_from_us, measured_to_us, measurement_count, state)
          values ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'received')",
@@ -421,11 +422,11 @@ async fn insert(
     .bind(from.micros())
     .bind(to.micros())
     .bind(batch.measurements.len() as i64)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     let json = |value: Result<String, serde_json::Error>| value.map_err(|e| bad_row("measurement")(&e));
     for rows in parts(batch.measurements.len()) {
-        let mut insert = sqlx::query(INSERT_MEASUREMENTS.of(rows.len()))
+        let mut insert = sql::query(INSERT_MEASUREMENTS.of(rows.len()))
             .bind(batch.structure.as_str())
             .bind(batch_id)
             .bind(&batch.source);
@@ -442,7 +443,7 @@ async fn insert(
                 .bind(json(serde_json::to_string(&m.settings))?)
                 .bind(m.mode_shapes.as_ref().map(|s| json(serde_json::to_string(s))).transpose()?);
         }
-        insert.execute(transaction.connection()).await?;
+        insert.execute(&mut *transaction).await?;
         fault_point!("store::measurement", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     }
     Ok(())
@@ -459,10 +460,10 @@ pub(super) async fn import_batch(
     let other =
         |there: &str| bad_row("batch of the archive")(&format!("batch {batch_id} is already stored here as {there}"));
     let holder: Option<(String,)> =
-        sqlx::query_as("select content_digest from measurement_batch where structure_id = $1 and batch_id = $2")
+        sql::query_as("select content_digest from measurement_batch where structure_id = $1 and batch_id = $2")
             .bind(batch.structure.as_str())
             .bind(batch_id)
-            .fetch_optional(transaction.connection())
+            .fetch_optional(&mut *transaction)
             .await?;
     if let Some((content,)) = holder {
         return if content == digest.as_str() { Ok(false) } else { Err(other("a batch of different content")) };

@@ -10,6 +10,7 @@ use super::chart_point::{state_of, stored_point, ChartPosition, PointRow, Stored
 use super::error::Error;
 use super::process;
 use super::rows::{parts, InsertStatements};
+use super::sql;
 use super::transaction::Transaction;
 use crate::alarm::chart::Series;
 use crate::alarm::machine::State;
@@ -117,20 +118,20 @@ async fn about(
     batch: &Charted<'_>,
     charts: &[NewChartPoint],
 ) -> Result<Vec<PointRow>, Error> {
-    let mut select = sqlx::query_as(sqlx::AssertSqlSafe(select_about(charts)))
+    let mut select = sql::query_as(sqlx::AssertSqlSafe(select_about(charts)))
         .bind(batch.structure)
         .bind(batch.position.0)
         .bind(&batch.position.1);
     for new in charts {
         select = select.bind(new.undamaged_version).bind(&new.series);
     }
-    Ok(select.fetch_all(transaction.connection()).await?)
+    Ok(select.fetch_all(&mut *transaction).await?)
 }
 
 async fn insert_points(transaction: &mut Transaction<'_>, batch: &Charted<'_>, placed: &[Placed]) -> Result<(), Error> {
     let new: Vec<&Placed> = placed.iter().filter(|placed| placed.new).collect();
     for part in parts(new.len()) {
-        let mut insert = sqlx::query(INSERT_POINTS.of(part.len()))
+        let mut insert = sql::query(INSERT_POINTS.of(part.len()))
             .bind(batch.structure)
             .bind(batch.position.0)
             .bind(&batch.position.1);
@@ -148,7 +149,7 @@ async fn insert_points(transaction: &mut Transaction<'_>, batch: &Charted<'_>, p
                 .bind(&row.state)
                 .bind(row.slow);
         }
-        insert.execute(transaction.connection()).await?;
+        insert.execute(&mut *transaction).await?;
     }
     Ok(())
 }
@@ -213,13 +214,13 @@ async fn place(
             }
         }
         let Some(last) = page.last().filter(|_| !last_page) else { break };
-        page = sqlx::query_as(SELECT_AFTER.as_str())
+        page = sql::query_as(SELECT_AFTER.as_str())
             .bind(batch.structure)
             .bind(new.undamaged_version)
             .bind(&new.series)
             .bind(last.measured_to_us)
             .bind(&last.batch_id)
-            .fetch_all(transaction.connection())
+            .fetch_all(&mut *transaction)
             .await?;
         last_page = page.len() < PAGE;
     }
@@ -251,7 +252,7 @@ async fn write_status(
     version: u32,
     row: &PointRow,
 ) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "update chart_point set ewma = $1, above = $2, state = $3
          where structure_id = $4 and undamaged_version = $5 and series = $6 and measured_to_us = $7 and batch_id = $8",
     )
@@ -263,7 +264,7 @@ async fn write_status(
     .bind(&row.series)
     .bind(row.measured_to_us)
     .bind(&row.batch_id)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }

@@ -3,6 +3,7 @@
 use super::alarm::{insert_episode, kind_of};
 use super::chart_point::{state_of, ChartPosition, PointRow};
 use super::error::Error;
+use super::sql;
 use super::transaction::Transaction;
 use crate::assessment::NewChartPoint;
 use crate::quantity::Timestamp;
@@ -56,7 +57,7 @@ impl Episodes {
         // Both statements have the same parameters: the series and the position in it.
         macro_rules! of_series {
             ($select:literal) => {
-                sqlx::query_as($select)
+                sql::query_as($select)
                     .bind(batch.structure)
                     .bind(kind_of(&new.series))
                     .bind(&new.series)
@@ -71,7 +72,7 @@ impl Episodes {
                  where structure_id = $1 and kind = $2 and series = $3 and undamaged_version = $4
                    and (opened_at_us, opened_batch) >= ($5, $6) order by opened_at_us, opened_batch"
             );
-            episodes.stored = select.fetch_all(transaction.connection()).await?;
+            episodes.stored = select.fetch_all(&mut *transaction).await?;
         }
         if inside {
             let select = of_series!(
@@ -79,7 +80,7 @@ impl Episodes {
                  where structure_id = $1 and kind = $2 and series = $3 and undamaged_version = $4 and withdrawn = 0
                    and (opened_at_us, opened_batch) < ($5, $6) order by opened_at_us desc, opened_batch desc limit 1"
             );
-            episodes.running = select.fetch_optional(transaction.connection()).await?;
+            episodes.running = select.fetch_optional(&mut *transaction).await?;
         }
         Ok(episodes)
     }
@@ -127,14 +128,14 @@ impl Episodes {
         let latest_end = batch.succeeded_at_us.filter(|_| new.undamaged_version > 0);
         let any = self.running.is_some() || !self.found.is_empty() || !self.stored.is_empty();
         if let Some((number, peak)) = self.running {
-            sqlx::query(
+            sql::query(
                 "update alarm_episode set ended_at_us = $1, peak_shift = $2 where structure_id = $3 and episode = $4",
             )
             .bind(self.running_end.or(latest_end))
             .bind(peak)
             .bind(structure)
             .bind(number)
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
         }
         for found in self.found {
@@ -145,8 +146,8 @@ impl Episodes {
             let known = self.stored.iter().position(same_batch).or_else(|| self.stored.iter().position(overlaps));
             if let Some(index) = known {
                 let (number, ..) = self.stored.remove(index);
-                sqlx::query(
-                    "update alarm_episode set opened_at_us = $1, opened_batch = $2, ended_at_us = $3, withdrawn = 0,
+                sql::query(
+                    "update alarm_episode set opened_at_us = $1, opened_batch = $2, ended_at_us = $3, withdrawn = false,
                          peak_shift = $4 where structure_id = $5 and episode = $6",
                 )
                 .bind(found.opened_at)
@@ -155,7 +156,7 @@ impl Episodes {
                 .bind(found.peak)
                 .bind(structure)
                 .bind(number)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                 continue;
             }
@@ -164,10 +165,10 @@ impl Episodes {
             insert_episode(transaction, structure, &new.series, row, batch.now).await?;
         }
         for (number, ..) in self.stored {
-            sqlx::query("update alarm_episode set withdrawn = 1 where structure_id = $1 and episode = $2")
+            sql::query("update alarm_episode set withdrawn = true where structure_id = $1 and episode = $2")
                 .bind(structure)
                 .bind(number)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
         }
         Ok(any)

@@ -5,6 +5,7 @@ use sqlx::FromRow;
 use super::alarm::Alarms;
 use super::column::{bad_row, timestamp};
 use super::error::Error;
+use super::sql::{self, Whole};
 use crate::alarm::chart::{ChartPoint, Series};
 use crate::alarm::machine::State;
 use crate::quantity::{StructureId, Timestamp};
@@ -104,7 +105,7 @@ impl Alarms<'_> {
                    where structure_id = $1 and batch_id = $2))
              order by undamaged_version desc, series"
         );
-        let rows: Vec<PointRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<PointRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(batch_id)
             .fetch_all(&self.database.reader)
@@ -118,7 +119,7 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn charts(self, structure: &StructureId, limit: usize) -> Result<Vec<StoredChartPoint>, Error> {
-        let series: Vec<(u32, String)> = sqlx::query_as(
+        let series: Vec<(Whole<u32>, String)> = sql::query_as(
             "select distinct undamaged_version, series from chart_point where structure_id = $1 and undamaged_version in
                  (0, coalesce((select max(version) from undamaged_state where structure_id = $1), 0))
              order by undamaged_version desc, series",
@@ -127,12 +128,12 @@ impl Alarms<'_> {
         .fetch_all(&self.database.reader)
         .await?;
         let mut points = Vec::new();
-        for (version, series) in series {
+        for (Whole(version), series) in series {
             let newest = format!(
                 "select {POINT_COLUMNS} from chart_point where structure_id = $1 and undamaged_version = $2 and series = $3
                  order by measured_to_us desc, batch_id desc limit $4"
             );
-            let rows: Vec<PointRow> = sqlx::query_as(sqlx::AssertSqlSafe(newest))
+            let rows: Vec<PointRow> = sql::query_as(sqlx::AssertSqlSafe(newest))
                 .bind(structure.as_str())
                 .bind(version)
                 .bind(series)
@@ -155,11 +156,12 @@ impl Alarms<'_> {
              {CHARTS}
              select version, series from chart where series is not null order by version desc, series"
         );
-        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let names: Vec<(Whole<u32>, String)> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure)
             .bind(undamaged_version)
             .fetch_all(&self.database.reader)
-            .await?)
+            .await?;
+        Ok(names.into_iter().map(|(version, series)| (version.0, series)).collect())
     }
 }
 

@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use futures_util::TryStreamExt as _;
-use sqlx::Row as _;
 
 use super::alarm::Alarms;
 use super::error::Error;
 use super::series::{bounds, Extent, Series, SeriesWindow};
+use super::sql::{self, Whole};
 use crate::quantity::StructureId;
 use crate::reduction::{Reduced, Reducer};
 
@@ -72,12 +72,12 @@ impl Series<'_> {
 
     /// The parts of each chart of the newest reference, the earliest first. The fit is compared with no reference.
     async fn chart_parts(self, structure: &StructureId) -> Result<Vec<(String, Vec<Part>)>, Error> {
-        let versions: Vec<(u32,)> =
-            sqlx::query_as("select version from undamaged_state where structure_id = $1 order by version desc")
+        let versions: Vec<(Whole<u32>,)> =
+            sql::query_as("select version from undamaged_state where structure_id = $1 order by version desc")
                 .bind(structure.as_str())
                 .fetch_all(&self.database.reader)
                 .await?;
-        let newest = versions.first().map_or(0, |(version,)| *version);
+        let newest = versions.first().map_or(0, |(version,)| version.0);
         let alarms = Alarms { database: self.database };
         let mut order = Vec::new();
         let mut parts = BTreeMap::<String, Vec<Part>>::new();
@@ -88,8 +88,8 @@ impl Series<'_> {
         for (chart, parts) in parts.iter_mut().filter(|(_, parts)| parts[0].version > 0) {
             let mut to_us = i64::MAX;
             parts.clear();
-            for (version,) in &versions {
-                let (from_us,): (Option<i64>,) = sqlx::query_as(
+            for (Whole(version),) in &versions {
+                let (from_us,): (Option<i64>,) = sql::query_as(
                     "select min(measured_to_us) from chart_point
                      where structure_id = $1 and undamaged_version = $2 and series = $3",
                 )
@@ -117,7 +117,7 @@ impl Series<'_> {
         reducer: &mut Reducer<ChartMark>,
     ) -> Result<Option<bool>, Error> {
         let (from, to) = bounds(window);
-        let mut rows = sqlx::query(
+        let mut rows = sql::query(
             "select measured_to_us, shift, ewma, batch_id, shift_limit, ewma_limit, held, state, slow is not null from chart_point
              where structure_id = $1 and undamaged_version = $2 and series = $3
                and measured_to_us >= $4 and measured_to_us < $5",
@@ -130,18 +130,18 @@ impl Series<'_> {
         .fetch(&self.database.reader);
         let mut is_process = None;
         while let Some(row) = rows.try_next().await? {
-            let values = [row.try_get_unchecked(1)?, row.try_get_unchecked(2)?];
+            let values = [row.get(1)?, row.get(2)?];
             let mark = || {
                 Ok(ChartMark {
-                    batch: row.try_get_unchecked(3)?,
-                    shift_limit: row.try_get_unchecked(4)?,
-                    ewma_limit: row.try_get_unchecked(5)?,
-                    held: row.try_get_unchecked(6)?,
-                    state: row.try_get_unchecked(7)?,
+                    batch: row.get(3)?,
+                    shift_limit: row.get(4)?,
+                    ewma_limit: row.get(5)?,
+                    held: row.get(6)?,
+                    state: row.get(7)?,
                 })
             };
-            reducer.try_push(row.try_get_unchecked(0)?, &values, mark).map_err(|e: sqlx::Error| Error::from(e))?;
-            is_process = Some(row.try_get_unchecked(8)?);
+            reducer.try_push(row.get(0)?, &values, mark).map_err(|e: sqlx::Error| Error::from(e))?;
+            is_process = Some(row.get(8)?);
         }
         Ok(is_process)
     }

@@ -6,6 +6,7 @@
 use super::column::elements;
 use super::current::CURRENT_FIRST;
 use super::error::Error;
+use super::sql;
 use super::transaction::Transaction;
 use crate::assessment::Assessment;
 
@@ -16,7 +17,7 @@ pub(super) async fn wait_for_comparison(
     batch_id: &str,
     a: &Assessment,
 ) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "update measurement_batch set state = 'received'
          where structure_id = $1 and batch_id = $2
            and $4 <> coalesce((select version from undamaged_state u
@@ -29,7 +30,7 @@ pub(super) async fn wait_for_comparison(
     .bind(batch_id)
     .bind(a.model_digest.as_str())
     .bind(a.undamaged_version.unwrap_or(0))
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }
@@ -55,8 +56,8 @@ pub(super) async fn requeue(
            and batch_id not in (select value from {})",
         elements!("$3")
     );
-    let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version).bind(except);
-    update.execute(transaction.connection()).await?;
+    let update = sql::query(sqlx::AssertSqlSafe(update)).bind(structure).bind(version).bind(except);
+    update.execute(&mut *transaction).await?;
     Ok(())
 }
 
@@ -66,11 +67,11 @@ pub(super) async fn replace_kept(
     structure: &str,
     (replaced, by): (u32, u32),
 ) -> Result<(), Error> {
-    sqlx::query("update kept_comparison set undamaged_version = $1 where structure_id = $2 and undamaged_version = $3")
+    sql::query("update kept_comparison set undamaged_version = $1 where structure_id = $2 and undamaged_version = $3")
         .bind(by)
         .bind(structure)
         .bind(replaced)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     Ok(())
 }
@@ -78,7 +79,7 @@ pub(super) async fn replace_kept(
 /// Waiting batches that keep references are compared with a new one after them, as if they had been assessed before it was made: if they
 /// are compared with none before, or came after its batches.
 pub(super) async fn keep_newer(transaction: &mut Transaction<'_>, structure: &str, version: u32) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "insert into kept_comparison
          select k.structure_id, k.batch_id, k.position + 1, $2
          from kept_comparison k join measurement_batch b using (structure_id, batch_id)
@@ -92,7 +93,7 @@ pub(super) async fn keep_newer(transaction: &mut Transaction<'_>, structure: &st
     )
     .bind(structure)
     .bind(version)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }
@@ -104,23 +105,23 @@ pub(super) async fn keep(
     versions: &[u32],
 ) -> Result<(), Error> {
     for version in versions {
-        sqlx::query(
+        sql::query(
             "insert into kept_comparison
              select $1, $2, coalesce(max(position) + 1, 0), $3 from kept_comparison where structure_id = $1 and batch_id = $2",
         )
         .bind(structure)
         .bind(batch)
         .bind(version)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     }
     if !versions.is_empty() {
-        sqlx::query(
+        sql::query(
             "update measurement_batch set state = 'received', failure = null where structure_id = $1 and batch_id = $2",
         )
         .bind(structure)
         .bind(batch)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     }
     Ok(())
@@ -132,14 +133,14 @@ pub(super) async fn settle_kept(
     (structure, batch): (&str, &str),
     version: u32,
 ) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "delete from kept_comparison where structure_id = $1 and batch_id = $2 and undamaged_version = $3
              and position = (select min(position) from kept_comparison where structure_id = $1 and batch_id = $2)",
     )
     .bind(structure)
     .bind(batch)
     .bind(version)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }

@@ -20,26 +20,44 @@ pub(super) struct Database {
     pub reader: Reader,
     /// The connection that writes.
     pub writer: Arc<Writer>,
-    /// The database file.
-    pub path: PathBuf,
-    /// Version of the SQLite library.
-    pub sqlite_version: String,
+    /// Where it is.
+    pub place: Place,
     /// Limits that can be changed while the database is open.
     pub limits: Limits,
-    /// Held as long as the database is open, so that a second process on the same folder is refused.
-    pub _lock: File,
+}
+
+/// Where a database is.
+pub(super) enum Place {
+    /// A SQLite file.
+    File {
+        path: PathBuf,
+        /// Version of the SQLite library.
+        version: String,
+        /// Held as long as the database is open, so that a second process on the same folder is refused.
+        _lock: File,
+    },
+    /// A PostgreSQL server.
+    Server {
+        /// The data folder of this process, for what is not in the database.
+        folder: PathBuf,
+        version: String,
+    },
 }
 
 impl Database {
     /// The data folder.
     pub fn folder(&self) -> &Path {
-        self.path.parent().unwrap_or(Path::new("."))
+        match &self.place {
+            Place::File { path, .. } => path.parent().unwrap_or(Path::new(".")),
+            Place::Server { folder, .. } => folder,
+        }
     }
 
     /// Fails while less space is free than the configured minimum, which SQLite needs to write the log back into the database.
     pub fn check_free_space(&self) -> Result<(), Error> {
         let minimum = self.limits.min_free_bytes();
-        if minimum == 0 {
+        // The disk of a server is the concern of the server.
+        if minimum == 0 || matches!(self.place, Place::Server { .. }) {
             return Ok(());
         }
         let folder = self.folder();

@@ -1,13 +1,40 @@
-//! The database file of an open store: its limits, its state, and whether it can be written.
+//! The database of an open store: its limits, its state, whether it can be written, and whether it was taken over.
 
 use std::path::Path;
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
-use super::database::Database;
+use super::database::{Database, Place};
 use super::error::Error;
-use super::file::StoreSettings;
+use super::file::{schema_version, StoreSettings};
+use super::server;
+use super::sql;
+use super::transaction::Transaction;
+use super::writer::WriterPool;
 
-/// The database file of an open store.
+/// A standby takes over after some seconds without a statement of the service.
+const BETWEEN_BEATS: Duration = Duration::from_secs(1);
+
+/// The program behind the database.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Engine {
+    /// SQLite, in this process: a file of the data folder.
+    Sqlite,
+    /// A PostgreSQL server.
+    Postgres,
+}
+
+impl Engine {
+    /// Its name.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Sqlite => "SQLite",
+            Self::Postgres => "PostgreSQL",
+        }
+    }
+}
+
+/// The database of an open store.
 #[derive(Clone, Copy)]
 pub struct DatabaseFile<'s> {
     pub(super) database: &'s Database,
@@ -42,9 +69,27 @@ impl<'s> DatabaseFile<'s> {
         self.database.check_free_space()
     }
 
-    /// Version of the SQLite library.
-    pub fn sqlite_version(self) -> &'s str {
-        &self.database.sqlite_version
+    /// The database program.
+    pub fn engine(self) -> Engine {
+        match &self.database.place {
+            Place::File { .. } => Engine::Sqlite,
+            Place::Server { .. } => Engine::Postgres,
+        }
+    }
+
+    /// Number of the last migration that this program knows for the database.
+    pub fn schema_version(self) -> i64 {
+        match self.engine() {
+            Engine::Sqlite => schema_version(),
+            Engine::Postgres => server::schema_version(),
+        }
+    }
+
+    /// Version of the SQLite library, or of the PostgreSQL server.
+    pub fn version(self) -> &'s str {
+        match &self.database.place {
+            Place::File { version, .. } | Place::Server { version, .. } => version,
+        }
     }
 
     /// Writes to the database file, which shows that a batch could be stored now.
@@ -54,12 +99,29 @@ impl<'s> DatabaseFile<'s> {
     pub async fn is_writable(self) -> Result<(), Error> {
         let written = self.database.write(|transaction| {
             Box::pin(async move {
-                // An update without a matching row would not reach the file. This sets a header field that nothing reads.
-                sqlx::query("pragma user_version = 1").execute(transaction.connection()).await?;
+                // An update without a matching row would not reach the disk.
+                let touch = match transaction {
+                    // A header field that nothing reads.
+                    Transaction::Sqlite(_) => "pragma user_version = 1",
+                    Transaction::Postgres(_) => "update application set probes = probes + 1",
+                };
+                sql::query(touch).execute(&mut *transaction).await?;
                 Ok(())
             })
         });
         written.await
+    }
+
+    /// Completes with the reason when another service has taken over the database of a server: what this one knows of the data is then out
+    /// of date. Never completes for a file, whose lock cannot be lost.
+    pub async fn taken_over(self) -> Error {
+        let WriterPool::Postgres(writer) = &self.database.writer.pool else { return std::future::pending().await };
+        loop {
+            if let Err(taken @ Error::ServedElsewhere(_)) = writer.beat().await {
+                return taken;
+            }
+            tokio::time::sleep(BETWEEN_BEATS).await;
+        }
     }
 
     /// Whether the store was closed, so that further writes are pointless.

@@ -3,6 +3,7 @@
 use super::database::Database;
 use super::error::Error;
 use super::retention::TABLES;
+use super::sql;
 use super::transaction::Transaction;
 use super::undamaged::Known;
 use crate::quantity::{StructureId, Timestamp};
@@ -59,18 +60,18 @@ impl Deletions<'_> {
         self.database
             .write_without_floor(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "insert into structure_deletion select structure_id, $2 from structure where structure_id = $1
                          on conflict do nothing",
                     )
                     .bind(&structure)
                     .bind(now.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     let (marked,): (bool,) =
-                        sqlx::query_as("select exists (select 1 from structure_deletion where structure_id = $1)")
+                        sql::query_as("select exists (select 1 from structure_deletion where structure_id = $1)")
                             .bind(&structure)
-                            .fetch_one(transaction.connection())
+                            .fetch_one(&mut *transaction)
                             .await?;
                     Ok(marked)
                 })
@@ -83,7 +84,7 @@ impl Deletions<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn begun(self) -> Result<Vec<StructureId>, Error> {
-        let ids: Vec<(String,)> = sqlx::query_as("select structure_id from structure_deletion order by structure_id")
+        let ids: Vec<(String,)> = sql::query_as("select structure_id from structure_deletion order by structure_id")
             .fetch_all(&self.database.reader)
             .await?;
         let id = |(id,): (String,)| StructureId::parse(&id).map_err(|e| super::column::bad_row("structure")(&e));
@@ -110,20 +111,16 @@ impl Deletions<'_> {
 
 async fn remove(transaction: &mut Transaction<'_>, structure: &str) -> Result<Removed, Error> {
     let batches: Vec<(String, i64)> =
-        sqlx::query_as("select batch_id, measurement_count from measurement_batch where structure_id = $1 limit $2")
+        sql::query_as("select batch_id, measurement_count from measurement_batch where structure_id = $1 limit $2")
             .bind(structure)
             .bind(AT_A_TIME)
-            .fetch_all(transaction.connection())
+            .fetch_all(&mut *transaction)
             .await?;
     let mut removed = Removed { complete: batches.is_empty(), ..Removed::default() };
     for (batch, measurements) in batches {
         for table in ["undamaged_batch"].into_iter().chain(TABLES) {
             let delete = format!("delete from {table} where structure_id = $1 and batch_id = $2");
-            sqlx::query(sqlx::AssertSqlSafe(delete))
-                .bind(structure)
-                .bind(&batch)
-                .execute(transaction.connection())
-                .await?;
+            sql::query(sqlx::AssertSqlSafe(delete)).bind(structure).bind(&batch).execute(&mut *transaction).await?;
         }
         removed.batches += 1;
         removed.measurements += measurements.unsigned_abs();
@@ -133,11 +130,11 @@ async fn remove(transaction: &mut Transaction<'_>, structure: &str) -> Result<Re
             let delete = format!(
                 "delete from {table} where event_id in (select event_id from outbox_event where structure_id = $1)"
             );
-            sqlx::query(sqlx::AssertSqlSafe(delete)).bind(structure).execute(transaction.connection()).await?;
+            sql::query(sqlx::AssertSqlSafe(delete)).bind(structure).execute(&mut *transaction).await?;
         }
         for table in OF_STRUCTURE {
             let delete = format!("delete from {table} where structure_id = $1");
-            sqlx::query(sqlx::AssertSqlSafe(delete)).bind(structure).execute(transaction.connection()).await?;
+            sql::query(sqlx::AssertSqlSafe(delete)).bind(structure).execute(&mut *transaction).await?;
         }
     }
     Ok(removed)
@@ -152,7 +149,7 @@ mod tests {
     async fn every_table_of_a_structure_is_covered() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).await.unwrap();
-        let tables: Vec<(String,)> = sqlx::query_as(
+        let tables: Vec<(String,)> = sql::query_as(
             "select distinct t.name from sqlite_schema t join pragma_table_info(t.name) c
              where t.type = 'table' and c.name = 'structure_id' order by t.name",
         )

@@ -6,6 +6,7 @@ use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
 use super::job_end::JobEnd;
+use super::sql;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// State of a job.
@@ -173,7 +174,7 @@ impl Diagnoses<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "insert into diagnosis (diagnosis_id, structure_id, structure_digest, request, started_by, alarm, state,
                              created_at_us)
                          values ($1, $2, $3, $4, $5, $6, 'running', $7)",
@@ -185,7 +186,7 @@ impl Diagnoses<'_> {
                     .bind(new.trigger.as_str())
                     .bind(new.alarm)
                     .bind(now.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -213,7 +214,7 @@ impl Diagnoses<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "update diagnosis set state = $1, failure = $2, result = $3, report = $4, finished_at_us = $5,
                              cancelled_at_us = $6
                      where diagnosis_id = $7",
@@ -225,7 +226,7 @@ impl Diagnoses<'_> {
                     .bind(now)
                     .bind(cancelled)
                     .bind(&id)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -243,7 +244,7 @@ impl Diagnoses<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let updated = sqlx::query(
+                    let updated = sql::query(
                         "update diagnosis set extension_state = 'running', extension_failure = null,
                          extension_begun_at_us = $1, extended_at_us = null, extension_cancelled_at_us = null,
                          extension_request = $2, extension_interruptions = 0
@@ -253,7 +254,7 @@ impl Diagnoses<'_> {
                     .bind(now)
                     .bind(&training)
                     .bind(&id)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(updated.rows_affected() == 1)
                 })
@@ -275,7 +276,7 @@ impl Diagnoses<'_> {
         };
         self.database.write(move |transaction| {
             Box::pin(async move {
-                sqlx::query(
+                sql::query(
                     "update diagnosis set extension_state = $1, extension_failure = $2, extension = $3, extended_at_us = $4,
                          extension_cancelled_at_us = $5
                      where diagnosis_id = $6",
@@ -286,7 +287,7 @@ impl Diagnoses<'_> {
                 .bind(now)
                 .bind(cancelled)
                 .bind(&id)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                 Ok(())
             })
@@ -301,7 +302,7 @@ impl Diagnoses<'_> {
     pub async fn diagnosis(self, id: &str) -> Result<Option<DiagnosisRecord>, Error> {
         let select = format!("select {COLUMNS} from diagnosis where diagnosis_id = $1");
         let row: Option<DiagnosisRow> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(id).fetch_optional(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).bind(id).fetch_optional(&self.database.reader).await?;
         row.map(record).transpose()
     }
 
@@ -312,7 +313,7 @@ impl Diagnoses<'_> {
     pub async fn list(self, structure: &StructureId, limit: usize) -> Result<Vec<DiagnosisRecord>, Error> {
         let select =
             format!("select {COLUMNS} from diagnosis where structure_id = $1 order by diagnosis_id desc limit $2");
-        let rows: Vec<DiagnosisRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<DiagnosisRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(limit as i64)
             .fetch_all(&self.database.reader)
@@ -325,7 +326,7 @@ impl Diagnoses<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn diagnosis_report(self, id: &str) -> Result<Option<String>, Error> {
-        let row: Option<(Option<String>,)> = sqlx::query_as("select report from diagnosis where diagnosis_id = $1")
+        let row: Option<(Option<String>,)> = sql::query_as("select report from diagnosis where diagnosis_id = $1")
             .bind(id)
             .fetch_optional(&self.database.reader)
             .await?;

@@ -4,6 +4,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use sqlx::migrate::MigrateError;
+use sqlx::postgres::PgDatabaseError;
+use sqlx::sqlite::SqliteError;
+
+use super::url::UrlError;
 
 /// Why an operation of the store failed.
 #[derive(Debug, thiserror::Error)]
@@ -45,10 +49,10 @@ pub enum Error {
         detail: String,
     },
     /// The database was written by a newer program.
-    #[error("{path} has schema version {found}, newer than this program's {known}: use the newer modalwatch")]
+    #[error("{place} has schema version {found}, newer than this program's {known}: use the newer modalwatch")]
     SchemaTooNew {
-        /// The file.
-        path: PathBuf,
+        /// The file, or the database of a server.
+        place: String,
         /// Schema version of the file.
         found: i64,
         /// Newest schema version known to this program.
@@ -57,6 +61,60 @@ pub enum Error {
     /// The linked SQLite library has a defect that can corrupt a database.
     #[error("SQLite {0} can corrupt a database (WAL reset): version 3.51.3 or later is needed")]
     LibraryTooOld(String),
+    /// The PostgreSQL server is older than version 15.
+    #[error("the PostgreSQL server has version {0}: version 15 or later is needed")]
+    ServerTooOld(String),
+    /// The setting `store.url` cannot be used.
+    #[error("store.url: {0}")]
+    Url(#[from] UrlError),
+    /// The server refuses the user, the password or the database.
+    #[error("{place} refuses the connection: {detail}; check user, password and database of store.url")]
+    Refused {
+        /// The database, without the password.
+        place: String,
+        /// What the server says.
+        detail: String,
+    },
+    /// The server does not answer, or the connection to it broke.
+    #[error("the database cannot be reached: {0}")]
+    Unreachable(String),
+    /// The database has no tables of this program yet.
+    #[error("{0} has no tables of modalwatch yet: make them by `modalwatch migrate schema`")]
+    NoSchema(String),
+    /// The database was last used by an earlier program.
+    #[error("{place} has schema version {found}, this program needs {known}: stop all services and run `modalwatch migrate schema`")]
+    SchemaTooOld {
+        /// The database, without the password.
+        place: String,
+        /// Schema version of the database.
+        found: i64,
+        /// Schema version that this program needs.
+        known: i64,
+    },
+    /// The file was last used by an earlier program.
+    #[error("{place} has schema version {found}, this program needs {known}: start `modalwatch serve` on it once, which brings it to that version")]
+    FileTooOld {
+        /// The file.
+        place: String,
+        /// Schema version of the file.
+        found: i64,
+        /// Schema version that this program needs.
+        known: i64,
+    },
+    /// The schema of the database has tables of another application.
+    #[error("the schema {schema} of {place} belongs to another application: give another database")]
+    ForeignSchema {
+        /// The database, without the password.
+        place: String,
+        /// The schema.
+        schema: &'static str,
+    },
+    /// Data were being moved into the database, and the move is not complete.
+    #[error("data are being moved into {0}, or a move was broken off: run the same `modalwatch migrate --from … --to …` again")]
+    MoveIncomplete(String),
+    /// Another service serves the database, or has taken it over.
+    #[error("{0}")]
+    ServedElsewhere(String),
     /// The structure is not stored.
     #[error("there is no structure {0}")]
     UnknownStructure(String),
@@ -114,6 +172,16 @@ pub enum Error {
 impl From<sqlx::Error> for Error {
     /// Maps failures of the disk to variants of their own, because they are temporary and not programming errors.
     fn from(error: sqlx::Error) -> Self {
+        let error = match error {
+            sqlx::Error::Configuration(cause) => match cause.downcast::<BrokenConnection>() {
+                Ok(broken) => return Self::Unreachable(broken.0),
+                Err(cause) => sqlx::Error::Configuration(cause),
+            },
+            other => other,
+        };
+        if let Some(state) = sql_state(&error) {
+            return Self::of_server(&state, error);
+        }
         match primary_code(&error) {
             Some(13) => Self::DiskFull(error.to_string()),
             // SQLITE_IOERR, and SQLITE_CANTOPEN, which opening the write-ahead log can return at any time.
@@ -132,13 +200,62 @@ impl From<sqlx::Error> for Error {
     }
 }
 
+/// A server that does not answer, or to which the connection broke. It travels inside [`sqlx::Error::Configuration`], because the errors of
+/// both databases have one type there.
+#[derive(Debug, Clone, thiserror::Error)]
+#[error("{0}")]
+struct BrokenConnection(String);
+
+impl From<BrokenConnection> for sqlx::Error {
+    fn from(broken: BrokenConnection) -> Self {
+        Self::Configuration(Box::new(broken))
+    }
+}
+
+/// Names a broken connection to a server as such. For SQLite, the same errors are faults of the disk or of the program.
+pub(super) fn over_network(error: sqlx::Error) -> sqlx::Error {
+    match error {
+        sqlx::Error::Io(_) | sqlx::Error::Tls(_) | sqlx::Error::Protocol(_) | sqlx::Error::WorkerCrashed => {
+            BrokenConnection(error.to_string()).into()
+        }
+        sqlx::Error::PoolTimedOut => {
+            BrokenConnection("no connection to the server could be made, or all are in use".to_owned()).into()
+        }
+        // Ended by an administrator or by a service that took over, crashed, stopping, starting; connection exceptions.
+        error if sql_state(&error).is_some_and(|state| state.starts_with("57P") || state.starts_with("08")) => {
+            BrokenConnection(error.to_string()).into()
+        }
+        error => error,
+    }
+}
+
+/// The state that a PostgreSQL server gives with an error, five characters.
+pub(super) fn sql_state(error: &sqlx::Error) -> Option<String> {
+    let error = error.as_database_error()?.try_downcast_ref::<PgDatabaseError>()?;
+    Some(error.code().to_owned())
+}
+
 /// The primary result code of SQLite, without its extension.
 fn primary_code(error: &sqlx::Error) -> Option<i32> {
-    let code = error.as_database_error()?.code()?;
+    let error = error.as_database_error()?;
+    error.try_downcast_ref::<SqliteError>()?;
+    let code = error.code()?;
     code.parse::<i32>().ok().map(|code| code & 0xff)
 }
 
 impl Error {
+    /// The error of a PostgreSQL server. Source: PostgreSQL 15, appendix A.
+    fn of_server(state: &str, error: sqlx::Error) -> Self {
+        match state {
+            "53100" => Self::DiskFull(error.to_string()),
+            "58030" => Self::Disk(error.to_string()),
+            "25006" => Self::BecameReadOnly(error.to_string()),
+            // Serialization failure, deadlock, lock not available, too many connections.
+            "40001" | "40P01" | "55P03" | "53300" => Self::Busy(error.to_string()),
+            _ => Self::Sqlite(Arc::new(error)),
+        }
+    }
+
     /// Short name of the cause if it is the disk and not the request, for metrics and for `/readyz`.
     pub fn disk_cause(&self) -> Option<&'static str> {
         match self {
@@ -147,6 +264,7 @@ impl Error {
             Self::BecameReadOnly(_) | Self::ReadOnly(_) => Some("read_only"),
             Self::Busy(_) => Some("database_busy"),
             Self::Gone(_) => Some("database_gone"),
+            Self::Unreachable(_) | Self::ServedElsewhere(_) => Some("database_unreachable"),
             _ => None,
         }
     }
@@ -157,7 +275,7 @@ impl Error {
         // SQLITE_ABORT, SQLITE_NOMEM, SQLITE_INTERRUPT.
         const ENDED_EARLY: [i32; 3] = [4, 7, 9];
         match self {
-            Self::DiskFull(_) | Self::Disk(_) | Self::BecameReadOnly(_) | Self::Busy(_) => true,
+            Self::DiskFull(_) | Self::Disk(_) | Self::BecameReadOnly(_) | Self::Busy(_) | Self::Unreachable(_) => true,
             Self::Sqlite(error) => {
                 matches!(**error, sqlx::Error::Io(_) | sqlx::Error::WorkerCrashed)
                     || primary_code(error).is_some_and(|code| ENDED_EARLY.contains(&code))
@@ -174,6 +292,8 @@ impl Error {
             Self::BecameReadOnly(reason) => Self::BecameReadOnly(reason.clone()),
             Self::Busy(reason) => Self::Busy(reason.clone()),
             Self::Gone(path) => Self::Gone(path.clone()),
+            Self::Unreachable(reason) => Self::Unreachable(reason.clone()),
+            Self::ServedElsewhere(reason) => Self::ServedElsewhere(reason.clone()),
             Self::Sqlite(error) => Self::Sqlite(Arc::clone(error)),
             other => Self::Sqlite(Arc::new(sqlx::Error::Protocol(other.to_string()))),
         }
@@ -181,7 +301,15 @@ impl Error {
 
     /// True when the connection that returned this error must not be used again.
     pub(super) fn spoils_the_connection(&self) -> bool {
-        matches!(self, Self::DiskFull(_) | Self::Disk(_) | Self::BecameReadOnly(_) | Self::Busy(_) | Self::Sqlite(_))
+        matches!(
+            self,
+            Self::DiskFull(_)
+                | Self::Disk(_)
+                | Self::BecameReadOnly(_)
+                | Self::Busy(_)
+                | Self::Unreachable(_)
+                | Self::Sqlite(_)
+        )
     }
 }
 
@@ -208,7 +336,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let settings = StoreSettings { min_free_bytes: 0, ..StoreSettings::default() };
         let store = Store::open_with(folder.path(), &settings).await.unwrap();
-        let pool = &store.database.writer.pool;
+        let super::super::WriterPool::Sqlite(pool, _) = &store.database.writer.pool else { unreachable!() };
         let pages: (i64,) = sqlx::query_as("pragma page_count").fetch_one(pool).await.unwrap();
         let limit = format!("pragma max_page_count = {}", pages.0 + 2);
         sqlx::query(sqlx::AssertSqlSafe(limit)).execute(pool).await.unwrap();
@@ -255,8 +383,8 @@ mod tests {
         let store = Store::open(folder.path()).await.unwrap();
         let broken = store.database.write(|transaction| {
             Box::pin(async move {
-                let insert = sqlx::query("insert into structure values (null, null, null, null, null)");
-                insert.execute(transaction.connection()).await?;
+                let insert = crate::store::sql::query("insert into structure values (null, null, null, null, null)");
+                insert.execute(&mut *transaction).await?;
                 Ok(())
             })
         });

@@ -5,6 +5,7 @@ use std::future::Future;
 use super::alarm::{insert_episode, NOT_ASSESSED_SERIES};
 use super::batch::Batches;
 use super::error::Error;
+use super::sql;
 use super::structure::is_present;
 use super::transaction::Transaction;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -40,13 +41,13 @@ impl Batches<'_> {
                 if !is_present(transaction, &structure, &version).await? {
                     return Ok(None);
                 }
-                sqlx::query(
+                sql::query(
                     "update measurement_batch set state = 'failed', failure = $1 where structure_id = $2 and batch_id = $3",
                 )
                 .bind(reason)
                 .bind(&structure)
                 .bind(&id)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                 let alarm_opened = open_alarm(transaction, &structure, &id).await?;
                 Ok(Some(MarkedFailed { alarm_opened }))
@@ -57,11 +58,11 @@ impl Batches<'_> {
 
 /// Opens the alarm if it is due. Returns whether it was.
 async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str, batch_id: &str) -> Result<bool, Error> {
-    let due: Option<(i64,)> = sqlx::query_as(
+    let due: Option<(i64,)> = sql::query_as(
         "select measured_to_us from measurement_batch b
          where structure_id = $1 and batch_id = $2
            and $3 = (select count(*) filter (where state = 'failed') from
-               (select state from measurement_batch where structure_id = $1 order by batch_id desc limit $3))
+               (select state from measurement_batch where structure_id = $1 order by batch_id desc limit $3) newest)
            and not exists (select 1 from alarm_episode
                where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null and withdrawn = 0)
            and not exists (select 1 from maintenance_window m
@@ -70,7 +71,7 @@ async fn open_alarm(transaction: &mut Transaction<'_>, structure: &str, batch_id
     .bind(structure)
     .bind(batch_id)
     .bind(IN_A_ROW)
-    .fetch_optional(transaction.connection())
+    .fetch_optional(&mut *transaction)
     .await?;
     let Some((measured_to_us,)) = due else { return Ok(false) };
     let row = (0, measured_to_us, Some(batch_id), None, 0.0);
@@ -84,14 +85,14 @@ pub(super) async fn end_alarm(
     structure: &str,
     now: Timestamp,
 ) -> Result<bool, Error> {
-    let ended = sqlx::query(
+    let ended = sql::query(
         "update alarm_episode set ended_at_us = $2
          where structure_id = $1 and kind = 'not_assessed' and ended_at_us is null and withdrawn = 0
            and 'failed' <> (select state from measurement_batch where structure_id = $1 order by batch_id desc limit 1)",
     )
     .bind(structure)
     .bind(now.micros())
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(ended.rows_affected() > 0)
 }

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::error::Error;
 use super::file::DATABASE_FILE;
 use super::overview::Overview;
+use super::sql;
 use crate::volume;
 
 /// Sizes of the files of a data folder, and the state of its volume.
@@ -50,12 +51,12 @@ impl Overview<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn figures(self) -> Result<Figures, Error> {
-        let (structures, pending): (i64, i64) = sqlx::query_as(
+        let (structures, pending): (i64, i64) = sql::query_as(
             "select (select count(*) from structure), (select count(*) from measurement_batch where state = 'received')",
         )
         .fetch_one(&self.database.reader)
         .await?;
-        let alarms: Vec<(String, i64, i64)> = sqlx::query_as(
+        let alarms: Vec<(String, i64, i64)> = sql::query_as(
             "select kind, count(*), count(*) filter (where acknowledged_at_us is null) from alarm_episode
              where ended_at_us is null and withdrawn = 0 group by kind order by kind",
         )

@@ -8,6 +8,7 @@ use super::column::timestamp;
 use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
+use super::sql::{self, Whole};
 use crate::assessment::{Assessment, BatchState};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -101,7 +102,7 @@ struct ExceedanceRow {
     threshold_probability: f64,
     threshold: f64,
     relative_change: f64,
-    undamaged_version: u32,
+    undamaged_version: Whole<u32>,
     model_digest: String,
 }
 
@@ -120,7 +121,7 @@ impl History<'_> {
         let (after_time, after_id) = query.after.clone().unzip();
         // SQLite uses only one lower bound to search the index. Without this one it would read all earlier pages again.
         let from = query.from.max(after_time);
-        let rows: Vec<EntryRow> = sqlx::query_as(
+        let rows: Vec<EntryRow> = sql::query_as(
             "select batch_id, source, measured_from_us, measured_to_us, received_at_us, measurement_count, state, failure
              from measurement_batch
              where structure_id = $1 and measured_from_us >= $2 and measured_from_us < $3
@@ -179,7 +180,7 @@ impl History<'_> {
                    order by {CURRENT_FIRST} limit 1)
              order by b.measured_from_us desc, b.batch_id desc, q.quantity desc limit $8"
         );
-        let rows: Vec<ExceedanceRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<ExceedanceRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(query.from.map_or(i64::MIN, Timestamp::micros))
             .bind(to)
@@ -201,7 +202,7 @@ impl History<'_> {
                 threshold_probability: row.threshold_probability,
                 threshold: row.threshold,
                 relative_change: row.relative_change,
-                undamaged_version: row.undamaged_version,
+                undamaged_version: row.undamaged_version.0,
                 model_digest: Digest::from_stored(row.model_digest),
             })
         };

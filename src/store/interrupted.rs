@@ -2,6 +2,7 @@
 
 use super::diagnosis::Diagnoses;
 use super::error::Error;
+use super::sql;
 use crate::quantity::Timestamp;
 
 /// Unexpected ends of the program after which a job is not begun again: it may be their cause.
@@ -52,22 +53,22 @@ impl Diagnoses<'_> {
                             TOO_OFTEN,
                         ),
                     ] {
-                        let query = sqlx::query(update).bind(why).bind(now);
+                        let query = sql::query(update).bind(why).bind(now);
                         let query = if update.contains("$3") { query.bind(MOST_INTERRUPTIONS) } else { query };
-                        failed += query.execute(transaction.connection()).await?.rows_affected();
+                        failed += query.execute(&mut *transaction).await?.rows_affected();
                     }
                     for update in [
                         "update diagnosis set extension_interruptions = extension_interruptions + 1
                          where extension_state = 'running'",
                         "update training set interruptions = interruptions + 1 where state = 'waiting'",
                     ] {
-                        sqlx::query(update).execute(transaction.connection()).await?;
+                        sql::query(update).execute(&mut *transaction).await?;
                     }
-                    let extensions = sqlx::query_as(
+                    let extensions = sql::query_as(
                         "select diagnosis_id, extension_request from diagnosis
                          where extension_state = 'running' order by extension_begun_at_us",
                     )
-                    .fetch_all(transaction.connection())
+                    .fetch_all(&mut *transaction)
                     .await?;
                     Ok(Interrupted { failed, extensions })
                 })
@@ -87,7 +88,7 @@ impl Diagnoses<'_> {
                         "update diagnosis set extension_interruptions = 0 where extension_state = 'running'",
                         "update training set interruptions = 0 where state = 'waiting'",
                     ] {
-                        sqlx::query(update).execute(transaction.connection()).await?;
+                        sql::query(update).execute(&mut *transaction).await?;
                     }
                     Ok(())
                 })

@@ -5,6 +5,7 @@ use sqlx::FromRow;
 use super::column::{bad_row, timestamp};
 use super::diagnosis::{job_state, Diagnoses, DiagnosisTrigger, JobState};
 use super::error::Error;
+use super::sql;
 use crate::quantity::{StructureId, Timestamp};
 
 /// Kind of a job.
@@ -67,7 +68,7 @@ impl Diagnoses<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn jobs(self, limit: usize) -> Result<Vec<JobRecord>, Error> {
         // The inner select chooses the newest jobs before their results, which can be long, are read.
-        let rows: Vec<JobRow> = sqlx::query_as(
+        let rows: Vec<JobRow> = sql::query_as(
             "with newest as (
                  select * from (
                      select diagnosis_id as job_id, 'diagnosis' as kind, created_at_us from diagnosis
@@ -75,7 +76,7 @@ impl Diagnoses<'_> {
                      select diagnosis_id, 'extension', coalesce(extension_begun_at_us, finished_at_us, created_at_us)
                      from diagnosis where extension_state is not null
                      union all
-                     select training_id, 'training', created_at_us from training)
+                     select training_id, 'training', created_at_us from training) jobs
                  order by created_at_us desc, job_id desc, kind desc limit $1)
              select n.job_id as job_id, d.structure_id, n.kind as kind, d.started_by, iif(d.cancelled_at_us is null, d.state, 'cancelled') as state,
                     d.failure, n.created_at_us as created_at_us, d.finished_at_us, d.result ->> 'verdict' as verdict,
@@ -103,7 +104,7 @@ impl Diagnoses<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn structure_of_job(self, id: &str) -> Result<Option<String>, Error> {
-        let row: Option<(String,)> = sqlx::query_as(
+        let row: Option<(String,)> = sql::query_as(
             "select structure_id from diagnosis where diagnosis_id = $1
              union all select structure_id from training where training_id = $1",
         )

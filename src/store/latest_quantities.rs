@@ -6,6 +6,7 @@ use super::chart_point::CHARTS;
 use super::current::IS_CURRENT;
 use super::error::Error;
 use super::overview::Overview;
+use super::sql;
 use crate::quantity::StructureId;
 
 /// A quantity in the current assessment of the assessed batch that was measured last.
@@ -63,12 +64,13 @@ impl Overview<'_> {
                  from structure s where $2 is null or s.structure_id = $2 order by s.structure_id limit $1)
              select q.structure_id, q.quantity, q.unit, q.mean, q.std, q.probability_of_damage, q.relative_change
              from latest l
-                  cross join assessment a on a.structure_id = l.structure_id and a.batch_id = l.batch_id
+                  cross join assessment a
                   join quantity_assessment q on q.structure_id = a.structure_id and q.batch_id = a.batch_id
                       and q.model_digest = a.model_digest and q.undamaged_version = a.undamaged_version
-             where {IS_CURRENT} order by q.structure_id, q.position"
+             where a.structure_id = l.structure_id and a.batch_id = l.batch_id and {IS_CURRENT}
+             order by q.structure_id, q.position"
         );
-        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select))
+        Ok(sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structures as i64)
             .bind(only.map(StructureId::as_str))
             .fetch_all(&self.database.reader)
@@ -96,6 +98,6 @@ impl Overview<'_> {
                      order by measured_to_us desc, batch_id desc limit 1)
              where chart.series is not null order by p.structure_id, p.series"
         );
-        Ok(sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(structures as i64).fetch_all(&self.database.reader).await?)
+        Ok(sql::query_as(sqlx::AssertSqlSafe(select)).bind(structures as i64).fetch_all(&self.database.reader).await?)
     }
 }

@@ -5,6 +5,7 @@ use super::column::{list, timestamp};
 use super::database::Database;
 use super::error::Error;
 use super::outbox::OutboxEvent;
+use super::sql::{self, Whole};
 use crate::quantity::{StructureId, Timestamp};
 
 /// State of a mail after an attempt.
@@ -61,7 +62,7 @@ pub struct MailFigures {
 }
 
 /// Columns of a due mail: number, address, attempts, start; message id, kind, structure, alarm, facts and time of its event.
-type MailRow = (i64, String, u32, i64, String, String, String, i64, String, i64);
+type MailRow = (i64, String, Whole<u32>, i64, String, String, String, i64, String, i64);
 
 /// Mails about alarms.
 #[derive(Clone, Copy)]
@@ -85,7 +86,7 @@ impl Mails<'_> {
         addresses.sort_unstable();
         addresses.dedup();
         let present: Vec<(String, String, String)> =
-            sqlx::query_as("select address, events, alarm_kinds from mail_recipient order by address")
+            sql::query_as("select address, events, alarm_kinds from mail_recipient order by address")
                 .fetch_all(&self.database.reader)
                 .await?;
         let (listed_events, listed_kinds) = (list(&events), list(&alarm_kinds));
@@ -97,20 +98,20 @@ impl Mails<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query("delete from mail_recipient").execute(transaction.connection()).await?;
+                    sql::query("delete from mail_recipient").execute(&mut *transaction).await?;
                     for address in addresses {
-                        sqlx::query("insert into mail_recipient values ($1, $2, $3) on conflict do nothing")
+                        sql::query("insert into mail_recipient values ($1, $2, $3) on conflict do nothing")
                             .bind(address)
                             .bind(&listed_events)
                             .bind(&listed_kinds)
-                            .execute(transaction.connection())
+                            .execute(&mut *transaction)
                             .await?;
                     }
-                    sqlx::query(
+                    sql::query(
                         "delete from mail_delivery where state in ('pending', 'dead')
                            and address not in (select address from mail_recipient)",
                     )
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -124,7 +125,7 @@ impl Mails<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn due(self, now: Timestamp, latest: Timestamp) -> Result<Option<DueMail>, Error> {
-        let row: Option<MailRow> = sqlx::query_as(
+        let row: Option<MailRow> = sql::query_as(
             "select d.delivery_id, d.address, d.attempts, d.started_at_us, e.message_id, e.kind, e.structure_id, e.episode, e.facts,
                     e.created_at_us
              from mail_delivery d join outbox_event e using (event_id)
@@ -139,7 +140,7 @@ impl Mails<'_> {
         .fetch_optional(&self.database.reader)
         .await?;
         let what = "mail";
-        row.map(|(id, address, attempts, started, message_id, kind, structure, alarm, facts, created)| {
+        row.map(|(id, address, Whole(attempts), started, message_id, kind, structure, alarm, facts, created)| {
             Ok(DueMail {
                 id,
                 address,
@@ -172,7 +173,7 @@ impl Mails<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "update mail_delivery set state = $1, attempts = attempts + 1, last_at_us = $2, next_at_us = $3,
                              last_error = $4 where delivery_id = $5",
                     )
@@ -181,7 +182,7 @@ impl Mails<'_> {
                     .bind(next_at.micros())
                     .bind(error)
                     .bind(id)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -194,7 +195,7 @@ impl Mails<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn figures(self) -> Result<MailFigures, Error> {
-        let (pending, failing, next, dead): (i64, i64, Option<i64>, i64) = sqlx::query_as(
+        let (pending, failing, next, dead): (i64, i64, Option<i64>, i64) = sql::query_as(
             "select count(*), count(*) filter (where attempts > 0), min(next_at_us),
                     (select count(*) from mail_delivery where state = 'dead')
              from mail_delivery where state = 'pending'",

@@ -3,6 +3,7 @@
 use super::alarm::Alarms;
 use super::column::timestamp;
 use super::error::Error;
+use super::sql;
 use crate::quantity::{StructureId, Timestamp};
 
 /// A period in which batches do not change the alarm charts.
@@ -31,7 +32,7 @@ impl Alarms<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "insert into maintenance_window values ($1, $2, $3, $4, $5)
                      on conflict (structure_id, from_us, to_us) do update
                      set reason = excluded.reason, created_at_us = excluded.created_at_us",
@@ -41,7 +42,7 @@ impl Alarms<'_> {
                     .bind(window.to.micros())
                     .bind(&window.reason)
                     .bind(now.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -54,7 +55,7 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn is_in_maintenance(self, structure: &StructureId, at: Timestamp) -> Result<bool, Error> {
-        let (found,): (bool,) = sqlx::query_as(
+        let (found,): (bool,) = sql::query_as(
             "select exists (select 1 from maintenance_window where structure_id = $1 and from_us <= $2 and to_us > $2)",
         )
         .bind(structure.as_str())
@@ -69,7 +70,7 @@ impl Alarms<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn maintenance(self, structure: &StructureId) -> Result<Vec<MaintenanceWindow>, Error> {
-        let rows: Vec<(i64, i64, String)> = sqlx::query_as(
+        let rows: Vec<(i64, i64, String)> = sql::query_as(
             "select from_us, to_us, reason from maintenance_window where structure_id = $1 order by from_us desc limit 1000",
         )
         .bind(structure.as_str())

@@ -6,6 +6,7 @@ use super::batch::Batches;
 use super::column::timestamp;
 use super::error::Error;
 use super::measurement_row::{measurement, MeasurementRow};
+use super::sql::{self, Whole};
 use crate::measurement::ModalMeasurement;
 use crate::quantity::{StructureId, Timestamp};
 
@@ -48,7 +49,7 @@ pub struct StoredMeasurement {
 struct StoredMeasurementRow {
     batch_id: String,
     measured_from_us: i64,
-    ordinal: u32,
+    ordinal: Whole<u32>,
     source: String,
     #[sqlx(flatten)]
     measurement: MeasurementRow,
@@ -66,7 +67,7 @@ impl Batches<'_> {
         query: &MeasurementQuery,
     ) -> Result<Vec<StoredMeasurement>, Error> {
         let after = query.after.as_ref();
-        let rows: Vec<StoredMeasurementRow> = sqlx::query_as(
+        let rows: Vec<StoredMeasurementRow> = sql::query_as(
             "select b.batch_id, b.measured_from_us, m.ordinal, m.source, m.measured_at_us, m.frequency_hz, m.std_hz,
                     m.mode_shapes, m.covariates, m.settings
              from measurement_batch b
@@ -87,7 +88,7 @@ impl Batches<'_> {
         .await?;
         let stored = |row: StoredMeasurementRow| {
             let batch_from = timestamp("batch", row.measured_from_us)?;
-            let place = MeasurementPlace { batch_from, batch_id: row.batch_id, ordinal: row.ordinal };
+            let place = MeasurementPlace { batch_from, batch_id: row.batch_id, ordinal: row.ordinal.0 };
             Ok(StoredMeasurement { place, source: row.source, measurement: measurement(row.measurement)? })
         };
         rows.into_iter().map(stored).collect()

@@ -1,10 +1,10 @@
 //! Everything that is stored, and the only module that contains SQL.
 //!
-//! [`Store`] opens the database of a data folder and hands out one small interface for each area: structures, batches,
-//! assessments, alarms and so on. The data are in one SQLite file with one connection that writes, a write-ahead log and
-//! `synchronous = FULL`, so that acknowledged data survive a power failure. Write tasks run in the order of the calls, in `BEGIN
-//! IMMEDIATE` transactions of a background task, so that a caller who disconnects never leaves a transaction open. Tasks that
-//! wait at the same time share one transaction and its sync to disk.
+//! [`Store`] opens the database of a data folder, or one of a PostgreSQL server, and hands out one small interface for each area:
+//! structures, batches, assessments, alarms and so on. The data of a folder are in one SQLite file with one connection that writes, a
+//! write-ahead log and `synchronous = FULL`, so that acknowledged data survive a power failure. Write tasks run in the order of the calls,
+//! in transactions of a background task, so that a caller who disconnects never leaves a transaction open. Tasks that wait at the same time
+//! share one transaction and its sync to disk. Every statement is one text for both databases ([`sql`]).
 
 mod alarm;
 mod alarm_action;
@@ -52,26 +52,31 @@ mod reference_version;
 mod retention;
 mod rows;
 mod series;
+pub mod server;
+mod sql;
 mod structure;
 #[cfg(test)]
 mod tests;
 mod token;
 mod training;
 mod transaction;
+pub mod transfer;
 mod undamaged;
 mod unreadable;
+mod url;
 mod version;
 mod webhook;
 mod writer;
 
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::volume;
-use database::Database;
+use database::{Database, Place};
 use reader::Reader;
 use undamaged::Known;
-use writer::Writer;
+use writer::{Writer, WriterPool};
 
 pub use alarm::{Acknowledgement, Alarms, Episode, EpisodeDiagnosis, EpisodeQuery, OpenAlarms};
 pub use alarm_action::{
@@ -84,7 +89,7 @@ pub use automatic::{LatestDiagnoses, RejectedEpisode};
 pub use batch::{BatchRecord, Batches, InsertBatch};
 pub use chart_point::StoredChartPoint;
 pub use chart_series::{ChartMark, ChartSeries};
-pub use database_file::DatabaseFile;
+pub use database_file::{DatabaseFile, Engine};
 pub use deletion::{Deletions, Removed};
 pub use diagnosis::{Diagnoses, DiagnosisRecord, DiagnosisTrigger, JobState, NewDiagnosis};
 pub use error::Error;
@@ -109,6 +114,7 @@ pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures}
 pub use token::Tokens;
 pub use training::{NewTraining, TrainingJobRecord, Trainings};
 pub use undamaged::{MeasuredBatch, NewReference, ReferenceRecord, References};
+pub use url::{DatabaseUrl, UrlError};
 pub use version::{NewVersion, StoredBaseline};
 pub use webhook::{EventFilter, Secret, WebhookRecord, Webhooks};
 
@@ -128,37 +134,47 @@ impl Store {
         Self::open_with(data_dir, &StoreSettings::default()).await
     }
 
-    /// As [`Self::open`], with settings.
+    /// As [`Self::open`], with settings: with a URL, the database of that server. `data_dir` is then the folder for what is not in the
+    /// database, which is not created.
     ///
     /// # Errors
     /// [`Error`], with one variant for each cause, whose message says what to do.
     pub async fn open_with(data_dir: &Path, settings: &StoreSettings) -> Result<Self, Error> {
-        let path = data_dir.join(DATABASE_FILE);
-        let lock = file::prepare_folder(data_dir, &path)?;
-        let volume = volume::of(data_dir).map_err(|source| Error::Folder { path: data_dir.to_owned(), source })?;
-        if volume.network && !settings.allow_network_filesystem {
-            let file_system = volume.file_system;
-            return Err(Error::NetworkFileSystem { path: data_dir.to_owned(), file_system });
-        }
-        file::refuse_foreign(&path).await?;
-        let file::Opened { writer, reader, sqlite_version } = file::open(&path).await?;
-        let opened = file::OpenedFile::of(path.clone())?;
-        let database = Database {
-            writer: Arc::new(Writer::new(writer, opened)),
-            reader: Reader::new(reader),
-            path,
-            sqlite_version,
-            limits: file::Limits::of(settings),
-            _lock: lock,
+        let limits = file::Limits::of(settings);
+        let database = if let Some(url) = &settings.url {
+            let takeover = settings.standby.then(|| Duration::from_secs(settings.takeover_s));
+            let server::Opened { writer, reader, version } = server::open(url, takeover).await?;
+            Database {
+                writer: Arc::new(Writer::new(WriterPool::Postgres(writer))),
+                reader: Reader::Postgres(reader),
+                place: Place::Server { folder: data_dir.to_owned(), version },
+                limits,
+            }
+        } else {
+            let path = data_dir.join(DATABASE_FILE);
+            let lock = file::prepare_folder(data_dir, &path)?;
+            let volume = volume::of(data_dir).map_err(|source| Error::Folder { path: data_dir.to_owned(), source })?;
+            if volume.network && !settings.allow_network_filesystem {
+                let file_system = volume.file_system;
+                return Err(Error::NetworkFileSystem { path: data_dir.to_owned(), file_system });
+            }
+            file::refuse_foreign(&path).await?;
+            let file::Opened { writer, reader, sqlite_version } = file::open(&path).await?;
+            let opened = file::OpenedFile::of(path.clone())?;
+            Database {
+                writer: Arc::new(Writer::new(WriterPool::Sqlite(writer, opened))),
+                reader: Reader::Sqlite(reader),
+                place: Place::File { path, version: sqlite_version, _lock: lock },
+                limits,
+            }
         };
         Ok(Self { database: Arc::new(database), known_undamaged: Arc::default() })
     }
 
-    /// Writes the log back into the database and closes it.
+    /// Closes the database, for SQLite after its log was written back.
     pub async fn close(&self) {
         let Database { reader, writer, .. } = &*self.database;
         reader.close().await;
-        let _ = sqlx::query("pragma wal_checkpoint(truncate)").execute(&writer.pool).await;
         writer.pool.close().await;
     }
 

@@ -3,6 +3,7 @@
 use super::column::timestamp;
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use super::transaction::Transaction;
 use crate::quantity::{StructureId, Timestamp};
 
@@ -52,7 +53,7 @@ impl Notes<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self, structure: &StructureId) -> Result<Vec<Note>, Error> {
-        let rows: Vec<NoteRow> = sqlx::query_as(
+        let rows: Vec<NoteRow> = sql::query_as(
             "select note_id, from_us, to_us, text, author, created_at_us from note where structure_id = $1
              order by from_us desc, note_id desc",
         )
@@ -76,8 +77,8 @@ impl Notes<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let deleted = sqlx::query("delete from note where structure_id = $1 and note_id = $2");
-                    let deleted = deleted.bind(structure).bind(id).execute(transaction.connection()).await?;
+                    let deleted = sql::query("delete from note where structure_id = $1 and note_id = $2");
+                    let deleted = deleted.bind(structure).bind(id).execute(&mut *transaction).await?;
                     Ok(deleted.rows_affected() > 0)
                 })
             })
@@ -87,7 +88,7 @@ impl Notes<'_> {
 
 /// Stores a note unless its id is stored already or the structure has [`MOST_NOTES`] notes. Returns whether it was stored.
 pub(super) async fn insert_note(transaction: &mut Transaction<'_>, structure: &str, note: Note) -> Result<bool, Error> {
-    let inserted = sqlx::query(
+    let inserted = sql::query(
         "insert into note select $1, $2, $3, $4, $5, $6, $7
          where (select count(*) from note where structure_id = $2) < $8 on conflict do nothing",
     )
@@ -99,7 +100,7 @@ pub(super) async fn insert_note(transaction: &mut Transaction<'_>, structure: &s
     .bind(note.author)
     .bind(note.created_at.micros())
     .bind(MOST_NOTES as i64)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(inserted.rows_affected() > 0)
 }

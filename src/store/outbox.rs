@@ -9,6 +9,7 @@ use sqlx::FromRow;
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::sql::{self, Whole};
 use super::webhook::{WebhookRecord, WebhookRow};
 use crate::quantity::{StructureId, Timestamp};
 
@@ -111,11 +112,11 @@ pub struct Turns {
 struct DeliveryRow {
     delivery_id: i64,
     state: String,
-    attempts: u32,
+    attempts: Whole<u32>,
     started_at_us: i64,
     next_at_us: i64,
     last_at_us: Option<i64>,
-    last_status: Option<u16>,
+    last_status: Option<Whole<u16>>,
     last_error: Option<String>,
     message_id: String,
     kind: String,
@@ -152,11 +153,11 @@ fn delivery(row: DeliveryRow) -> Result<Delivery, Error> {
             created_at: timestamp(what, row.created_at_us)?,
         },
         state: state.ok_or_else(|| bad_row(what)(&row.state))?,
-        attempts: row.attempts,
+        attempts: row.attempts.0,
         started_at: timestamp(what, row.started_at_us)?,
         next_at: timestamp(what, row.next_at_us)?,
         last_at: row.last_at_us.map(|at| timestamp(what, at)).transpose()?,
-        last_status: row.last_status,
+        last_status: row.last_status.map(|status| status.0),
         last_error: row.last_error,
     })
 }
@@ -189,12 +190,12 @@ impl Outbox<'_> {
                         where d.webhook_id = w.webhook_id and d.state = 'pending' and d.next_at_us > $1)
              from webhook w where w.enabled = 1"
         );
-        let webhooks: Vec<(String, bool, bool, Option<i64>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let webhooks: Vec<(String, bool, bool, Option<i64>)> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(now.micros())
             .bind(latest.micros())
             .fetch_all(&self.database.reader)
             .await?;
-        let (pending, dead): (i64, i64) = sqlx::query_as(
+        let (pending, dead): (i64, i64) = sql::query_as(
             "select (select count(*) from webhook_delivery where state = 'pending'),
                     (select count(*) from webhook_delivery where state = 'dead')",
         )
@@ -224,9 +225,9 @@ impl Outbox<'_> {
         latest: Timestamp,
     ) -> Result<Option<(WebhookRecord, Delivery)>, Error> {
         let mut reader = self.database.reader.acquire().await?;
-        let hook: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = $1 and enabled = 1")
+        let hook: Option<WebhookRow> = sql::query_as("select * from webhook where webhook_id = $1 and enabled = 1")
             .bind(webhook)
-            .fetch_optional(&mut *reader)
+            .fetch_optional(&mut reader)
             .await?;
         let Some(hook) = hook else { return Ok(None) };
         // Two queries that each follow the order of an index, so that SQLite does not sort thousands of waiting messages.
@@ -235,11 +236,11 @@ impl Outbox<'_> {
                 "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
                  where {DUE} and {FIRST_OF_ITS_ALARM} and d.webhook_id = $3 {rest} limit 1"
             );
-            let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+            let row: Option<DeliveryRow> = sql::query_as(sqlx::AssertSqlSafe(select))
                 .bind(now.micros())
                 .bind(latest.micros())
                 .bind(webhook)
-                .fetch_optional(&mut *reader)
+                .fetch_optional(&mut reader)
                 .await?;
             if let Some(row) = row {
                 return Ok(Some((hook.into_record()?, delivery(row)?)));
@@ -256,7 +257,7 @@ impl Outbox<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                     "update webhook_delivery set state = $1, attempts = attempts + 1, next_at_us = $2, last_at_us = $3,
                          last_status = $4, last_error = $5 where delivery_id = $6",
                 )
@@ -266,7 +267,7 @@ impl Outbox<'_> {
                 .bind(settlement.status)
                 .bind(settlement.error)
                 .bind(id)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                     Ok(())
                 })
@@ -290,7 +291,7 @@ impl Outbox<'_> {
              where d.webhook_id = $1 and d.delivery_id < $2 and ($3 is null or d.state = $3)
              order by d.delivery_id desc limit $4"
         );
-        let rows: Vec<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<DeliveryRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(webhook)
             .bind(before.unwrap_or(i64::MAX))
             .bind(state.map(DeliveryState::as_str))
@@ -309,23 +310,23 @@ impl Outbox<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "update webhook_delivery set state = 'pending', started_at_us = $1, next_at_us = $1
                      where webhook_id = $2 and delivery_id = $3 and state <> 'delivered'",
                     )
                     .bind(now.micros())
                     .bind(&webhook)
                     .bind(id)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     let select = format!(
                         "select {DELIVERY_COLUMNS} from webhook_delivery d join outbox_event e using (event_id)
                      where d.webhook_id = $1 and d.delivery_id = $2"
                     );
-                    let row: Option<DeliveryRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+                    let row: Option<DeliveryRow> = sql::query_as(sqlx::AssertSqlSafe(select))
                         .bind(&webhook)
                         .bind(id)
-                        .fetch_optional(transaction.connection())
+                        .fetch_optional(&mut *transaction)
                         .await?;
                     row.map(delivery).transpose()
                 })
@@ -342,27 +343,27 @@ impl Outbox<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "delete from webhook_delivery where state = 'delivered'
                        and event_id in (select event_id from outbox_event where created_at_us < $1)",
                     )
                     .bind(before.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
-                    sqlx::query(
+                    sql::query(
                         "delete from mail_delivery where state in ('delivered', 'skipped')
                        and event_id in (select event_id from outbox_event where created_at_us < $1)",
                     )
                     .bind(before.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
-                    let deleted = sqlx::query(
+                    let deleted = sql::query(
                         "delete from outbox_event where created_at_us < $1
                        and not exists (select 1 from webhook_delivery d where d.event_id = outbox_event.event_id)
                        and not exists (select 1 from mail_delivery d where d.event_id = outbox_event.event_id)",
                     )
                     .bind(before.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(deleted.rows_affected())
                 })

@@ -11,6 +11,7 @@ use super::column::{bad_row, timestamp};
 use super::current::IS_CURRENT;
 use super::database::Database;
 use super::error::Error;
+use super::sql::{self, Whole};
 use crate::alarm::machine::State;
 use crate::quantity::{Digest, StructureId, Timestamp};
 use crate::trust::TrustVerdict;
@@ -86,7 +87,7 @@ struct OverviewRow {
     unacknowledged: i64,
     silent: bool,
     failing: bool,
-    undamaged_version: Option<u32>,
+    undamaged_version: Option<Whole<u32>>,
     undamaged_model: Option<String>,
     waiting: i64,
     waiting_since_us: Option<i64>,
@@ -162,7 +163,7 @@ impl Overview<'_> {
              where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id"
         );
         let rows: Vec<OverviewRow> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut latest = self.latest_assessments().await?;
         let mut charts = self.chart_states().await?;
         let what = "structure";
@@ -177,7 +178,7 @@ impl Overview<'_> {
                 unacknowledged_alarms: row.unacknowledged.unsigned_abs(),
                 silent: row.silent,
                 failing: row.failing,
-                undamaged_version: row.undamaged_version,
+                undamaged_version: row.undamaged_version.map(|version| version.0),
                 undamaged_model: row.undamaged_model.map(Digest::from_stored),
                 charts: charts.remove(&row.structure_id).unwrap_or_default(),
                 waiting: row.waiting.unsigned_abs(),
@@ -206,7 +207,7 @@ impl Overview<'_> {
              from latest l cross join assessment a
              where a.structure_id = l.structure_id and a.batch_id = l.batch_id and {IS_CURRENT}"
         );
-        let rows: Vec<LatestRow> = sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+        let rows: Vec<LatestRow> = sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut all = BTreeMap::new();
         for row in rows {
             let trust = match &row.trust {
@@ -237,7 +238,7 @@ impl Overview<'_> {
                    and e.series = q.quantity and e.ended_at_us is null and e.withdrawn = 0)
              order by q.position"
         );
-        let rows: Vec<ChangeRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<ChangeRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(&latest.structure_id)
             .bind(&latest.batch_id)
             .fetch_all(&self.database.reader)
@@ -264,7 +265,7 @@ impl Overview<'_> {
              from chart where series is not null"
         );
         let rows: Vec<(String, String, String)> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         let mut states: BTreeMap<String, BTreeMap<String, State>> = BTreeMap::new();
         for (structure, series, state) in rows {
             states.entry(structure).or_default().insert(series, state_of(&state)?);
@@ -286,7 +287,9 @@ mod tests {
         let kept = "select structure_id, batches, last_measured_us from structure_summary
                     where batches > 0 or last_measured_us is not null";
         let counted = "select structure_id, count(*), max(measured_to_us) from measurement_batch group by structure_id";
-        let ask = async |select: &'static str| sqlx::query_as(select).fetch_all(&store.database.reader).await.unwrap();
+        let ask = async |select: &'static str| {
+            crate::store::sql::query_as(select).fetch_all(&store.database.reader).await.unwrap()
+        };
         [ask(kept).await, ask(counted).await]
     }
 

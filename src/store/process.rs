@@ -9,6 +9,7 @@ use super::chart_episode::Charted;
 use super::chart_point::ChartPosition;
 use super::column::{bad_row, from_blob, to_blob};
 use super::error::Error;
+use super::sql;
 use super::transaction::Transaction;
 use crate::alarm::chart::ChartPoint;
 use crate::assessment::{NewChartPoint, NewProcessPoint};
@@ -141,7 +142,7 @@ async fn before(
     batch: &Charted<'_>,
     version: u32,
 ) -> Result<Vec<ProcessRow>, Error> {
-    let mut rows: Vec<ProcessRow> = sqlx::query_as(
+    let mut rows: Vec<ProcessRow> = sql::query_as(
         "select measured_to_us, batch_id, estimate, held, known, memory from process_point
          where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) < ($3, $4) and held = 0
          order by measured_to_us desc, batch_id desc limit $5",
@@ -151,14 +152,14 @@ async fn before(
     .bind(batch.position.0)
     .bind(&batch.position.1)
     .bind(WINDOW as i64)
-    .fetch_all(transaction.connection())
+    .fetch_all(&mut *transaction)
     .await?;
     rows.reverse();
     Ok(rows)
 }
 
 async fn after(transaction: &mut Transaction<'_>, batch: &Charted<'_>, version: u32) -> Result<Vec<ProcessRow>, Error> {
-    Ok(sqlx::query_as(
+    Ok(sql::query_as(
         "select measured_to_us, batch_id, estimate, held, known, memory from process_point
          where structure_id = $1 and undamaged_version = $2 and (measured_to_us, batch_id) > ($3, $4)
          order by measured_to_us, batch_id limit $5",
@@ -168,7 +169,7 @@ async fn after(transaction: &mut Transaction<'_>, batch: &Charted<'_>, version: 
     .bind(batch.position.0)
     .bind(&batch.position.1)
     .bind(MOST_LATER as i64)
-    .fetch_all(transaction.connection())
+    .fetch_all(&mut *transaction)
     .await?)
 }
 
@@ -191,7 +192,7 @@ async fn write(
     (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
 ) -> Result<(), Error> {
     let estimate = serde_json::to_string(&new.estimate).map_err(|e| bad_row("process point")(&e))?;
-    sqlx::query(
+    sql::query(
         "insert into process_point
              (structure_id, undamaged_version, measured_to_us, batch_id, estimate, held, known, changes, memory)
          values ($1, $2, $3, $4, $5, $6, $7, $8, $9)
@@ -208,7 +209,7 @@ async fn write(
     .bind(to_blob(chain.known().to_numbers().into_iter()))
     .bind(changes(point)?)
     .bind(memory(chain)?)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }
@@ -221,7 +222,7 @@ async fn write_again(
     row: &ProcessRow,
     (chain, point): (&Chain<'_>, Option<&ProcessPoint>),
 ) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "update process_point set known = $1, changes = $2, memory = $7
          where structure_id = $3 and undamaged_version = $4 and measured_to_us = $5 and batch_id = $6",
     )
@@ -232,11 +233,11 @@ async fn write_again(
     .bind(row.measured_to_us)
     .bind(&row.batch_id)
     .bind(memory(chain)?)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     for series in new.reference.series() {
         let Some(evidence) = point.and_then(|point| point.of_series(&new.reference, &series)) else { continue };
-        sqlx::query(
+        sql::query(
             "update chart_point set shift = $1, slow = $2
              where structure_id = $3 and undamaged_version = $4 and series = $5 and measured_to_us = $6 and batch_id = $7",
         )
@@ -247,7 +248,7 @@ async fn write_again(
         .bind(&series)
         .bind(row.measured_to_us)
         .bind(&row.batch_id)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     }
     Ok(())

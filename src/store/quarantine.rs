@@ -5,6 +5,7 @@ use sqlx::FromRow;
 use super::column::timestamp;
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::quantity::{Digest, Timestamp};
 
 /// Largest number of bytes of a payload that is kept.
@@ -87,7 +88,7 @@ impl Quarantine<'_> {
         let (kept, bytes) = (payload[..payload.len().min(KEPT_BYTES)].to_vec(), payload.len() as i64);
         self.database.write(move |transaction| {
             Box::pin(async move {
-                sqlx::query(
+                sql::query(
                     "insert into quarantine (topic, digest, payload, payload_bytes, reason, tries, first_at_us, last_at_us)
                      values ($1, $2, $3, $4, $5, $6, $7, $7)
                      on conflict (topic, digest) do update set
@@ -100,14 +101,14 @@ impl Quarantine<'_> {
                 .bind(reason)
                 .bind(tries)
                 .bind(now.micros())
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
-                sqlx::query(
+                sql::query(
                     "delete from quarantine where message <=
                          (select message from quarantine order by message desc limit 1 offset $1)",
                 )
                 .bind(KEPT_MESSAGES)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                 Ok(())
             })
@@ -121,7 +122,7 @@ impl Quarantine<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn quarantined(self, before: Option<i64>, limit: usize) -> Result<Vec<QuarantinedMessage>, Error> {
         let rows: Vec<QuarantineRow> =
-            sqlx::query_as("select * from quarantine where message < $1 order by message desc limit $2")
+            sql::query_as("select * from quarantine where message < $1 order by message desc limit $2")
                 .bind(before.unwrap_or(i64::MAX))
                 .bind(limit as i64)
                 .fetch_all(&self.database.reader)
@@ -137,8 +138,8 @@ impl Quarantine<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let deleted = sqlx::query("delete from quarantine where message = $1");
-                    Ok(deleted.bind(number).execute(transaction.connection()).await?.rows_affected() > 0)
+                    let deleted = sql::query("delete from quarantine where message = $1");
+                    Ok(deleted.bind(number).execute(&mut *transaction).await?.rows_affected() > 0)
                 })
             })
             .await

@@ -1,70 +1,59 @@
 //! The connections that read, with a point before each statement at which unit tests can make it fail.
 
-use std::ops::Deref;
+use sqlx::pool::PoolConnection;
+use sqlx::postgres::PgPool;
+use sqlx::sqlite::SqlitePool;
+use sqlx::{Postgres, Sqlite};
 
-use futures_util::future::BoxFuture;
-use futures_util::stream::BoxStream;
-use sqlx::sqlite::{SqlitePool, SqliteQueryResult, SqliteRow, SqliteStatement, SqliteTypeInfo};
-use sqlx::{Describe, Either, Execute, Executor, SqlStr, Sqlite};
+use super::error::over_network;
+use super::sql::On;
 
 /// Connections that only read.
 #[derive(Debug)]
-pub(super) struct Reader(SqlitePool);
+pub(super) enum Reader {
+    Sqlite(SqlitePool),
+    Postgres(PgPool),
+}
+
+/// One of the connections.
+pub(super) enum ReaderConnection {
+    Sqlite(PoolConnection<Sqlite>),
+    Postgres(PoolConnection<Postgres>),
+}
 
 impl Reader {
-    pub(super) fn new(pool: SqlitePool) -> Self {
-        Self(pool)
+    /// Where a statement runs that reads.
+    pub(super) fn on(&self) -> On<'_> {
+        fault_point!("store::query", |kind| On::Failing(faults::of(kind.as_deref())));
+        match self {
+            Self::Sqlite(pool) => On::SqlitePool(pool),
+            Self::Postgres(pool) => On::PostgresPool(pool),
+        }
+    }
+
+    /// One of the connections, for several statements.
+    pub(super) async fn acquire(&self) -> Result<ReaderConnection, sqlx::Error> {
+        Ok(match self {
+            Self::Sqlite(pool) => ReaderConnection::Sqlite(pool.acquire().await?),
+            Self::Postgres(pool) => ReaderConnection::Postgres(pool.acquire().await.map_err(over_network)?),
+        })
+    }
+
+    /// Waits until all connections are closed.
+    pub(super) async fn close(&self) {
+        match self {
+            Self::Sqlite(pool) => pool.close().await,
+            Self::Postgres(pool) => pool.close().await,
+        }
     }
 }
 
-impl Deref for Reader {
-    type Target = SqlitePool;
-
-    fn deref(&self) -> &SqlitePool {
-        &self.0
-    }
-}
-
-impl<'p> Executor<'p> for &'p Reader {
-    type Database = Sqlite;
-
-    fn fetch_many<'e, 'q: 'e, E>(
-        self,
-        query: E,
-    ) -> BoxStream<'e, Result<Either<SqliteQueryResult, SqliteRow>, sqlx::Error>>
-    where
-        'p: 'e,
-        E: 'q + Execute<'q, Sqlite>,
-    {
-        fault_point!("store::query", |kind| Box::pin(futures_util::stream::iter([Err(faults::of(kind.as_deref()))])));
-        self.0.fetch_many(query)
-    }
-
-    fn fetch_optional<'e, 'q: 'e, E>(self, query: E) -> BoxFuture<'e, Result<Option<SqliteRow>, sqlx::Error>>
-    where
-        'p: 'e,
-        E: 'q + Execute<'q, Sqlite>,
-    {
-        fault_point!("store::query", |kind| Box::pin(futures_util::future::ready(Err(faults::of(kind.as_deref())))));
-        self.0.fetch_optional(query)
-    }
-
-    fn prepare_with<'e>(
-        self,
-        sql: SqlStr,
-        parameters: &'e [SqliteTypeInfo],
-    ) -> BoxFuture<'e, Result<SqliteStatement, sqlx::Error>>
-    where
-        'p: 'e,
-    {
-        self.0.prepare_with(sql, parameters)
-    }
-
-    fn describe<'e>(self, sql: SqlStr) -> BoxFuture<'e, Result<Describe<Sqlite>, sqlx::Error>>
-    where
-        'p: 'e,
-    {
-        self.0.describe(sql)
+impl<'c> From<&'c mut ReaderConnection> for On<'c> {
+    fn from(connection: &'c mut ReaderConnection) -> Self {
+        match connection {
+            ReaderConnection::Sqlite(connection) => Self::Sqlite(connection),
+            ReaderConnection::Postgres(connection) => Self::Postgres(connection),
+        }
     }
 }
 

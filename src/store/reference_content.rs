@@ -3,6 +3,7 @@
 use super::column::bad_row;
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::damage::ReferenceOrigin;
 use crate::quantity::StructureId;
 
@@ -12,7 +13,7 @@ pub(super) async fn batches_of(
     structure: &StructureId,
     version: u32,
 ) -> Result<Vec<String>, Error> {
-    let batches: Vec<(String,)> = sqlx::query_as(
+    let batches: Vec<(String,)> = sql::query_as(
         "select batch_id from undamaged_batch where structure_id = $1 and version = $2 order by batch_id",
     )
     .bind(structure.as_str())

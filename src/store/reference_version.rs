@@ -7,6 +7,7 @@ use sqlx::FromRow;
 use super::column::{bad_row, timestamp};
 use super::error::Error;
 use super::reference_content::{batches_of, stored_origin};
+use super::sql::{self, Whole};
 use super::undamaged::{ReferenceRecord, References};
 use crate::damage::ReferenceOrigin;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -35,7 +36,7 @@ pub struct ReferenceVersion {
 
 #[derive(FromRow)]
 struct VersionRow {
-    version: u32,
+    version: Whole<u32>,
     created_at_us: i64,
     measurement_count: i64,
     origin: Option<String>,
@@ -58,12 +59,12 @@ impl References<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn versions(self, structure: &StructureId) -> Result<Vec<ReferenceVersion>, Error> {
-        let rows: Vec<VersionRow> = sqlx::query_as(
+        let rows: Vec<VersionRow> = sql::query_as(
             "select version, s.created_at_us, s.measurement_count, origin, count(*) as batches,
                     min(measured_from_us) as measured_from_us, max(measured_to_us) as measured_to_us
              from undamaged_state s join undamaged_batch u using (structure_id, version)
              join measurement_batch b using (structure_id, batch_id)
-             where structure_id = $1 group by version order by version desc",
+             where structure_id = $1 group by structure_id, version, s.created_at_us, s.measurement_count, origin order by version desc",
         )
         .bind(structure.as_str())
         .fetch_all(&self.database.reader)
@@ -71,7 +72,7 @@ impl References<'_> {
         let what = "undamaged reference";
         let version = |row: VersionRow| {
             Ok(ReferenceVersion {
-                version: row.version,
+                version: row.version.0,
                 created_at: timestamp(what, row.created_at_us)?,
                 measurements: row.measurement_count as usize,
                 batches: row.batches as usize,
@@ -95,12 +96,12 @@ impl References<'_> {
         batches: &[String],
     ) -> Result<Vec<(String, i64)>, Error> {
         let ids = serde_json::to_string(batches).map_err(|e| bad_row("batch")(&e))?;
-        Ok(sqlx::query_as(
+        Ok(sql::query_as(
             "select b.batch_id, min(a.episode) from measurement_batch b join alarm_episode a using (structure_id)
              where structure_id = $1 and b.batch_id in (select value from json_each($2))
                and a.kind = 'damage' and a.withdrawn = 0 and a.undamaged_version >= $3 and a.opened_at_us <= b.measured_to_us
                and (a.ended_at_us is null or a.ended_at_us > b.measured_to_us)
-             group by b.batch_id order by b.measured_to_us",
+             group by b.batch_id, b.measured_to_us order by b.measured_to_us",
         )
         .bind(structure.as_str())
         .bind(ids)
@@ -134,7 +135,7 @@ impl References<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn kept_of_other_models(self, structure: &StructureId, model: &Digest) -> Result<Vec<u32>, Error> {
-        let versions: Vec<(u32,)> = sqlx::query_as(
+        let versions: Vec<(Whole<u32>,)> = sql::query_as(
             "select distinct undamaged_version from kept_comparison k join undamaged_state s
                  on s.structure_id = k.structure_id and s.version = k.undamaged_version
              where k.structure_id = $1 and s.model_digest <> $2 order by undamaged_version",
@@ -143,7 +144,7 @@ impl References<'_> {
         .bind(model.as_str())
         .fetch_all(&self.database.reader)
         .await?;
-        Ok(versions.into_iter().map(|(version,)| version).collect())
+        Ok(versions.into_iter().map(|(version,)| version.0).collect())
     }
 
     /// Batches that keep a reference of another trained baseline than `model` are compared with none. Returns their number.
@@ -158,8 +159,8 @@ impl References<'_> {
                     let update = "update kept_comparison set undamaged_version = 0
                          where structure_id = $1 and undamaged_version in
                              (select version from undamaged_state where structure_id = $1 and model_digest <> $2)";
-                    let update = sqlx::query(update).bind(&structure).bind(&model);
-                    Ok(update.execute(transaction.connection()).await?.rows_affected())
+                    let update = sql::query(update).bind(&structure).bind(&model);
+                    Ok(update.execute(&mut *transaction).await?.rows_affected())
                 })
             })
             .await
@@ -171,8 +172,8 @@ impl References<'_> {
         let structure = structure.to_string();
         let written = self.database.write(move |transaction| {
             Box::pin(async move {
-                let update = sqlx::query("update undamaged_state set model_digest = 'another' where structure_id = $1");
-                update.bind(structure).execute(transaction.connection()).await?;
+                let update = sql::query("update undamaged_state set model_digest = 'another' where structure_id = $1");
+                update.bind(structure).execute(&mut *transaction).await?;
                 Ok(())
             })
         });

@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::column::timestamp;
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::quantity::Timestamp;
 
 /// Tables with data of batches, in an order that respects foreign keys.
@@ -71,7 +72,7 @@ impl Retention<'_> {
              {EXPIRED} group by b.structure_id order by b.structure_id"
         );
         let rows: Vec<(String, i64, i64, i64, i64)> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(before.micros()).fetch_all(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).bind(before.micros()).fetch_all(&self.database.reader).await?;
         let expired = |(structure, batches, measurements, oldest, newest): (String, i64, i64, i64, i64)| {
             Ok(Expired {
                 structure,
@@ -95,19 +96,19 @@ impl Retention<'_> {
                 let select = format!(
                     "select b.structure_id, b.batch_id, b.measurement_count {EXPIRED} order by b.measured_to_us limit $2"
                 );
-                let rows: Vec<(String, String, i64)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+                let rows: Vec<(String, String, i64)> = sql::query_as(sqlx::AssertSqlSafe(select))
                     .bind(before.micros())
                     .bind(most as i64)
-                    .fetch_all(transaction.connection())
+                    .fetch_all(&mut *transaction)
                     .await?;
                 let mut deleted = Deleted::default();
                 for (structure, batch, measurements) in rows {
                     for table in TABLES {
                         let delete = format!("delete from {table} where structure_id = $1 and batch_id = $2");
-                        sqlx::query(sqlx::AssertSqlSafe(delete))
+                        sql::query(sqlx::AssertSqlSafe(delete))
                             .bind(&structure)
                             .bind(&batch)
-                            .execute(transaction.connection())
+                            .execute(&mut *transaction)
                             .await?;
                     }
                     deleted.batches += 1;
@@ -129,7 +130,7 @@ mod tests {
     async fn every_table_that_refers_to_a_batch_is_covered() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).await.unwrap();
-        let tables: Vec<(String,)> = sqlx::query_as(
+        let tables: Vec<(String,)> = sql::query_as(
             "select distinct t.name from sqlite_schema t join pragma_table_info(t.name) c
              where t.type = 'table' and c.name = 'batch_id' order by t.name",
         )

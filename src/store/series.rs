@@ -7,11 +7,11 @@ use std::collections::BTreeMap;
 
 use futures_util::TryStreamExt as _;
 use serde::Deserialize;
-use sqlx::Row as _;
 
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::damage::QuantityKind;
 use crate::quantity::{StructureId, Timestamp};
 use crate::reduction::{Reduced, Reducer};
@@ -101,7 +101,7 @@ impl Series<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn extent(self, structure: &StructureId, window: SeriesWindow) -> Result<Extent, Error> {
         let (from, to) = bounds(window);
-        let (batches, measurements, first, last): (i64, i64, Option<i64>, Option<i64>) = sqlx::query_as(
+        let (batches, measurements, first, last): (i64, i64, Option<i64>, Option<i64>) = sql::query_as(
             "select count(*), coalesce(cast(sum(measurement_count) as bigint), 0), min(measured_from_us), max(measured_to_us)
              from measurement_batch where structure_id = $1 and measured_from_us >= $2 and measured_from_us < $3",
         )
@@ -137,15 +137,16 @@ impl Series<'_> {
              where b.structure_id = $1 and b.measured_from_us >= $2 and b.measured_from_us < $3";
         let columns = "measured_at_us, frequency_hz, covariates";
         let select = if stride == 1 {
-            format!("select {columns} {joined} order by b.measured_from_us, b.batch_id")
+            format!("select {columns} {joined} order by b.measured_from_us, b.batch_id, m.ordinal")
         } else {
-            // Skipped inside SQLite, because returning a row costs more than finding it.
+            // Skipped inside the database, because returning a row costs more than finding it.
             format!(
-                "select {columns} from (select {columns}, row_number() over () as number {joined}) numbered
-                 where number % {stride} = 1"
+                "select {columns} from (select {columns},
+                     row_number() over (order by b.measured_from_us, b.batch_id, m.ordinal) as number {joined}) numbered
+                 where number % {stride} = 1 order by number"
             )
         };
-        let mut rows = sqlx::query(sqlx::AssertSqlSafe(select))
+        let mut rows = sql::query(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(from)
             .bind(to)
@@ -154,19 +155,19 @@ impl Series<'_> {
         let mut values = Vec::with_capacity(modes + covariates.len());
         while let Some(row) = rows.try_next().await? {
             values.clear();
-            let (blocks, rest) = row.try_get_unchecked::<&[u8], _>(1)?.as_chunks::<8>();
+            let (blocks, rest) = row.get::<&[u8]>(1)?.as_chunks::<8>();
             if !rest.is_empty() {
                 return Err(bad_row(what)(&"the length of a vector is not a multiple of 8 bytes"));
             }
             values.extend(blocks.iter().take(modes).map(|block| f64::from_le_bytes(*block)));
             values.resize(modes, f64::NAN);
             if !covariates.is_empty() {
-                let text = row.try_get_unchecked::<&str, _>(2)?;
+                let text = row.get::<&str>(2)?;
                 let given: BTreeMap<&str, Covariate<'_>> = serde_json::from_str(text).map_err(|e| bad_row(what)(&e))?;
                 values
                     .extend(covariates.iter().map(|name| given.get(name.as_str()).map_or(f64::NAN, Covariate::number)));
             }
-            reducer.push(row.try_get_unchecked(0)?, &values, || ());
+            reducer.push(row.get(0)?, &values, || ());
         }
         Ok(reducer.finish())
     }

@@ -3,6 +3,7 @@
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use super::transaction::Transaction;
 use crate::quantity::{Digest, StructureId, Timestamp};
 
@@ -56,10 +57,10 @@ pub(super) async fn is_present(
     digest: &Digest,
 ) -> Result<bool, Error> {
     let (present,): (bool,) =
-        sqlx::query_as("select exists (select 1 from structure where structure_id = $1 and digest = $2)")
+        sql::query_as("select exists (select 1 from structure where structure_id = $1 and digest = $2)")
             .bind(structure)
             .bind(digest.as_str())
-            .fetch_one(transaction.connection())
+            .fetch_one(&mut *transaction)
             .await?;
     Ok(present)
 }
@@ -95,7 +96,7 @@ impl Structures<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn structure(self, id: &StructureId) -> Result<Option<StructureRecord>, Error> {
-        let row: Option<(String, String, i64, i64)> = sqlx::query_as(
+        let row: Option<(String, String, i64, i64)> = sql::query_as(
             "select definition, digest, created_at_us, updated_at_us from structure s
              where structure_id = $1 and not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id)",
         )
@@ -119,7 +120,7 @@ impl Structures<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn list(self) -> Result<Vec<StructureSummary>, Error> {
-        let rows: Vec<(String, String, i64, i64, Option<i64>)> = sqlx::query_as(
+        let rows: Vec<(String, String, i64, i64, Option<i64>)> = sql::query_as(
             "select s.structure_id, s.digest, s.created_at_us, coalesce(c.batches, 0), c.last_measured_us
              from structure s left join structure_summary c using (structure_id)
              where not exists (select 1 from structure_deletion d where d.structure_id = s.structure_id) order by s.structure_id",
@@ -146,45 +147,44 @@ pub(super) async fn put_definition(
     (json, digest): (&str, &str),
     now: i64,
 ) -> Result<PutStructure, Error> {
-    let stored: Option<(String,)> = sqlx::query_as("select digest from structure where structure_id = $1")
+    let stored: Option<(String,)> = sql::query_as("select digest from structure where structure_id = $1")
         .bind(id)
-        .fetch_optional(transaction.connection())
+        .fetch_optional(&mut *transaction)
         .await?;
     let Some((stored,)) = stored else {
-        sqlx::query("insert into structure values ($1, $2, $3, $4, $5)")
+        sql::query("insert into structure values ($1, $2, $3, $4, $5)")
             .bind(id)
             .bind(json)
             .bind(digest)
             .bind(now)
             .bind(now)
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
         return Ok(PutStructure::Created);
     };
-    let (deleted,): (bool,) =
-        sqlx::query_as("select exists (select 1 from structure_deletion where structure_id = $1)")
-            .bind(id)
-            .fetch_one(transaction.connection())
-            .await?;
+    let (deleted,): (bool,) = sql::query_as("select exists (select 1 from structure_deletion where structure_id = $1)")
+        .bind(id)
+        .fetch_one(&mut *transaction)
+        .await?;
     if deleted {
         return Ok(PutStructure::Refused);
     }
     if stored == digest {
         return Ok(PutStructure::Unchanged);
     }
-    let (in_use,): (bool,) = sqlx::query_as("select exists (select 1 from measurement_batch where structure_id = $1)")
+    let (in_use,): (bool,) = sql::query_as("select exists (select 1 from measurement_batch where structure_id = $1)")
         .bind(id)
-        .fetch_one(transaction.connection())
+        .fetch_one(&mut *transaction)
         .await?;
     if in_use {
         return Ok(PutStructure::Refused);
     }
-    sqlx::query("update structure set definition = $1, digest = $2, updated_at_us = $3 where structure_id = $4")
+    sql::query("update structure set definition = $1, digest = $2, updated_at_us = $3 where structure_id = $4")
         .bind(json)
         .bind(digest)
         .bind(now)
         .bind(id)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     Ok(PutStructure::Replaced)
 }

@@ -145,7 +145,7 @@ async fn a_first_start_that_was_killed_before_it_marked_its_file_can_be_repeated
     assert!(std::fs::metadata(folder.path().join(DATABASE_FILE)).unwrap().len() > 0);
     let store = Store::open(folder.path()).await.unwrap();
     store.file().is_writable().await.unwrap();
-    let (id,): (i64,) = sqlx::query_as("pragma application_id").fetch_one(&store.database.reader).await.unwrap();
+    let (id,): (i64,) = super::sql::query_as("pragma application_id").fetch_one(&store.database.reader).await.unwrap();
     assert_eq!(id, APPLICATION_ID);
 }
 

@@ -8,6 +8,7 @@ use sqlx::FromRow;
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::access::{Scope, SecretDigest, TokenId, TokenRecord};
 use crate::quantity::{StructureId, Timestamp};
 
@@ -42,17 +43,16 @@ impl Tokens<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self) -> Result<Vec<TokenRecord>, Error> {
-        let rows: Vec<TokenRow> = sqlx::query_as(
+        let rows: Vec<TokenRow> = sql::query_as(
             "select token_id, name, ingest, read, admin, limited, digest, previous_digest, previous_until_us,
                     created_at_us, expires_at_us, revoked_at_us
              from api_token order by created_at_us, token_id",
         )
         .fetch_all(&self.database.reader)
         .await?;
-        let structures: Vec<(String, String)> =
-            sqlx::query_as("select token_id, structure_id from api_token_structure")
-                .fetch_all(&self.database.reader)
-                .await?;
+        let structures: Vec<(String, String)> = sql::query_as("select token_id, structure_id from api_token_structure")
+            .fetch_all(&self.database.reader)
+            .await?;
         rows.into_iter().map(|row| record(row, &structures)).collect()
     }
 
@@ -65,7 +65,7 @@ impl Tokens<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query("insert into api_token values ($1, $2, $3, $4, $5, $6, $7, null, null, $8, $9, null)")
+                    sql::query("insert into api_token values ($1, $2, $3, $4, $5, $6, $7, null, null, $8, $9, null)")
                         .bind(token.id.as_str())
                         .bind(&token.name)
                         .bind(has(&token, Scope::Ingest))
@@ -75,13 +75,13 @@ impl Tokens<'_> {
                         .bind(token.digest.as_bytes().as_slice())
                         .bind(token.created_at.micros())
                         .bind(token.expires_at.map(Timestamp::micros))
-                        .execute(transaction.connection())
+                        .execute(&mut *transaction)
                         .await?;
                     for structure in token.structures.iter().flat_map(|ids| ids.iter()) {
-                        sqlx::query("insert into api_token_structure values ($1, $2)")
+                        sql::query("insert into api_token_structure values ($1, $2)")
                             .bind(token.id.as_str())
                             .bind(structure.as_str())
-                            .execute(transaction.connection())
+                            .execute(&mut *transaction)
                             .await?;
                     }
                     Ok(())
@@ -100,7 +100,7 @@ impl Tokens<'_> {
             .write(move |transaction| {
                 Box::pin(async move {
                     let previous = token.previous.as_ref();
-                    sqlx::query(
+                    sql::query(
                     "update api_token set digest = $1, previous_digest = $2, previous_until_us = $3, revoked_at_us = $4
                      where token_id = $5",
                 )
@@ -109,7 +109,7 @@ impl Tokens<'_> {
                 .bind(previous.map(|(_, until)| until.micros()))
                 .bind(token.revoked_at.map(Timestamp::micros))
                 .bind(token.id.as_str())
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                     Ok(())
                 })

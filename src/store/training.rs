@@ -7,6 +7,7 @@ use super::database::Database;
 use super::diagnosis::{job_state, JobState};
 use super::error::Error;
 use super::job_end::JobEnd;
+use super::sql::{self, Whole};
 use crate::quantity::{Digest, StructureId, Timestamp};
 
 /// A training that is about to wait for its turn.
@@ -54,7 +55,7 @@ struct TrainingRow {
     structure_digest: String,
     request: String,
     state: String,
-    interruptions: u32,
+    interruptions: Whole<u32>,
     failure: Option<String>,
     result: Option<String>,
     created_at_us: i64,
@@ -72,7 +73,7 @@ fn record(row: TrainingRow) -> Result<TrainingJobRecord, Error> {
         structure_digest: Digest::from_stored(row.structure_digest),
         request: row.request,
         state: job_state(&row.state)?,
-        interruptions: row.interruptions,
+        interruptions: row.interruptions.0,
         failure: row.failure,
         result: row.result,
         created_at: timestamp(what, row.created_at_us)?,
@@ -95,7 +96,7 @@ impl Trainings<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "insert into training (training_id, structure_id, structure_digest, request, state, created_at_us)
                          values ($1, $2, $3, $4, 'waiting', $5)",
                     )
@@ -104,7 +105,7 @@ impl Trainings<'_> {
                     .bind(new.structure_digest.as_str())
                     .bind(&new.request)
                     .bind(now.micros())
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -126,7 +127,7 @@ impl Trainings<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    sqlx::query(
+                    sql::query(
                         "update training set state = $1, failure = $2, result = $3, finished_at_us = $4
                          where training_id = $5",
                     )
@@ -135,7 +136,7 @@ impl Trainings<'_> {
                     .bind(result)
                     .bind(now)
                     .bind(&id)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(())
                 })
@@ -150,7 +151,7 @@ impl Trainings<'_> {
     pub async fn training(self, id: &str) -> Result<Option<TrainingJobRecord>, Error> {
         let select = format!("select {COLUMNS} from training where training_id = $1");
         let row: Option<TrainingRow> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).bind(id).fetch_optional(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).bind(id).fetch_optional(&self.database.reader).await?;
         row.map(record).transpose()
     }
 
@@ -161,7 +162,7 @@ impl Trainings<'_> {
     pub async fn list(self, structure: &StructureId, limit: usize) -> Result<Vec<TrainingJobRecord>, Error> {
         let select =
             format!("select {COLUMNS} from training where structure_id = $1 order by training_id desc limit $2");
-        let rows: Vec<TrainingRow> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let rows: Vec<TrainingRow> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(limit as i64)
             .fetch_all(&self.database.reader)
@@ -176,7 +177,7 @@ impl Trainings<'_> {
     pub async fn unfinished(self) -> Result<Vec<TrainingJobRecord>, Error> {
         let select = format!("select {COLUMNS} from training where state = 'waiting' order by training_id");
         let rows: Vec<TrainingRow> =
-            sqlx::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
+            sql::query_as(sqlx::AssertSqlSafe(select)).fetch_all(&self.database.reader).await?;
         rows.into_iter().map(record).collect()
     }
 }

@@ -1,23 +1,25 @@
 //! The open write transaction as the areas of the store see it.
 
+use sqlx::postgres::PgConnection;
 use sqlx::sqlite::SqliteConnection;
+
+use super::sql::On;
 
 /// The write transaction in which a write task runs.
 ///
 /// Only the write queue begins and ends transactions. A function of one area that takes part in a larger write takes the
 /// transaction as its first argument.
-pub(super) struct Transaction<'c> {
-    connection: &'c mut SqliteConnection,
+pub(super) enum Transaction<'c> {
+    Sqlite(&'c mut SqliteConnection),
+    Postgres(&'c mut PgConnection),
 }
 
-impl<'c> Transaction<'c> {
-    /// The transaction that is open on a connection.
-    pub const fn of(connection: &'c mut SqliteConnection) -> Self {
-        Self { connection }
-    }
-
-    /// The connection, to execute a statement inside the transaction.
-    pub const fn connection(&mut self) -> &mut SqliteConnection {
-        self.connection
+impl Transaction<'_> {
+    /// The place where a statement inside the transaction runs.
+    pub(super) fn on(&mut self) -> On<'_> {
+        match self {
+            Self::Sqlite(connection) => On::Sqlite(connection),
+            Self::Postgres(connection) => On::Postgres(connection),
+        }
     }
 }

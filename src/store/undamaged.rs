@@ -13,6 +13,7 @@ use super::current::CURRENT_FIRST;
 use super::database::Database;
 use super::error::Error;
 use super::reference_content::{batches_of, stored_origin};
+use super::sql::{self, Whole};
 use super::transaction::Transaction;
 use crate::assessment::BatchState;
 use crate::damage::{ChartReference, UndamagedQuantity, UndamagedReference};
@@ -149,7 +150,7 @@ impl References<'_> {
                    order by {CURRENT_FIRST} limit 1)"
         );
         let select = format!("select exists (select 1 from measurement_batch where {uncompared})");
-        let (any,): (bool,) = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let (any,): (bool,) = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(version)
             .fetch_one(&self.database.reader)
@@ -161,8 +162,8 @@ impl References<'_> {
         let written = self.database.write(move |transaction| {
             Box::pin(async move {
                 let update = format!("update measurement_batch set state = 'received' where {uncompared}");
-                let update = sqlx::query(sqlx::AssertSqlSafe(update)).bind(id).bind(version);
-                update.execute(transaction.connection()).await?;
+                let update = sql::query(sqlx::AssertSqlSafe(update)).bind(id).bind(version);
+                update.execute(&mut *transaction).await?;
                 Ok(())
             })
         });
@@ -179,7 +180,7 @@ impl References<'_> {
         from: Timestamp,
         to: Timestamp,
     ) -> Result<Vec<MeasuredBatch>, Error> {
-        let rows: Vec<MeasuredRow> = sqlx::query_as(
+        let rows: Vec<MeasuredRow> = sql::query_as(
             "select batch_id, measured_from_us, measured_to_us, state, failure,
                     exists (select 1 from assessment a where a.structure_id = b.structure_id and a.batch_id = b.batch_id) as assessed,
                     (select reason from maintenance_window w where w.structure_id = b.structure_id
@@ -214,12 +215,12 @@ impl References<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn undamaged(self, structure: &StructureId) -> Result<Option<Arc<ReferenceRecord>>, Error> {
         fault_point!("store::read", |_| Err(super::error::unreadable()));
-        let (newest,): (Option<u32>,) =
-            sqlx::query_as("select max(version) from undamaged_state where structure_id = $1")
+        let (newest,): (Option<Whole<u32>>,) =
+            sql::query_as("select max(version) from undamaged_state where structure_id = $1")
                 .bind(structure.as_str())
                 .fetch_one(&self.database.reader)
                 .await?;
-        let Some(newest) = newest else { return Ok(None) };
+        let Some(Whole(newest)) = newest else { return Ok(None) };
         if let Some(record) = self.known_undamaged(structure).filter(|record| record.state.version == newest) {
             return Ok(Some(record));
         }
@@ -253,7 +254,7 @@ impl References<'_> {
         version: u32,
     ) -> Result<(Option<Arc<ReferenceProcess>>, Option<String>), Error> {
         let row: Option<(Option<String>, Option<String>)> =
-            sqlx::query_as("select process, reason from undamaged_process where structure_id = $1 and version = $2")
+            sql::query_as("select process, reason from undamaged_process where structure_id = $1 and version = $2")
                 .bind(structure.as_str())
                 .bind(version)
                 .fetch_optional(&self.database.reader)
@@ -268,7 +269,7 @@ impl References<'_> {
         structure: &StructureId,
         version: Option<u32>,
     ) -> Result<Option<ReferenceRecord>, Error> {
-        let row: Option<StateRow> = sqlx::query_as(
+        let row: Option<StateRow> = sql::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint,
                     origin
              from undamaged_state where structure_id = $1 and ($2 is null or version = $2) order by version desc limit 1",
@@ -291,8 +292,9 @@ impl References<'_> {
         else {
             return Ok(None);
         };
+        let Whole(version) = version;
         let batches = batches_of(self.database, structure, version).await?;
-        let quantities: Vec<ReferenceQuantityRow> = sqlx::query_as(
+        let quantities: Vec<ReferenceQuantityRow> = sql::query_as(
             "select quantity, mean, std, threshold, detail, mean_draws, std_draws from undamaged_quantity
              where structure_id = $1 and version = $2 order by position",
         )
@@ -330,22 +332,22 @@ async fn insert_reference(
     NewReference { state, batches, replaces }: &NewReference,
     (digest, now): (&Digest, Timestamp),
 ) -> Result<u32, Error> {
-    let (version,): (u32,) =
-        sqlx::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = $1")
+    let (Whole(version),): (Whole<u32>,) =
+        sql::query_as("select coalesce(max(version), 0) + 1 from undamaged_state where structure_id = $1")
             .bind(id)
-            .fetch_one(transaction.connection())
+            .fetch_one(&mut *transaction)
             .await?;
     insert_state(transaction, (id, version), state, digest, now).await?;
     insert_batches(transaction, (id, version), batches).await?;
     insert_quantities(transaction, (id, version), &state.quantities).await?;
     insert_process(transaction, (id, version), state).await?;
     // The open alarms refer to the earlier reference: the new charts raise them again where they persist.
-    sqlx::query(
+    sql::query(
         "update alarm_episode set ended_at_us = $1 where structure_id = $2 and kind = 'damage' and ended_at_us is null",
     )
     .bind(now.micros())
     .bind(id)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     match replaces {
         Some(replaced) => replace_kept(transaction, id, (*replaced, version)).await?,
@@ -361,18 +363,18 @@ async fn insert_process(
     (structure, version): Key<'_>,
     state: &UndamagedReference,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_process values ($1, $2, $3, $4)")
+    sql::query("insert into undamaged_process values ($1, $2, $3, $4)")
         .bind(structure)
         .bind(version)
         .bind(state.process.as_deref().map(to_json).transpose()?)
         .bind(&state.without_process)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     Ok(())
 }
 
 /// Version, model digest, time, threshold probability, number of measurements, conditions, doubts, joint probability, origin.
-type StateRow = (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>);
+type StateRow = (Whole<u32>, String, i64, f64, i64, String, String, Option<String>, Option<String>);
 
 /// Structure and version of a reference.
 type Key<'k> = (&'k str, u32);
@@ -388,7 +390,7 @@ async fn insert_state(
     model_digest: &Digest,
     now: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
+    sql::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
         .bind(structure)
         .bind(version)
         .bind(model_digest.as_str())
@@ -399,7 +401,7 @@ async fn insert_state(
         .bind(to_json(&state.doubts)?)
         .bind(state.joint.as_ref().map(to_json).transpose()?)
         .bind(to_json(&state.origin)?)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     Ok(())
 }
@@ -410,14 +412,14 @@ pub(super) async fn insert_batches(
     batches: &[String],
 ) -> Result<(), Error> {
     for batch in batches {
-        let inserted = sqlx::query(
+        let inserted = sql::query(
             "insert into undamaged_batch
              select structure_id, $1, batch_id from measurement_batch where structure_id = $2 and batch_id = $3",
         )
         .bind(version)
         .bind(structure)
         .bind(batch)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
         if inserted.rows_affected() == 0 {
             return Err(Error::UnknownBatch { structure: structure.to_owned(), batch: batch.clone() });
@@ -432,7 +434,7 @@ async fn insert_quantities(
     quantities: &[UndamagedQuantity],
 ) -> Result<(), Error> {
     for (position, q) in quantities.iter().enumerate() {
-        sqlx::query("insert into undamaged_quantity values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
+        sql::query("insert into undamaged_quantity values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
             .bind(structure)
             .bind(version)
             .bind(&q.name)
@@ -443,7 +445,7 @@ async fn insert_quantities(
             .bind(to_json(q)?)
             .bind(to_blob(q.mean_draws.iter().copied()))
             .bind(to_blob(q.std_draws.iter().copied()))
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
     }
     Ok(())

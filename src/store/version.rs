@@ -4,6 +4,7 @@ use sqlx::FromRow;
 
 use super::current::IS_CURRENT;
 use super::error::Error;
+use super::sql;
 use super::structure::{is_present, Structures};
 use super::transaction::Transaction;
 use crate::quantity::{Digest, StructureId, Timestamp};
@@ -58,42 +59,42 @@ impl Structures<'_> {
                     if !is_present(transaction, &structure, &expected).await? {
                         return Ok(false);
                     }
-                    sqlx::query(
+                    sql::query(
                         "insert into structure_version
                      select structure_id, digest, definition, null, null, created_at_us from structure
                      where structure_id = $1
                      on conflict do nothing",
                     )
                     .bind(&structure)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
-                    sqlx::query("insert into structure_version values ($1, $2, $3, $4, $5, $6) on conflict do nothing")
+                    sql::query("insert into structure_version values ($1, $2, $3, $4, $5, $6) on conflict do nothing")
                         .bind(&structure)
                         .bind(version.digest.as_str())
                         .bind(&version.definition_json)
                         .bind(version.parent.as_ref().map(Digest::as_str))
                         .bind(&version.diagnosis)
                         .bind(now)
-                        .execute(transaction.connection())
+                        .execute(&mut *transaction)
                         .await?;
                     if let Some(baseline) = &version.baseline {
                         insert_baseline(transaction, &structure, &version.digest, baseline, now).await?;
                     }
-                    sqlx::query(
+                    sql::query(
                         "update structure set definition = $1, digest = $2, updated_at_us = $3 where structure_id = $4",
                     )
                     .bind(&version.definition_json)
                     .bind(version.digest.as_str())
                     .bind(now)
                     .bind(&structure)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     keep_all(transaction, &structure).await?;
-                    sqlx::query(
+                    sql::query(
                         "update measurement_batch set state = 'received', failure = null where structure_id = $1",
                     )
                     .bind(&structure)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(true)
                 })
@@ -110,7 +111,7 @@ impl Structures<'_> {
         structure: &StructureId,
         digest: &Digest,
     ) -> Result<Option<(String, Option<Digest>)>, Error> {
-        let row: Option<(String, Option<String>)> = sqlx::query_as(
+        let row: Option<(String, Option<String>)> = sql::query_as(
             "select definition, parent_digest from structure_version where structure_id = $1 and digest = $2",
         )
         .bind(structure.as_str())
@@ -129,7 +130,7 @@ impl Structures<'_> {
         structure: &StructureId,
         structure_digest: &Digest,
     ) -> Result<Option<StoredBaseline>, Error> {
-        Ok(sqlx::query_as(
+        Ok(sql::query_as(
             "select model_digest, manifest, weights, accepted from trained_baseline
              where structure_id = $1 and structure_digest = $2",
         )
@@ -148,7 +149,7 @@ async fn insert_baseline(
     baseline: &StoredBaseline,
     now_us: i64,
 ) -> Result<(), Error> {
-    sqlx::query(
+    sql::query(
         "insert into trained_baseline values ($1, $2, $3, $4, $5, $6, $7)
          on conflict (structure_id, structure_digest) do update
          set model_digest = excluded.model_digest, manifest = excluded.manifest, weights = excluded.weights,
@@ -161,16 +162,16 @@ async fn insert_baseline(
     .bind(&baseline.weights)
     .bind(baseline.accepted)
     .bind(now_us)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(())
 }
 
 /// All batches of a structure are to be assessed again: those that are compared with another reference than the newest keep theirs.
 async fn keep_all(transaction: &mut Transaction<'_>, structure: &str) -> Result<(), Error> {
-    sqlx::query("delete from kept_comparison where structure_id = $1")
+    sql::query("delete from kept_comparison where structure_id = $1")
         .bind(structure)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     let insert = format!(
         "insert into kept_comparison
@@ -178,6 +179,6 @@ async fn keep_all(transaction: &mut Transaction<'_>, structure: &str) -> Result<
          where a.structure_id = $1 and a.undamaged_version > 0
            and a.undamaged_version < (select max(version) from undamaged_state where structure_id = $1) and {IS_CURRENT}"
     );
-    sqlx::query(sqlx::AssertSqlSafe(insert)).bind(structure).execute(transaction.connection()).await?;
+    sql::query(sqlx::AssertSqlSafe(insert)).bind(structure).execute(&mut *transaction).await?;
     Ok(())
 }

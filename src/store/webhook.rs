@@ -7,6 +7,7 @@ use sqlx::FromRow;
 use super::column::{bad_row, timestamp};
 use super::database::Database;
 use super::error::Error;
+use super::sql;
 use crate::quantity::Timestamp;
 
 /// A signing secret, which does not appear in debug output.
@@ -124,11 +125,11 @@ impl Webhooks<'_> {
             .write(move |transaction| {
                 Box::pin(async move {
                     let (found,): (i64,) =
-                        sqlx::query_as("select count(*) from webhook").fetch_one(transaction.connection()).await?;
+                        sql::query_as("select count(*) from webhook").fetch_one(&mut *transaction).await?;
                     if found >= most as i64 {
                         return Ok(false);
                     }
-                    sqlx::query("insert into webhook values ($1, $2, $3, null, null, $4, $5, $6, $7, $8, $9)")
+                    sql::query("insert into webhook values ($1, $2, $3, null, null, $4, $5, $6, $7, $8, $9)")
                         .bind(webhook.id)
                         .bind(webhook.url)
                         .bind(webhook.secret.0)
@@ -138,7 +139,7 @@ impl Webhooks<'_> {
                         .bind(webhook.enabled)
                         .bind(webhook.created_at.micros())
                         .bind(webhook.updated_at.micros())
-                        .execute(transaction.connection())
+                        .execute(&mut *transaction)
                         .await?;
                     Ok(true)
                 })
@@ -162,7 +163,7 @@ impl Webhooks<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let updated = sqlx::query(
+                    let updated = sql::query(
                         "update webhook set url = $1, events = $2, alarm_kinds = $3, structures = $4, enabled = $5,
                          updated_at_us = $6 where webhook_id = $7",
                     )
@@ -173,7 +174,7 @@ impl Webhooks<'_> {
                     .bind(enabled)
                     .bind(now.micros())
                     .bind(id)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                     Ok(updated.rows_affected() > 0)
                 })
@@ -195,7 +196,7 @@ impl Webhooks<'_> {
         let id = id.to_owned();
         self.database.write(move |transaction| {
             Box::pin(async move {
-                let updated = sqlx::query(
+                let updated = sql::query(
                     "update webhook set previous_secret = nullif(secret, ''), previous_until_us = iif(secret = '', null, $1), secret = $2, updated_at_us = $3
                      where webhook_id = $4",
                 )
@@ -203,7 +204,7 @@ impl Webhooks<'_> {
                 .bind(secret.0)
                 .bind(now.micros())
                 .bind(id)
-                .execute(transaction.connection())
+                .execute(&mut *transaction)
                 .await?;
                 Ok(updated.rows_affected() > 0)
             })
@@ -220,8 +221,8 @@ impl Webhooks<'_> {
         self.database
             .write(move |transaction| {
                 Box::pin(async move {
-                    let deleted = sqlx::query("delete from webhook where webhook_id = $1");
-                    Ok(deleted.bind(id).execute(transaction.connection()).await?.rows_affected() > 0)
+                    let deleted = sql::query("delete from webhook where webhook_id = $1");
+                    Ok(deleted.bind(id).execute(&mut *transaction).await?.rows_affected() > 0)
                 })
             })
             .await
@@ -232,7 +233,7 @@ impl Webhooks<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn webhook(self, id: &str) -> Result<Option<WebhookRecord>, Error> {
-        let row: Option<WebhookRow> = sqlx::query_as("select * from webhook where webhook_id = $1")
+        let row: Option<WebhookRow> = sql::query_as("select * from webhook where webhook_id = $1")
             .bind(id)
             .fetch_optional(&self.database.reader)
             .await?;
@@ -245,7 +246,7 @@ impl Webhooks<'_> {
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn list(self) -> Result<Vec<WebhookRecord>, Error> {
         let rows: Vec<WebhookRow> =
-            sqlx::query_as("select * from webhook order by webhook_id").fetch_all(&self.database.reader).await?;
+            sql::query_as("select * from webhook order by webhook_id").fetch_all(&self.database.reader).await?;
         rows.into_iter().map(WebhookRow::into_record).collect()
     }
 }

@@ -13,12 +13,13 @@ use std::sync::{Arc, Mutex, MutexGuard};
 
 use futures_util::FutureExt as _;
 use sqlx::pool::PoolConnection;
-use sqlx::sqlite::{SqliteConnection, SqlitePool};
-use sqlx::{Connection as _, Sqlite};
+use sqlx::sqlite::SqlitePool;
+use sqlx::{AssertSqlSafe, Connection as _, Postgres, Sqlite};
 use tokio::sync::{oneshot, Notify};
 
-use super::error::Error;
+use super::error::{over_network, Error};
 use super::file::OpenedFile;
+use super::server::{HeldConnection, ServerWriter};
 use super::transaction::Transaction;
 
 /// Largest number of tasks in one group commit. The first of them is answered only after the last has run.
@@ -52,21 +53,39 @@ struct Queue {
     draining: bool,
 }
 
+/// The place of the connection that writes.
+pub(super) enum WriterPool {
+    /// A pool of one connection, which lives as long as the store, and the file, which must stay where it is.
+    Sqlite(SqlitePool, OpenedFile),
+    /// The connection that holds the lock of the service.
+    Postgres(ServerWriter),
+}
+
+/// The connection.
+enum Held<'w> {
+    Sqlite(PoolConnection<Sqlite>),
+    Postgres(HeldConnection<'w>),
+}
+
+/// An open transaction of the connection, which is rolled back unless it is committed.
+enum Open<'c> {
+    Sqlite(sqlx::Transaction<'c, Sqlite>),
+    Postgres(sqlx::Transaction<'c, Postgres>),
+}
+
 /// The connection that writes, and its queue.
 pub(super) struct Writer {
-    /// A pool of one connection, which lives as long as the store.
-    pub(super) pool: SqlitePool,
+    pub(super) pool: WriterPool,
     /// Notified after every transaction that wrote something.
     pub(super) written: Notify,
     /// Number of writes that failed because of the disk since the store was opened.
     pub(super) refused: AtomicU64,
-    file: OpenedFile,
     queue: Mutex<Queue>,
 }
 
 impl Writer {
-    pub(super) fn new(pool: SqlitePool, file: OpenedFile) -> Self {
-        Self { pool, file, written: Notify::new(), refused: AtomicU64::new(0), queue: Mutex::default() }
+    pub(super) fn new(pool: WriterPool) -> Self {
+        Self { pool, written: Notify::new(), refused: AtomicU64::new(0), queue: Mutex::default() }
     }
 
     /// Queues a write task immediately. The returned future resolves when the task is committed. The task runs in the order of
@@ -125,7 +144,7 @@ impl Writer {
     /// Runs queued tasks, group by group, until the queue is empty.
     async fn drain(&self) {
         loop {
-            let connection = self.pool.acquire().await.map_err(Error::from);
+            let connection = self.pool.acquire().await;
             // The group is taken after the connection is free, so that tasks that arrived in the meantime share the transaction.
             let group: Vec<Queued> = {
                 let mut queue = self.lock();
@@ -149,7 +168,7 @@ impl Writer {
     }
 
     /// Runs a group of tasks in one transaction and answers their callers.
-    async fn write(&self, mut connection: PoolConnection<Sqlite>, group: Vec<Queued>) {
+    async fn write(&self, mut connection: Held<'_>, group: Vec<Queued>) {
         let mut finished = Vec::with_capacity(group.len());
         let ended = run_group(&mut connection, group, &mut finished).await;
         if ended.is_ok() && finished.iter().any(|task| task.outcome.is_ok()) {
@@ -159,9 +178,9 @@ impl Writer {
         if ended.as_ref().is_err_and(spoilt) || finished.iter().any(|task| task.outcome.as_ref().is_err_and(spoilt)) {
             // SQLite rolls a transaction back by itself when the disk fails. sqlx would still count it as open and refuse every
             // later one, so the connection is closed and the pool opens a new one.
-            let _ = connection.detach().close_hard().await;
+            connection.close().await;
         }
-        let ended = ended.and_then(|()| self.file.check());
+        let ended = ended.and_then(|()| self.pool.check());
         for Finished { caller, outcome } in finished {
             // A failed task reports its own error; all others report the outcome of the transaction.
             let outcome = outcome.and_then(|()| ended.as_ref().copied().map_err(Error::copy));
@@ -187,11 +206,7 @@ where
 ///
 /// The transaction is immediate, because SQLite refuses at once, without waiting for the busy timeout, to upgrade a transaction
 /// that began with a read while another connection writes.
-async fn run_group(
-    connection: &mut SqliteConnection,
-    group: Vec<Queued>,
-    finished: &mut Vec<Finished>,
-) -> Result<(), Error> {
+async fn run_group(connection: &mut Held<'_>, group: Vec<Queued>, finished: &mut Vec<Finished>) -> Result<(), Error> {
     let mut transaction = match begin(connection).await {
         Ok(transaction) => transaction,
         Err(error) => {
@@ -227,9 +242,92 @@ async fn run_group(
     Ok(())
 }
 
-async fn begin(connection: &mut SqliteConnection) -> Result<sqlx::Transaction<'_, Sqlite>, Error> {
+async fn begin<'c>(connection: &'c mut Held<'_>) -> Result<Open<'c>, Error> {
     fault_point!("store::begin", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
-    Ok(connection.begin_with("begin immediate").await?)
+    Ok(match connection {
+        Held::Sqlite(connection) => Open::Sqlite(connection.begin_with("begin immediate").await?),
+        Held::Postgres(connection) => Open::Postgres(connection.get().begin().await.map_err(over_network)?),
+    })
+}
+
+impl WriterPool {
+    async fn acquire(&self) -> Result<Held<'_>, Error> {
+        Ok(match self {
+            Self::Sqlite(pool, _) => Held::Sqlite(pool.acquire().await?),
+            Self::Postgres(writer) => Held::Postgres(writer.acquire().await?),
+        })
+    }
+
+    /// Whether it was closed.
+    pub(super) fn is_closed(&self) -> bool {
+        match self {
+            Self::Sqlite(pool, _) => pool.is_closed(),
+            Self::Postgres(writer) => writer.is_closed(),
+        }
+    }
+
+    /// Ends the connection, for SQLite after its log was written back.
+    pub(super) async fn close(&self) {
+        match self {
+            Self::Sqlite(pool, _) => {
+                let _ = sqlx::query("pragma wal_checkpoint(truncate)").execute(pool).await;
+                pool.close().await;
+            }
+            Self::Postgres(writer) => writer.close().await,
+        }
+    }
+
+    /// Checks that what was written is where it will be found again.
+    fn check(&self) -> Result<(), Error> {
+        match self {
+            Self::Sqlite(_, file) => file.check(),
+            Self::Postgres(_) => Ok(()),
+        }
+    }
+}
+
+impl Held<'_> {
+    /// Closes the connection, so that the next transaction has a new one.
+    async fn close(self) {
+        match self {
+            // There is nothing to be done about a connection that cannot be closed.
+            Self::Sqlite(connection) => drop(connection.detach().close_hard().await),
+            Self::Postgres(connection) => connection.break_off().await,
+        }
+    }
+}
+
+impl Open<'_> {
+    fn transaction(&mut self) -> Transaction<'_> {
+        match self {
+            Self::Sqlite(open) => Transaction::Sqlite(&mut *open),
+            Self::Postgres(open) => Transaction::Postgres(&mut *open),
+        }
+    }
+
+    async fn commit(self) -> Result<(), sqlx::Error> {
+        match self {
+            Self::Sqlite(open) => open.commit().await,
+            Self::Postgres(open) => open.commit().await.map_err(over_network),
+        }
+    }
+
+    async fn rollback(self) -> Result<(), sqlx::Error> {
+        match self {
+            Self::Sqlite(open) => open.rollback().await,
+            Self::Postgres(open) => open.rollback().await.map_err(over_network),
+        }
+    }
+
+    /// Runs statements without parameters.
+    async fn run(&mut self, statements: &'static str) -> Result<(), sqlx::Error> {
+        match self {
+            Self::Sqlite(open) => sqlx::raw_sql(AssertSqlSafe(statements)).execute(&mut **open).await.map(|_| ()),
+            Self::Postgres(open) => {
+                sqlx::raw_sql(AssertSqlSafe(statements)).execute(&mut **open).await.map(|_| ()).map_err(over_network)
+            }
+        }
+    }
 }
 
 /// Statements that set the savepoint of the first task, and of each later one. The commit releases the last savepoint.
@@ -240,13 +338,13 @@ const NEXT_SAVEPOINT: &str = "release task; savepoint task";
 /// is lost.
 async fn run_in_savepoint(
     task: Task,
-    connection: &mut SqliteConnection,
+    open: &mut Open<'_>,
     savepoint: &'static str,
 ) -> Result<Result<(), Error>, Error> {
-    sqlx::query(savepoint).execute(&mut *connection).await?;
-    let Err(error) = run(task, connection).await else { return Ok(Ok(())) };
-    match sqlx::query("rollback to task").execute(&mut *connection).await {
-        Ok(_) => Ok(Err(error)),
+    open.run(savepoint).await?;
+    let Err(error) = run(task, open).await else { return Ok(Ok(())) };
+    match open.run("rollback to task").await {
+        Ok(()) => Ok(Err(error)),
         // SQLite has rolled back everything, or its state is unknown.
         Err(failed) if error.disk_cause().is_none() => Err(failed.into()),
         Err(_) => Err(error),
@@ -254,8 +352,8 @@ async fn run_in_savepoint(
 }
 
 /// Runs a task and turns a panic into an error.
-async fn run(task: Task, connection: &mut SqliteConnection) -> Result<(), Error> {
-    let mut transaction = Transaction::of(connection);
+async fn run(task: Task, open: &mut Open<'_>) -> Result<(), Error> {
+    let mut transaction = open.transaction();
     let outcome = AssertUnwindSafe(task(&mut transaction)).catch_unwind().await.unwrap_or(Err(Error::Panicked));
     fault_point!("store::task", |_| Err(sqlx::Error::Io(std::io::Error::other("a fault")).into()));
     outcome
@@ -279,8 +377,8 @@ mod tests {
     async fn put(store: &Store, number: usize) -> Result<usize, Error> {
         let work = store.database.write(move |transaction| {
             Box::pin(async move {
-                let insert = sqlx::query("insert into structure values ($1, '{}', 'digest', 0, 0)");
-                insert.bind(format!("s{number:03}")).execute(transaction.connection()).await?;
+                let insert = super::super::sql::query("insert into structure values ($1, '{}', 'digest', 0, 0)");
+                insert.bind(format!("s{number:03}")).execute(&mut *transaction).await?;
                 if number.is_multiple_of(4) {
                     return Err(Error::UnknownStructure(format!("s{number:03}")));
                 }
@@ -341,7 +439,7 @@ mod tests {
                 Box::pin(async move {
                     let insert = "insert into structure values ('s', $1, 'digest', 0, 0)
                                   on conflict do update set definition = definition || $1";
-                    sqlx::query(insert).bind(definition).execute(transaction.connection()).await?;
+                    super::super::sql::query(insert).bind(definition).execute(&mut *transaction).await?;
                     Ok(())
                 })
             })

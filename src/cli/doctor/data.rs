@@ -4,7 +4,7 @@ use super::check::{size, Check};
 use crate::config::Config;
 use crate::quantity::Timestamp;
 use crate::store::inspect::{inspect, Inspection};
-use crate::store::{backup, Error, FolderFigures};
+use crate::store::{backup, server, Error, FolderFigures};
 use std::cmp::Ordering;
 
 /// A warning is given if the newest backup is older, days.
@@ -100,6 +100,17 @@ pub async fn database(config: &Config) -> DatabaseChecks {
     let only = |check: Check, in_use: bool| DatabaseChecks { checks: vec![check], inspection: None, in_use };
     let restore =
         "restore a backup: modalwatch restore --from BACKUP --replace, which keeps the present file under another name";
+    if let Some(url) = &config.store.url {
+        return match server::look(url).await {
+            Ok(found) => {
+                let used = if found.in_use { "used by a running service" } else { "no service uses it" };
+                only(Check::ok("database", format!("{url}: PostgreSQL {}, {used}", found.version)), found.in_use)
+            }
+            Err(error) => {
+                only(Check::fail("database", error.to_string(), "correct store.url, or start the server"), false)
+            }
+        };
+    }
     let inspection = match inspect(&config.data_dir).await {
         Ok(Some(inspection)) => inspection,
         Ok(None) => return only(Check::ok("database", "none yet: the service creates it at its start"), false),

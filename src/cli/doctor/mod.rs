@@ -51,12 +51,18 @@ async fn checks(args: &DoctorArgs) -> Vec<Check> {
         }
     };
     let mut checks = vec![host::configuration(&config)];
-    checks.extend(data::folder(&config));
+    // With a database server, nothing is kept in the data folder.
+    let in_folder = config.store.url.is_none();
+    if in_folder {
+        checks.extend(data::folder(&config));
+    }
     let database = data::database(&config).await;
     checks.extend(database.checks);
     let newest = database.inspection.as_ref().and_then(|inspection| inspection.newest_received);
-    checks.extend(data::backups(&config, newest.is_some()));
-    checks.extend(data::left_behind(&config));
+    if in_folder {
+        checks.extend(data::backups(&config, newest.is_some()));
+        checks.extend(data::left_behind(&config));
+    }
     checks.extend(models::library(&config));
     if let Some(inspection) = &database.inspection {
         checks.extend(models::trained(inspection));

@@ -11,6 +11,7 @@ use super::super::database::Database;
 use super::super::error::Error;
 use super::super::measurement_row::mode_shapes;
 use super::super::reference_content::batches_of;
+use super::super::sql::{self, Whole};
 use super::super::structure::Structures;
 use super::record::{
     Acknowledged, ArchivedModel, Batch, Maintenance, Measurement, Record, Structure, Undamaged, UndamagedQuantity,
@@ -44,7 +45,7 @@ type BatchRow = (String, String, Option<String>, String, i64, String);
 /// Columns of an undamaged reference: version, model digest, creation in µs, threshold probability, number of measurements,
 /// conditions, doubts, joint probability, origin, process, why there is none.
 type StateRow =
-    (u32, String, i64, f64, i64, String, String, Option<String>, Option<String>, Option<String>, Option<String>);
+    (Whole<u32>, String, i64, f64, i64, String, String, Option<String>, Option<String>, Option<String>, Option<String>);
 
 /// The error of an export whose receiver was dropped while records were still to be sent.
 pub(super) fn receiver_dropped<T>(_: T) -> Error {
@@ -67,7 +68,7 @@ impl Archive<'_> {
     ) -> Result<(), Error> {
         let present = Structures { database: self.database }.structure(structure).await?;
         let present = present.ok_or_else(|| Error::UnknownStructure(structure.to_string()))?;
-        let versions: Vec<(String, String, Option<String>, i64)> = sqlx::query_as(
+        let versions: Vec<(String, String, Option<String>, i64)> = sql::query_as(
             "select digest, definition, parent_digest, created_at_us from structure_version where structure_id = $1
              order by created_at_us, digest",
         )
@@ -97,7 +98,7 @@ impl Archive<'_> {
     async fn export_batches(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
         let (mut received, mut last) = (i64::MIN, String::new());
         loop {
-            let rows: Vec<BatchRow> = sqlx::query_as(
+            let rows: Vec<BatchRow> = sql::query_as(
                 "select batch_id, source, idempotency_key, content_digest, received_at_us, state from measurement_batch
                  where structure_id = $1 and (received_at_us, batch_id) > ($2, $3) order by received_at_us, batch_id limit $4",
             )
@@ -110,7 +111,7 @@ impl Archive<'_> {
             let Some(end) = rows.last() else { return Ok(()) };
             (received, last) = (end.4, end.0.clone());
             let ids: Vec<&String> = rows.iter().map(|row| &row.0).collect();
-            let measured: Vec<ExportedMeasurement> = sqlx::query_as(concat!(
+            let measured: Vec<ExportedMeasurement> = sql::query_as(concat!(
                 "select batch_id, measured_at_us, frequency_hz, std_hz, mode_shapes, covariates, settings
                  from measurement where structure_id = $1 and batch_id in (select value from ",
                 elements!("$2"),
@@ -149,12 +150,12 @@ impl Archive<'_> {
              where structure_id = $1 and batch_id in (select value from {}) order by batch_id, {CURRENT_FIRST}",
             elements!("$2")
         );
-        let assessed: Vec<(String, u32, String)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        let assessed: Vec<(String, Whole<u32>, String)> = sql::query_as(sqlx::AssertSqlSafe(select))
             .bind(structure.as_str())
             .bind(list(ids))
             .fetch_all(&self.database.reader)
             .await?;
-        let kept: Vec<(String, u32)> = sqlx::query_as(concat!(
+        let kept: Vec<(String, Whole<u32>)> = sql::query_as(concat!(
             "select batch_id, undamaged_version from kept_comparison where structure_id = $1 and batch_id in (select value from ",
             elements!("$2"),
             ") order by batch_id, position"
@@ -164,17 +165,17 @@ impl Archive<'_> {
         .fetch_all(&self.database.reader)
         .await?;
         let mut all = BTreeMap::<String, Compared>::new();
-        for (batch, version, model) in assessed {
+        for (batch, Whole(version), model) in assessed {
             all.entry(batch).or_default().assessed.push((version, model));
         }
-        for (batch, version) in kept {
+        for (batch, Whole(version)) in kept {
             all.entry(batch).or_default().kept.push(version);
         }
         Ok(all)
     }
 
     async fn export_states(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
-        let rows: Vec<StateRow> = sqlx::query_as(
+        let rows: Vec<StateRow> = sql::query_as(
             "select version, model_digest, created_at_us, threshold_probability, measurement_count, conditions, doubts, joint,
                     origin, (select process from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version),
                     (select reason from undamaged_process p where p.structure_id = s.structure_id and p.version = s.version)
@@ -185,7 +186,7 @@ impl Archive<'_> {
         .await?;
         for row in rows {
             let (
-                version,
+                Whole(version),
                 model_digest,
                 created,
                 threshold_probability,
@@ -198,7 +199,7 @@ impl Archive<'_> {
                 without,
             ) = row;
             let batches = batches_of(self.database, structure, version).await?;
-            let quantities: Vec<UndamagedQuantity> = sqlx::query_as(
+            let quantities: Vec<UndamagedQuantity> = sql::query_as(
                 "select quantity, position, mean, std, threshold, detail, mean_draws, std_draws
                  from undamaged_quantity where structure_id = $1 and version = $2 order by position",
             )
@@ -227,7 +228,7 @@ impl Archive<'_> {
     }
 
     async fn export_notes(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
-        let windows: Vec<(i64, i64, String, i64)> = sqlx::query_as(
+        let windows: Vec<(i64, i64, String, i64)> = sql::query_as(
             "select from_us, to_us, reason, created_at_us from maintenance_window where structure_id = $1 order by from_us, to_us",
         )
         .bind(structure.as_str())
@@ -238,7 +239,7 @@ impl Archive<'_> {
             let window = Maintenance { from: time(from)?, to: time(to)?, reason, created_at: time(created)? };
             records.send(Record::Maintenance(window)).await.map_err(receiver_dropped)?;
         }
-        let seen: Vec<AcknowledgedRow> = sqlx::query_as(
+        let seen: Vec<AcknowledgedRow> = sql::query_as(
             "select kind, series, undamaged_version, opened_batch, acknowledged_at_us, acknowledged_by, acknowledgement_note
              from alarm_episode where structure_id = $1 and acknowledged_at_us is not null and acknowledged_by is not null
                and opened_batch is not null and withdrawn = 0 order by episode",
@@ -246,7 +247,7 @@ impl Archive<'_> {
         .bind(structure.as_str())
         .fetch_all(&self.database.reader)
         .await?;
-        for (kind, series, version, opened_batch, at, by, note) in seen {
+        for (kind, series, Whole(version), opened_batch, at, by, note) in seen {
             let at = timestamp("acknowledgement", at)?.to_string();
             let undamaged_version = Some(version);
             let record = Acknowledged { kind, series, undamaged_version, opened_batch, at, by, note };
@@ -260,7 +261,7 @@ impl Archive<'_> {
     /// # Errors
     /// [`Error::Sqlite`].
     pub async fn trained_models(self, structure: &StructureId) -> Result<Vec<ArchivedModel>, Error> {
-        let rows: Vec<ModelRow> = sqlx::query_as(
+        let rows: Vec<ModelRow> = sql::query_as(
             "select structure_digest, model_digest, manifest, weights, accepted from trained_baseline
              where structure_id = $1 order by created_at_us, structure_digest",
         )
@@ -275,7 +276,7 @@ impl Archive<'_> {
 }
 
 /// Kind, series, version of the reference, opening batch, time in µs, person and note of an acknowledgement.
-type AcknowledgedRow = (String, String, u32, String, i64, String, Option<String>);
+type AcknowledgedRow = (String, String, Whole<u32>, String, i64, String, Option<String>);
 
 /// What a batch was compared with.
 #[derive(Default)]

@@ -11,6 +11,7 @@ use super::super::column::{bad_row, list};
 use super::super::comparison::{keep, requeue};
 use super::super::error::Error;
 use super::super::note::insert_note;
+use super::super::sql::{self, Whole};
 use super::super::structure::{put_definition, PutStructure};
 use super::super::transaction::Transaction;
 use super::export::Archive;
@@ -129,9 +130,9 @@ impl Import {
         structure: String,
         known_model: Option<Digest>,
     ) -> Result<Self, Error> {
-        sqlx::query("delete from imported_action where structure_id = $1")
+        sql::query("delete from imported_action where structure_id = $1")
             .bind(&structure)
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
         let (batches, states, done) = (Vec::new(), Vec::new(), Stored::default());
         Ok(Self { structure, known_model, states_comparisons: false, batches, states, actions: 0, done })
@@ -173,11 +174,11 @@ impl Import {
             }
             action @ (Record::Acknowledgement(_) | Record::AlarmAction(_)) => {
                 let text = serde_json::to_string(&action).map_err(|e| bad_row("action of the archive")(&e))?;
-                sqlx::query("insert into imported_action values ($1, $2, $3)")
+                sql::query("insert into imported_action values ($1, $2, $3)")
                     .bind(structure)
                     .bind(self.actions)
                     .bind(text)
-                    .execute(transaction.connection())
+                    .execute(&mut *transaction)
                     .await?;
                 self.actions += 1;
             }
@@ -248,13 +249,13 @@ impl Import {
         let mut rules = Vec::new();
         let Some(newest) = self.states.iter().max_by_key(|state| state.version) else { return Ok(rules) };
         for state in self.states.iter().filter(|state| state.model == newest.model) {
-            let (last,): (i64,) = sqlx::query_as(
+            let (last,): (i64,) = sql::query_as(
                 "select coalesce(max(measured_to_us), 0) from measurement_batch join undamaged_batch using (structure_id, batch_id)
                  where structure_id = $1 and version = $2",
             )
             .bind(&self.structure)
             .bind(state.version)
-            .fetch_one(transaction.connection())
+            .fetch_one(&mut *transaction)
             .await?;
             rules.push((state, last));
         }
@@ -280,36 +281,35 @@ fn compared_by_rule(batch: &Placed, rules: &[(&State, i64)]) -> Vec<u32> {
 
 /// The newest reference that a batch is or will be compared with here; 0 if there is none.
 async fn newest_comparison(transaction: &mut Transaction<'_>, (structure, batch): (&str, &str)) -> Result<u32, Error> {
-    let (newest,): (u32,) = sqlx::query_as(
+    let (Whole(newest),): (Whole<u32>,) = sql::query_as(
         "select coalesce(max(undamaged_version), 0) from (
              select undamaged_version from assessment where structure_id = $1 and batch_id = $2
-             union all select undamaged_version from kept_comparison where structure_id = $1 and batch_id = $2)",
+             union all select undamaged_version from kept_comparison where structure_id = $1 and batch_id = $2) compared",
     )
     .bind(structure)
     .bind(batch)
-    .fetch_one(transaction.connection())
+    .fetch_one(&mut *transaction)
     .await?;
     Ok(newest)
 }
 
 async fn insert_version(transaction: &mut Transaction<'_>, structure: &str, version: Version) -> Result<bool, Error> {
     let created = Timestamp::parse(&version.created_at).map_err(|e| bad_row("version of the archive")(&e))?;
-    let inserted =
-        sqlx::query("insert into structure_version values ($1, $2, $3, $4, null, $5) on conflict do nothing")
-            .bind(structure)
-            .bind(&version.digest)
-            .bind(&version.definition)
-            .bind(&version.parent_digest)
-            .bind(created.micros())
-            .execute(transaction.connection())
-            .await?;
+    let inserted = sql::query("insert into structure_version values ($1, $2, $3, $4, null, $5) on conflict do nothing")
+        .bind(structure)
+        .bind(&version.digest)
+        .bind(&version.definition)
+        .bind(&version.parent_digest)
+        .bind(created.micros())
+        .execute(&mut *transaction)
+        .await?;
     Ok(inserted.rows_affected() > 0)
 }
 
 async fn insert_model(transaction: &mut Transaction<'_>, structure: &str, model: ArchivedModel) -> Result<bool, Error> {
     let weights = model.weights().map_err(|e| bad_row("model of the archive")(&e))?;
     let inserted =
-        sqlx::query("insert into trained_baseline values ($1, $2, $3, $4, $5, $6, $7) on conflict do nothing")
+        sql::query("insert into trained_baseline values ($1, $2, $3, $4, $5, $6, $7) on conflict do nothing")
             .bind(structure)
             .bind(&model.structure_digest)
             .bind(&model.model_digest)
@@ -317,20 +317,20 @@ async fn insert_model(transaction: &mut Transaction<'_>, structure: &str, model:
             .bind(weights)
             .bind(model.accepted)
             .bind(Timestamp::now().micros())
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
     Ok(inserted.rows_affected() > 0)
 }
 
 async fn insert_window(transaction: &mut Transaction<'_>, structure: &str, window: Maintenance) -> Result<bool, Error> {
     let (from, to, created) = window.check()?;
-    let inserted = sqlx::query("insert into maintenance_window values ($1, $2, $3, $4, $5) on conflict do nothing")
+    let inserted = sql::query("insert into maintenance_window values ($1, $2, $3, $4, $5) on conflict do nothing")
         .bind(structure)
         .bind(from.micros())
         .bind(to.micros())
         .bind(&window.reason)
         .bind(created.micros())
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     Ok(inserted.rows_affected() > 0)
 }

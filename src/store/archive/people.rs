@@ -6,6 +6,7 @@ use super::super::alarm_action::{insert_action, kind_of_row, NewAction};
 use super::super::column::{bad_row, timestamp};
 use super::super::error::Error;
 use super::super::note::{Note, Notes};
+use super::super::sql::{self, Whole};
 use super::super::transaction::Transaction;
 use super::export::{receiver_dropped, Archive};
 use super::record::{Acknowledged, ArchivedAction, ArchivedNote, Record};
@@ -15,7 +16,7 @@ impl Archive<'_> {
     /// Sends the actions on alarms and the notes of a structure. Of a withdrawn alarm only the comments are sent: its closing must not
     /// close another alarm.
     pub(super) async fn export_people(self, structure: &StructureId, records: &Sender<Record>) -> Result<(), Error> {
-        let rows = sqlx::query(
+        let rows = sql::query(
             "select e.kind, e.series, e.opened_batch, e.opened_at_us, e.ended_at_us, a.uid, a.kind, a.at_us, a.author, a.text, a.reason,
                     a.assignee, e.undamaged_version
              from alarm_action a join alarm_episode e using (structure_id, episode)
@@ -49,7 +50,7 @@ impl Archive<'_> {
     /// # Errors
     /// [`Error::Sqlite`], [`Error::Row`].
     pub async fn settle_actions(self, structure: &StructureId) -> Result<ImportedActions, Error> {
-        let (any,): (bool,) = sqlx::query_as("select exists (select 1 from imported_action where structure_id = $1)")
+        let (any,): (bool,) = sql::query_as("select exists (select 1 from imported_action where structure_id = $1)")
             .bind(structure.as_str())
             .fetch_one(&self.database.reader)
             .await?;
@@ -61,9 +62,9 @@ impl Archive<'_> {
             .write(move |transaction| {
                 Box::pin(async move {
                     let records: Vec<(String,)> =
-                        sqlx::query_as("select record from imported_action where structure_id = $1 order by position")
+                        sql::query_as("select record from imported_action where structure_id = $1 order by position")
                             .bind(&structure)
-                            .fetch_all(transaction.connection())
+                            .fetch_all(&mut *transaction)
                             .await?;
                     let mut done = ImportedActions::default();
                     for (record,) in records {
@@ -80,9 +81,9 @@ impl Archive<'_> {
                             _ => {}
                         }
                     }
-                    sqlx::query("delete from imported_action where structure_id = $1")
+                    sql::query("delete from imported_action where structure_id = $1")
                         .bind(&structure)
-                        .execute(transaction.connection())
+                        .execute(&mut *transaction)
                         .await?;
                     Ok(done)
                 })
@@ -155,7 +156,7 @@ impl ArchivedNote {
 /// acknowledged already.
 async fn acknowledge(transaction: &mut Transaction<'_>, structure: &str, note: Acknowledged) -> Result<bool, Error> {
     let at = Timestamp::parse(&note.at).map_err(|e| bad_row("acknowledgement of the archive")(&e))?;
-    let updated = sqlx::query(
+    let updated = sql::query(
         "update alarm_episode set acknowledged_at_us = $1, acknowledged_by = $2, acknowledgement_note = $3
          where structure_id = $4 and kind = $5 and series = $6 and opened_batch = $7 and withdrawn = 0
            and acknowledged_at_us is null and ($8 is null or undamaged_version = $8)",
@@ -168,7 +169,7 @@ async fn acknowledge(transaction: &mut Transaction<'_>, structure: &str, note: A
     .bind(&note.series)
     .bind(&note.opened_batch)
     .bind(note.undamaged_version)
-    .execute(transaction.connection())
+    .execute(&mut *transaction)
     .await?;
     Ok(updated.rows_affected() > 0)
 }
@@ -186,11 +187,12 @@ async fn import_action(
     let ended = action.ended_at.as_deref().map(time).transpose()?;
     let kind = kind_of_row(&action.kind, action.text, action.reason.as_deref(), action.assignee)?;
     let new = NewAction { kind, at, author: action.author, seen: None };
-    let alarm: Option<(i64,)> = sqlx::query_as(
+    let alarm: Option<(i64,)> = sql::query_as(
         "select episode from alarm_episode
          where structure_id = $1 and kind = $2 and series = $3 and withdrawn = 0
            and (opened_batch = $4 or opened_at_us <= $6 and coalesce(ended_at_us, 9e18) >= $5)
-         order by undamaged_version is $7 and opened_batch = $4 desc, opened_batch = $4 desc, undamaged_version is $7 desc, episode desc
+         order by undamaged_version is not distinct from $7 and opened_batch = $4 desc, opened_batch = $4 desc,
+                  undamaged_version is not distinct from $7 desc, episode desc
          limit 1",
     )
     .bind(structure)
@@ -200,29 +202,28 @@ async fn import_action(
     .bind(opened.micros())
     .bind(ended.map_or(i64::MAX, Timestamp::micros))
     .bind(action.undamaged_version)
-    .fetch_optional(transaction.connection())
+    .fetch_optional(&mut *transaction)
     .await?;
     let Some((alarm,)) = alarm else { return Ok(None) };
     Ok(Some(insert_action(transaction, (structure, alarm), &action.uid, &new, true).await?))
 }
 
-fn action(row: &sqlx::sqlite::SqliteRow) -> Result<ArchivedAction, Error> {
-    use sqlx::Row as _;
-    let time = |column: usize| timestamp("alarm action", row.try_get(column)?).map(|at| at.to_string());
-    let ended: Option<i64> = row.try_get(4)?;
+fn action(row: &sql::Row) -> Result<ArchivedAction, Error> {
+    let time = |column: usize| timestamp("alarm action", row.get(column)?).map(|at| at.to_string());
+    let ended: Option<i64> = row.get(4)?;
     Ok(ArchivedAction {
-        alarm_kind: row.try_get(0)?,
-        series: row.try_get(1)?,
-        opened_batch: row.try_get(2)?,
+        alarm_kind: row.get(0)?,
+        series: row.get(1)?,
+        opened_batch: row.get(2)?,
         opened_at: time(3)?,
         ended_at: ended.map(|at| timestamp("alarm action", at).map(|at| at.to_string())).transpose()?,
-        uid: row.try_get(5)?,
-        kind: row.try_get(6)?,
+        uid: row.get(5)?,
+        kind: row.get(6)?,
         at: time(7)?,
-        author: row.try_get(8)?,
-        text: row.try_get(9)?,
-        reason: row.try_get(10)?,
-        assignee: row.try_get(11)?,
-        undamaged_version: Some(row.try_get(12)?),
+        author: row.get(8)?,
+        text: row.get(9)?,
+        reason: row.get(10)?,
+        assignee: row.get(11)?,
+        undamaged_version: Some(row.get::<Whole<u32>>(12)?.0),
     })
 }

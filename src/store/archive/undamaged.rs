@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use super::super::column::bad_row;
 use super::super::error::Error;
 use super::super::reference_content::stored_origin;
+use super::super::sql;
 use super::super::transaction::Transaction;
 use super::super::undamaged::{insert_batches, quantity, stored_process, ReferenceQuantityRow};
 use super::record::Undamaged;
@@ -67,12 +68,12 @@ pub(super) async fn import_undamaged(
 ) -> Result<bool, Error> {
     let bad = bad_row("undamaged reference of the archive");
     let created = Timestamp::parse(&state.created_at).map_err(|e| bad(&e))?;
-    let known: Option<(String, i64)> = sqlx::query_as(
+    let known: Option<(String, i64)> = sql::query_as(
         "select model_digest, created_at_us from undamaged_state where structure_id = $1 and version = $2",
     )
     .bind(structure)
     .bind(state.version)
-    .fetch_optional(transaction.connection())
+    .fetch_optional(&mut *transaction)
     .await?;
     if let Some((model_digest, created_here)) = known {
         if model_digest == state.model_digest && created_here == created.micros() {
@@ -91,7 +92,7 @@ async fn insert_undamaged(
     state: &Undamaged,
     created: Timestamp,
 ) -> Result<(), Error> {
-    sqlx::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
+    sql::query("insert into undamaged_state values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
         .bind(structure)
         .bind(state.version)
         .bind(&state.model_digest)
@@ -102,18 +103,18 @@ async fn insert_undamaged(
         .bind(&state.doubts)
         .bind(&state.joint)
         .bind(&state.origin)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
-    sqlx::query("insert into undamaged_process values ($1, $2, $3, $4)")
+    sql::query("insert into undamaged_process values ($1, $2, $3, $4)")
         .bind(structure)
         .bind(state.version)
         .bind(&state.process)
         .bind(&state.without_process)
-        .execute(transaction.connection())
+        .execute(&mut *transaction)
         .await?;
     insert_batches(transaction, (structure, state.version), &state.batches).await?;
     for q in &state.quantities {
-        sqlx::query("insert into undamaged_quantity values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
+        sql::query("insert into undamaged_quantity values ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10)")
             .bind(structure)
             .bind(state.version)
             .bind(&q.quantity)
@@ -124,7 +125,7 @@ async fn insert_undamaged(
             .bind(&q.detail)
             .bind(&q.mean_draws)
             .bind(&q.std_draws)
-            .execute(transaction.connection())
+            .execute(&mut *transaction)
             .await?;
     }
     Ok(())

@@ -9,6 +9,7 @@ use sqlx::Connection as _;
 use super::super::database_file::DatabaseFile;
 use super::super::error::Error as StoreError;
 use super::super::file::{refuse_foreign, take_lock, DATABASE_FILE};
+use super::super::reader::Reader;
 use super::copy::{read_contents, sha256, sync_folder, Contents};
 use super::draft_folder::DraftFolder;
 use super::error::{at, Error};
@@ -25,11 +26,12 @@ impl DatabaseFile<'_> {
     pub async fn backup(self, name: &str, content: Content, now: Timestamp) -> Result<Manifest, Error> {
         check_name(name)?;
         let target = self.folder().join(FOLDER).join(name);
+        let Reader::Sqlite(pool) = &self.database.reader else { return Err(Error::Server) };
         let pages: (i64,) = sqlx::query_as("select page_count * page_size from pragma_page_count, pragma_page_size")
-            .fetch_one(&self.database.reader)
+            .fetch_one(pool)
             .await?;
         let draft = Draft::begin(&target, pages.0.unsigned_abs() + self.min_free_bytes())?;
-        let mut reader = self.database.reader.acquire().await?;
+        let mut reader = pool.acquire().await?;
         vacuum_into(&mut reader, &draft.database()).await?;
         drop(reader);
         draft.finish(content, now).await

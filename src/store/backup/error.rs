@@ -13,6 +13,11 @@ pub enum Error {
     /// A backup with this name exists.
     #[error("there is a backup {0} already: give another name")]
     Exists(String),
+    /// The database is not a file.
+    #[error(
+        "the database is on a PostgreSQL server: back it up by pg_dump, or with its write-ahead log (docs/cluster.md)"
+    )]
+    Server,
     /// The folder has no database.
     #[error("{0} has no database: give the --data-dir of a service")]
     NoDatabase(PathBuf),

@@ -1,5 +1,6 @@
 //! Opening the database: pragmas, integrity check, and migrations.
 
+use std::cmp::Ordering;
 use std::path::Path;
 use std::time::Duration;
 
@@ -71,7 +72,7 @@ pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
     }
     MIGRATIONS.run(&writer).await.map_err(|error| match error {
         MigrateError::VersionMissing(found) => {
-            Error::SchemaTooNew { path: path.to_owned(), found, known: schema_version() }
+            Error::SchemaTooNew { place: path.display().to_string(), found, known: schema_version() }
         }
         other => Error::Migration(other),
     })?;
@@ -84,6 +85,19 @@ pub(in super::super) async fn open(path: &Path) -> Result<Opened, Error> {
         .connect_with(options.read_only(true).row_buffer_size(ROWS_AT_A_TIME))
         .await?;
     Ok(Opened { writer, reader, sqlite_version })
+}
+
+/// Checks that a file that is only read has the newest schema.
+pub(in super::super) async fn check_version(connection: &mut SqliteConnection, path: &Path) -> Result<(), Error> {
+    let (found,): (i64,) = sqlx::query_as("select coalesce(max(version), 0) from _sqlx_migrations where success = 1")
+        .fetch_one(connection)
+        .await?;
+    let (place, known) = (path.display().to_string(), schema_version());
+    match found.cmp(&known) {
+        Ordering::Less => Err(Error::FileTooOld { place, found, known }),
+        Ordering::Greater => Err(Error::SchemaTooNew { place, found, known }),
+        Ordering::Equal => Ok(()),
+    }
 }
 
 /// The version of the SQLite library, and whether it is free of the WAL-reset defect.

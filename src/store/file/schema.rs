@@ -6,7 +6,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
 use super::super::error::Error;
-use super::opening::MIGRATIONS;
+use super::opening::{schema_version, MIGRATIONS};
 
 /// Objects that are named in an error.
 const MOST_NAMED: usize = 5;
@@ -20,10 +20,7 @@ pub(in super::super) async fn foreign_objects(
     let found = objects(connection).await?;
     let mut expected = BTreeMap::new();
     if version > 0 {
-        let mut empty = SqliteConnection::connect_with(&SqliteConnectOptions::new().in_memory(true)).await?;
-        for migration in MIGRATIONS.iter().filter(|migration| migration.version <= version) {
-            sqlx::raw_sql(migration.sql.clone()).execute(&mut empty).await?;
-        }
+        let mut empty = empty(version).await?;
         expected = objects(&mut empty).await?;
         empty.close().await?;
     }
@@ -38,6 +35,25 @@ pub(in super::super) async fn foreign_objects(
     let changed = expected.iter().filter(|(name, text)| found.get(*name).is_some_and(|other| other != *text));
     let changed = changed.map(|((kind, name), _)| format!("{kind} {name} was changed"));
     Ok(foreign.chain(missing).chain(changed).take(MOST_NAMED).collect())
+}
+
+/// A database in memory with the schema of a version and without rows.
+async fn empty(version: i64) -> Result<SqliteConnection, Error> {
+    let mut empty = SqliteConnection::connect_with(&SqliteConnectOptions::new().in_memory(true)).await?;
+    for migration in MIGRATIONS.iter().filter(|migration| migration.version <= version) {
+        sqlx::raw_sql(migration.sql.clone()).execute(&mut empty).await?;
+    }
+    Ok(empty)
+}
+
+/// The triggers of the newest schema: name and definition.
+pub(in super::super) async fn triggers() -> Result<Vec<(String, String)>, Error> {
+    let mut empty = empty(schema_version()).await?;
+    let triggers = sqlx::query_as("select name, sql from sqlite_schema where type = 'trigger' order by name")
+        .fetch_all(&mut empty)
+        .await?;
+    empty.close().await?;
+    Ok(triggers)
 }
 
 /// The objects by kind and name, with their definition without white space and quotes.

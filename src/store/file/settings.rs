@@ -1,13 +1,22 @@
-//! Settings of the database file.
+//! Settings of the database.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::{Deserialize, Serialize};
 
-/// Where a database may be located, and how much disk space it needs.
+use super::super::url::DatabaseUrl;
+
+/// Where the database is, and how much disk space it needs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreSettings {
+    /// A database of a PostgreSQL server, instead of the file in the data folder.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub url: Option<DatabaseUrl>,
+    /// Wait while another service serves the database of the server, and take over when it ends.
+    pub standby: bool,
+    /// A standby takes over when the service that holds the database has not been heard of for so many seconds.
+    pub takeover_s: u64,
     /// Open a database on NFS, SMB or another network file system nevertheless.
     pub allow_network_filesystem: bool,
     /// Free bytes below which nothing is written; 0 = write until the disk is full.
@@ -18,7 +27,22 @@ pub struct StoreSettings {
 
 impl Default for StoreSettings {
     fn default() -> Self {
-        Self { allow_network_filesystem: false, min_free_bytes: 64 << 20, max_wal_bytes: 256 << 20 }
+        Self {
+            url: None,
+            standby: false,
+            takeover_s: 10,
+            allow_network_filesystem: false,
+            min_free_bytes: 64 << 20,
+            max_wal_bytes: 256 << 20,
+        }
+    }
+}
+
+impl StoreSettings {
+    /// The settings for a command, which does not wait until a service ends.
+    #[must_use]
+    pub fn without_waiting(&self) -> Self {
+        Self { standby: false, ..self.clone() }
     }
 }
 

@@ -10,6 +10,7 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::{AssertSqlSafe, Connection as _};
 
 use super::{assessment, at, batch, bridge, open, undamaged};
+use crate::database::IS_FILE;
 
 const MANY: i64 = 100_000;
 /// Seconds from one batch to the next.
@@ -84,6 +85,9 @@ async fn fill(folder: &tempfile::TempDir) {
 
 #[tokio::test]
 async fn a_reduced_series_of_a_hundred_thousand_batches_keeps_unusual_values() {
+    if !IS_FILE {
+        return;
+    }
     let (store, folder) = open().await;
     store
         .reference()
@@ -212,6 +216,9 @@ async fn only_the_current_assessment_of_a_batch_that_waits_for_none_is_drawn() {
 
 #[tokio::test]
 async fn the_packed_column_for_plots_agrees_with_the_rows() {
+    if !IS_FILE {
+        return;
+    }
     let (store, folder) = open().await;
     for i in 0..60 {
         let id = format!("b{i:02}");

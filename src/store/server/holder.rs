@@ -1,0 +1,73 @@
+//! The service that holds a database: the lock of its session, and the end of a session that is no longer heard of.
+
+use std::time::Duration;
+
+use sqlx::postgres::PgConnection;
+use sqlx::Connection as _;
+
+use super::super::error::{over_network, Error};
+use super::connect::Place;
+
+/// Number of the lock, among those that applications give a meaning of their own: "modalw" in ASCII. The server knows it by two halves.
+const LOCK: i64 = 0x6d6f_6461_6c77;
+
+/// Sessions that hold the lock of this database, of which there is at most one.
+const HOLDER: &str = "from pg_locks l join pg_stat_activity a on a.pid = l.pid
+     where l.locktype = 'advisory' and l.granted and l.objsubid = 1
+       and l.classid::bigint = $1 >> 32 and l.objid::bigint = $1 & 4294967295
+       and l.database = (select oid from pg_database where datname = current_database())";
+
+/// Takes the lock for the session of a connection.
+///
+/// # Errors
+/// [`Error::ServedElsewhere`], which names the holder.
+pub(super) async fn take(connection: &mut PgConnection, place: &Place) -> Result<(), Error> {
+    let (taken,): (bool,) = sqlx::query_as("select pg_try_advisory_lock($1)")
+        .bind(LOCK)
+        .fetch_one(&mut *connection)
+        .await
+        .map_err(over_network)?;
+    if taken {
+        return Ok(());
+    }
+    let select = format!("select a.application_name, a.client_addr::text {HOLDER}");
+    let holder: Option<(Option<String>, Option<String>)> = sqlx::query_as(sqlx::AssertSqlSafe(select))
+        .bind(LOCK)
+        .fetch_optional(connection)
+        .await
+        .map_err(over_network)?;
+    let holder = match holder {
+        Some((Some(name), address)) => {
+            let address = address.map(|address| format!(", from {address}")).unwrap_or_default();
+            format!("{name}{address}")
+        }
+        _ => "another service".to_owned(),
+    };
+    Err(Error::ServedElsewhere(format!(
+        "{} is served by {holder}: stop that service, or let this one wait for it by store.standby = true",
+        place.name()
+    )))
+}
+
+/// Ends the session of a holder that has not been heard of for `limit`: it is suspended, or was cut off from the server. A living one sends
+/// a statement every second.
+pub(super) async fn end_silent(place: &Place, limit: Duration) -> Result<(), Error> {
+    let mut connection = place.connect().await?;
+    // A session with a running statement is at work, for which the server itself is responsible.
+    let end = format!(
+        "select a.application_name, pg_terminate_backend(a.pid) {HOLDER} and a.state <> 'active'
+           and extract(epoch from clock_timestamp() - greatest(a.state_change, a.query_start)) > $2"
+    );
+    let ended: Vec<(Option<String>, bool)> = sqlx::query_as(sqlx::AssertSqlSafe(end))
+        .bind(LOCK)
+        .bind(limit.as_secs_f64())
+        .fetch_all(&mut connection)
+        .await
+        .map_err(over_network)?;
+    for (name, _) in ended {
+        let name = name.unwrap_or_default();
+        tracing::warn!("{name} has not been heard of for {} s: taking over from it", limit.as_secs());
+    }
+    connection.close().await.map_err(over_network)?;
+    Ok(())
+}

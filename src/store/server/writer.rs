@@ -1,0 +1,93 @@
+//! The one connection that writes, which holds the lock of the service.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use sqlx::postgres::PgConnection;
+use sqlx::Connection as _;
+use tokio::sync::{Mutex, MutexGuard};
+
+use super::super::error::{over_network, Error};
+use super::connect::Place;
+use super::holder;
+
+/// The connection that writes; made again, with the lock, when it broke.
+pub(in super::super) struct ServerWriter {
+    place: Place,
+    connection: Mutex<Option<PgConnection>>,
+    closed: AtomicBool,
+}
+
+/// The connection while a transaction uses it.
+pub(in super::super) struct HeldConnection<'w>(MutexGuard<'w, Option<PgConnection>>);
+
+impl ServerWriter {
+    pub(super) fn new(place: Place) -> Self {
+        Self { place, connection: Mutex::default(), closed: AtomicBool::new(false) }
+    }
+
+    /// Makes the connection, with the lock.
+    ///
+    /// # Errors
+    /// [`Error::ServedElsewhere`], [`Error::Unreachable`].
+    pub(super) async fn hold(&self) -> Result<(), Error> {
+        self.acquire().await.map(drop)
+    }
+
+    /// The connection, checked by a round trip to the server.
+    ///
+    /// # Errors
+    /// [`Error::ServedElsewhere`] if another service has taken the lock since the connection broke; [`Error::Unreachable`].
+    pub(in super::super) async fn acquire(&self) -> Result<HeldConnection<'_>, Error> {
+        let mut place = self.connection.lock().await;
+        if self.closed.load(Ordering::Relaxed) {
+            return Err(Error::Unreachable("the connection was closed".to_owned()));
+        }
+        if let Some(mut connection) = place.take() {
+            if connection.ping().await.is_ok() {
+                *place = Some(connection);
+                return Ok(HeldConnection(place));
+            }
+            let _ = connection.close_hard().await;
+        }
+        let mut connection = self.place.connect().await?;
+        if let Err(error) = holder::take(&mut connection, &self.place).await {
+            let _ = connection.close_hard().await;
+            return Err(error);
+        }
+        *place = Some(connection);
+        Ok(HeldConnection(place))
+    }
+
+    /// Sends a statement without effect, by which the server and a standby see that this service lives, and which finds a broken connection.
+    pub(in super::super) async fn beat(&self) -> Result<(), Error> {
+        let mut held = self.acquire().await?;
+        sqlx::query("select 1").execute(held.get()).await.map_err(over_network)?;
+        Ok(())
+    }
+
+    pub(in super::super) fn is_closed(&self) -> bool {
+        self.closed.load(Ordering::Relaxed)
+    }
+
+    /// Ends the connection, which releases the lock.
+    pub(in super::super) async fn close(&self) {
+        self.closed.store(true, Ordering::Relaxed);
+        if let Some(connection) = self.connection.lock().await.take() {
+            let _ = connection.close().await;
+        }
+    }
+}
+
+impl HeldConnection<'_> {
+    /// The connection.
+    pub(in super::super) fn get(&mut self) -> &mut PgConnection {
+        self.0.as_mut().expect("acquire leaves a connection in its place, and break_off consumes the holder")
+    }
+
+    /// Closes a connection whose state is unknown; the next transaction makes a new one.
+    pub(in super::super) async fn break_off(mut self) {
+        if let Some(connection) = self.0.take() {
+            let _ = connection.close_hard().await;
+        }
+    }
+}
