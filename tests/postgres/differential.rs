@@ -140,7 +140,7 @@ fn batch(dice: &mut Dice, position: usize, damaged: bool) -> Value {
     if damaged {
         k[1] *= 0.8;
     }
-    let mut rows = measurements(k, 2 + dice.below(11), position * 43_200);
+    let mut rows = measurements(k, 2 + dice.below(11), position * 21_600);
     match dice.below(12) {
         // A mode was not identified.
         0 => rows[0]["frequencies_hz"][1] = Value::Null,
@@ -202,8 +202,9 @@ async fn step(pair: &mut Pair, dice: &mut Dice, posted: &mut Vec<Value>, damaged
             pair.both(Method::GET, "/v1/overview", None).await;
         }
         _ => {
-            // Sometimes a place is left for a batch that comes late.
-            let position = posted.len() + usize::from(dice.below(6) == 0);
+            // Sometimes one comes late, between earlier ones.
+            let late = dice.below(6) == 0;
+            let position = if late { 2 * dice.below(posted.len() + 1) + 1 } else { 2 * posted.len() };
             let body = batch(dice, position, damaged);
             pair.both(Method::POST, &batches, Some(&body)).await;
             posted.push(body);
