@@ -214,13 +214,14 @@ impl From<JsonError> for ApiError {
 }
 
 impl From<crate::monitor::stored::Error> for ApiError {
-    /// A disk failure is not an error of the program: the client is asked to repeat the request, and the answer is not
-    /// a 500.
+    /// A disk failure, or a row that is damaged, is not an error of the program: the client is asked to repeat the request, and the answer
+    /// is not a 500.
     fn from(error: crate::monitor::stored::Error) -> Self {
         if matches!(error, crate::monitor::stored::Error::Row { .. }) {
-            error!(cause = %error, "Answering 500: {error}");
+            error!(cause = %error, "Answering 503: {error}");
             let detail = format!("{error}; run `modalwatch doctor`, and restore a backup if it names this");
-            return Self::new(StatusCode::INTERNAL_SERVER_ERROR, "stored_data_unreadable", detail);
+            let unreadable = Self::new(StatusCode::SERVICE_UNAVAILABLE, "stored_data_unreadable", detail);
+            return Self { retry_after_s: Some(RETRY_AFTER_DISK_SECONDS), ..unreadable };
         }
         let Some(cause) = error.disk_cause() else { return Self::internal(&error) };
         let status = match cause {

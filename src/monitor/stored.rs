@@ -2,10 +2,11 @@
 
 pub use crate::store::{
     backup, schema_version, Acknowledgement, ActionKind, ActionOutcome, AlarmAction, AuditEntry, AuditQuery,
-    BatchRecord, ChartMark, ChartSeries, ClosingReason, Delivery, DeliveryState, DiagnosisRecord, DiagnosisTrigger,
-    Episode, EpisodeDiagnosis, EpisodeQuery, Error, EventFilter, Exceedance, Handling, HistoryEntry, HistoryQuery,
-    JobKind, JobRecord, JobState, LatestAssessment, LatestPoint, LatestQuantity, MaintenanceWindow, MeasurementPlace,
-    MeasurementQuery, NewAction, NewAuditEntry, Note, OpenAlarms, PutStructure, QuantityMark, QuantitySeries,
-    QuarantinedMessage, ReferenceRecord, ReferenceVersion, RelativeChange, SeriesWindow, StoredChartPoint,
-    StoredMeasurement, StructureOverview, TrainingJobRecord, TrustMark, WebhookRecord, MOST_ACTIONS, MOST_NOTES,
+    BatchHeader, BatchRecord, ChartMark, ChartSeries, ClosingReason, Delivery, DeliveryState, DiagnosisRecord,
+    DiagnosisTrigger, Episode, EpisodeDiagnosis, EpisodeQuery, Error, EventFilter, Exceedance, Handling, HistoryEntry,
+    HistoryQuery, JobKind, JobRecord, JobState, LatestAssessment, LatestPoint, LatestQuantity, MaintenanceWindow,
+    MeasurementPlace, MeasurementQuery, NewAction, NewAuditEntry, Note, OpenAlarms, PutStructure, QuantityMark,
+    QuantitySeries, QuarantinedMessage, ReferenceRecord, ReferenceVersion, RelativeChange, SeriesWindow,
+    StoredChartPoint, StoredMeasurement, StructureOverview, TrainingJobRecord, TrustMark, WebhookRecord, MOST_ACTIONS,
+    MOST_NOTES,
 };
