@@ -215,7 +215,7 @@ impl From<JsonError> for ApiError {
 
 impl From<crate::monitor::stored::Error> for ApiError {
     /// A disk failure, or a row that is damaged, is not an error of the program: the client is asked to repeat the request, and the answer
-    /// is not a 500.
+    /// is not a 500. It does not say that nothing was stored: the call that failed may be one behind the commit.
     fn from(error: crate::monitor::stored::Error) -> Self {
         if matches!(error, crate::monitor::stored::Error::Row { .. }) {
             error!(cause = %error, "Answering 503: {error}");
@@ -231,14 +231,18 @@ impl From<crate::monitor::stored::Error> for ApiError {
         error!(cause = %error, "Answering {status}: {error}");
         let detail = match cause {
             "disk_full" => {
-                "the disk is full: nothing was stored; reading continues, and writing resumes when there is space; repeat the request then"
+                "the disk is full: whether a change was stored is not known, and a batch can be repeated safely; reading continues, and \
+                 writing resumes when there is space"
             }
-            "disk_failed" => "the disk failed: nothing was stored; repeat the request; the log has the cause under this request id",
-            "read_only" => "the database is read-only: nothing was stored",
+            "disk_failed" => {
+                "the disk failed: whether a change was stored is not known, and a batch can be repeated safely; the log has the cause \
+                 under this request id"
+            }
+            "read_only" => "the database is read-only: nothing can be stored",
             "database_gone" => {
                 "the database was deleted or replaced while it was open: nothing can be stored until it is restored"
             }
-            _ => "the database is busy: nothing was stored; repeat the request",
+            _ => "the database is busy: whether a change was stored is not known, and a batch can be repeated safely",
         };
         let wait = if cause == "database_busy" { RETRY_AFTER_SECONDS } else { RETRY_AFTER_DISK_SECONDS };
         Self { retry_after_s: Some(wait), ..Self::new(status, cause, detail) }

@@ -132,15 +132,15 @@ pub const CODES: [(&str, StatusCode, &str); 82] = [
     ),
     ("starting", StatusCode::SERVICE_UNAVAILABLE, "the service is starting"),
     ("stopping", StatusCode::SERVICE_UNAVAILABLE, "the service is stopping"),
-    ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; nothing was stored"),
-    ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing was stored"),
+    ("disk_failed", StatusCode::SERVICE_UNAVAILABLE, "the disk failed; whether a change was stored is not known"),
+    ("read_only", StatusCode::SERVICE_UNAVAILABLE, "the database is read-only; nothing can be stored"),
     (
         "database_busy",
         StatusCode::SERVICE_UNAVAILABLE,
-        "the database is busy; nothing was stored",
+        "the database is busy; whether a change was stored is not known",
     ),
-    ("database_gone", StatusCode::SERVICE_UNAVAILABLE, "the database was deleted or replaced; nothing was stored"),
-    ("disk_full", StatusCode::INSUFFICIENT_STORAGE, "the disk is full; nothing was stored"),
+    ("database_gone", StatusCode::SERVICE_UNAVAILABLE, "the database was deleted or replaced; nothing can be stored"),
+    ("disk_full", StatusCode::INSUFFICIENT_STORAGE, "the disk is full; whether a change was stored is not known"),
 ];
 
 /// A problem (RFC 9457, `application/problem+json`). It has no `type`; `title` is the name of the HTTP status, and

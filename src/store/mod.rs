@@ -105,6 +105,8 @@ pub use outbox::{Delivery, DeliveryState, Outbox, OutboxEvent, Settlement, Turns
 pub use overview::{LatestAssessment, Overview, RelativeChange, StructureOverview};
 pub use quarantine::{Quarantine, QuarantinedMessage};
 pub use reference_version::ReferenceVersion;
+#[cfg(test)]
+pub(crate) use retention::remove_beside;
 pub use retention::{Deleted, Expired, Retention};
 pub use series::{Extent, QuantityMark, QuantitySeries, Series, SeriesWindow, TrustMark};
 pub use structure::{PutStructure, StructureRecord, StructureSummary, Structures};
