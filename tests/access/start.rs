@@ -13,7 +13,7 @@ const LIST: &str = "/v1/structures";
 
 /// A service on an address that other machines could reach (none does).
 fn public(data_dir: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_modalwatch"));
+    let mut command = Command::new(crate::helpers::program());
     command.args(["serve", "--listen", "0.0.0.0:0", "--data-dir"]).arg(data_dir);
     command.env("MODALWATCH__LOG__LEVEL", "warn").env_remove("MODALWATCH_ADMIN_TOKEN_FILE");
     command
