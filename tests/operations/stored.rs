@@ -2,13 +2,14 @@
 //! structures that are deleted.
 
 use std::path::Path;
+use std::time::Duration;
 
 use reqwest::Method;
 use serde_json::{json, Value};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
 use sqlx::Connection as _;
 
-use crate::helpers::{command, created, eventually, measurements, problem, spawn, Service};
+use crate::helpers::{command, created, eventually, measurements, problem, spawn, within, Service};
 use crate::world::{fails, program, run, settled, text, with_past};
 
 /// Executes SQL on a database that no service has open.
@@ -235,6 +236,19 @@ async fn a_structure_is_deleted_with_all_its_data_and_nothing_else() {
         problem(delete(&service, &unconfirmed).await, 422, "invalid").await;
     }
     problem(delete(&service, "/v1/structures/none?confirm=none").await, 404, "unknown_structure").await;
+    // While a training runs, which would end in a structure that is gone.
+    let recipe = json!({ "samples": 20_000, "epochs": 2_000, "units": 16 });
+    let begun = service.post(&format!("{path}/trainings"), &recipe).await;
+    assert_eq!(begun.status(), 202);
+    let training: Value = begun.json().await.unwrap();
+    let training = training["training"].as_str().unwrap();
+    problem(delete(&service, asked).await, 409, "structure_has_jobs").await;
+    let cancelled = service.request(Method::DELETE, &format!("/v1/jobs/{training}")).send().await.unwrap();
+    assert!(cancelled.status().is_success(), "{}", cancelled.status());
+    within(Duration::from_mins(3), "the end of the training", async || {
+        (service.read(&format!("/v1/trainings/{training}")).await["state"] == "cancelled").then_some(())
+    })
+    .await;
     let others = service.read("/v1/structures").await["items"].as_array().unwrap().len();
     let gone: Value = delete(&service, asked).await.json().await.unwrap();
     assert_eq!(
