@@ -6,8 +6,8 @@ use sqlx::sqlite::SqliteConnection;
 
 use super::column::bad_row;
 use super::error::Error;
-use super::reference_content::stored_origin;
-use super::undamaged::{quantity, stored_process, ReferenceQuantityRow};
+use super::reference_content::{stored_origin, stored_process};
+use super::undamaged::{quantity, ReferenceQuantityRow};
 use crate::damage::{JointReference, SeenCovariate};
 
 /// Rows that are named.
